@@ -1,0 +1,1 @@
+"""Estimators: measurements to trajectories, maps and covariances."""

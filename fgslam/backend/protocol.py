@@ -1,0 +1,72 @@
+"""What every estimator, filter or smoother, offers.
+
+The loop is always: ``predict`` with the odometry, match against ``landmarks()``, ``update`` with the
+frame's measurements. A live run and a replay of its log call the same three, so any estimator can
+steer the front-end and any log can be given to any estimator.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, Protocol
+
+from fgslam.types import (
+    EgoMotion,
+    Estimate,
+    FloatArray,
+    Increment,
+    IntArray,
+    LandmarkMap,
+    MeasurementType,
+    Odometry,
+    Prediction,
+    StateArrays,
+    UpdateStats,
+)
+
+
+class Estimator(Protocol):
+    """A SLAM estimator over stereo landmarks.
+
+    Calls come in time order; a time stamp that does not increase raises EstimatorError and leaves
+    the state as it was. Arguments are never mutated. Returned arrays must not be written to.
+    """
+
+    kind: ClassVar[str]
+    supports: ClassVar[frozenset[MeasurementType]]
+
+    def predict(self, odometry: Odometry | None) -> Prediction:
+        """Pose expected after the camera moved by ``odometry``; the prior pose for None.
+
+        Does not change the state: predicting twice gives the same answer.
+        """
+        ...
+
+    def landmarks(self) -> LandmarkMap:
+        """Current landmarks, those initiated and not yet pruned."""
+        ...
+
+    def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
+        """Take in one frame.
+
+        Args:
+            increment: the frame's measurements.
+            tracking: least-squares pose of the frame against this estimator's own landmarks. Its
+                ``inliers`` run over the increment's matched (not new) observations, in order.
+        """
+        ...
+
+    def estimate(self) -> Estimate:
+        """Trajectory, pose covariances and map as known now."""
+        ...
+
+    def landmark_covariances(self, ids: IntArray) -> FloatArray:
+        """Marginal covariances (k, 3, 3) of the named landmarks. KeyError for an unknown one."""
+        ...
+
+    def state(self) -> StateArrays:
+        """Everything needed to continue bit by bit, as plain arrays."""
+        ...
+
+    def restore(self, state: StateArrays) -> None:
+        """Continue from what :meth:`state` gave."""
+        ...

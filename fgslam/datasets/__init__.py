@@ -1,0 +1,1 @@
+"""Readers of recordings, one a module, all behind the Sequence protocol."""

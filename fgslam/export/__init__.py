@@ -1,0 +1,1 @@
+"""The run folder, trajectories, point clouds and pictures."""

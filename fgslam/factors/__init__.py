@@ -1,0 +1,1 @@
+"""Measurements to factors: noise models and keys."""

@@ -1,0 +1,1 @@
+"""Images to measurements: SIFT, stereo matching, the landmark database, ego-motion."""

@@ -1,0 +1,318 @@
+"""Pure geometry: rigid motions, the stereo camera and its Jacobians, triangulation, frame changes.
+
+Conventions as in :mod:`fgslam.types`: ``wTc`` poses as 4x4 matrices, tangent vectors
+[rotation, translation] on the right (``T * Exp(xi)``), which is GTSAM's ``Pose3`` convention.
+Functions over many items are vectorised over the leading axis.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.types import CameraRig, FloatArray
+
+# Below this rotation angle the series of sin and cos are exact to double precision.
+_SMALL_ANGLE = 1e-4
+
+BODY_FORWARD_LEFT_UP_FROM_CAMERA: FloatArray = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""``bTc`` of a level camera looking ahead: body x forward, y left, z up; camera z forward, y down."""
+
+
+# --------------------------------------------------------------------------------------------
+# Rotations and rigid motions
+
+
+def skew(v: FloatArray) -> FloatArray:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3): ``skew(a) @ b == cross(a, b)``."""
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def so3_exp(omega: FloatArray) -> FloatArray:
+    """Rotation matrix (3, 3) of a rotation vector (3,), by Rodrigues' formula."""
+    theta2 = float(omega @ omega)
+    theta = np.sqrt(theta2)
+    if theta < _SMALL_ANGLE:
+        a, b = 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0
+    else:
+        a, b = np.sin(theta) / theta, (1.0 - np.cos(theta)) / theta2
+    k = skew(omega)
+    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+
+
+def so3_log(rotation: FloatArray) -> FloatArray:
+    """Rotation vector (3,) of a rotation matrix (3, 3), angle in [0, pi], stable at both ends."""
+    quaternion = quaternion_from_rotation(rotation)
+    if quaternion[3] < 0.0:
+        quaternion = -quaternion
+    vector, w = quaternion[:3], quaternion[3]
+    sine = float(np.linalg.norm(vector))
+    if sine < _SMALL_ANGLE:
+        return np.asarray(vector * (2.0 / w) * (1.0 - sine * sine / (3.0 * w * w)))
+    return np.asarray(vector * (2.0 * np.arctan2(sine, w) / sine))
+
+
+def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
+    """Unit quaternion (x, y, z, w) of a rotation matrix (3, 3); Shepperd's method."""
+    diagonal = np.diagonal(rotation)
+    trace = float(diagonal.sum())
+    choice = int(np.argmax([diagonal[0], diagonal[1], diagonal[2], trace]))
+    q = np.empty(4)
+    if choice == 3:
+        q[3] = 1.0 + trace
+        q[0] = rotation[2, 1] - rotation[1, 2]
+        q[1] = rotation[0, 2] - rotation[2, 0]
+        q[2] = rotation[1, 0] - rotation[0, 1]
+    else:
+        i, j, k = choice, (choice + 1) % 3, (choice + 2) % 3
+        q[i] = 1.0 - trace + 2.0 * rotation[i, i]
+        q[j] = rotation[j, i] + rotation[i, j]
+        q[k] = rotation[k, i] + rotation[i, k]
+        q[3] = rotation[k, j] - rotation[j, k]
+    return np.asarray(q / np.linalg.norm(q))
+
+
+def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
+    """Rotation matrix (3, 3) of a quaternion (x, y, z, w), normalised first."""
+    x, y, z, w = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """Homogeneous (4, 4) matrix of a rotation (3, 3) and a translation (3,)."""
+    out = np.eye(4)
+    out[:3, :3] = rotation
+    out[:3, 3] = translation
+    return out
+
+
+def inverse(aTb: FloatArray) -> FloatArray:
+    """``bTa`` of a rigid ``aTb``; poses (..., 4, 4)."""
+    out = np.zeros_like(aTb)
+    transposed = np.swapaxes(aTb[..., :3, :3], -1, -2)
+    out[..., :3, :3] = transposed
+    out[..., :3, 3] = -(transposed @ aTb[..., :3, 3:])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def _so3_left_jacobian(omega: FloatArray) -> FloatArray:
+    theta2 = float(omega @ omega)
+    theta = np.sqrt(theta2)
+    if theta < _SMALL_ANGLE:
+        b, c = 0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0
+    else:
+        b, c = (1.0 - np.cos(theta)) / theta2, (theta - np.sin(theta)) / (theta2 * theta)
+    k = skew(omega)
+    return np.asarray(np.eye(3) + b * k + c * (k @ k))
+
+
+def se3_exp(xi: FloatArray) -> FloatArray:
+    """Rigid motion (4, 4) of a tangent vector (6,) [rotation, translation]; GTSAM's Expmap."""
+    return pose(so3_exp(xi[:3]), _so3_left_jacobian(xi[:3]) @ xi[3:])
+
+
+def se3_log(aTb: FloatArray) -> FloatArray:
+    """Tangent vector (6,) [rotation, translation] of a rigid motion (4, 4); GTSAM's Logmap."""
+    omega = so3_log(aTb[:3, :3])
+    return np.concatenate([omega, np.linalg.solve(_so3_left_jacobian(omega), aTb[:3, 3])])
+
+
+def adjoint(aTb: FloatArray) -> FloatArray:
+    """Adjoint (6, 6) of ``aTb``: maps a tangent vector in b to the same motion's in a."""
+    rotation = aTb[:3, :3]
+    out = np.zeros((6, 6))
+    out[:3, :3] = rotation
+    out[3:, 3:] = rotation
+    out[3:, :3] = skew(aTb[:3, 3]) @ rotation
+    return out
+
+
+def se3_log_jacobian(xi: FloatArray) -> FloatArray:
+    """d Log(Exp(xi) Exp(delta)) / d delta at delta = 0: the inverse right Jacobian (6, 6).
+
+    Bernoulli series of the adjoint representation up to the sixth order; for |xi| < 0.5 exact to
+    1e-8, which is all that a correction to a predicted pose needs.
+    """
+    ad = np.zeros((6, 6))
+    ad[:3, :3] = ad[3:, 3:] = skew(xi[:3])
+    ad[3:, :3] = skew(xi[3:])
+    ad2 = ad @ ad
+    ad4 = ad2 @ ad2
+    return np.asarray(np.eye(6) + ad / 2 + ad2 / 12 - ad4 / 720 + (ad4 @ ad2) / 30240)
+
+
+def compose_covariance(motion: FloatArray, before: FloatArray, noise: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of ``T * motion`` given that of ``T`` and of the motion (at its end)."""
+    ad = adjoint(inverse(motion))
+    return np.asarray(ad @ before @ ad.T + noise)
+
+
+def change_tangent_frame(aTb: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of a motion expressed in b, expressed in a: ``Ad(aTb) C Ad(aTb)^T``."""
+    ad = adjoint(aTb)
+    return np.asarray(ad @ covariance @ ad.T)
+
+
+def body_to_camera_motion(bTb: FloatArray, bTc: FloatArray) -> FloatArray:
+    """Motion (4, 4) of the camera when the robot's body moves by ``bTb`` (Se et al. 5; S30).
+
+    The lever arm turns a pure spin of the robot into an arc at the camera.
+    """
+    return np.asarray(inverse(bTc) @ bTb @ bTc)
+
+
+def reorthonormalise(wTc: FloatArray) -> FloatArray:
+    """The nearest rigid motion (4, 4); removes the drift of many products."""
+    u, _, vt = np.linalg.svd(wTc[:3, :3])
+    return pose(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, wTc[:3, 3])
+
+
+def rotation_angle(rotation: FloatArray) -> float:
+    """Angle in radians of a rotation matrix (3, 3)."""
+    return float(np.linalg.norm(so3_log(rotation)))
+
+
+def yaw_pitch_roll(wTc: FloatArray) -> tuple[float, float, float]:
+    """Paper's angles of a camera pose, radians: yaw clockwise from above, pitch up, roll clockwise.
+
+    The rotation is yaw about y (down), then pitch about x, then roll about z: ``Ry Rx Rz``.
+    """
+    r = wTc[:3, :3]
+    pitch = float(np.arcsin(np.clip(-r[1, 2], -1.0, 1.0)))
+    yaw = float(np.arctan2(r[0, 2], r[2, 2]))
+    roll = float(np.arctan2(r[1, 0], r[1, 1]))
+    return yaw, pitch, roll
+
+
+def wrap_angle(angle: FloatArray) -> FloatArray:
+    """Angles wrapped to [-pi, pi)."""
+    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+# --------------------------------------------------------------------------------------------
+# The stereo camera
+
+
+def transform_to_camera(wTc: FloatArray, points: FloatArray) -> FloatArray:
+    """World points (n, 3) in camera coordinates."""
+    return np.asarray((points - wTc[:3, 3]) @ wTc[:3, :3])
+
+
+def transform_to_world(wTc: FloatArray, points: FloatArray) -> FloatArray:
+    """Camera points (n, 3) in world coordinates."""
+    return np.asarray(points @ wTc[:3, :3].T + wTc[:3, 3])
+
+
+def project(rig: CameraRig, points: FloatArray) -> FloatArray:
+    """(column, row, disparity) (n, 3) of points (n, 3) in the reference camera's frame, Z != 0."""
+    inverse_depth = 1.0 / points[:, 2]
+    out = np.empty_like(points)
+    out[:, 0] = rig.cx + rig.fx * points[:, 0] * inverse_depth
+    out[:, 1] = rig.cy + rig.fy * points[:, 1] * inverse_depth
+    out[:, 2] = rig.fx * rig.baseline * inverse_depth
+    return out
+
+
+def projection_jacobian(rig: CameraRig, points: FloatArray) -> FloatArray:
+    """d(column, row, disparity)/d(point) (n, 3, 3) at points (n, 3) in the camera's frame."""
+    inverse_depth = 1.0 / points[:, 2]
+    inverse_depth2 = inverse_depth * inverse_depth
+    out = np.zeros((len(points), 3, 3))
+    out[:, 0, 0] = rig.fx * inverse_depth
+    out[:, 0, 2] = -rig.fx * points[:, 0] * inverse_depth2
+    out[:, 1, 1] = rig.fy * inverse_depth
+    out[:, 1, 2] = -rig.fy * points[:, 1] * inverse_depth2
+    out[:, 2, 2] = -rig.fx * rig.baseline * inverse_depth2
+    return out
+
+
+def point_pose_jacobian(points: FloatArray) -> FloatArray:
+    """d(point in camera)/d(tangent of wTc) (n, 3, 6) for points (n, 3) in the camera's frame."""
+    out = np.empty((len(points), 3, 6))
+    out[:, :, :3] = skew(points)
+    out[:, :, 3:] = -np.eye(3)
+    return out
+
+
+def triangulate(rig: CameraRig, measurement: FloatArray) -> FloatArray:
+    """Points (n, 3) in the reference camera from (column, row, disparity) (n, 3), disparity > 0.
+
+    Se et al. 2.2; the inverse of :func:`project`.
+    """
+    depth = rig.fx * rig.baseline / measurement[:, 2]
+    out = np.empty_like(measurement)
+    out[:, 0] = (measurement[:, 0] - rig.cx) * depth / rig.fx
+    out[:, 1] = (measurement[:, 1] - rig.cy) * depth / rig.fy
+    out[:, 2] = depth
+    return out
+
+
+def triangulation_covariance(
+    rig: CameraRig, measurement: FloatArray, covariance: FloatArray
+) -> FloatArray:
+    """Full covariance (n, 3, 3) of triangulated points by first-order propagation.
+
+    Keeps the off-diagonals, so that the ellipsoids lie along the rays (design B4).
+
+    Args:
+        rig: the cameras.
+        measurement: (n, 3) (column, row, disparity), pixels.
+        covariance: (n, 3, 3) of the measurement, pixels squared.
+    """
+    d = measurement[:, 2]
+    jacobian = np.zeros((len(d), 3, 3))
+    jacobian[:, 0, 0] = rig.baseline / d
+    jacobian[:, 0, 2] = -(measurement[:, 0] - rig.cx) * rig.baseline / d**2
+    jacobian[:, 1, 1] = rig.fx * rig.baseline / (rig.fy * d)
+    jacobian[:, 1, 2] = -(measurement[:, 1] - rig.cy) * rig.fx * rig.baseline / (rig.fy * d**2)
+    jacobian[:, 2, 2] = -rig.fx * rig.baseline / d**2
+    return congruence(jacobian, covariance)
+
+
+def congruence(a: FloatArray, s: FloatArray) -> FloatArray:
+    """``a @ s @ a^T`` over the leading axis, symmetric to the last bit."""
+    out = a @ s @ np.swapaxes(a, -1, -2)
+    return np.asarray(0.5 * (out + np.swapaxes(out, -1, -2)))
+
+
+def inverse_spd3(matrices: FloatArray) -> FloatArray:
+    """Inverses (n, 3, 3) of symmetric positive definite matrices, by cofactors.
+
+    Four times faster than LAPACK on batches of fifty, and symmetric to the last bit.
+    """
+    a, b, c = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 0, 2]
+    d, e, f = matrices[:, 1, 1], matrices[:, 1, 2], matrices[:, 2, 2]
+    c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
+    scale = 1.0 / (a * c00 + b * c01 + c * c02)
+    out = np.empty_like(matrices)
+    out[:, 0, 0] = c00 * scale
+    out[:, 0, 1] = out[:, 1, 0] = c01 * scale
+    out[:, 0, 2] = out[:, 2, 0] = c02 * scale
+    out[:, 1, 1] = (a * f - c * c) * scale
+    out[:, 1, 2] = out[:, 2, 1] = (b * c - a * e) * scale
+    out[:, 2, 2] = (a * d - b * b) * scale
+    return out
+
+
+def right_from_left_camera(wTl: FloatArray, baseline: float) -> FloatArray:
+    """Poses (..., 4, 4) of the right camera from those of the left one (design E-S6)."""
+    out = np.array(wTl, dtype=np.float64)
+    out[..., :3, 3] += baseline * wTl[..., :3, 0]
+    return out
+
+
+def left_from_right_camera(wTr: FloatArray, baseline: float) -> FloatArray:
+    """Poses (..., 4, 4) of the left camera (GTSAM's stereo reference) from the right one's."""
+    return right_from_left_camera(wTr, -baseline)
