@@ -1,0 +1,40 @@
+# Every target works from a fresh clone: what it needs is set up first, once.
+
+PYTEST = .venv/bin/python -m pytest -n 2
+DEMO_OUT ?= runs/demo
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-all check bench clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+# Two stamps, because running needs less than developing: the demo does not wait for linters.
+.venv/.runtime-stamp: pyproject.toml scripts/setup.sh
+	@bash scripts/setup.sh runtime
+
+.venv/.dev-stamp: .venv/.runtime-stamp
+	@bash scripts/setup.sh dev
+
+setup: .venv/.dev-stamp ## make .venv with the package and the development tools
+
+demo: .venv/.runtime-stamp ## render the lab, run the paper's drive, write $(DEMO_OUT)
+	.venv/bin/fgslam run experiments/lab_loop.yaml --out $(DEMO_OUT) --overwrite
+
+test: setup ## the tests that take seconds
+	$(PYTEST)
+
+test-all: setup ## all tests, the slow ones too
+	$(PYTEST) -m ""
+
+check: setup ## linter, formatter and type checker; changes nothing
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+
+bench: setup ## measure speed as ratios, write bench.json
+	.venv/bin/python -m tests.benchmark.bench
+
+clean: ## remove the environment, caches and results
+	rm -rf .venv runs bench.json build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

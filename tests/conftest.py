@@ -1,0 +1,29 @@
+"""What all tests share: repeatable property tests, the folder of real recordings, generators."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import settings
+
+# A red test must be red again on the next run, and slow machines must not make one red.
+settings.register_profile("fgslam", derandomize=True, deadline=None, print_blob=True)
+settings.load_profile("fgslam")
+
+SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of real recordings beside the checkout; skips the test where there is none."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip(f"no recordings at {SHARED_DATA}: this test needs real data")
+    return SHARED_DATA
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A generator that starts afresh, the same, in every test."""
+    return np.random.default_rng(20010521)

@@ -1,0 +1,344 @@
+"""The house rules as a checker over a package's syntax trees; knows no module by heart but layers.
+
+Every finding is a :class:`Violation` with file and line. ``test_architecture.py`` runs it on fgslam
+and, to show that it can fail, on packages written to break each rule.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+BASE = frozenset({"types", "geometry", "errors", "settings", "measurement_log"})
+STAGES = frozenset({"datasets", "simulation", "frontend", "factors", "evaluation", "export"})
+PACKAGES = BASE | STAGES | {"config", "backend", "pipeline", "cli"}
+
+FOUNDATION_ALLOWS: dict[str, frozenset[str]] = {
+    "errors": frozenset(),
+    "types": frozenset({"errors"}),
+    "geometry": frozenset({"types", "errors"}),
+    "settings": frozenset({"types", "errors"}),
+    "measurement_log": frozenset({"types", "errors", "geometry"}),
+}
+"""The order within the lowest layer, so that it has no cycle to begin with."""
+
+STAGE_EXTRAS: dict[str, frozenset[str]] = {
+    "datasets": frozenset({"simulation"}),
+    "backend": frozenset({"factors"}),
+    "config": frozenset(),
+}
+
+THIRD_PARTY_HOMES: dict[str, frozenset[str]] = {
+    "cv2": frozenset({"frontend", "datasets"}),
+    "open3d": frozenset({"simulation", "export"}),
+    "gtsam": frozenset({"factors", "backend"}),
+    "gtsam_unstable": frozenset({"factors", "backend"}),
+}
+LAZY_LIBRARIES = frozenset({"open3d"})
+"""Imported inside functions only: their import is slow and needs system libraries."""
+
+FORBIDDEN_LIBRARIES = frozenset(
+    {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "random"}
+)
+FORBIDDEN_CALLS = frozenset({"eval", "exec", "compile", "__import__"})
+SAFE_YAML = frozenset({"safe_load", "safe_dump", "SafeLoader", "SafeDumper", "YAMLError"})
+MAX_MODULE_LINES = 450
+MAX_FUNCTION_LINES = 50
+
+FunctionNode = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+@dataclass(frozen=True, order=True)
+class Violation:
+    """One broken rule, printed as ``file:line: message``."""
+
+    path: str
+    line: int
+    message: str
+
+    def __str__(self) -> str:
+        return f"{self.path}:{self.line}: {self.message}"
+
+
+@dataclass(frozen=True)
+class Import:
+    """An imported name and where; ``lazy`` inside a function, ``typing`` for type checkers only."""
+
+    target: str
+    line: int
+    lazy: bool
+    typing: bool
+
+
+@dataclass(frozen=True)
+class Module:
+    """A parsed source file of the package under check."""
+
+    name: str
+    path: str
+    lines: int
+    tree: ast.Module = field(repr=False)
+    is_package: bool
+
+    @property
+    def layer(self) -> str:
+        """First name below the package's root, or the empty string for the root itself."""
+        return [*self.name.split("."), ""][1]
+
+
+def load_package(root: Path) -> list[Module]:
+    """All modules under the package folder ``root``, by name."""
+    modules = []
+    for path in sorted(root.rglob("*.py")):
+        parts = [root.name, *path.relative_to(root).with_suffix("").parts]
+        is_package = parts[-1] == "__init__"
+        source = path.read_text(encoding="utf-8")
+        modules.append(
+            Module(
+                name=".".join(parts[:-1] if is_package else parts),
+                path=path.relative_to(root.parent).as_posix(),
+                lines=len(source.splitlines()),
+                tree=ast.parse(source, str(path)),
+                is_package=is_package,
+            )
+        )
+    return modules
+
+
+def check_package(root: Path) -> list[Violation]:
+    """Every violation in the package folder ``root``, sorted."""
+    modules = load_package(root)
+    found: list[Violation] = []
+    imports = {module.name: list(imports_of(module, modules)) for module in modules}
+    for module in modules:
+        found += layer_violations(module, imports[module.name])
+        found += library_violations(module, imports[module.name])
+        found += size_violations(module)
+        found += statement_violations(module)
+    found += cycle_violations(modules, imports)
+    return sorted(found)
+
+
+# --------------------------------------------------------------------------------------------
+# Reading imports
+
+
+def imports_of(module: Module, modules: list[Module]) -> Iterator[Import]:
+    """What a module imports, wherever in it; ``from a import b`` means ``a.b`` if that exists."""
+    known = {m.name for m in modules}
+    for node, lazy, typing in _walk_with_context(module.tree):
+        for target in _targets(node, module, known):
+            yield Import(target, node.lineno, lazy, typing)
+
+
+def _walk_with_context(tree: ast.Module) -> Iterator[tuple[ast.stmt | ast.expr, bool, bool]]:
+    stack: list[tuple[ast.AST, bool, bool]] = [(tree, False, False)]
+    while stack:
+        node, lazy, typing = stack.pop()
+        if isinstance(node, ast.stmt | ast.expr):
+            yield node, lazy, typing
+        lazy = lazy or isinstance(node, FunctionNode | ast.Lambda)
+        if isinstance(node, ast.If) and _names_type_checking(node.test):
+            stack += [(child, lazy, True) for child in node.body]
+            stack += [(child, lazy, typing) for child in node.orelse]
+        else:
+            stack += [(child, lazy, typing) for child in ast.iter_child_nodes(node)]
+
+
+def _names_type_checking(test: ast.expr) -> bool:
+    name = test.attr if isinstance(test, ast.Attribute) else getattr(test, "id", None)
+    return name == "TYPE_CHECKING"
+
+
+def _targets(node: ast.AST, module: Module, known: set[str]) -> Iterator[str]:
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names)
+    elif isinstance(node, ast.ImportFrom):
+        base = _absolute(node, module)
+        for alias in node.names:
+            inner = f"{base}.{alias.name}"
+            yield inner if inner in known else base
+    elif isinstance(node, ast.Call) and _imports_literal(node):
+        yield str(getattr(node.args[0], "value", ""))
+
+
+def _imports_literal(node: ast.Call) -> bool:
+    # A computed name escapes every rule; `_call_violation` refuses it.
+    return (
+        _called_name(node) == "import_module"
+        and bool(node.args)
+        and isinstance(node.args[0], ast.Constant)
+    )
+
+
+def _absolute(node: ast.ImportFrom, module: Module) -> str:
+    if not node.level:
+        return node.module or ""
+    parts = module.name.split(".")
+    parts = parts[: len(parts) - node.level + module.is_package]
+    return ".".join([*parts, node.module] if node.module else parts)
+
+
+def _called_name(node: ast.Call) -> str:
+    function = node.func
+    return function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
+
+
+# --------------------------------------------------------------------------------------------
+# Layers, libraries, cycles
+
+
+def allowed_layers(layer: str) -> frozenset[str] | None:
+    """Layers that ``layer`` may import besides itself; None for all but ``cli``."""
+    if layer in FOUNDATION_ALLOWS:
+        return FOUNDATION_ALLOWS[layer]
+    if layer in STAGES or layer in STAGE_EXTRAS:
+        return BASE | STAGE_EXTRAS.get(layer, frozenset())
+    return frozenset() if layer == "" else None
+
+
+def layer_violations(module: Module, imports: list[Import]) -> Iterator[Violation]:
+    """Imports that go against the layers, and packages that no layer knows."""
+    root = module.name.split(".")[0]
+    if module.name.count(".") == 1 and module.is_package and module.layer not in PACKAGES:
+        yield Violation(
+            module.path, 1, f"package '{module.layer}' has no layer; give it one in {__name__}.py"
+        )
+    allowed = allowed_layers(module.layer)
+    for item in imports:
+        parts = item.target.split(".")
+        if parts[0] != root or len(parts) == 1 or parts[1] == module.layer:
+            continue
+        if parts[1] == "cli" and module.layer != "__main__":
+            yield Violation(module.path, item.line, "nothing imports cli")
+        elif allowed is not None and parts[1] not in allowed:
+            yield Violation(
+                module.path, item.line, f"layer '{module.layer}' must not import '{item.target}'"
+            )
+
+
+def library_violations(module: Module, imports: list[Import]) -> Iterator[Violation]:
+    """Libraries outside their homes, at module level where they must be lazy, or banned."""
+    for item in imports:
+        library = item.target.split(".")[0]
+        if library in FORBIDDEN_LIBRARIES:
+            yield Violation(module.path, item.line, f"'{library}' is banned")
+        homes = THIRD_PARTY_HOMES.get(library)
+        if homes is not None and module.layer not in homes:
+            yield Violation(
+                module.path, item.line, f"'{library}' only in {', '.join(sorted(homes))}"
+            )
+        if library in LAZY_LIBRARIES and not (item.lazy or item.typing):
+            yield Violation(module.path, item.line, f"import '{library}' inside a function")
+
+
+def cycle_violations(
+    modules: list[Module], imports: dict[str, list[Import]]
+) -> Iterator[Violation]:
+    """One finding for each module that can reach itself over imports, lazy ones included."""
+    known = {module.name for module in modules}
+    edges = {
+        name: {item.target for item in items if item.target in known}
+        for name, items in imports.items()
+    }
+    for module in modules:
+        route = _route_back(module.name, edges)
+        if route:
+            first = next(i for i in imports[module.name] if i.target == route[1])
+            yield Violation(module.path, first.line, f"import cycle: {' -> '.join(route)}")
+
+
+def _route_back(start: str, edges: dict[str, set[str]]) -> list[str]:
+    """Shortest route from ``start`` to itself, breadth first, or nothing."""
+    routes = [[start]]
+    seen: set[str] = set()
+    for route in routes:
+        for target in sorted(edges[route[-1]]):
+            if target == start:
+                return [*route, start]
+            if target not in seen:
+                seen.add(target)
+                routes.append([*route, target])
+    return []
+
+
+# --------------------------------------------------------------------------------------------
+# Sizes and statements
+
+
+def size_violations(module: Module) -> Iterator[Violation]:
+    """Modules and functions that are too long; a function's docstring does not count."""
+    if module.lines > MAX_MODULE_LINES:
+        yield Violation(
+            module.path,
+            module.lines,
+            f"module of {module.lines} lines (at most {MAX_MODULE_LINES})",
+        )
+    for node in ast.walk(module.tree):
+        if isinstance(node, FunctionNode):
+            length = _length_without_docstring(node)
+            if length > MAX_FUNCTION_LINES:
+                yield Violation(
+                    module.path,
+                    node.lineno,
+                    f"function {node.name} of {length} lines (at most {MAX_FUNCTION_LINES})",
+                )
+
+
+def _length_without_docstring(node: FunctionNode) -> int:
+    length = (node.end_lineno or node.lineno) - node.lineno + 1
+    if ast.get_docstring(node) is not None:
+        docstring = node.body[0]
+        length -= (docstring.end_lineno or docstring.lineno) - docstring.lineno + 1
+    return length
+
+
+def statement_violations(module: Module) -> Iterator[Violation]:
+    """Handlers that swallow everything, and calls that run data as code or hide randomness."""
+    for node in _statements(module.tree):
+        if isinstance(node, ast.ExceptHandler) and _swallows_everything(node):
+            yield Violation(module.path, node.lineno, "handler catches everything: name the errors")
+        if isinstance(node, ast.Call):
+            message = _call_violation(node)
+            if message:
+                yield Violation(module.path, node.lineno, message)
+        for name in sorted(_yaml_names(node) - SAFE_YAML):
+            yield Violation(module.path, node.lineno, f"yaml.{name}: use yaml.safe_load")
+
+
+def _statements(tree: ast.Module) -> Iterator[ast.stmt | ast.expr | ast.ExceptHandler]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.stmt | ast.expr | ast.ExceptHandler):
+            yield node
+
+
+def _yaml_names(node: ast.AST) -> set[str]:
+    if isinstance(node, ast.ImportFrom) and node.module == "yaml":
+        return {alias.name for alias in node.names}
+    if isinstance(node, ast.Attribute) and getattr(node.value, "id", "") == "yaml":
+        return {node.attr}
+    return set()
+
+
+def _swallows_everything(node: ast.ExceptHandler) -> bool:
+    # Cleaning up and raising again swallows nothing.
+    last = node.body[-1]
+    if isinstance(last, ast.Raise) and last.exc is None:
+        return False
+    kinds = node.type.elts if isinstance(node.type, ast.Tuple) else [node.type]
+    return any(k is None or getattr(k, "id", "") in ("Exception", "BaseException") for k in kinds)
+
+
+def _call_violation(node: ast.Call) -> str | None:
+    name = _called_name(node)
+    if isinstance(node.func, ast.Name) and name in FORBIDDEN_CALLS:
+        return f"{name}() is banned"
+    if name == "import_module" and not _imports_literal(node):
+        return "import_module of a computed name"
+    if name == "default_rng" and not (node.args or node.keywords):
+        return "default_rng() without a seed is not repeatable"
+    if any(k.arg == "allow_pickle" and getattr(k.value, "value", True) for k in node.keywords):
+        return "allow_pickle=True runs what a file says"
+    return None
