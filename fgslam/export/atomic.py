@@ -1,0 +1,190 @@
+"""Files that are either whole or absent, and the folder they live in.
+
+Every file is written beside its place and then renamed over it, which POSIX does in one step: an
+interrupted run leaves the previous version or none, never half a file.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+from fgslam.errors import OutputError
+
+ExistingFolder: TypeAlias = Literal["refuse", "overwrite", "resume"]
+
+RUN_MARKER = "config.yaml"
+"""The file that every run folder holds; it is written first."""
+
+_ESTIMATOR_FILES = ("online.tum", "final.tum", "covariance.csv", "map.ply")
+# What a run writes, and so all that overwriting one may delete.
+_RUN_FILES = (
+    RUN_MARKER,
+    "measurements.npz",
+    "checkpoint.npz",
+    "ground_truth.tum",
+    "metrics.json",
+    "timing.csv",
+    "report.html",
+    "pictures/*.png",
+    *(f"*/{name}" for name in _ESTIMATOR_FILES),
+    "**/.*.partial",
+)
+
+_MENDS = {
+    errno.ENOSPC: "the disk is full; free some space or choose another folder",
+    errno.EDQUOT: "the disk quota is used up; free some space or choose another folder",
+    errno.EACCES: "permission denied; choose a folder that you may write to",
+    errno.EPERM: "permission denied; choose a folder that you may write to",
+    errno.EROFS: "the file system is read-only; choose another folder",
+    errno.ENOTDIR: "part of the path is a file, not a folder; choose another folder",
+    errno.EISDIR: "that is a folder; name a file",
+    errno.ENOENT: "its folder does not exist; create it first",
+    errno.EFBIG: "the file grew beyond the allowed size; raise the limit (ulimit -f)",
+    errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
+}
+
+
+@contextmanager
+def clear_output_errors(path: Path) -> Iterator[None]:
+    """Turn an OSError about ``path`` into an OutputError of one line with its mend."""
+    try:
+        yield
+    except OSError as error:
+        cause = error.strerror or str(error)
+        mend = _MENDS.get(error.errno or 0, f"{cause}; choose another folder")
+        raise OutputError(f"cannot write {path}: {mend}") from error
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A path beside ``path`` to write to; it takes the place of ``path`` when all went well.
+
+    Args:
+        path: the file to write; its folder must exist.
+
+    Yields:
+        The temporary path, with the same suffix, so that writers which look at it are content.
+
+    Raises:
+        OutputError: the folder cannot be written to, or the disk is full.
+    """
+    partial = path.with_name(f".{path.name}.partial{path.suffix}")
+    with clear_output_errors(path):
+        try:
+            yield partial
+            os.replace(partial, path)
+        finally:
+            # Still there only when something failed; what failed is what the user must hear of.
+            _remove_quietly(partial)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a whole file atomically. Raises OutputError when it cannot be written."""
+    with replacing(path) as partial:
+        partial.write_bytes(content)
+
+
+def write_text(path: Path, content: str) -> None:
+    """Write a whole UTF-8 file atomically, with Unix line ends. Raises OutputError."""
+    write_bytes(path, content.encode("utf-8"))
+
+
+def write_with(path: Path, writer: Callable[[Path], None]) -> None:
+    """Let ``writer`` write a file of its own accord (a library's `save`), atomically."""
+    with replacing(path) as partial:
+        writer(partial)
+
+
+def _remove_quietly(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:
+        return
+
+
+# --------------------------------------------------------------------------------------------
+# The run folder
+
+
+def create_run_folder(path: Path, existing: ExistingFolder = "refuse") -> Path:
+    """Make the folder of a run, and make sure *now* that it can be written to.
+
+    Args:
+        path: the folder itself; its parents are created too. An empty one is as good as none.
+        existing: what to do with a folder that holds a run already: refuse it, delete that run's
+            files (and only those), or keep them to resume.
+
+    Returns:
+        ``path``.
+
+    Raises:
+        OutputError: it exists (`refuse`), holds something else than a run (`overwrite`), holds
+            no run (`resume`), or cannot be written to.
+    """
+    if existing == "resume":
+        _require_run(path)
+    elif path.exists() or path.is_symlink():
+        _make_room(path, overwrite=existing == "overwrite")
+    with clear_output_errors(path):
+        path.mkdir(parents=True, exist_ok=True)
+    probe = path / ".writable.partial"
+    with clear_output_errors(path):
+        try:
+            probe.write_bytes(b"\0")
+        finally:
+            _remove_quietly(probe)
+    return path
+
+
+def make_subfolder(run: Path, name: str) -> Path:
+    """A folder inside the run folder, created when absent. Raises OutputError."""
+    folder = run / name
+    with clear_output_errors(folder):
+        folder.mkdir(exist_ok=True)
+    return folder
+
+
+def is_run_folder(path: Path) -> bool:
+    """Whether ``path`` holds a run, whole or interrupted."""
+    return (path / RUN_MARKER).is_file()
+
+
+def _require_run(path: Path) -> None:
+    if not is_run_folder(path):
+        raise OutputError(
+            f"cannot resume {path}: it holds no run (no {RUN_MARKER}); "
+            "name the folder of an interrupted run, or start one without --resume"
+        )
+
+
+def _make_room(path: Path, *, overwrite: bool) -> None:
+    if not path.is_dir():
+        raise OutputError(f"cannot write {path}: it is not a folder; choose another name")
+    with clear_output_errors(path):
+        empty = not any(path.iterdir())
+    if empty:
+        return
+    if not is_run_folder(path):
+        raise OutputError(
+            f"{path} exists and holds something else than a run; choose another folder"
+        )
+    if not overwrite:
+        raise OutputError(
+            f"{path} holds a run already; choose another --out, or add --overwrite or --resume"
+        )
+    with clear_output_errors(path):
+        _delete_run_files(path)
+
+
+def _delete_run_files(path: Path) -> None:
+    files = {file for pattern in _RUN_FILES for file in path.glob(pattern) if file.is_file()}
+    for file in sorted(files):
+        file.unlink()
+    for folder in sorted({file.parent for file in files} - {path}, reverse=True):
+        if not any(folder.iterdir()):
+            folder.rmdir()

@@ -1,0 +1,198 @@
+"""Trajectories as text: TUM and KITTI files, and the covariances of their poses as CSV.
+
+The same poses give the same bytes. Time stamps keep 9 decimals; positions and quaternions keep
+12, far below any measurement, with the quaternion's w not negative and no negative zeros.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.errors import DatasetError, OutputError
+from fgslam.export.atomic import write_text
+from fgslam.geometry import pose, quaternion_from_rotation, rotation_from_quaternion
+from fgslam.types import BoolArray, FloatArray, IntArray, Trajectory
+
+_TUM_FORMAT = "%.9f" + 7 * " %.12f"
+_KITTI_FORMAT = " ".join(12 * ["%.12e"])
+_COVARIANCE_FORMAT = "%.9f" + 21 * ",%.9e"
+_TUM_COLUMNS = 8
+_KITTI_COLUMNS = 12
+_NOT_FINITE = "a number is not finite; repair or remove the line"
+_UPPER = np.triu_indices(6)
+_TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
+_COVARIANCE_NAMES = [f"c_{_TANGENT[i]}_{_TANGENT[j]}" for i, j in zip(*_UPPER, strict=True)]
+_COVARIANCE_HEADER = (
+    "# covariance of xi in wTc = wTc_estimate * Exp(xi), tangent [rotation, translation] in the "
+    "reference camera's frame at the estimate (x right, y down, z forward); rad, m\n"
+    f"timestamp,{','.join(_COVARIANCE_NAMES)}\n"
+)
+
+
+# --------------------------------------------------------------------------------------------
+# TUM
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write lines of `timestamp tx ty tz qx qy qz qw` (seconds, metres), as evo reads them.
+
+    Args:
+        path: the file to write, atomically.
+        trajectory: poses ``wTc``.
+
+    Raises:
+        OutputError: a pose is not finite, or the file cannot be written.
+    """
+    _require_finite(path, trajectory)
+    rows = np.empty((len(trajectory), _TUM_COLUMNS))
+    rows[:, 0] = trajectory.timestamps
+    rows[:, 1:4] = trajectory.poses[:, :3, 3]
+    for row, wTc in zip(rows, trajectory.poses, strict=True):
+        row[4:] = _canonical(quaternion_from_rotation(wTc[:3, :3]))
+    rows[:, 1:] = _without_negative_zeros(rows[:, 1:], decimals=12)
+    write_text(path, _format_rows(rows, _TUM_FORMAT))
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read a TUM trajectory: `timestamp tx ty tz qx qy qz qw`; `#` starts a comment.
+
+    Raises:
+        DatasetError: the file is missing, a line is malformed, a quaternion is zero, or the time
+            stamps do not increase. The message names the line.
+    """
+    expected = "timestamp tx ty tz qx qy qz qw on each line"
+    values, lines = _parse_rows(path, _read_text(path, expected), _TUM_COLUMNS, expected)
+    _refuse(path, lines, np.asarray(~np.isfinite(values).all(axis=1)), _NOT_FINITE)
+    norms = np.linalg.norm(values[:, 4:], axis=1)
+    _refuse(path, lines, norms < 0.5, "the quaternion has no length; repair or remove the line")
+    backwards = np.concatenate([[False], np.diff(values[:, 0]) <= 0.0])
+    _refuse(path, lines, backwards, "the time stamp does not increase; sort or repair the file")
+    poses = np.empty((len(values), 4, 4))
+    for out, row in zip(poses, values, strict=True):
+        out[:] = pose(rotation_from_quaternion(row[4:]), row[1:4])
+    return Trajectory(values[:, 0].copy(), poses)
+
+
+# --------------------------------------------------------------------------------------------
+# KITTI
+
+
+def write_kitti(path: Path, trajectory: Trajectory) -> None:
+    """Write one row-major 3x4 ``wTc`` a line (metres), as KITTI odometry and evo read.
+
+    The format has no time stamps. Raises OutputError as :func:`write_tum`.
+    """
+    _require_finite(path, trajectory)
+    rows = trajectory.poses[:, :3, :].reshape(len(trajectory), _KITTI_COLUMNS)
+    write_text(path, _format_rows(rows + 0.0, _KITTI_FORMAT))
+
+
+def read_kitti(path: Path) -> FloatArray:
+    """Poses (n, 4, 4) of a KITTI trajectory. Raises DatasetError naming the line at fault."""
+    expected = "the 12 numbers of a 3x4 matrix on each line"
+    values, lines = _parse_rows(path, _read_text(path, expected), _KITTI_COLUMNS, expected)
+    _refuse(path, lines, np.asarray(~np.isfinite(values).all(axis=1)), _NOT_FINITE)
+    poses = np.tile(np.eye(4), (len(values), 1, 1))
+    poses[:, :3, :] = values.reshape(-1, 3, 4)
+    return poses
+
+
+# --------------------------------------------------------------------------------------------
+# Covariances
+
+
+def write_covariances(path: Path, timestamps: FloatArray, covariances: FloatArray) -> None:
+    """Write the upper triangles of pose covariances, row by row, with a header naming the frame.
+
+    Args:
+        path: the file to write, atomically.
+        timestamps: (n,) seconds.
+        covariances: (n, 6, 6), [rotation, translation], in the tangent space at the estimate.
+    """
+    upper = covariances[:, _UPPER[0], _UPPER[1]]
+    rows = np.column_stack([timestamps, upper + 0.0])
+    write_text(path, _COVARIANCE_HEADER + _format_rows(rows, _COVARIANCE_FORMAT))
+
+
+def read_covariances(path: Path) -> tuple[FloatArray, FloatArray]:
+    """Time stamps (n,) and covariances (n, 6, 6) of a covariance.csv; NaN where unknown.
+
+    Raises:
+        DatasetError: the file is missing, or a line is malformed; the message names the line.
+    """
+    text = _read_text(path, "a covariance.csv").replace(_COVARIANCE_HEADER, "", 1)
+    columns = 1 + len(_COVARIANCE_NAMES)
+    expected = "timestamp and 21 covariances, separated by commas"
+    values, _ = _parse_rows(path, text.replace(",", " "), columns, expected)
+    out = np.zeros((len(values), 6, 6))
+    out[:, _UPPER[0], _UPPER[1]] = values[:, 1:]
+    out[:, _UPPER[1], _UPPER[0]] = values[:, 1:]
+    return values[:, 0].copy(), out
+
+
+# --------------------------------------------------------------------------------------------
+# Rows of numbers
+
+
+def _format_rows(rows: FloatArray, row_format: str) -> str:
+    buffer = io.StringIO()
+    np.savetxt(buffer, rows, fmt=row_format)
+    return buffer.getvalue()
+
+
+def _without_negative_zeros(values: FloatArray, decimals: int) -> FloatArray:
+    """Values rounded as they will be printed; adding zero turns -0 into 0."""
+    return np.asarray(np.round(values, decimals) + 0.0)
+
+
+def _canonical(quaternion: FloatArray) -> FloatArray:
+    """The one of the two quaternions (x, y, z, w) of a rotation that has w >= 0."""
+    return -quaternion if quaternion[3] < 0.0 else quaternion
+
+
+def _require_finite(path: Path, trajectory: Trajectory) -> None:
+    bad = ~np.isfinite(trajectory.poses).all(axis=(1, 2)) | ~np.isfinite(trajectory.timestamps)
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise OutputError(
+            f"cannot write {path}: pose {row} (t = {trajectory.timestamps[row]:.9f} s) is not "
+            "finite; the estimator diverged there, check its input before that time"
+        )
+
+
+def _read_text(path: Path, expected: str) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise DatasetError(f"cannot read {path}: {error.strerror}; check the path") from error
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{path} is not a text file; give {expected}") from error
+
+
+def _parse_rows(path: Path, text: str, columns: int, expected: str) -> tuple[FloatArray, IntArray]:
+    """Numbers (n, columns) and the line number (n,) of each row; `#` starts a comment."""
+    rows: list[list[float]] = []
+    lines: list[int] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        cells = line.partition("#")[0].split()
+        if not cells:
+            continue
+        try:
+            rows.append([float(cell) for cell in cells])
+        except ValueError as error:
+            raise DatasetError(f"{path}, line {number}: {error}; give {expected}") from error
+        if len(cells) != columns:
+            raise DatasetError(
+                f"{path}, line {number}: {len(cells)} numbers instead of {columns}; give {expected}"
+            )
+        lines.append(number)
+    values = np.array(rows, dtype=np.float64).reshape(-1, columns)
+    return values, np.array(lines, dtype=np.int64)
+
+
+def _refuse(path: Path, lines: IntArray, bad: BoolArray, what: str) -> None:
+    if bad.any():
+        raise DatasetError(f"{path}, line {lines[int(np.argmax(bad))]}: {what}")

@@ -1,0 +1,287 @@
+"""Trajectory error: against evo and GTSAM, and the cases in which nothing can be known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fgslam.evaluation.trajectory import (
+    Alignment,
+    align,
+    associate,
+    end_pose,
+    evaluate_trajectory,
+    path_length,
+    relative_errors,
+    rotation_angles,
+    to_estimate_world,
+    umeyama,
+)
+from fgslam.geometry import pose, quaternion_from_rotation, se3_exp, so3_exp
+from fgslam.types import FloatArray, Trajectory
+
+
+def wandering(seed: int, n: int = 60) -> Trajectory:
+    """A bent path in space with turning cameras."""
+    rng = np.random.default_rng(seed)
+    poses = [se3_exp(rng.normal(size=6))]
+    for _ in range(n - 1):
+        step = np.concatenate([rng.normal(scale=0.1, size=3), [0.05, 0.0, 0.3]])
+        poses.append(poses[-1] @ se3_exp(step))
+    return Trajectory(10.0 + 0.1 * np.arange(n), np.array(poses))
+
+
+def disturbed(truth: Trajectory, seed: int, scale: float = 1.0) -> Trajectory:
+    """The same path in another world, with noise on every pose."""
+    rng = np.random.default_rng(seed)
+    world = se3_exp(np.array([0.3, -0.8, 0.5, 4.0, -2.0, 7.0]))
+    noise = [se3_exp(rng.normal(scale=[0.02] * 3 + [0.05] * 3)) for _ in truth.poses]
+    poses = world @ truth.poses @ np.array(noise)
+    poses[:, :3, 3] *= scale
+    return Trajectory(truth.timestamps + 0.001, poses)
+
+
+def evo_path(trajectory: Trajectory):
+    evo_trajectory = pytest.importorskip("evo.core.trajectory", reason="evo is not installed")
+    quaternions = [quaternion_from_rotation(p[:3, :3]) for p in trajectory.poses]
+    return evo_trajectory.PoseTrajectory3D(
+        positions_xyz=trajectory.poses[:, :3, 3].copy(),
+        orientations_quat_wxyz=np.array(quaternions)[:, [3, 0, 1, 2]],
+        timestamps=trajectory.timestamps,
+    )
+
+
+def evo_aligned(estimate: Trajectory, truth: Trajectory, alignment: Alignment):
+    from evo.core import sync
+
+    true, estimated = sync.associate_trajectories(evo_path(truth), evo_path(estimate), max_diff=0.01)
+    if alignment is Alignment.FIRST_POSE:
+        estimated.align_origin(true)
+    elif alignment is not Alignment.NONE:
+        estimated.align(true, correct_scale=alignment is Alignment.SIM3)
+    return true, estimated
+
+
+@pytest.mark.parametrize("alignment", list(Alignment))
+@pytest.mark.parametrize("delta", [1, 7])
+def test_ate_and_rpe_agree_with_evo(alignment: Alignment, delta: int) -> None:
+    truth = wandering(1)
+    estimate = disturbed(truth, 2, scale=1.3 if alignment is Alignment.SIM3 else 1.0)
+    true, estimated = evo_aligned(estimate, truth, alignment)
+    from evo.core import metrics
+
+    expected = {}
+    for name, metric in {
+        "ate": metrics.APE(metrics.PoseRelation.translation_part),
+        "trans": metrics.RPE(
+            metrics.PoseRelation.translation_part, delta, metrics.Unit.frames, all_pairs=True
+        ),
+        "rot": metrics.RPE(
+            metrics.PoseRelation.rotation_angle_deg, delta, metrics.Unit.frames, all_pairs=True
+        ),
+    }.items():
+        metric.process_data((true, estimated))
+        expected[name] = metric.get_statistic(metrics.StatisticsType.rmse)
+
+    ours = evaluate_trajectory(estimate, truth, alignment, rpe_delta=delta)
+
+    assert ours.matched_poses == len(truth)
+    assert ours.ate_rmse_m == pytest.approx(expected["ate"], rel=1e-9)
+    assert ours.rpe_trans_m == pytest.approx(expected["trans"], rel=1e-9)
+    assert ours.rpe_rot_deg == pytest.approx(expected["rot"], rel=1e-8)
+
+
+def test_rigid_alignment_agrees_with_gtsam() -> None:
+    gtsam = pytest.importorskip("gtsam")
+    truth = wandering(3)
+    estimate = disturbed(truth, 4)
+    source, target = estimate.poses[:, :3, 3], truth.poses[:, :3, 3]
+
+    ours = umeyama(source, target, with_scale=False)
+
+    reference = gtsam.Pose3.Align(target.T.copy(), source.T.copy()).matrix()
+    assert ours is not None
+    np.testing.assert_allclose(ours.rotation, reference[:3, :3], atol=1e-9)
+    np.testing.assert_allclose(ours.translation, reference[:3, 3], atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [0.01, 1.0, 250.0])
+def test_similarity_recovers_an_exact_one(scale: float) -> None:
+    rng = np.random.default_rng(5)
+    source = rng.normal(size=(30, 3))
+    rotation, translation = so3_exp(rng.normal(size=3)), rng.normal(size=3)
+    target = scale * source @ rotation.T + translation
+
+    found = umeyama(source, target, with_scale=True)
+
+    assert found is not None
+    assert found.scale == pytest.approx(scale, rel=1e-12)
+    np.testing.assert_allclose(found.rotation, rotation, atol=1e-12)
+    np.testing.assert_allclose(found.points(source), target, atol=1e-12 * max(scale, 1.0))
+
+
+def test_similarity_is_the_minimum_of_its_cost() -> None:
+    rng = np.random.default_rng(6)
+    source, target = rng.normal(size=(2, 40, 3))
+    target += source
+
+    best = umeyama(source, target, with_scale=True)
+
+    def cost(rotation: FloatArray, translation: FloatArray, scale: float) -> float:
+        return float(((scale * source @ rotation.T + translation - target) ** 2).sum())
+
+    assert best is not None
+    smallest = cost(best.rotation, best.translation, best.scale)
+    for axis in np.eye(7):
+        for step in (1e-3, -1e-3):
+            rotation = best.rotation @ so3_exp(step * axis[:3])
+            translation = best.translation + step * axis[3:6]
+            assert cost(rotation, translation, best.scale + step * axis[6]) > smallest
+
+
+def test_alignment_never_mirrors() -> None:
+    rng = np.random.default_rng(7)
+    source = rng.normal(size=(20, 3))
+    found = umeyama(source, source * [1.0, 1.0, -1.0], with_scale=False)
+    assert found is not None
+    assert np.linalg.det(found.rotation) == pytest.approx(1.0)
+
+
+def test_straight_path_still_has_an_ate() -> None:
+    truth = Trajectory(np.arange(5.0), np.array([pose(np.eye(3), [0, 0, z]) for z in range(5)]))
+    turned = Trajectory(
+        truth.timestamps, pose(so3_exp(np.array([0, 1.0, 0])), [1, 2, 3]) @ truth.poses
+    )
+    result = evaluate_trajectory(turned, truth, Alignment.SE3)
+    assert result.ate_rmse_m == pytest.approx(0.0, abs=1e-12)
+
+
+def test_perfect_estimate_has_no_error_under_any_rigid_alignment() -> None:
+    truth = wandering(8)
+    moved = Trajectory(truth.timestamps, se3_exp(np.arange(6.0) / 6) @ truth.poses)
+    for alignment in (Alignment.FIRST_POSE, Alignment.SE3, Alignment.SIM3):
+        result = evaluate_trajectory(moved, truth, alignment)
+        assert result.alignment is alignment
+        assert result.ate_rmse_m == pytest.approx(0.0, abs=1e-12)
+        assert result.rpe_rot_deg == pytest.approx(0.0, abs=1e-6)
+        assert result.end_error_m == pytest.approx(0.0, abs=1e-12)
+        assert result.scale == pytest.approx(1.0)
+
+
+def test_end_error_and_drift_by_hand() -> None:
+    positions = [[0, 0, 0], [0, 0, 10.0], [0, 0, 20.0]]
+    truth = Trajectory(np.arange(3.0), np.array([pose(np.eye(3), p) for p in positions]))
+    poses = truth.poses.copy()
+    poses[2] = pose(so3_exp(np.array([0, np.radians(2.0), 0])), [0.3, 0, 20.4])
+    result = evaluate_trajectory(Trajectory(truth.timestamps, poses), truth, Alignment.NONE)
+    assert result.path_length_m == pytest.approx(20.0)
+    assert result.end_error_m == pytest.approx(0.5)
+    assert result.drift_percent == pytest.approx(2.5)
+    assert result.end_error_deg == pytest.approx(2.0)
+
+
+def test_without_truth_nothing_is_known() -> None:
+    result = evaluate_trajectory(wandering(9), None)
+    assert result.matched_poses == 0
+    assert result.ate_rmse_m is result.rpe_trans_m is result.drift_percent is None
+
+
+def test_too_few_poses_leave_what_cannot_be_known_none() -> None:
+    truth = wandering(10, n=2)
+    result = evaluate_trajectory(disturbed(truth, 11), truth, Alignment.SE3)
+    assert result.matched_poses == 2
+    assert result.ate_rmse_m is None
+    assert result.end_error_m is not None
+    alone = wandering(12, n=1)
+    first = evaluate_trajectory(alone, alone, Alignment.FIRST_POSE)
+    assert first.ate_rmse_m == pytest.approx(0.0, abs=1e-12)
+    assert first.rpe_trans_m is None
+    assert first.drift_percent is None
+
+
+def test_standstill_has_no_drift_percentage() -> None:
+    still = Trajectory(np.arange(4.0), np.tile(np.eye(4), (4, 1, 1)))
+    result = evaluate_trajectory(still, still, Alignment.SIM3)
+    assert result.drift_percent is None
+    assert result.scale is None
+    assert result.ate_rmse_m is None
+
+
+def test_diverged_estimate_is_not_called_accurate() -> None:
+    truth = wandering(13)
+    poses = truth.poses.copy()
+    poses[30:] = np.nan
+    result = evaluate_trajectory(Trajectory(truth.timestamps, poses), truth, Alignment.NONE)
+    assert result.matched_poses == len(truth)
+    assert result.ate_rmse_m is None
+    assert result.end_error_m is None
+
+
+def test_association_is_mutual_and_within_tolerance() -> None:
+    truth = np.arange(0.0, 1.0, 0.01)
+    estimate = np.array([0.0502, 0.0504, 0.3, 0.7049, 5.0])
+    rows, true_rows = associate(estimate, truth, 0.004)
+    np.testing.assert_array_equal(rows, [0, 2])
+    np.testing.assert_array_equal(true_rows, [5, 30])
+
+
+def test_association_matches_evo_on_jittered_times() -> None:
+    sync = pytest.importorskip("evo.core.sync", reason="evo is not installed")
+    rng = np.random.default_rng(14)
+    truth = np.arange(0.0, 20.0, 0.1)
+    estimate = truth[::3] + rng.uniform(-0.02, 0.02, size=len(truth[::3]))
+    rows, true_rows = associate(estimate, truth, 0.01)
+    expected = sync.matching_time_indices(estimate, truth, 0.01)
+    np.testing.assert_array_equal(rows, expected[0])
+    np.testing.assert_array_equal(true_rows, expected[1])
+
+
+@pytest.mark.parametrize(("n", "m"), [(0, 3), (3, 0), (0, 0)])
+def test_association_of_nothing(n: int, m: int) -> None:
+    rows, true_rows = associate(np.arange(float(n)), np.arange(float(m)), 1.0)
+    assert len(rows) == len(true_rows) == 0
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.3, 3.0, np.pi - 1e-9, np.pi])
+def test_rotation_angles_at_both_ends(angle: float) -> None:
+    axis = np.array([2.0, -1.0, 2.0]) / 3.0
+    assert rotation_angles(so3_exp(angle * axis)[None])[0] == pytest.approx(angle, abs=1e-12)
+
+
+def test_end_pose_in_the_papers_units() -> None:
+    start = se3_exp(np.array([0.1, 2.0, -0.3, 1, 2, 3.0]))
+    motion = pose(so3_exp(np.array([0, np.radians(0.3), 0])), [-0.0209, 0.0, -0.0391])
+    closed = end_pose(Trajectory(np.arange(2.0), np.array([start, start @ motion])))
+    assert closed is not None
+    assert (closed.x_cm, closed.y_cm, closed.z_cm) == pytest.approx((-2.09, 0.0, -3.91))
+    assert closed.distance_cm == pytest.approx(np.hypot(2.09, 3.91))
+    assert (closed.yaw_deg, closed.pitch_deg, closed.roll_deg) == pytest.approx((0.3, 0, 0))
+    assert end_pose(Trajectory(np.empty(0), np.empty((0, 4, 4)))) is None
+
+
+def test_truth_is_brought_into_the_estimates_world() -> None:
+    truth = wandering(15)
+    world = se3_exp(np.array([1.0, 0.5, -0.2, 3, 2, 1.0]))
+    estimate = Trajectory(truth.timestamps[5:], world @ truth.poses[5:])
+    found = to_estimate_world(estimate, truth)
+    assert found is not None
+    rows, poses = found
+    np.testing.assert_array_equal(rows, np.arange(len(estimate)))
+    np.testing.assert_allclose(poses, estimate.poses, atol=1e-12)
+    late = Trajectory(truth.timestamps + 1e6, truth.poses)
+    assert to_estimate_world(late, truth) is None
+
+
+def test_relative_errors_do_not_depend_on_the_world() -> None:
+    truth, estimate = wandering(16), disturbed(wandering(16), 17)
+    found = align(estimate.poses, truth.poses, Alignment.SE3)
+    assert found is not None
+    plain = relative_errors(estimate.poses, truth.poses)
+    aligned = relative_errors(found.poses(estimate.poses), truth.poses)
+    np.testing.assert_allclose(plain[0], aligned[0], atol=1e-12)
+    np.testing.assert_allclose(plain[1], aligned[1], atol=1e-12)
+
+
+def test_path_length_of_a_square() -> None:
+    corners = [[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1], [0, 0, 0]]
+    assert path_length(np.array([pose(np.eye(3), c) for c in corners])) == pytest.approx(4.0)
