@@ -1,0 +1,122 @@
+"""``calib.json`` of the image folder: read, checked, turned into a rig."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fgslam.errors import CalibrationError
+from fgslam.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose, so3_exp
+from fgslam.types import CameraRig, FloatArray
+
+_RIGID_TOLERANCE = 1e-4
+
+
+def read_calibration(path: Path, three_cameras: bool) -> CameraRig:
+    """The rig of a ``calib.json``; ``three_cameras`` asks for its vertical baseline as well.
+
+    Raises:
+        CalibrationError: a value is missing, not finite or impossible.
+    """
+    values = read_json_object(path)
+    if values.get("rectified") is False:
+        raise CalibrationError(
+            f"{path} says that the images are not rectified; rectify them first (rows of the left "
+            "and right image must agree)"
+        )
+    return CameraRig(
+        width=pixels(path, values, "width"),
+        height=pixels(path, values, "height"),
+        fx=positive(path, values, "fx"),
+        fy=positive(path, values, "fy"),
+        cx=number(path, values, "cx"),
+        cy=number(path, values, "cy"),
+        baseline=positive(path, values, "baseline_m"),
+        vertical_baseline=positive(path, values, "vertical_baseline_m") if three_cameras else None,
+        bTc=_body_from_camera(path, values),
+    )
+
+
+def read_json_object(path: Path) -> Mapping[str, Any]:
+    """A JSON file's outermost object. Raises CalibrationError when there is none."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as cause:
+        raise CalibrationError(
+            f"calibration {path} cannot be read: {cause.strerror}; put it there (its keys are in "
+            "docs/datasets/image_folder.md), and check dataset.path"
+        ) from cause
+    except ValueError as cause:
+        raise CalibrationError(f"{path} is not JSON: {cause}; correct the file") from cause
+    if not isinstance(values, dict):
+        raise CalibrationError(f"{path} must hold one JSON object with the calibration's keys")
+    return values
+
+
+def number(path: Path, values: Mapping[str, Any], key: str) -> float:
+    """A finite number of the calibration. Raises CalibrationError otherwise."""
+    if key not in values:
+        raise CalibrationError(f"{path} has no {key!r}; add it to the calibration")
+    value = values[key]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise CalibrationError(f"{path}: {key} is {value!r}, not a finite number; correct it")
+    return float(value)
+
+
+def positive(path: Path, values: Mapping[str, Any], key: str) -> float:
+    """A positive number of the calibration. Raises CalibrationError otherwise."""
+    value = number(path, values, key)
+    if value <= 0.0:
+        hint = (
+            "it is the distance between the cameras in metres; if left and right are swapped, swap "
+            "the folders"
+            if "baseline" in key
+            else "correct it"
+        )
+        raise CalibrationError(f"{path}: {key} is {value:g}, must be positive: {hint}")
+    return value
+
+
+def pixels(path: Path, values: Mapping[str, Any], key: str) -> int:
+    """A positive whole number of the calibration. Raises CalibrationError otherwise."""
+    value = positive(path, values, key)
+    if value != int(value):
+        raise CalibrationError(f"{path}: {key} is {value:g}, not a whole number of pixels")
+    return int(value)
+
+
+def _body_from_camera(path: Path, values: Mapping[str, Any]) -> FloatArray:
+    if "bTc" not in values:
+        return BODY_FORWARD_LEFT_UP_FROM_CAMERA
+    try:
+        bTc = np.array(values["bTc"], np.float64)
+    except (TypeError, ValueError):
+        bTc = np.empty(0)
+    if not is_rigid(bTc):
+        raise CalibrationError(
+            f"{path}: bTc must be a rigid 4x4 matrix (the pose of the right camera in the body); "
+            "correct or remove it"
+        )
+    return bTc
+
+
+def is_rigid(matrix: FloatArray) -> bool:
+    """Whether the matrix is a finite rigid motion (4, 4)."""
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        return False
+    rotation = matrix[:3, :3]
+    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=_RIGID_TOLERANCE)
+    right_handed = np.linalg.det(rotation) > 0.0
+    return bool(orthonormal and right_handed and np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]))
+
+
+def level_mounting(camera_yaw_deg: float, lever_arm_m: tuple[float, float, float]) -> FloatArray:
+    """``bTc`` (4, 4) of a level camera: heading in degrees to the left, position in the body."""
+    heading = so3_exp(np.array([0.0, 0.0, np.radians(camera_yaw_deg)]))
+    ahead = BODY_FORWARD_LEFT_UP_FROM_CAMERA[:3, :3]
+    return pose(heading @ ahead, np.array(lever_arm_m, np.float64))

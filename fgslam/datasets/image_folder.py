@@ -1,0 +1,199 @@
+"""Our own layout: left/, right/[, top/], calib.json, times.txt (docs/datasets/image_folder.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.datasets.calibration import level_mounting, read_calibration
+from fgslam.datasets.images import list_numbered_images
+from fgslam.datasets.recorded_odometry import (
+    motions_from_poses,
+    motions_from_speed,
+    read_pose_log,
+    read_speed_log,
+)
+from fgslam.datasets.recording import OdometrySource, Recording, recording_identity
+from fgslam.datasets.selection import select_frames
+from fgslam.datasets.stereo_files import StereoFiles, check_sizes, missing_notes, require_folder
+from fgslam.datasets.tables import Table, read_table, require_increasing
+from fgslam.datasets.trajectories import read_tum_table, trajectory_at_frames
+from fgslam.errors import DatasetError, OdometryError
+from fgslam.geometry import right_from_left_camera
+from fgslam.settings.datasets import ImageFolderSettings, RecordedOdometrySettings
+from fgslam.types import CameraRig, FloatArray, IntArray, Odometry, Trajectory
+
+TRUTH_LEFT = "gt_left_cam.txt"
+TRUTH_RIGHT = "gt_right_cam.txt"
+_DEFAULT_NOISE = RecordedOdometrySettings()
+
+
+def open_image_folder(
+    settings: ImageFolderSettings, odometry: RecordedOdometrySettings = _DEFAULT_NOISE
+) -> Recording:
+    """Open a recording in the image-folder layout.
+
+    Args:
+        settings: where it is and which frames are used.
+        odometry: noise and limits of recorded odometry; read only when a motion is asked for.
+
+    Raises:
+        DatasetError: a folder or file is missing or malformed, or no frame is left.
+        CalibrationError: calib.json is missing, not finite or impossible.
+    """
+    root = Path(settings.path)
+    require_folder(root, "the recording")
+    folders = _camera_folders(root, settings.use_top)
+    rig = _mounted(read_calibration(root / "calib.json", len(folders) == 3), settings)
+    numbers, stamps = _read_times(root / "times.txt")
+    chosen = select_frames(len(stamps), settings)
+    listed = [list_numbered_images(folder) for folder in folders]
+    files = _files(folders, listed, numbers, rig)
+    check_sizes(files, root)
+    truth = _read_truth(root, rig.baseline)
+    odometry_file = _find_odometry(root, settings.odometry_file)
+    defining = [
+        root / "calib.json",
+        root / "times.txt",
+        *([odometry_file] if odometry_file else []),
+    ]
+    return Recording(
+        name=root.resolve().name,
+        rig=rig,
+        timestamps=stamps[chosen],
+        identity=recording_identity(defining, (p for images in listed for p in images.values())),
+        ground_truth=None if truth is None else trajectory_at_frames(truth, stamps[chosen]),
+        notes=missing_notes(files, stamps) + _unlisted(folders, listed, numbers),
+        indices=chosen,
+        load_images=files.load,
+        odometry_source=_odometry_source(odometry_file, odometry),
+    )
+
+
+def _camera_folders(root: Path, use_top: bool) -> list[Path]:
+    """Folders of the cameras, right first. Raises DatasetError when one is absent or empty."""
+    folders = [root / "right", root / "left"]
+    absent = [folder.name for folder in folders if not folder.is_dir()]
+    if absent:
+        raise DatasetError(
+            f"{root} has no folder {' and no folder '.join(absent)}: a recording of one camera "
+            "cannot be used, a stereo pair (left/ and right/) is the least; check dataset.path"
+        )
+    if use_top and (root / "top").is_dir():
+        folders.append(root / "top")
+    for folder in folders:
+        if not list_numbered_images(folder):
+            raise DatasetError(
+                f"{folder} holds no image named by its number (000000.png ...): the whole camera "
+                "is missing; restore it"
+            )
+    return folders
+
+
+def _mounted(rig: CameraRig, settings: ImageFolderSettings) -> CameraRig:
+    if settings.camera_yaw_deg is None and settings.lever_arm_m is None:
+        return rig
+    lever_arm = settings.lever_arm_m or (0.0, 0.0, 0.0)
+    return replace(rig, bTc=level_mounting(settings.camera_yaw_deg or 0.0, lever_arm))
+
+
+def _read_times(path: Path) -> tuple[IntArray, FloatArray]:
+    """Image numbers (n,) and stamps (n,) in seconds."""
+    table = read_table(path, ("image number", "time"))
+    numbers = table.column(0).astype(np.int64)
+    wrong = np.flatnonzero((numbers != table.column(0)) | (numbers < 0))
+    if len(wrong):
+        line = table.lines[wrong[0]]
+        raise DatasetError(
+            f"{path}, line {line}: the image number {table.values[wrong[0], 0]:g} is not a whole "
+            "number from 0; the line must be: number, seconds"
+        )
+    _require_unique(table, numbers)
+    require_increasing(table, table.column(1))
+    return numbers, table.column(1)
+
+
+def _require_unique(table: Table, numbers: IntArray) -> None:
+    _, first = np.unique(numbers, return_index=True)
+    repeated = np.setdiff1d(np.arange(len(numbers)), first)
+    if len(repeated):
+        k = int(repeated[0])
+        raise DatasetError(
+            f"{table.path}, line {table.lines[k]}: image number {numbers[k]} is listed twice; "
+            "remove one of the lines"
+        )
+
+
+def _files(
+    folders: list[Path], listed: list[dict[int, Path]], numbers: IntArray, rig: CameraRig
+) -> StereoFiles:
+    """Files of all frames; an absent one gets the name that it should have."""
+    suffixes = [next(iter(images.values())).suffix for images in listed]
+    cameras = list(zip(folders, listed, suffixes, strict=True))
+    paths = tuple(
+        tuple(images.get(n, folder / f"{n:06d}{suffix}") for folder, images, suffix in cameras)
+        for n in numbers.tolist()
+    )
+    return StereoFiles(paths, rig.width, rig.height)
+
+
+def _unlisted(
+    folders: list[Path], listed: list[dict[int, Path]], numbers: IntArray
+) -> tuple[str, ...]:
+    known = set(numbers.tolist())
+    extra = [
+        (f.name, len(images.keys() - known)) for f, images in zip(folders, listed, strict=True)
+    ]
+    return tuple(f"{n} images of {name}/ are not in times.txt and unused" for name, n in extra if n)
+
+
+def _read_truth(root: Path, baseline: float) -> Trajectory | None:
+    """True poses of the reference (right) camera at their own stamps, or None."""
+    if (root / TRUTH_RIGHT).is_file():
+        return read_tum_table(root / TRUTH_RIGHT)[1]
+    if (root / TRUTH_LEFT).is_file():
+        left = read_tum_table(root / TRUTH_LEFT)[1]
+        return Trajectory(left.timestamps, right_from_left_camera(left.poses, baseline))
+    return None
+
+
+def _find_odometry(root: Path, name: str | None) -> Path | None:
+    if name is not None:
+        if not (root / name).is_file():
+            raise DatasetError(
+                f"dataset.odometry_file {root / name} does not exist; correct the name, or leave "
+                "it out"
+            )
+        return root / name
+    found: Iterable[Path] = [root / "odometry.txt", *sorted(root.glob("odom*.csv"))]
+    candidates = [path for path in found if path.is_file()]
+    if len(candidates) > 1:
+        raise DatasetError(
+            f"{root} has several odometry files ({', '.join(p.name for p in candidates)}); name "
+            "one in dataset.odometry_file"
+        )
+    return candidates[0] if candidates else None
+
+
+def _odometry_source(
+    path: Path | None, settings: RecordedOdometrySettings
+) -> OdometrySource | None:
+    if path is None:
+        return None
+
+    def source(frames: FloatArray) -> tuple[Odometry | None, ...]:
+        if path.suffix == ".csv":
+            steps = motions_from_speed(read_speed_log(path, settings), frames, settings)
+        else:
+            steps = motions_from_poses(read_pose_log(path, settings), frames, settings)
+        if len(frames) > 1 and all(step is None for step in steps):
+            raise OdometryError(
+                f"{path} covers none of the frames ({frames[0]:.3f} to {frames[-1]:.3f} s); check "
+                "that both use one clock, or set odometry.time_offset_s"
+            )
+        return steps
+
+    return source

@@ -1,0 +1,176 @@
+"""Recorded odometry: body motions between frames from speed and yaw rate, or from poses.
+
+The body's axes are x forward, y left, z up. All covariances are 6x6 [rotation, translation] in the
+tangent space at the new pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fgslam.datasets.tables import Table, read_table, require_increasing
+from fgslam.datasets.trajectories import covered, interpolate_poses, read_tum_table
+from fgslam.errors import OdometryError
+from fgslam.geometry import inverse, rotation_angle
+from fgslam.settings.datasets import RecordedOdometrySettings
+from fgslam.types import BoolArray, FloatArray, Odometry, Trajectory
+
+SPEED_COLUMNS = ("time", "forward speed", "yaw rate")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SpeedLog:
+    """Forward speed (n,) in m/s and yaw rate (n,) in rad/s, counter-clockwise, at stamps (n,)."""
+
+    stamps: FloatArray
+    speed: FloatArray
+    yaw_rate: FloatArray
+
+
+def read_speed_log(path: Path, settings: RecordedOdometrySettings) -> SpeedLog:
+    """Read a comma-separated file: time in s, forward speed in m/s, yaw rate (up) in rad/s.
+
+    Raises:
+        OdometryError: a line is malformed, not finite, out of time order, or absurd.
+    """
+    table = read_table(path, SPEED_COLUMNS, ",", OdometryError)
+    _require_samples(path, len(table))
+    require_increasing(table, table.column(0), OdometryError)
+    _require_sane(table, table.column(1), settings.max_speed_mps, "forward speed", "m/s")
+    turn = np.degrees(table.column(2))
+    _require_sane(table, turn, settings.max_turn_dps, "yaw rate", "degrees/s")
+    return SpeedLog(table.column(0) + settings.time_offset_s, table.column(1), table.column(2))
+
+
+def _require_samples(path: Path, count: int) -> None:
+    if count < 2:
+        raise OdometryError(
+            f"{path} holds {count} samples, at least 2 are needed; restore the file, or choose "
+            "another odometry.kind (constant_velocity, synthetic)"
+        )
+
+
+def _require_sane(table: Table, values: FloatArray, limit: float, what: str, unit: str) -> None:
+    """Raise OdometryError, naming the line, if one of the values (n,) exceeds the limit."""
+    bad = np.flatnonzero(np.abs(values) > limit)
+    if len(bad):
+        k = int(bad[0])
+        raise OdometryError(
+            f"{table.path}, line {table.lines[k]}: {what} of {values[k]:.4g} {unit} is absurd "
+            f"(limit {limit:g}); correct the line, or raise the limit in the odometry settings"
+        )
+
+
+# --------------------------------------------------------------------------------------------
+# Speed and yaw rate
+
+
+def planar_poses(log: SpeedLog, at: FloatArray) -> FloatArray:
+    """(x, y, yaw) (m, 3) at increasing times (m,): the path of interpolated speed and yaw rate.
+
+    Between neighbouring stamps both are linear in time, so that the trapezoid gives the exact
+    distance and turn; the chord of each piece is that of the circular arc with this length and
+    turn. Outside the log the nearest sample is held.
+    """
+    times = np.union1d(log.stamps, at)
+    duration = np.diff(times)
+    speed, rate = (np.interp(times, log.stamps, y) for y in (log.speed, log.yaw_rate))
+    turn = duration * 0.5 * (rate[1:] + rate[:-1])
+    yaw = np.concatenate([[0.0], np.cumsum(turn)])
+    # np.sinc(x) is sin(pi x) / (pi x).
+    chord = duration * 0.5 * (speed[1:] + speed[:-1]) * np.sinc(turn / (2.0 * np.pi))
+    heading = yaw[:-1] + 0.5 * turn
+    x = np.concatenate([[0.0], np.cumsum(chord * np.cos(heading))])
+    y = np.concatenate([[0.0], np.cumsum(chord * np.sin(heading))])
+    return np.column_stack([x, y, yaw])[np.searchsorted(times, at)]
+
+
+def motions_from_speed(
+    log: SpeedLog, frames: FloatArray, settings: RecordedOdometrySettings
+) -> tuple[Odometry | None, ...]:
+    """Body motions (n - 1) between consecutive frame stamps (n,): planar arcs; None if not covered.
+
+    The covariance is diagonal: noise of the measured speed and yaw rate, and of the unmeasured
+    rates, each times the step's duration.
+    """
+    planar = planar_poses(log, frames)
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("z", planar[:, 2:]).as_matrix()
+    poses[:, :2, 3] = planar[:, :2]
+    rotation = [settings.roll_rate_sigma_dps, settings.pitch_rate_sigma_dps]
+    rotation.append(settings.yaw_rate_sigma_dps)
+    translation = [
+        settings.speed_sigma_mps,
+        settings.lateral_sigma_mps,
+        settings.vertical_sigma_mps,
+    ]
+    rates = np.concatenate([np.radians(rotation), translation])
+    covariances = [np.diag((rates * dt) ** 2) for dt in np.diff(frames)]
+    known = steps_covered(log.stamps, frames, settings.max_gap_s)
+    return _motions(poses, covariances, known)
+
+
+def _motions(
+    poses: FloatArray, covariances: Sequence[FloatArray], known: BoolArray
+) -> tuple[Odometry | None, ...]:
+    motions = inverse(poses[:-1]) @ poses[1:]
+    steps = zip(motions, covariances, known, strict=True)
+    return tuple(Odometry(m, c) if ok else None for m, c, ok in steps)
+
+
+def steps_covered(stamps: FloatArray, frames: FloatArray, max_gap: float) -> BoolArray:
+    """Which of the n - 1 steps between frames (n,) the stamps cover without a longer gap."""
+    ends = covered(stamps, frames, max_gap, max_gap)
+    gap_starts = stamps[:-1][np.diff(stamps) > max_gap]
+    # A step also fails when a gap lies wholly inside it.
+    gaps = np.diff(np.searchsorted(gap_starts, frames)) > 0
+    return np.asarray(ends[:-1] & ends[1:] & ~gaps)
+
+
+# --------------------------------------------------------------------------------------------
+# Poses
+
+
+def read_pose_log(path: Path, settings: RecordedOdometrySettings) -> Trajectory:
+    """Read body poses in TUM format, in whatever world the odometry started.
+
+    Raises:
+        OdometryError: a line is malformed, out of time order, or moves absurdly fast.
+    """
+    table, log = read_tum_table(path, OdometryError)
+    _require_samples(path, len(table))
+    motions = inverse(log.poses[:-1]) @ log.poses[1:]
+    duration = np.diff(log.timestamps)
+    speed = np.linalg.norm(motions[:, :3, 3], axis=1) / duration
+    angle = Rotation.from_matrix(motions[:, :3, :3]).magnitude()
+    arrival = Table(path, table.values[1:], table.lines[1:])
+    _require_sane(arrival, speed, settings.max_speed_mps, "speed", "m/s")
+    _require_sane(arrival, np.degrees(angle) / duration, settings.max_turn_dps, "turn", "degrees/s")
+    return Trajectory(log.timestamps + settings.time_offset_s, log.poses)
+
+
+def motions_from_poses(
+    log: Trajectory, frames: FloatArray, settings: RecordedOdometrySettings
+) -> tuple[Odometry | None, ...]:
+    """Body motions between consecutive frame stamps (n,): n - 1 of them; None where not covered."""
+    poses = interpolate_poses(log, frames)
+    motions = inverse(poses[:-1]) @ poses[1:]
+    covariances = [_pose_noise(motion, settings) for motion in motions]
+    # Unlike a speed, a pose cannot be held beyond the log's ends: that would say "no motion".
+    known = covered(log.timestamps, frames, settings.max_gap_s, 1e-3)
+    return _motions(poses, covariances, known[:-1] & known[1:])
+
+
+def _pose_noise(motion: FloatArray, settings: RecordedOdometrySettings) -> FloatArray:
+    length = float(np.linalg.norm(motion[:3, 3]))
+    angle = rotation_angle(motion[:3, :3])
+    rotation = max(
+        settings.rotation_sigma_fraction * angle, float(np.radians(settings.rotation_floor_deg))
+    )
+    translation = max(settings.translation_sigma_fraction * length, settings.translation_floor_m)
+    return np.diag(np.repeat([rotation**2, translation**2], 3))

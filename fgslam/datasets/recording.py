@@ -1,0 +1,84 @@
+"""The one implementation of the Sequence protocol that all readers of files return."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TypeAlias
+
+from fgslam.types import CameraRig, FloatArray, Frame, Image, IntArray, Odometry, Trajectory
+
+ImageLoader: TypeAlias = Callable[[int], tuple[Image, ...]]
+"""Images (right, left[, top]) of one of the recording's own frames; raises FrameError."""
+
+OdometrySource: TypeAlias = Callable[[FloatArray], tuple[Odometry | None, ...]]
+"""Body motions between consecutive stamps (n,): n - 1 of them, None where nothing was recorded."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Selected frames of a recording on disk; images are read when asked for.
+
+    Attributes:
+        name: short name for titles.
+        rig: the rectified cameras.
+        timestamps: (n,) seconds of the selected frames, strictly increasing.
+        identity: hexadecimal digest of the recording.
+        ground_truth: true poses of the reference camera at the selected frames, or None.
+        notes: what was tolerated when opening.
+        indices: (n,) the recording's own numbers of the selected frames.
+        load_images: reads the images of one of the recording's own frames.
+        odometry_source: where the body's motions come from, or None. Asked once, when first
+            needed, so that a bad odometry file hurts only who uses it.
+    """
+
+    name: str
+    rig: CameraRig
+    timestamps: FloatArray
+    identity: str
+    ground_truth: Trajectory | None
+    notes: tuple[str, ...]
+    indices: IntArray
+    load_images: ImageLoader
+    odometry_source: OdometrySource | None
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def frame(self, i: int) -> Frame:
+        """Images of frame ``i``, 0 <= i < len. Raises FrameError when missing or corrupt."""
+        self._check_index(i, 0)
+        index = int(self.indices[i])
+        return Frame(index, float(self.timestamps[i]), self.load_images(index))
+
+    def odometry(self, i: int) -> Odometry | None:
+        """Body motion from frame ``i - 1`` to ``i``, 1 <= i < len; None where none was recorded.
+
+        Raises:
+            OdometryError: the recording's odometry is malformed.
+        """
+        self._check_index(i, 1)
+        steps = self._steps
+        return None if steps is None else steps[i - 1]
+
+    @cached_property
+    def _steps(self) -> tuple[Odometry | None, ...] | None:
+        return None if self.odometry_source is None else self.odometry_source(self.timestamps)
+
+    def _check_index(self, i: int, least: int) -> None:
+        if not least <= i < len(self):
+            raise IndexError(f"frame {i} of {self.name}: expected {least} to {len(self) - 1}")
+
+
+def recording_identity(contents: Iterable[Path], listed: Iterable[Path]) -> str:
+    """SHA-256 over the bytes of ``contents`` and the names and sizes of ``listed`` files."""
+    digest = hashlib.sha256()
+    for path in contents:
+        digest.update(f"{path.name}\0".encode())
+        digest.update(path.read_bytes())
+    for path in sorted(listed):
+        digest.update(f"{path.parent.name}/{path.name}\0{path.stat().st_size}\0".encode())
+    return digest.hexdigest()

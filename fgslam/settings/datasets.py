@@ -1,0 +1,240 @@
+"""Settings of the recordings and of what serves as odometry, each a tagged union over ``kind``."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, TypeAlias
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fgslam.settings.base import STRICT
+
+Vector3: TypeAlias = tuple[float, float, float]
+PositiveVector3: TypeAlias = tuple[
+    Annotated[float, Field(gt=0.0)],
+    Annotated[float, Field(gt=0.0)],
+    Annotated[float, Field(gt=0.0)],
+]
+
+# --------------------------------------------------------------------------------------------
+# Recordings
+
+
+@dataclass(frozen=True, config=STRICT)
+class RecordingSettings:
+    """What every recording has: where it lies and which of its frames are used."""
+
+    path: Annotated[str, Field(min_length=1, description="folder of the recording")]
+    start: Annotated[int, Field(ge=0, description="first frame used, counted from 0")] = 0
+    stop: Annotated[
+        int | None, Field(ge=1, description="frame before which to stop; null: to the end")
+    ] = None
+    stride: Annotated[int, Field(ge=1, description="use every n-th frame")] = 1
+
+
+@dataclass(frozen=True, config=STRICT)
+class ImageFolderSettings(RecordingSettings):
+    """Our own layout, left/ right/ [top/] calib.json times.txt: docs/datasets/image_folder.md."""
+
+    kind: Literal["image_folder"] = "image_folder"
+    use_top: Annotated[bool, Field(description="use the third camera where the folder has one")] = (
+        True
+    )
+    odometry_file: Annotated[
+        str | None,
+        Field(
+            description="odometry inside the folder: .csv is speed and yaw rate, .txt is TUM poses "
+            "of the body; null: odometry.txt or the only odom*.csv, where there is one"
+        ),
+    ] = None
+    camera_yaw_deg: Annotated[
+        float | None,
+        Field(
+            description="heading of the reference camera in the body, degrees to the left; given, "
+            "it replaces the mounting (bTc) of calib.json; null: as calib.json, or straight ahead"
+        ),
+    ] = None
+    lever_arm_m: Annotated[
+        Vector3 | None,
+        Field(
+            description="position of the reference (right) camera in the body, metres forward, "
+            "left, up; given, it replaces bTc of calib.json; null: as calib.json, or none"
+        ),
+    ] = None
+
+
+@dataclass(frozen=True, config=STRICT)
+class KittiSettings(RecordingSettings):
+    """KITTI odometry in its native layout (docs/datasets/kitti.md)."""
+
+    kind: Literal["kitti"] = "kitti"
+    sequence: Annotated[
+        str, Field(pattern=r"^\d{2}$", description='which drive, two digits in quotes: "06"')
+    ] = "00"
+
+
+@dataclass(frozen=True, config=STRICT)
+class EurocSettings(RecordingSettings):
+    """EuRoC MAV in its native layout, rectified on reading (docs/datasets/euroc.md)."""
+
+    kind: Literal["euroc"] = "euroc"
+    pairing_tolerance_ms: Annotated[
+        float,
+        Field(ge=0.0, le=50.0, description="largest time between the two images of a pair, ms"),
+    ] = 2.0
+    rectify_alpha: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            le=1.0,
+            description="0 crops the rectified image to valid pixels, 1 keeps all (black borders)",
+        ),
+    ] = 0.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class LightFieldSettings(RecordingSettings):
+    """A gantry's grid of views read as a trinocular walk (docs/datasets/light_field.md)."""
+
+    kind: Literal["light_field"] = "light_field"
+    row: Annotated[int, Field(ge=0, description="grid row along which the reference walks")] = 8
+    spacing: Annotated[
+        int, Field(ge=1, description="grid steps from the reference to the left and the top view")
+    ] = 4
+    use_top: Annotated[bool, Field(description="use the vertical neighbour as third camera")] = True
+    focal_length_px: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="nominal focal length: the recording gives none; depth scales with it, the "
+            "trajectory does not",
+        ),
+    ] = 800.0
+    shift_px_per_step: Annotated[
+        float,
+        Field(
+            description="pixels by which each view is shifted per grid step, so that all "
+            "disparities are positive (measured without: -0.3 to 1.5 px a step)"
+        ),
+    ] = 1.0
+    metres_per_unit: Annotated[
+        float, Field(gt=0.0, description="metres in one unit of positions.csv (taken as mm)")
+    ] = 0.001
+
+
+# --------------------------------------------------------------------------------------------
+# Odometry
+
+
+@dataclass(frozen=True, config=STRICT)
+class RecordedOdometrySettings:
+    """Use the recording's own odometry, with this noise.
+
+    The rates are taken as constant over one step, so each standard deviation is multiplied by the
+    step's duration. Defaults: measured on KITTI raw 2011_09_26 against its truth (step 0.206 s,
+    7.5 m/s), where truth's own noise is included; docs/datasets/image_folder.md has the numbers.
+    """
+
+    kind: Literal["recorded"] = "recorded"
+    time_offset_s: Annotated[
+        float, Field(ge=-10.0, le=10.0, description="added to the odometry's time stamps, seconds")
+    ] = 0.0
+    max_gap_s: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="longest gap in the odometry that is bridged (inside by interpolation, at "
+            "the ends by the nearest value); over a longer one the step has no odometry, seconds",
+        ),
+    ] = 0.5
+    max_speed_mps: Annotated[
+        float, Field(gt=0.0, description="a faster sample is refused as absurd, m/s")
+    ] = 60.0
+    max_turn_dps: Annotated[
+        float, Field(gt=0.0, description="a faster turn is refused as absurd, degrees/s")
+    ] = 720.0
+    speed_sigma_mps: Annotated[
+        float, Field(gt=0.0, description="speed and yaw rate: noise of the forward speed, m/s")
+    ] = 0.10
+    lateral_sigma_mps: Annotated[
+        float, Field(gt=0.0, description="speed and yaw rate: unmeasured sideways speed, m/s")
+    ] = 0.08
+    vertical_sigma_mps: Annotated[
+        float, Field(gt=0.0, description="speed and yaw rate: unmeasured vertical speed, m/s")
+    ] = 0.12
+    yaw_rate_sigma_dps: Annotated[
+        float, Field(gt=0.0, description="speed and yaw rate: noise of the yaw rate, degrees/s")
+    ] = 0.30
+    pitch_rate_sigma_dps: Annotated[
+        float, Field(gt=0.0, description="speed and yaw rate: unmeasured pitch rate, degrees/s")
+    ] = 1.9
+    roll_rate_sigma_dps: Annotated[
+        float, Field(gt=0.0, description="speed and yaw rate: unmeasured roll rate, degrees/s")
+    ] = 1.3
+    translation_sigma_fraction: Annotated[
+        float, Field(ge=0.0, description="poses: noise per axis as a fraction of the step's length")
+    ] = 0.02
+    rotation_sigma_fraction: Annotated[
+        float, Field(ge=0.0, description="poses: noise per axis as a fraction of the step's angle")
+    ] = 0.05
+    translation_floor_m: Annotated[
+        float, Field(gt=0.0, description="poses: least noise per axis and step, metres")
+    ] = 0.002
+    rotation_floor_deg: Annotated[
+        float, Field(gt=0.0, description="poses: least noise per axis and step, degrees")
+    ] = 0.1
+
+
+@dataclass(frozen=True, config=STRICT)
+class ConstantVelocitySettings:
+    """No odometry: the camera is expected to keep its velocity, with this random acceleration.
+
+    Over a step of ``dt`` seconds the prediction's standard deviation is ``sigma * dt**2``.
+    Defaults: the change of velocity between frames of the cars of KITTI, rounded (standard
+    deviation per camera axis; KITTI raw 2011_09_26 at 5 Hz: 12, 6, 8 degrees/s^2 and 0.35, 0.43,
+    2.3 m/s^2, without outliers 9, 3, 6 and 0.22, 0.23, 0.57; KITTI 06 at 10 Hz: 5, 2, 5 and 0.12,
+    0.11, 0.18).
+    """
+
+    kind: Literal["constant_velocity"] = "constant_velocity"
+    rotation_sigma_dps2: Annotated[
+        PositiveVector3,
+        Field(description="about the camera's axes x, y, z (right, down, forward), degrees/s^2"),
+    ] = (10.0, 6.0, 8.0)
+    translation_sigma_mps2: Annotated[
+        PositiveVector3, Field(description="along the camera's axes x, y, z, m/s^2")
+    ] = (0.4, 0.4, 1.0)
+    start_speed_sigma_mps: Annotated[
+        float, Field(gt=0.0, description="speed per axis before the first motion is known, m/s")
+    ] = 15.0
+    start_rotation_sigma_dps: Annotated[
+        float, Field(gt=0.0, description="turn per axis before the first motion is known, deg/s")
+    ] = 20.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class SyntheticOdometrySettings:
+    """Ground truth plus stated noise stands in for odometry; every output says so.
+
+    Independent normal noise per body axis on each step, drawn from the experiment's seed.
+    """
+
+    kind: Literal["synthetic"] = "synthetic"
+    translation_sigma_fraction: Annotated[
+        float, Field(ge=0.0, description="per axis, as a fraction of the step's length")
+    ] = 0.02
+    rotation_sigma_deg: Annotated[
+        float, Field(ge=0.0, description="per axis and step, degrees")
+    ] = 1.0
+    translation_floor_m: Annotated[
+        float, Field(gt=0.0, description="least noise per axis and step, metres")
+    ] = 0.001
+    rotation_floor_deg: Annotated[
+        float, Field(gt=0.0, description="least noise per axis and step, degrees")
+    ] = 0.01
+
+
+OdometrySettings: TypeAlias = Annotated[
+    RecordedOdometrySettings | ConstantVelocitySettings | SyntheticOdometrySettings,
+    Field(discriminator="kind"),
+]
