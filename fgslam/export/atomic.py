@@ -32,7 +32,7 @@ _RUN_FILES = (
     "report.html",
     "pictures/*.png",
     *(f"*/{name}" for name in _ESTIMATOR_FILES),
-    "**/.*.partial",
+    "**/.*.partial*",
 )
 
 _MENDS = {
@@ -43,7 +43,7 @@ _MENDS = {
     errno.EROFS: "the file system is read-only; choose another folder",
     errno.ENOTDIR: "part of the path is a file, not a folder; choose another folder",
     errno.EISDIR: "that is a folder; name a file",
-    errno.ENOENT: "its folder does not exist; create it first",
+    errno.ENOENT: "its folder does not exist; choose another folder",
     errno.EFBIG: "the file grew beyond the allowed size; raise the limit (ulimit -f)",
     errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
 }

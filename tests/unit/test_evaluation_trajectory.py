@@ -54,7 +54,9 @@ def evo_path(trajectory: Trajectory):
 def evo_aligned(estimate: Trajectory, truth: Trajectory, alignment: Alignment):
     from evo.core import sync
 
-    true, estimated = sync.associate_trajectories(evo_path(truth), evo_path(estimate), max_diff=0.01)
+    true, estimated = sync.associate_trajectories(
+        evo_path(truth), evo_path(estimate), max_diff=0.01
+    )
     if alignment is Alignment.FIRST_POSE:
         estimated.align_origin(true)
     elif alignment is not Alignment.NONE:
@@ -103,6 +105,24 @@ def test_rigid_alignment_agrees_with_gtsam() -> None:
     assert ours is not None
     np.testing.assert_allclose(ours.rotation, reference[:3, :3], atol=1e-9)
     np.testing.assert_allclose(ours.translation, reference[:3, 3], atol=1e-9)
+
+
+def test_similarity_agrees_with_gtsam_where_the_data_are_exact() -> None:
+    gtsam = pytest.importorskip("gtsam")
+    truth = wandering(18)
+    source = truth.poses[:, :3, 3]
+    target = 2.5 * source @ so3_exp(np.array([0.4, -1.0, 0.2])).T + [1.0, 2.0, 3.0]
+
+    ours = umeyama(source, target, with_scale=True)
+
+    reference = gtsam.Similarity3.Align(list(zip(target, source, strict=True)))
+    assert ours is not None
+    assert ours.scale == pytest.approx(reference.scale(), rel=1e-9)
+    np.testing.assert_allclose(ours.rotation, reference.rotation().matrix(), atol=1e-9)
+    # GTSAM puts the scale outside: target = s (R source + t).
+    np.testing.assert_allclose(
+        ours.translation, reference.scale() * reference.translation(), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 250.0])

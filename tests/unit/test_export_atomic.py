@@ -1,0 +1,196 @@
+"""Atomic files and the run folder: whole or absent, and one clear line when it cannot be."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fgslam.errors import OutputError
+from fgslam.export import atomic
+from fgslam.export.atomic import (
+    create_run_folder,
+    is_run_folder,
+    make_subfolder,
+    replacing,
+    write_bytes,
+    write_text,
+    write_with,
+)
+
+
+def leftovers(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*") if "partial" in path.name]
+
+
+def test_file_appears_whole(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.txt", "one\ntwo\n")
+    assert (tmp_path / "a.txt").read_bytes() == b"one\ntwo\n"
+    assert not leftovers(tmp_path)
+
+
+def test_failure_keeps_the_previous_version(tmp_path: Path) -> None:
+    target = tmp_path / "a.txt"
+    write_text(target, "old")
+
+    def interrupted(partial: Path) -> None:
+        partial.write_text("half of the n")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_with(target, interrupted)
+    assert target.read_text() == "old"
+    assert not leftovers(tmp_path)
+
+
+def test_previous_version_stands_until_the_new_one_is_complete(tmp_path: Path) -> None:
+    target = tmp_path / "a.txt"
+    write_text(target, "old")
+    with replacing(target) as partial:
+        partial.write_text("new")
+        assert target.read_text() == "old"
+        assert partial.parent == target.parent
+    assert target.read_text() == "new"
+
+
+def test_library_writers_see_their_suffix(tmp_path: Path) -> None:
+    target = tmp_path / "log.npz"
+    write_with(target, lambda path: np.savez(path, a=np.arange(3)))
+    with np.load(target) as log:
+        np.testing.assert_array_equal(log["a"], [0, 1, 2])
+    assert [path.name for path in tmp_path.iterdir()] == ["log.npz"]
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (errno.ENOSPC, "disk is full"),
+        (errno.EDQUOT, "quota"),
+        (errno.EACCES, "permission denied"),
+        (errno.EROFS, "read-only"),
+    ],
+)
+def test_system_errors_become_one_clear_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, words: str
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(atomic.os, "replace", refuse)
+    with pytest.raises(OutputError, match=words) as caught:
+        write_bytes(tmp_path / "a.bin", b"content")
+    assert "\n" not in str(caught.value)
+    assert str(tmp_path / "a.bin") in str(caught.value)
+    assert not leftovers(tmp_path)
+
+
+def test_file_that_outgrows_what_the_system_allows(tmp_path: Path) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(OutputError, match="cannot write"):
+            write_bytes(tmp_path / "big.bin", b"x" * 100_000)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="does not exist"):
+        write_text(tmp_path / "absent" / "a.txt", "x")
+
+
+# --------------------------------------------------------------------------------------------
+# The run folder
+
+
+def a_run(folder: Path) -> Path:
+    create_run_folder(folder)
+    write_text(folder / "config.yaml", "name: demo\n")
+    write_text(make_subfolder(folder, "landmark_kalman") / "final.tum", "")
+    write_text(make_subfolder(folder, "pictures") / "map.png", "")
+    return folder
+
+
+def test_new_folder_with_its_parents(tmp_path: Path) -> None:
+    folder = create_run_folder(tmp_path / "a" / "b")
+    assert folder.is_dir()
+    assert not any(folder.iterdir())
+    assert not is_run_folder(folder)
+
+
+def test_empty_folder_is_as_good_as_none(tmp_path: Path) -> None:
+    assert create_run_folder(tmp_path) == tmp_path
+
+
+def test_folder_with_a_run_is_refused_and_untouched(tmp_path: Path) -> None:
+    folder = a_run(tmp_path / "run")
+    before = sorted(folder.rglob("*"))
+    with pytest.raises(OutputError, match="holds a run already"):
+        create_run_folder(folder)
+    assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize("existing", ["refuse", "overwrite"])
+def test_folder_of_something_else_is_never_touched(tmp_path: Path, existing: str) -> None:
+    write_text(tmp_path / "thesis.tex", "years of work")
+    with pytest.raises(OutputError, match="something else"):
+        create_run_folder(tmp_path, existing)  # type: ignore[arg-type]
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+
+
+def test_overwriting_deletes_the_run_and_nothing_else(tmp_path: Path) -> None:
+    folder = a_run(tmp_path / "run")
+    write_text(folder / "notes.txt", "mine")
+    write_text(folder / "landmark_kalman" / "plot.svg", "mine too")
+    write_text(folder / ".final.tum.partial.tum", "left by a killed run")
+    create_run_folder(folder, "overwrite")
+    left = sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
+    assert left == ["landmark_kalman/plot.svg", "notes.txt"]
+    assert not (folder / "pictures").exists()
+
+
+def test_resume_keeps_everything(tmp_path: Path) -> None:
+    folder = a_run(tmp_path / "run")
+    before = sorted(folder.rglob("*"))
+    create_run_folder(folder, "resume")
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_resume_needs_a_run(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="holds no run"):
+        create_run_folder(tmp_path / "absent", "resume")
+    assert not (tmp_path / "absent").exists()
+
+
+def test_name_of_a_file_is_refused(tmp_path: Path) -> None:
+    write_text(tmp_path / "file", "x")
+    with pytest.raises(OutputError, match="not a folder"):
+        create_run_folder(tmp_path / "file")
+    with pytest.raises(OutputError, match="part of the path is a file"):
+        create_run_folder(tmp_path / "file" / "run")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_read_only_parent(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    try:
+        with pytest.raises(OutputError, match="permission denied"):
+            create_run_folder(tmp_path / "run")
+    finally:
+        tmp_path.chmod(0o700)
+
+
+def test_unwritable_folder_is_found_out_before_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> int:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(Path, "write_bytes", refuse)
+    with pytest.raises(OutputError, match="read-only"):
+        create_run_folder(tmp_path / "run")

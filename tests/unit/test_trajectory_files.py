@@ -1,0 +1,163 @@
+"""TUM, KITTI and covariance files: exact there and back, readable by evo, clear when broken."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fgslam.errors import DatasetError, OutputError
+from fgslam.export.trajectories import (
+    read_covariances,
+    read_kitti,
+    read_tum,
+    write_covariances,
+    write_kitti,
+    write_tum,
+)
+from fgslam.geometry import se3_exp
+from fgslam.types import Trajectory
+
+
+def trajectory(seed: int = 1, n: int = 50) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    xi = rng.normal(size=(n, 6)) * [2.0, 2.0, 2.0, 30.0, 3.0, 30.0]
+    return Trajectory(1.5e9 + np.cumsum(rng.uniform(0.01, 1, n)), np.array([*map(se3_exp, xi)]))
+
+
+def test_tum_there_and_back(tmp_path: Path) -> None:
+    written = trajectory()
+    write_tum(tmp_path / "a.tum", written)
+    read = read_tum(tmp_path / "a.tum")
+    np.testing.assert_array_equal(read.timestamps, written.timestamps)
+    np.testing.assert_allclose(read.poses, written.poses, atol=2e-12)
+
+
+def test_tum_there_and_back_keeps_the_bytes(tmp_path: Path) -> None:
+    write_tum(tmp_path / "a.tum", trajectory())
+    write_tum(tmp_path / "b.tum", read_tum(tmp_path / "a.tum"))
+    first = np.loadtxt(tmp_path / "a.tum")
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "b.tum"), first, atol=2e-12)
+    write_tum(tmp_path / "c.tum", trajectory())
+    assert (tmp_path / "c.tum").read_bytes() == (tmp_path / "a.tum").read_bytes()
+
+
+def test_tum_lines_are_in_the_formats_order(tmp_path: Path) -> None:
+    turn = se3_exp(np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0]))
+    turn[:3, 3] = [1.0, -2.0, 3.5]
+    write_tum(tmp_path / "a.tum", Trajectory(np.array([1403715273.262142976]), turn[None]))
+    fields = (tmp_path / "a.tum").read_text().split()
+    assert fields[0] == "1403715273.262142897"  # the nearest double, nine decimals
+    half = np.sqrt(0.5)
+    np.testing.assert_allclose(np.array(fields[1:], float), [1, -2, 3.5, 0, half, 0, half])
+
+
+def test_tum_has_no_negative_zeros_and_no_negative_w(tmp_path: Path) -> None:
+    poses = np.array([se3_exp(np.array([0, 0, angle, -1e-15, 0, 0])) for angle in (-3.0, 0, 3.0)])
+    write_tum(tmp_path / "a.tum", Trajectory(np.arange(3.0), poses))
+    text = (tmp_path / "a.tum").read_text()
+    assert "-0.000000000000" not in text
+    assert (np.loadtxt(tmp_path / "a.tum")[:, 7] >= 0).all()
+
+
+def test_evo_reads_both(tmp_path: Path) -> None:
+    file_interface = pytest.importorskip("evo.tools.file_interface", reason="evo is not installed")
+    written = trajectory()
+    write_tum(tmp_path / "a.tum", written)
+    write_kitti(tmp_path / "a.kitti", written)
+    tum = file_interface.read_tum_trajectory_file(str(tmp_path / "a.tum"))
+    kitti = file_interface.read_kitti_poses_file(str(tmp_path / "a.kitti"))
+    assert tum.check()[0]
+    assert kitti.check()[0]
+    np.testing.assert_array_equal(tum.timestamps, written.timestamps)
+    np.testing.assert_allclose(np.array(tum.poses_se3), written.poses, atol=2e-12)
+    np.testing.assert_allclose(np.array(kitti.poses_se3), written.poses, atol=1e-10)
+
+
+def test_kitti_there_and_back(tmp_path: Path) -> None:
+    written = trajectory(2)
+    write_kitti(tmp_path / "a.kitti", written)
+    np.testing.assert_allclose(read_kitti(tmp_path / "a.kitti"), written.poses, rtol=1e-12)
+
+
+def test_empty_trajectory(tmp_path: Path) -> None:
+    write_tum(tmp_path / "a.tum", Trajectory(np.empty(0), np.empty((0, 4, 4))))
+    assert len(read_tum(tmp_path / "a.tum")) == 0
+
+
+def test_comments_blank_lines_and_windows_line_ends_are_accepted(tmp_path: Path) -> None:
+    (tmp_path / "a.tum").write_bytes(
+        b"# timestamp tx ty tz qx qy qz qw\r\n\r\n1 0 0 0 0 0 0 2  # not of unit length\r\n"
+    )
+    read = read_tum(tmp_path / "a.tum")
+    np.testing.assert_allclose(read.poses[0], np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("2 0 0 0 0 0 0", "7 numbers instead of 8"),
+        ("2 0 0 0 0 0 0 1 9", "9 numbers instead of 8"),
+        ("2 0 0 zero 0 0 0 1", "zero"),
+        ("2 0 0 nan 0 0 0 1", "not finite"),
+        ("2 0 0 0 0 0 0 0", "quaternion"),
+        ("1 0 0 0 0 0 0 1", "does not increase"),
+        ("2,0,0,0,0,0,0,1", "2,0,0"),
+    ],
+)
+def test_broken_tum_lines_are_named(tmp_path: Path, line: str, words: str) -> None:
+    path = tmp_path / "a.tum"
+    path.write_text(f"# header\n1 0 0 0 0 0 0 1\n{line}\n")
+    with pytest.raises(DatasetError, match=words) as caught:
+        read_tum(path)
+    assert f"{path}, line 3" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_and_binary_files(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="No such file"):
+        read_tum(tmp_path / "absent.tum")
+    (tmp_path / "image.tum").write_bytes(b"\x89PNG\xff\xfe")
+    with pytest.raises(DatasetError, match="not a text file"):
+        read_tum(tmp_path / "image.tum")
+    (tmp_path / "short.kitti").write_text("1 0 0 0\n")
+    with pytest.raises(DatasetError, match="4 numbers instead of 12"):
+        read_kitti(tmp_path / "short.kitti")
+
+
+@pytest.mark.parametrize("writer", [write_tum, write_kitti])
+def test_poses_that_are_not_finite_are_refused(tmp_path: Path, writer) -> None:
+    poses = trajectory().poses.copy()
+    poses[7, 0, 3] = np.inf
+    with pytest.raises(OutputError, match="pose 7"):
+        writer(tmp_path / "a.tum", Trajectory(trajectory().timestamps, poses))
+    assert not (tmp_path / "a.tum").exists()
+
+
+def test_covariances_there_and_back(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(20, 6, 6))
+    covariances = root @ np.swapaxes(root, 1, 2) * 1e-4
+    covariances[4] = np.nan
+    times = 0.5 * np.arange(20)
+    path = tmp_path / "covariance.csv"
+    write_covariances(path, times, covariances)
+    read_times, read = read_covariances(path)
+    np.testing.assert_array_equal(read_times, times)
+    np.testing.assert_allclose(read, covariances, rtol=1e-9)
+
+    comment, names, first = path.read_text().splitlines()[:3]
+    assert "rotation, translation" in comment
+    assert "reference camera" in comment
+    columns = names.split(",")
+    assert columns[:3] == ["timestamp", "c_rx_rx", "c_rx_ry"]
+    assert columns[-1] == "c_tz_tz"
+    values = dict(zip(columns, map(float, first.split(",")), strict=True))
+    assert values["c_rz_ty"] == pytest.approx(covariances[0, 2, 4])
+
+
+def test_broken_covariance_file(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("timestamp,c\n")
+    with pytest.raises(DatasetError, match="line 1"):
+        read_covariances(tmp_path / "a.csv")
