@@ -199,6 +199,30 @@ class StereoFeatures:
     def __len__(self) -> int:
         return len(self.scale)
 
+    def observations(self, which: IntArray, ids: IntArray, is_new: bool) -> Observations:
+        """Some of the features as observations of the landmarks ``ids``."""
+        return Observations(
+            ids,
+            self.measurement[which],
+            self.measurement_covariance[which],
+            self.pixels[which],
+            np.full(len(which), is_new),
+        )
+
+    @staticmethod
+    def empty() -> StereoFeatures:
+        """No feature at all."""
+        return StereoFeatures(
+            measurement=np.empty((0, 3)),
+            measurement_covariance=np.empty((0, 3, 3)),
+            scale=np.empty(0),
+            orientation=np.empty(0),
+            descriptors=np.empty((0, 128), np.uint8),
+            position=np.empty((0, 3)),
+            position_covariance=np.empty((0, 3, 3)),
+            pixels=np.empty((0, 3, 2)),
+        )
+
 
 class EgoMotionStatus(str, Enum):
     """How the pose of a frame was found."""
@@ -272,15 +296,14 @@ class Observations:
             self.is_new[keep],
         )
 
-    @staticmethod
-    def empty() -> Observations:
-        """No observation at all."""
+    def join(self, other: Observations) -> Observations:
+        """Both, one after the other."""
         return Observations(
-            np.empty(0, np.int64),
-            np.empty((0, 3)),
-            np.empty((0, 3, 3)),
-            np.empty((0, 3, 2)),
-            np.empty(0, np.bool_),
+            np.concatenate([self.ids, other.ids]),
+            np.concatenate([self.measurement, other.measurement]),
+            np.concatenate([self.covariance, other.covariance]),
+            np.concatenate([self.pixels, other.pixels]),
+            np.concatenate([self.is_new, other.is_new]),
         )
 
 

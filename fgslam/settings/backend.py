@@ -25,11 +25,15 @@ class LandmarkKalmanSettings:
     ] = "pixel"
     pose_covariance: Annotated[
         bool,
-        Field(description="add the pose's covariance to the observation's (6.4 read with IJRR 2002)"),
+        Field(
+            description="add the pose's covariance to the observation's (6.4 read with IJRR 2002)"
+        ),
     ] = True
     miss_growth_m: Annotated[
         float,
-        Field(ge=0.0, description="standard deviation in metres added to a landmark on a miss (6.4)"),
+        Field(
+            ge=0.0, description="standard deviation in metres added to a landmark on a miss (6.4)"
+        ),
     ] = 0.002
 
 

@@ -1,0 +1,70 @@
+"""Builds the parts of a run from its configuration; the only place where kinds are told apart."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.backend.protocol import Estimator
+from fgslam.frontend.database import LandmarkDatabase
+from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.frontend.map_matching import MapMatcher
+from fgslam.frontend.sift import SiftExtractor
+from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.stream import FeatureStream
+from fgslam.frontend.tracker import LandmarkTracker
+from fgslam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
+from fgslam.pipeline import SlamPipeline
+from fgslam.settings.backend import EstimatorSettings
+from fgslam.settings.datasets import ConstantVelocitySettings, OdometrySettings
+from fgslam.types import CameraRig, Prediction, Sequence
+
+
+def make_stream(sequence: Sequence, settings: FrontendSettings) -> FeatureStream:
+    """Features of the sequence's frames, found ahead of the loop."""
+    extractor = SiftExtractor(settings.sift, settings.appearance.mode)
+    return FeatureStream(sequence, extractor.extract)
+
+
+def make_tracker(rig: CameraRig, settings: FrontendSettings) -> LandmarkTracker:
+    """The landmark database with its matchers and the ego-motion."""
+    database = LandmarkDatabase(rig, settings.database, settings.stereo.max_disparity_px)
+    solver = EgoMotionSolver(rig, settings.ego_motion)
+    return LandmarkTracker(rig, database, _matchers(settings), solver)
+
+
+def _matchers(settings: FrontendSettings) -> tuple[MapMatcher, ...]:
+    """One matcher, or a wide one followed by the narrow one around the pose it gave."""
+    matcher = MapMatcher(settings.matching, settings.appearance)
+    return (matcher, matcher) if settings.matching.refine else (matcher,)
+
+
+def make_motion(sequence: Sequence, settings: OdometrySettings) -> MotionModel:
+    """What predicts the camera's motion."""
+    if isinstance(settings, ConstantVelocitySettings):
+        return ConstantVelocityMotion(settings)
+    stand_in = ConstantVelocityMotion(ConstantVelocitySettings())
+    return OdometryMotion(sequence, settings.kind, stand_in)
+
+
+def make_estimator(rig: CameraRig, settings: EstimatorSettings) -> Estimator:
+    """The estimator, at the origin: the world is the first camera frame, without uncertainty."""
+    prior = Prediction(np.eye(4), np.zeros((6, 6)))
+    match settings.kind:
+        case "landmark_kalman":
+            return LandmarkKalman(rig, settings, prior)
+
+
+def make_pipeline(
+    sequence: Sequence,
+    frontend: FrontendSettings,
+    odometry: OdometrySettings,
+    estimator: EstimatorSettings,
+) -> SlamPipeline:
+    """The whole system for one sequence."""
+    return SlamPipeline(
+        stereo=StereoMatcher(sequence.rig, frontend.stereo, frontend.appearance),
+        tracker=make_tracker(sequence.rig, frontend),
+        motion=make_motion(sequence, odometry),
+        estimator=make_estimator(sequence.rig, estimator),
+    )

@@ -1,0 +1,357 @@
+"""Pose of a frame by least squares on image residuals against the map (Se et al. 3.3 and 5).
+
+Newton's method in its Gauss-Newton form with analytic Jacobians, Lowe's stabilisation towards the
+odometry (Lowe 1991; design B6), Levenberg's damping where a step would raise the cost, repeated
+after outliers are dropped, and capped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.geometry import (
+    congruence,
+    inverse,
+    inverse_spd3,
+    point_pose_jacobian,
+    pose,
+    project,
+    projection_jacobian,
+    reorthonormalise,
+    se3_exp,
+    se3_log,
+    se3_log_jacobian,
+    so3_exp,
+    transform_to_camera,
+)
+from fgslam.settings.frontend import EgoMotionSettings
+from fgslam.types import (
+    BoolArray,
+    CameraRig,
+    EgoMotion,
+    EgoMotionStatus,
+    FloatArray,
+    LandmarkMap,
+    Observations,
+    Prediction,
+)
+
+_NEAREST_DEPTH_M = 1e-3  # a point nearer than this, or behind, cannot be linearised
+_STEP_TOLERANCE = 1e-9  # radians and metres; far below anything measurable
+_REPEATS = 4  # minimisations with the remaining matches; two suffice on all recordings tried
+_MAX_DAMPING = 1e8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseProblem:
+    """Matches of one frame: landmark positions and covariances, measurements and theirs.
+
+    Attributes:
+        points: (k, 3) world, metres.
+        point_covariances: (k, 3, 3).
+        measurement: (k, 3) (column, row, disparity), pixels.
+        measurement_covariance: (k, 3, 3).
+    """
+
+    points: FloatArray
+    point_covariances: FloatArray
+    measurement: FloatArray
+    measurement_covariance: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @staticmethod
+    def of(landmarks: LandmarkMap, observed: Observations) -> PoseProblem:
+        """The observations of landmarks that are in the map. KeyError for one that is not."""
+        rows = landmarks.rows(observed.ids)
+        return PoseProblem(
+            landmarks.positions[rows],
+            landmarks.covariances[rows],
+            observed.measurement,
+            observed.covariance,
+        )
+
+    def select(self, keep: BoolArray) -> PoseProblem:
+        """The chosen matches."""
+        return PoseProblem(
+            self.points[keep],
+            self.point_covariances[keep],
+            self.measurement[keep],
+            self.measurement_covariance[keep],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Minimum:
+    wTc: FloatArray
+    hessian: FloatArray
+    converged: bool
+    iterations: int
+
+
+class EgoMotionSolver:
+    """Solves for ``wTc`` from matched landmarks and a predicted pose."""
+
+    def __init__(self, rig: CameraRig, settings: EgoMotionSettings) -> None:
+        """The world's vertical is that of the robot's body in the first camera frame."""
+        self._rig = rig
+        self._settings = settings
+        self._down = -rig.bTc[2, :3]
+        self._horizontal = np.linalg.svd(self._down[None, :])[2][1:].T
+
+    def constrain(self, wTc: FloatArray) -> FloatArray:
+        """The nearest pose that the chosen degrees of freedom allow."""
+        if self._settings.dof == 6:
+            return wTc
+        translation = wTc[:3, 3] - self._down * (self._down @ wTc[:3, 3])
+        rotation = wTc[:3, :3]
+        if self._settings.dof == 3:
+            rotation = self._turn_about_vertical(rotation)
+        return pose(rotation, translation)
+
+    def solve(self, prediction: Prediction, problem: PoseProblem) -> EgoMotion:
+        """Pose with covariance, inliers, residuals and a status; the odometry's where it fails."""
+        prediction = Prediction(self.constrain(prediction.wTc), prediction.covariance)
+        start = prediction.wTc
+        inliers = transform_to_camera(start, problem.points)[:, 2] > _NEAREST_DEPTH_M
+        iterations = 0
+        wTc, robust = start, self._settings.kernel != "none"
+        for _ in range(_REPEATS):
+            if inliers.sum() < self._settings.min_matches:
+                return self._fall_back(prediction, problem, EgoMotionStatus.TOO_FEW_MATCHES)
+            minimum = self._minimise(wTc, prediction, problem.select(inliers), robust)
+            iterations += minimum.iterations
+            if not minimum.converged:
+                return self._fall_back(prediction, problem, EgoMotionStatus.DIVERGED)
+            wTc = minimum.wTc
+            kept = self._inliers(wTc, problem)
+            if not robust and np.array_equal(kept, inliers):
+                break
+            inliers, robust = kept, False
+        return self._finish(prediction, problem, minimum, inliers, iterations)
+
+    def basis(self, wTc: FloatArray) -> FloatArray:
+        """Columns (6, dof) span the tangent directions that the degrees of freedom allow."""
+        if self._settings.dof == 6:
+            return np.eye(6)
+        cRw = wTc[:3, :3].T
+        rotations = np.eye(3) if self._settings.dof == 5 else (cRw @ self._down)[:, None]
+        out = np.zeros((6, rotations.shape[1] + 2))
+        out[:3, : rotations.shape[1]] = rotations
+        out[3:, rotations.shape[1] :] = cRw @ self._horizontal
+        return out
+
+    # ----------------------------------------------------------------------------------------
+
+    def _minimise(
+        self, start: FloatArray, prediction: Prediction, problem: PoseProblem, robust: bool
+    ) -> _Minimum:
+        information = self._information(start, problem)
+        prior = _inverse_spd(prediction.covariance) if self._settings.prior else None
+        best_cost, damping = np.inf, 0.0
+        wTc = best = start
+        hessian, gradient = np.eye(6), np.zeros(6)
+        for iteration in range(1, self._settings.max_iterations + 1):
+            cost, h, g = self._linearise(wTc, problem, information, robust)
+            if prior is not None:
+                cost, h, g = _add_prior(wTc, prediction.wTc, prior, (cost, h, g))
+            if cost <= best_cost * (1.0 + 1e-12):
+                best, best_cost, hessian, gradient = wTc, cost, h, g
+                damping *= 0.1
+            else:
+                damping = max(10.0 * damping, 1e-4)
+                if damping > _MAX_DAMPING:
+                    break
+            step = self._step(best, hessian, gradient, damping)
+            if step is None or not np.isfinite(best_cost):
+                return _Minimum(start, hessian, False, iteration)
+            if np.abs(step).max() < _STEP_TOLERANCE:
+                break
+            wTc = _retract(best, step)
+        return _Minimum(best, hessian, True, iteration)
+
+    def _information(self, wTc: FloatArray, problem: PoseProblem) -> FloatArray:
+        """Inverse covariances (k, 3, 3) of the residuals; the disparity's row 0 if unused."""
+        settings = self._settings
+        if settings.weighting == "uniform":
+            covariance = np.tile(np.eye(3), (len(problem), 1, 1))
+        else:
+            covariance = problem.measurement_covariance
+        if settings.weighting == "landmark":
+            points = transform_to_camera(wTc, problem.points)
+            jacobian = projection_jacobian(self._rig, points) @ wTc[:3, :3].T
+            covariance = covariance + congruence(jacobian, problem.point_covariances)
+        if settings.residuals == "image_disparity":
+            return inverse_spd3(covariance)
+        out = np.zeros_like(covariance)
+        out[:, :2, :2] = np.linalg.inv(covariance[:, :2, :2])
+        return out
+
+    def _linearise(
+        self, wTc: FloatArray, problem: PoseProblem, information: FloatArray, robust: bool
+    ) -> tuple[float, FloatArray, FloatArray]:
+        """Cost, Gauss-Newton Hessian (6, 6) and gradient (6,) at ``wTc``."""
+        points = transform_to_camera(wTc, problem.points)
+        if points[:, 2].min() <= _NEAREST_DEPTH_M:
+            return np.inf, np.eye(6), np.zeros(6)
+        residual = project(self._rig, points) - problem.measurement
+        jacobian = projection_jacobian(self._rig, points) @ point_pose_jacobian(points)
+        squared = np.einsum("ki,kij,kj->k", residual, information, residual)
+        rho, weight = self._kernel(squared, robust)
+        weighted = weight[:, None, None] * (information @ jacobian)
+        flat = weighted.reshape(-1, 6)
+        hessian = flat.T @ jacobian.reshape(-1, 6)
+        return float(rho.sum()), hessian, flat.T @ residual.ravel()
+
+    def _kernel(self, squared: FloatArray, robust: bool) -> tuple[FloatArray, FloatArray]:
+        """Robust cost and weight (k,) of squared normalised residuals."""
+        if not robust:
+            return squared, np.ones_like(squared)
+        width = self._settings.kernel_width
+        if self._settings.kernel == "cauchy":
+            ratio = squared / width**2
+            return width**2 * np.log1p(ratio), 1.0 / (1.0 + ratio)
+        norm = np.sqrt(squared)
+        linear = norm > width
+        weight = np.where(linear, width / np.maximum(norm, width), 1.0)
+        return np.where(linear, width * (2.0 * norm - width), squared), weight
+
+    def _step(
+        self, wTc: FloatArray, hessian: FloatArray, gradient: FloatArray, damping: float
+    ) -> FloatArray | None:
+        """The correction (6,), to be applied on the right; None where it is undetermined."""
+        basis = self.basis(wTc)
+        reduced = basis.T @ hessian @ basis
+        reduced[np.diag_indices_from(reduced)] *= 1.0 + damping
+        try:
+            return np.asarray(-(basis @ np.linalg.solve(reduced, basis.T @ gradient)))
+        except np.linalg.LinAlgError:
+            return None
+
+    def _inliers(self, wTc: FloatArray, problem: PoseProblem) -> BoolArray:
+        points = transform_to_camera(wTc, problem.points)
+        in_front = points[:, 2] > _NEAREST_DEPTH_M
+        points[~in_front, 2] = np.inf
+        residual = project(self._rig, points) - problem.measurement
+        keep = in_front & (np.linalg.norm(residual[:, :2], axis=1) <= self._settings.outlier_px)
+        if self._settings.outlier_sigmas > 0.0 and self._settings.weighting != "uniform":
+            points[~in_front, 2] = 1.0
+            information = self._information(wTc, problem)
+            squared = np.einsum("ki,kij,kj->k", residual, information, residual)
+            keep &= squared <= self._settings.outlier_sigmas**2
+        return keep
+
+    def _finish(
+        self,
+        prediction: Prediction,
+        problem: PoseProblem,
+        minimum: _Minimum,
+        inliers: BoolArray,
+        iterations: int,
+    ) -> EgoMotion:
+        correction = se3_log(inverse(prediction.wTc) @ minimum.wTc)
+        allowed = self._allowed_fraction(correction)
+        wTc, status = minimum.wTc, EgoMotionStatus.OK
+        covariance = self._covariance(wTc, minimum.hessian)
+        if allowed < 1.0:
+            status = EgoMotionStatus.CAPPED
+            wTc = self.constrain(prediction.wTc @ se3_exp(allowed * correction))
+            covariance = prediction.covariance
+        return EgoMotion(
+            wTc=reorthonormalise(wTc),
+            covariance=covariance,
+            inliers=inliers,
+            residuals=self.image_residuals(wTc, problem),
+            status=status,
+            iterations=iterations,
+        )
+
+    def _allowed_fraction(self, correction: FloatArray) -> float:
+        """Fraction of the correction that the cap lets through (section 5; S29)."""
+        rotation = np.linalg.norm(correction[:3])
+        translation = np.linalg.norm(correction[3:])
+        return float(
+            min(
+                1.0,
+                np.deg2rad(self._settings.max_correction_deg) / max(rotation, 1e-12),
+                self._settings.max_correction_m / max(translation, 1e-12),
+            )
+        )
+
+    def _covariance(self, wTc: FloatArray, hessian: FloatArray) -> FloatArray:
+        basis = self.basis(wTc)
+        return congruence(basis, np.linalg.inv(basis.T @ hessian @ basis))
+
+    def _fall_back(
+        self, prediction: Prediction, problem: PoseProblem, status: EgoMotionStatus
+    ) -> EgoMotion:
+        """The odometry as the frame's ego-motion (4.1); no match is used."""
+        return EgoMotion(
+            wTc=reorthonormalise(prediction.wTc),
+            covariance=prediction.covariance,
+            inliers=np.zeros(len(problem), np.bool_),
+            residuals=self.image_residuals(prediction.wTc, problem),
+            status=status,
+            iterations=0,
+        )
+
+    def image_residuals(self, wTc: FloatArray, problem: PoseProblem) -> FloatArray:
+        """The paper's E (k,): distance in pixels of projection and measurement; inf if behind."""
+        points = transform_to_camera(wTc, problem.points)
+        behind = points[:, 2] <= _NEAREST_DEPTH_M
+        points[behind, 2] = 1.0
+        error = np.linalg.norm(
+            project(self._rig, points)[:, :2] - problem.measurement[:, :2], axis=1
+        )
+        return np.where(behind, np.inf, error)
+
+    def _turn_about_vertical(self, rotation: FloatArray) -> FloatArray:
+        """The rotation about the vertical that is nearest to ``rotation``."""
+        n = self._down
+        sine = n @ np.array(
+            [
+                rotation[2, 1] - rotation[1, 2],
+                rotation[0, 2] - rotation[2, 0],
+                rotation[1, 0] - rotation[0, 1],
+            ]
+        )
+        cosine = np.trace(rotation) - n @ rotation @ n
+        return so3_exp(n * np.arctan2(sine, cosine))
+
+
+def unmeasured(prediction: Prediction, status: EgoMotionStatus) -> EgoMotion:
+    """The predicted pose as it stands, for a frame without matches."""
+    return EgoMotion(
+        prediction.wTc, prediction.covariance, np.empty(0, np.bool_), np.empty(0), status, 0
+    )
+
+
+def _inverse_spd(matrix: FloatArray) -> FloatArray:
+    inverted = np.linalg.inv(matrix)
+    return np.asarray(0.5 * (inverted + inverted.T))
+
+
+def _retract(wTc: FloatArray, step: FloatArray) -> FloatArray:
+    """Move by a tangent vector, rotation and translation apart: planar motion stays planar."""
+    return pose(wTc[:3, :3] @ so3_exp(step[:3]), wTc[:3, 3] + wTc[:3, :3] @ step[3:])
+
+
+def _add_prior(
+    wTc: FloatArray,
+    predicted: FloatArray,
+    information: FloatArray,
+    system: tuple[float, FloatArray, FloatArray],
+) -> tuple[float, FloatArray, FloatArray]:
+    """Adds ``|Log(predicted^-1 wTc)|^2`` in the prediction's metric (Lowe 1991, design B6)."""
+    cost, hessian, gradient = system
+    deviation = se3_log(inverse(predicted) @ wTc)
+    jacobian = se3_log_jacobian(deviation)
+    weighted = jacobian.T @ information
+    return (
+        cost + float(deviation @ information @ deviation),
+        hessian + weighted @ jacobian,
+        gradient + weighted @ deviation,
+    )

@@ -1,0 +1,85 @@
+"""Matching a frame's features to the landmarks expected in view (Se et al. 3.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.frontend.candidates import alike, choose, pairs_within
+from fgslam.frontend.database import ExpectedLandmarks
+from fgslam.settings.frontend import AppearanceSettings, MapMatchingSettings
+from fgslam.types import BoolArray, FloatArray, IntArray, StereoFeatures
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapMatches:
+    """Matches between expected landmarks and features.
+
+    Attributes:
+        landmarks: (k,) indices into the expected landmarks, ascending.
+        features: (k,) indices into the features.
+        had_candidates: (n,) features near any landmark, matched or ambiguous: not new ones.
+    """
+
+    landmarks: IntArray
+    features: IntArray
+    had_candidates: BoolArray
+
+
+class MapMatcher:
+    """Search window, disparity, scale and orientation gates, then the appearance."""
+
+    def __init__(self, settings: MapMatchingSettings, appearance: AppearanceSettings) -> None:
+        """Takes the gates as plain values."""
+        self._settings = settings
+        self._appearance = appearance
+
+    @property
+    def widens(self) -> bool:
+        """Whether the gates follow the predicted uncertainty."""
+        return self._settings.widen_sigmas > 0.0
+
+    def match(
+        self,
+        expected: ExpectedLandmarks,
+        features: StereoFeatures,
+        uncertainty: FloatArray | None = None,
+    ) -> MapMatches:
+        """Matches one frame.
+
+        Args:
+            expected: landmarks in view with predicted characteristics.
+            features: the frame's stereo features.
+            uncertainty: (v, 3) standard deviations of the predicted (column, row, disparity) by
+                which the gates are widened; None keeps the fixed window.
+        """
+        s = self._settings
+        reach = self._reach(len(expected), uncertainty)
+        i, j = pairs_within(expected.measurement[:, 1], reach[:, 1], features.measurement[:, 1])
+        offset = np.abs(features.measurement[j] - expected.measurement[i])
+        near = (offset <= reach[i]).all(axis=1)
+        i, j = i[near], j[near]
+        same = alike(
+            (expected.scale[i], features.scale[j]),
+            (expected.orientation[i], features.orientation[j]),
+            s.scale_ratio,
+            np.deg2rad(s.orientation_deg),
+        )
+        i, j = i[same], j[same]
+        had_candidates = np.zeros(len(features), np.bool_)
+        had_candidates[j] = True
+        descriptors = (expected.descriptors, features.descriptors)
+        landmarks, matched = choose(i, j, descriptors, self._appearance)
+        return MapMatches(landmarks, matched, had_candidates)
+
+    def _reach(self, count: int, uncertainty: FloatArray | None) -> FloatArray:
+        """Half widths (v, 3) of the gates in column, row and disparity."""
+        s = self._settings
+        half = 0.5 * s.window_px
+        base = np.array([half, half, s.disparity_px])
+        if uncertainty is None:
+            return np.tile(base, (count, 1))
+        widened = base + s.widen_sigmas * uncertainty
+        limit = 0.5 * s.max_window_px
+        return np.minimum(widened, np.maximum(limit, base))

@@ -1,0 +1,103 @@
+"""Loads frames and finds their features ahead of the loop, on all cores."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+from fgslam.errors import FrameError
+from fgslam.types import Features, Frame, Image, Sequence
+
+# Frames in work at once. Three images on two cores leave one idle at the end of each frame;
+# the next frame's images fill the gap.
+_FRAMES_AHEAD = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FeatureFrame:
+    """A frame with its features, or the reason why it has none.
+
+    Attributes:
+        i: position in the sequence.
+        frame: the images, or None when they could not be read.
+        features: of right, left[, top]; empty when there is no image.
+        problem: what was wrong with the frame, in words; empty when nothing was.
+        load_ms: time spent reading, in its own thread.
+        sift_ms: the images' SIFT times, added up over threads.
+    """
+
+    i: int
+    frame: Frame | None
+    features: tuple[Features, ...]
+    problem: str
+    load_ms: float
+    sift_ms: float
+
+
+class FeatureStream:
+    """Iterates over a sequence's frames in order, features found in parallel ahead of time."""
+
+    def __init__(self, sequence: Sequence, extract: Callable[[Image], Features]) -> None:
+        """Takes any extractor; it must be safe to call from several threads."""
+        self._sequence = sequence
+        self._extract = extract
+
+    def __call__(self, start: int = 0) -> Iterator[FeatureFrame]:
+        """Yields frames ``start`` and after; stops its threads when closed."""
+        pool = ThreadPoolExecutor(os.cpu_count() or 1)
+        waiting: deque[tuple[int, Future[tuple[Frame | str, float]]]] = deque()
+        found: deque[_Pending] = deque()
+        upcoming = iter(range(start, len(self._sequence)))
+        try:
+            while True:
+                for i in upcoming:
+                    waiting.append((i, pool.submit(self._load, i)))
+                    if len(waiting) + len(found) > _FRAMES_AHEAD:
+                        break
+                while waiting and len(found) < _FRAMES_AHEAD:
+                    i, loading = waiting.popleft()
+                    found.append(self._start(i, *loading.result(), pool))
+                if not found:
+                    return
+                yield found.popleft().finish()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+    def _load(self, i: int) -> tuple[Frame | str, float]:
+        start = time.perf_counter()
+        try:
+            frame: Frame | str = self._sequence.frame(i)
+        except FrameError as error:
+            frame = str(error)
+        return frame, 1e3 * (time.perf_counter() - start)
+
+    def _start(
+        self, i: int, frame: Frame | str, load_ms: float, pool: ThreadPoolExecutor
+    ) -> _Pending:
+        if isinstance(frame, str):
+            return _Pending(i, None, frame, load_ms, [])
+        tasks = [pool.submit(self._timed, image) for image in frame.images]
+        return _Pending(i, frame, "", load_ms, tasks)
+
+    def _timed(self, image: Image) -> tuple[Features, float]:
+        start = time.perf_counter()
+        return self._extract(image), 1e3 * (time.perf_counter() - start)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pending:
+    i: int
+    frame: Frame | None
+    problem: str
+    load_ms: float
+    tasks: list[Future[tuple[Features, float]]]
+
+    def finish(self) -> FeatureFrame:
+        results = [task.result() for task in self.tasks]
+        features = tuple(found for found, _ in results)
+        sift_ms = sum(ms for _, ms in results)
+        return FeatureFrame(self.i, self.frame, features, self.problem, self.load_ms, sift_ms)

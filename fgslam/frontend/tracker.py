@@ -1,0 +1,141 @@
+"""Tracking a frame against the map and deciding each landmark's type (Se et al. 3 and 4.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.frontend.database import ExpectedLandmarks, LandmarkDatabase, predicted_covariance
+from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
+from fgslam.frontend.map_matching import MapMatcher, MapMatches
+from fgslam.types import (
+    BoolArray,
+    ByteArray,
+    CameraRig,
+    EgoMotion,
+    FloatArray,
+    Image,
+    IntArray,
+    LandmarkMap,
+    Observations,
+    Prediction,
+    StereoFeatures,
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """One frame tracked: what was expected, what matched, and the pose that follows."""
+
+    expected: ExpectedLandmarks
+    matches: MapMatches
+    ego_motion: EgoMotion
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Association:
+    """The landmarks' types: III and IV as observations, II as misses; I is all others.
+
+    Attributes:
+        observations: matched, then new.
+        rejected: (k,) matched ones whose residual made them outliers; they count as misses.
+        missed_ids: landmarks expected in view and not seen.
+        pruned_ids: landmarks dropped now.
+    """
+
+    observations: Observations
+    rejected: BoolArray
+    missed_ids: IntArray
+    pruned_ids: IntArray
+
+    @staticmethod
+    def nothing() -> Association:
+        """Of a frame without images: no landmark was looked for."""
+        none = np.empty(0, np.int64)
+        observations = StereoFeatures.empty().observations(none, none, is_new=False)
+        return Association(observations, np.empty(0, np.bool_), none, none)
+
+
+class LandmarkTracker:
+    """Joins the database's appearance with the estimator's geometry."""
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        database: LandmarkDatabase,
+        matchers: tuple[MapMatcher, ...],
+        ego_motion: EgoMotionSolver,
+    ) -> None:
+        """The matchers run one after the other, each around the pose that the last one gave."""
+        self._rig = rig
+        self.database = database
+        self._matchers = matchers
+        self._ego_motion = ego_motion
+
+    def track(
+        self, prediction: Prediction, landmarks: LandmarkMap, features: StereoFeatures
+    ) -> Tracked:
+        """Matches expected landmarks and solves for the pose."""
+        around = Prediction(self._ego_motion.constrain(prediction.wTc), prediction.covariance)
+        for matcher in self._matchers:
+            expected = self.database.expected(landmarks, around.wTc)
+            uncertainty = self._uncertainty(matcher, around, landmarks, expected)
+            matches = matcher.match(expected, features, uncertainty)
+            observed = _matched(expected, matches, features)
+            problem = PoseProblem.of(landmarks, observed)
+            ego_motion = self._ego_motion.solve(prediction, problem)
+            if ego_motion.status.measured:
+                around = Prediction(ego_motion.wTc, ego_motion.covariance)
+        return Tracked(expected, matches, ego_motion)
+
+    def associate(self, tracked: Tracked, features: StereoFeatures, image: Image) -> Association:
+        """Books hits and misses, starts new tracks, prunes (4.1 to 4.3)."""
+        expected, matches = tracked.expected, tracked.matches
+        inliers = tracked.ego_motion.inliers
+        matched = _matched(expected, matches, features)
+        hit = np.zeros(len(expected), np.bool_)
+        hit[matches.landmarks[inliers]] = True
+        missed_ids = expected.ids[~hit]
+        self.database.record_hits(matched.ids[inliers], features, matches.features[inliers])
+        self.database.record_misses(missed_ids)
+        fresh = np.flatnonzero(~matches.had_candidates)
+        new_ids = self.database.add(features, fresh, _grey_values(image, features, fresh))
+        new = features.observations(fresh, new_ids, is_new=True)
+        return Association(
+            observations=matched.join(new),
+            rejected=np.concatenate([~inliers, np.zeros(len(new), np.bool_)]),
+            missed_ids=missed_ids,
+            pruned_ids=self.database.prune(),
+        )
+
+    def _uncertainty(
+        self,
+        matcher: MapMatcher,
+        around: Prediction,
+        landmarks: LandmarkMap,
+        expected: ExpectedLandmarks,
+    ) -> FloatArray | None:
+        """Standard deviations (v, 3) of the predicted measurements, where the matcher asks."""
+        if not matcher.widens:
+            return None
+        rows = expected.rows
+        covariance = predicted_covariance(
+            self._rig, around, landmarks.positions[rows], landmarks.covariances[rows]
+        )
+        return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+
+
+def _matched(
+    expected: ExpectedLandmarks, matches: MapMatches, features: StereoFeatures
+) -> Observations:
+    ids = expected.ids[matches.landmarks]
+    return features.observations(matches.features, ids, is_new=False)
+
+
+def _grey_values(image: Image, features: StereoFeatures, which: IntArray) -> ByteArray:
+    """Grey values (k,) of the reference image at the features, for the map's colour."""
+    at = np.rint(features.measurement[which, :2]).astype(np.int64)
+    rows = np.clip(at[:, 1], 0, image.shape[0] - 1)
+    columns = np.clip(at[:, 0], 0, image.shape[1] - 1)
+    return image[rows, columns]

@@ -1,0 +1,205 @@
+"""The measurement log: everything that estimators consume, replayable without images.
+
+One uncompressed ``.npz`` of plain arrays (no pickle). Ragged rows are stored flat with offsets:
+rows of frame ``k`` are ``start[k]:start[k + 1]``.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fgslam.errors import MeasurementLogError
+from fgslam.types import (
+    CameraRig,
+    FloatArray,
+    Increment,
+    IntArray,
+    Observations,
+    Odometry,
+    StateArrays,
+)
+
+FORMAT = "fgslam measurement log"
+VERSION = 1
+_UPPER = np.triu_indices(3)
+_RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline")
+
+
+@dataclass(slots=True, eq=False)
+class MeasurementLog:
+    """Measurements of a run, frame by frame.
+
+    Attributes:
+        rig: the cameras, with the lever arm.
+        motion_model: how odometry came about, and the stand-in's numbers where there was none
+            (plain JSON values): replays need it to predict as the live run did.
+        increments: one a frame, time increasing.
+    """
+
+    rig: CameraRig
+    motion_model: dict[str, Any]
+    increments: list[Increment] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.increments)
+
+    def __iter__(self) -> Iterator[Increment]:
+        return iter(self.increments)
+
+    def append(self, increment: Increment) -> None:
+        """Adds one frame; its time must come after the last one's."""
+        if self.increments and not increment.timestamp > self.increments[-1].timestamp:
+            raise MeasurementLogError(
+                f"frame {increment.index}: time stamp {increment.timestamp:.9f} s does not come "
+                f"after {self.increments[-1].timestamp:.9f} s; sort the measurements by time"
+            )
+        self.increments.append(increment)
+
+    def to_arrays(self) -> StateArrays:
+        """The log as the arrays of its file."""
+        rig = {name: getattr(self.rig, name) for name in _RIG}
+        rig["vertical_baseline"] = self.rig.vertical_baseline
+        header = {"format": FORMAT, "version": VERSION, "rig": rig, "motion": self.motion_model}
+        out: StateArrays = {
+            "header": np.array(json.dumps(header, sort_keys=True)),
+            "rig_bTc": self.rig.bTc,
+            "frame_index": np.array([s.index for s in self], np.int64),
+            "timestamp": np.array([s.timestamp for s in self], np.float64),
+            "odometry_motion": _stack([_motion(s) for s in self], (4, 4)),
+            "odometry_covariance": _stack([_motion_covariance(s) for s in self], (6, 6)),
+        }
+        out |= _ragged("missed", [s.missed_ids for s in self])
+        out |= _ragged("pruned", [s.pruned_ids for s in self])
+        return out | self._observation_arrays()
+
+    def _observation_arrays(self) -> StateArrays:
+        seen = [s.observations for s in self]
+        return {
+            **_ragged("observation", [o.ids for o in seen]),
+            "measurement": _concatenate([o.measurement for o in seen], (3,)),
+            "measurement_covariance": _concatenate(
+                [o.covariance[:, _UPPER[0], _UPPER[1]] for o in seen], (6,)
+            ),
+            "pixels": _concatenate([o.pixels for o in seen], (3, 2)),
+            "is_new": _concatenate([o.is_new for o in seen], (), np.bool_),
+            "rejected": _concatenate([s.rejected for s in self], (), np.bool_),
+        }
+
+    @staticmethod
+    def from_arrays(arrays: StateArrays, where: str) -> MeasurementLog:
+        """The log back from its arrays; ``where`` names the source in messages."""
+        header = _read_header(arrays, where)
+        rig = CameraRig(**header["rig"], bTc=arrays["rig_bTc"])
+        log = MeasurementLog(rig, header["motion"])
+        observed = _split_observations(arrays)
+        missed = _split(arrays, "missed")
+        pruned = _split(arrays, "pruned")
+        start = arrays["observation_start"]
+        for k, index in enumerate(arrays["frame_index"]):
+            log.append(
+                Increment(
+                    index=int(index),
+                    timestamp=float(arrays["timestamp"][k]),
+                    odometry=_odometry(arrays, k),
+                    observations=observed[k],
+                    rejected=arrays["rejected"][start[k] : start[k + 1]],
+                    missed_ids=missed[k],
+                    pruned_ids=pruned[k],
+                )
+            )
+        return log
+
+    @staticmethod
+    def load(path: Path) -> MeasurementLog:
+        """Reads a log. Raises MeasurementLogError for a missing, truncated or foreign file."""
+        return MeasurementLog.from_arrays(load_arrays(path), str(path))
+
+
+def load_arrays(path: Path) -> StateArrays:
+    """All arrays of an ``.npz`` file, never unpickled."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise MeasurementLogError(f"{path}: no such file; give the run folder's own") from None
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
+        raise MeasurementLogError(
+            f"{path}: not a readable .npz file ({error}); it may be truncated, run again"
+        ) from None
+
+
+def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
+    try:
+        header = json.loads(str(arrays["header"]))
+    except (KeyError, json.JSONDecodeError):
+        header = {}
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise MeasurementLogError(f"{where}: not an fgslam measurement log; give measurements.npz")
+    if header["version"] != VERSION:
+        raise MeasurementLogError(
+            f"{where}: measurement log of version {header['version']}, this fgslam reads version "
+            f"{VERSION}; repeat the run or use the matching fgslam"
+        )
+    return header
+
+
+def _motion(increment: Increment) -> FloatArray:
+    return np.full((4, 4), np.nan) if increment.odometry is None else increment.odometry.motion
+
+
+def _motion_covariance(increment: Increment) -> FloatArray:
+    if increment.odometry is None:
+        return np.full((6, 6), np.nan)
+    return increment.odometry.covariance
+
+
+def _odometry(arrays: StateArrays, k: int) -> Odometry | None:
+    motion = arrays["odometry_motion"][k]
+    if np.isnan(motion[0, 0]):
+        return None
+    return Odometry(motion, arrays["odometry_covariance"][k])
+
+
+def _stack(parts: list[FloatArray], shape: tuple[int, ...]) -> FloatArray:
+    return np.array(parts, np.float64).reshape(len(parts), *shape)
+
+
+def _concatenate(
+    parts: list[Any], shape: tuple[int, ...], dtype: type = np.float64
+) -> np.ndarray[Any, Any]:
+    return np.concatenate([np.empty((0, *shape), dtype), *parts])
+
+
+def _ragged(name: str, parts: list[IntArray]) -> StateArrays:
+    sizes = np.array([0, *(len(p) for p in parts)], np.int64)
+    return {
+        f"{name}_start": np.cumsum(sizes),
+        f"{name}_id": _concatenate(parts, (), np.int64),
+    }
+
+
+def _split(arrays: StateArrays, name: str) -> list[IntArray]:
+    return np.split(arrays[f"{name}_id"], arrays[f"{name}_start"][1:-1])
+
+
+def _split_observations(arrays: StateArrays) -> list[Observations]:
+    upper = arrays["measurement_covariance"]
+    covariance = np.empty((len(upper), 3, 3))
+    covariance[:, _UPPER[0], _UPPER[1]] = upper
+    covariance[:, _UPPER[1], _UPPER[0]] = upper
+    everything = Observations(
+        arrays["observation_id"],
+        arrays["measurement"],
+        covariance,
+        arrays["pixels"],
+        arrays["is_new"],
+    )
+    start = arrays["observation_start"]
+    return [everything.select(np.arange(a, b)) for a, b in zip(start[:-1], start[1:], strict=True)]

@@ -1,0 +1,138 @@
+"""What predicts the camera's motion between frames: recorded odometry, or constant velocity."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any, Protocol
+
+import numpy as np
+
+from fgslam.geometry import (
+    body_to_camera_motion,
+    change_tangent_frame,
+    inverse,
+    se3_exp,
+    se3_log,
+)
+from fgslam.settings.datasets import ConstantVelocitySettings
+from fgslam.types import FloatArray, Odometry, Sequence, StateArrays
+
+
+class MotionModel(Protocol):
+    """Gives the camera's motion from the previous frame to the next one."""
+
+    def between(self, i: int, timestamp: float) -> tuple[Odometry | None, bool]:
+        """Camera motion to frame ``i``, None for the first; and whether it was measured."""
+        ...
+
+    def observe(self, timestamp: float, wTc: FloatArray) -> None:
+        """Learns the pose that was estimated for the last frame."""
+        ...
+
+    def description(self) -> dict[str, Any]:
+        """Kind and numbers, as plain JSON values, for the log."""
+        ...
+
+    def state(self) -> StateArrays:
+        """What is needed to continue."""
+        ...
+
+    def restore(self, state: StateArrays) -> None:
+        """Continues from :meth:`state`."""
+        ...
+
+
+class OdometryMotion:
+    """The recording's odometry, moved from the robot's body to the camera (Se et al. 5; S30).
+
+    Over a gap in it, constant velocity stands in.
+    """
+
+    def __init__(self, sequence: Sequence, kind: str, stand_in: ConstantVelocityMotion) -> None:
+        """``kind`` is `recorded` or `synthetic`, for the log."""
+        self._sequence = sequence
+        self._bTc = sequence.rig.bTc
+        self._cTb = inverse(self._bTc)
+        self._kind = kind
+        self._stand_in = stand_in
+
+    def between(self, i: int, timestamp: float) -> tuple[Odometry | None, bool]:
+        """Camera motion to frame ``i``; raises OdometryError for an unusable increment."""
+        if i == 0:
+            return None, False
+        body = self._sequence.odometry(i)
+        if body is None:
+            return self._stand_in.between(i, timestamp)
+        motion = body_to_camera_motion(body.motion, self._bTc)
+        return Odometry(motion, change_tangent_frame(self._cTb, body.covariance)), True
+
+    def observe(self, timestamp: float, wTc: FloatArray) -> None:
+        """Keeps the stand-in's velocity fresh."""
+        self._stand_in.observe(timestamp, wTc)
+
+    def description(self) -> dict[str, Any]:
+        """The kind of odometry and what bridges its gaps."""
+        return {"kind": self._kind, "stand_in": self._stand_in.description()}
+
+    def state(self) -> StateArrays:
+        """The stand-in's."""
+        return self._stand_in.state()
+
+    def restore(self, state: StateArrays) -> None:
+        """The stand-in's."""
+        self._stand_in.restore(state)
+
+
+class ConstantVelocityMotion:
+    """The camera keeps its last velocity, up to a random acceleration; no sensor needed."""
+
+    def __init__(self, settings: ConstantVelocitySettings) -> None:
+        """Knows nothing until two poses were observed; at first the camera is expected to rest."""
+        self._settings = settings
+        self._sigma = np.concatenate(
+            [
+                np.deg2rad(settings.rotation_sigma_dps2),
+                np.array(settings.translation_sigma_mps2),
+            ]
+        )
+        self._start_sigma = np.repeat(
+            [np.deg2rad(settings.start_rotation_sigma_dps), settings.start_speed_sigma_mps], 3
+        )
+        self._timestamp: float | None = None
+        self._pose = np.eye(4)
+        self._velocity: FloatArray | None = None
+
+    def between(self, i: int, timestamp: float) -> tuple[Odometry | None, bool]:
+        """The last velocity over the new interval; standard deviation ``sigma * dt^2``."""
+        if self._timestamp is None:
+            return None, False
+        dt = timestamp - self._timestamp
+        if self._velocity is None:
+            return Odometry(np.eye(4), np.diag((self._start_sigma * dt) ** 2)), False
+        return Odometry(se3_exp(self._velocity * dt), np.diag((self._sigma * dt**2) ** 2)), False
+
+    def observe(self, timestamp: float, wTc: FloatArray) -> None:
+        """Updates the velocity from the last two poses."""
+        if self._timestamp is not None:
+            dt = timestamp - self._timestamp
+            self._velocity = se3_log(inverse(self._pose) @ wTc) / dt
+        self._timestamp, self._pose = timestamp, wTc
+
+    def description(self) -> dict[str, Any]:
+        """Kind and numbers."""
+        return asdict(self._settings)
+
+    def state(self) -> StateArrays:
+        """Last pose, time and velocity; NaN where unknown."""
+        return {
+            "timestamp": np.array(np.nan if self._timestamp is None else self._timestamp),
+            "pose": self._pose,
+            "velocity": np.full(6, np.nan) if self._velocity is None else self._velocity,
+        }
+
+    def restore(self, state: StateArrays) -> None:
+        """Continues from :meth:`state`."""
+        timestamp = float(state["timestamp"])
+        self._timestamp = None if np.isnan(timestamp) else timestamp
+        self._pose = state["pose"]
+        self._velocity = None if np.isnan(state["velocity"][0]) else state["velocity"]

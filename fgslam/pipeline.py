@@ -1,0 +1,140 @@
+"""The SLAM loop (Se et al. 4): predict, match, ego-motion, update, upkeep of the database.
+
+The same ego-motion serves a live run and the replay of its log, against each estimator's own map.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.backend.protocol import Estimator
+from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
+from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.stream import FeatureFrame
+from fgslam.frontend.tracker import Association, LandmarkTracker
+from fgslam.motion import MotionModel
+from fgslam.types import (
+    EgoMotion,
+    EgoMotionStatus,
+    Increment,
+    Observations,
+    Odometry,
+    Prediction,
+    StereoFeatures,
+    UpdateStats,
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameReport:
+    """What one frame gave, for outputs and pictures."""
+
+    found: FeatureFrame
+    stereo: StereoFeatures
+    increment: Increment
+    tracking: EgoMotion
+    stats: UpdateStats
+    stage_ms: dict[str, float]
+
+
+class Stopwatch:
+    """Milliseconds by stage, within one frame."""
+
+    def __init__(self) -> None:
+        """Starts now."""
+        self.ms: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """Books the time since the last lap to ``stage``."""
+        now = time.perf_counter()
+        self.ms[stage] = 1e3 * (now - self._last)
+        self._last = now
+
+
+@dataclass(slots=True, eq=False)
+class SlamPipeline:
+    """The parts of the system and the loop over them."""
+
+    stereo: StereoMatcher
+    tracker: LandmarkTracker
+    motion: MotionModel
+    estimator: Estimator
+
+    def process(self, found: FeatureFrame, index: int, timestamp: float) -> FrameReport:
+        """One frame: Sections 2 to 4 of the paper in their order."""
+        watch = Stopwatch()
+        odometry, measured = self.motion.between(found.i, timestamp)
+        prediction = self.estimator.predict(odometry)
+        watch.lap("predict")
+        stereo = self._match_stereo(found)
+        watch.lap("stereo")
+        tracking, association = self._track(prediction, found, stereo)
+        watch.lap("track")
+        increment = _increment(index, timestamp, odometry if measured else None, association)
+        stats = self.estimator.update(increment, tracking)
+        self.motion.observe(timestamp, stats.wTc)
+        watch.lap("update")
+        return FrameReport(found, stereo, increment, tracking, stats, watch.ms)
+
+    def _match_stereo(self, found: FeatureFrame) -> StereoFeatures:
+        return StereoFeatures.empty() if found.frame is None else self.stereo.match(found.features)
+
+    def _track(
+        self, prediction: Prediction, found: FeatureFrame, stereo: StereoFeatures
+    ) -> tuple[EgoMotion, Association]:
+        if found.frame is None:
+            return unmeasured(prediction, EgoMotionStatus.NO_IMAGE), Association.nothing()
+        tracked = self.tracker.track(prediction, self.estimator.landmarks(), stereo)
+        association = self.tracker.associate(tracked, stereo, found.frame.images[0])
+        if found.i == 0:
+            return unmeasured(prediction, EgoMotionStatus.FIRST), association
+        return tracked.ego_motion, association
+
+
+def replay_step(
+    increment: Increment,
+    estimator: Estimator,
+    ego_motion: EgoMotionSolver,
+    motion: MotionModel,
+    k: int,
+) -> UpdateStats:
+    """Gives frame ``k`` of a log to an estimator: the live loop without its matching."""
+    odometry = increment.odometry
+    if odometry is None:
+        odometry, _ = motion.between(k, increment.timestamp)
+    prediction = estimator.predict(odometry)
+    matched = increment.observations.select(~increment.observations.is_new)
+    if k == 0:
+        tracking = unmeasured(prediction, EgoMotionStatus.FIRST)
+    else:
+        tracking = _solve(estimator, ego_motion, prediction, matched)
+    stats = estimator.update(increment, tracking)
+    motion.observe(increment.timestamp, stats.wTc)
+    return stats
+
+
+def _solve(
+    estimator: Estimator,
+    ego_motion: EgoMotionSolver,
+    prediction: Prediction,
+    matched: Observations,
+) -> EgoMotion:
+    return ego_motion.solve(prediction, PoseProblem.of(estimator.landmarks(), matched))
+
+
+def _increment(
+    index: int, timestamp: float, odometry: Odometry | None, association: Association
+) -> Increment:
+    return Increment(
+        index=index,
+        timestamp=timestamp,
+        odometry=odometry,
+        observations=association.observations,
+        rejected=association.rejected,
+        missed_ids=association.missed_ids,
+        pruned_ids=association.pruned_ids,
+    )

@@ -1,0 +1,224 @@
+"""Settings of the front-end: SIFT, stereo matching, landmark database, map matching, ego-motion."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, TypeAlias
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fgslam.settings.base import STRICT
+
+Appearance: TypeAlias = Literal["descriptor", "paper"]
+
+
+@dataclass(frozen=True, config=STRICT)
+class SiftSettings:
+    """SIFT features of one image (Se et al. 2.1)."""
+
+    scale_levels: Annotated[
+        int,
+        Field(ge=1, le=64, description="scale levels searched, finest first; 8 in the paper"),
+    ] = 8
+    octave_layers: Annotated[
+        int,
+        Field(ge=1, le=8, description="levels an octave; 2 is a factor 1.41 a level (paper: 1.5)"),
+    ] = 2
+    contrast_threshold: Annotated[
+        float,
+        Field(ge=0.0, description="OpenCV's contrast threshold, divided by octave_layers inside"),
+    ] = 0.03
+    edge_threshold: Annotated[
+        float, Field(gt=1.0, description="ratio of principal curvatures above which edges go")
+    ] = 10.0
+    base_sigma_px: Annotated[
+        float, Field(gt=0.5, le=3.0, description="Gaussian of the first level, doubled image")
+    ] = 1.6
+    max_features: Annotated[
+        int, Field(ge=0, description="keep this many of the strongest features; 0 keeps all")
+    ] = 0
+
+
+@dataclass(frozen=True, config=STRICT)
+class StereoSettings:
+    """Matching over the rig (Se et al. 2.2); gates from the authors' later paper (IJRR 2002)."""
+
+    epipolar_px: Annotated[
+        float, Field(gt=0.0, description="largest distance from the epipolar line")
+    ] = 1.0
+    min_disparity_px: Annotated[
+        float, Field(gt=0.0, description="smallest disparity; below it depth is meaningless")
+    ] = 1.0
+    max_disparity_px: Annotated[
+        float, Field(gt=0.0, description="largest disparity; 20 in IJRR 2002 (1.4 m at 320x240)")
+    ] = 40.0
+    scale_ratio: Annotated[
+        float, Field(gt=1.0, description="largest ratio of scales; one level is 1.5 in IJRR 2002")
+    ] = 1.5
+    orientation_deg: Annotated[
+        float, Field(gt=0.0, le=180.0, description="largest difference of orientations")
+    ] = 20.0
+    disparity_agreement_px: Annotated[
+        float,
+        Field(gt=0.0, description="largest difference of horizontal and vertical disparity"),
+    ] = 1.0
+    measurement: Annotated[
+        Literal["fused", "paper"],
+        Field(
+            description="`paper`: reference (row, column) and the mean of both disparities; "
+            "`fused`: least squares over all coordinates of the two or three images"
+        ),
+    ] = "fused"
+    pixel_sigma: Annotated[
+        float,
+        Field(gt=0.0, description="standard deviation of a SIFT coordinate, pixels"),
+    ] = 0.35
+
+
+@dataclass(frozen=True, config=STRICT)
+class AppearanceSettings:
+    """Use of SIFT descriptors, which the 2001 paper does without."""
+
+    mode: Annotated[
+        Appearance,
+        Field(
+            description="`descriptor`: among candidates that pass all gates the closest descriptor "
+            "wins; `paper`: no descriptors, more than one candidate means none"
+        ),
+    ] = "descriptor"
+    max_distance: Annotated[
+        float,
+        Field(gt=0.0, description="largest distance of descriptors, whose norm is 512"),
+    ] = 250.0
+    ratio: Annotated[
+        float,
+        Field(gt=0.0, le=1.0, description="best distance at most this fraction of second best"),
+    ] = 0.85
+
+
+@dataclass(frozen=True, config=STRICT)
+class MapMatchingSettings:
+    """Matching of features to predicted landmarks (Se et al. 3.1)."""
+
+    window_px: Annotated[
+        float,
+        Field(gt=0.0, description="side of the search window in the image; 5 in the paper"),
+    ] = 5.0
+    disparity_px: Annotated[
+        float, Field(gt=0.0, description="largest difference from the predicted disparity")
+    ] = 2.0
+    scale_ratio: Annotated[
+        float, Field(gt=1.0, description="largest ratio to the predicted scale")
+    ] = 1.5
+    orientation_deg: Annotated[
+        float, Field(gt=0.0, le=180.0, description="largest difference of orientations")
+    ] = 20.0
+    widen_sigmas: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="widen window and disparity gate by this many standard deviations of the "
+            "predicted measurement; 0 keeps the paper's fixed window",
+        ),
+    ] = 0.0
+    max_window_px: Annotated[
+        float, Field(gt=0.0, description="side that widening may not exceed")
+    ] = 80.0
+    refine: Annotated[
+        bool,
+        Field(
+            description="after a first pose from a widened search, match again around it with the "
+            "narrow window"
+        ),
+    ] = False
+
+
+@dataclass(frozen=True, config=STRICT)
+class DatabaseSettings:
+    """Life and death of landmarks (Se et al. 4 and 6.1)."""
+
+    prune_after_misses: Annotated[
+        int, Field(ge=1, description="N: consecutive misses until a landmark goes; 20 in 4.3")
+    ] = 20
+    valid_hits: Annotated[
+        int, Field(ge=1, description="hits until a landmark counts as valid; 3 in 6.1")
+    ] = 3
+    field_of_view: Annotated[
+        Literal["image", "cone"],
+        Field(
+            description="`image`: expected in view within the image's bounds; `cone`: the paper's "
+            "30 degrees on both axes (4.4), which exceeds a 320x240 image's height"
+        ),
+    ] = "image"
+    cone_deg: Annotated[
+        float, Field(gt=0.0, lt=90.0, description="half angle of the cone; 30 in 4.4")
+    ] = 30.0
+    border_px: Annotated[
+        float,
+        Field(ge=0.0, description="margin inside the image within which none is expected"),
+    ] = 8.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class EgoMotionSettings:
+    """Least-squares pose of a frame against the map (Se et al. 3.3 and 5)."""
+
+    dof: Annotated[
+        Literal[6, 5, 3],
+        Field(description="6 general; 5 height fixed (section 5); 3 planar: x, z and yaw"),
+    ] = 6
+    residuals: Annotated[
+        Literal["image_disparity", "image"],
+        Field(description="`image`: row and column, as 3.3; `image_disparity`: disparity too"),
+    ] = "image_disparity"
+    weighting: Annotated[
+        Literal["landmark", "measurement", "uniform"],
+        Field(
+            description="covariance of a residual: `uniform` as in 3.3, `measurement` from the "
+            "matching, `landmark` the landmark's own added"
+        ),
+    ] = "landmark"
+    prior: Annotated[
+        bool,
+        Field(description="stabilise towards the odometry by its covariance (Lowe 1991)"),
+    ] = True
+    outlier_px: Annotated[
+        float, Field(gt=0.0, description="drop matches with a larger image residual; 3 in 3.3")
+    ] = 3.0
+    outlier_sigmas: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="drop matches whose residual exceeds this many standard deviations of "
+            "itself as well; 0 switches it off",
+        ),
+    ] = 4.0
+    kernel: Annotated[
+        Literal["none", "huber", "cauchy"],
+        Field(description="robust kernel on the normalised residual before outliers are dropped"),
+    ] = "cauchy"
+    kernel_width: Annotated[
+        float, Field(gt=0.0, description="its width, in standard deviations")
+    ] = 2.0
+    min_matches: Annotated[
+        int, Field(ge=1, description="fewer inliers than this: the odometry is the pose (4.1)")
+    ] = 6
+    max_correction_m: Annotated[
+        float, Field(gt=0.0, description="cap on the correction of the odometry (5)")
+    ] = 0.3
+    max_correction_deg: Annotated[
+        float, Field(gt=0.0, description="cap on the correction of the odometry (5)")
+    ] = 6.0
+    max_iterations: Annotated[int, Field(ge=1, description="Newton steps a minimisation")] = 15
+
+
+@dataclass(frozen=True, config=STRICT)
+class FrontendSettings:
+    """All of the front-end."""
+
+    sift: SiftSettings = SiftSettings()
+    stereo: StereoSettings = StereoSettings()
+    appearance: AppearanceSettings = AppearanceSettings()
+    matching: MapMatchingSettings = MapMatchingSettings()
+    database: DatabaseSettings = DatabaseSettings()
+    ego_motion: EgoMotionSettings = EgoMotionSettings()
