@@ -76,11 +76,16 @@ provide_environment() {
 }
 
 install_package() {
-  local target="."
-  [ "$kind" = dev ] && target=".[dev]"
-  say "installing fgslam for ${kind/dev/development} (minutes the first time)"
-  .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable "$target" \
-    </dev/null || fail "the package index could not deliver what pyproject.toml asks for; see above"
+  local target="." what="fgslam and what it runs on"
+  if [ "$kind" = dev ]; then
+    target=".[dev]"
+    what="the development tools"
+  fi
+  say "installing $what (minutes the first time)"
+  # Twice quiet: errors only.
+  .venv/bin/python -m pip install -qq --disable-pip-version-check --editable "$target" </dev/null ||
+    fail "pip could not install what pyproject.toml asks for (see above);" \
+      "mend the connection to the package index and run make again"
 }
 
 # Open3D renders the lab; all else runs without it, so that nothing here is an error.
