@@ -1,0 +1,293 @@
+"""The rendered lab as a recording: our own exact world (docs/datasets/rendered_lab.md).
+
+Images are rendered once, cached by the content of the settings that shape them, and get their
+noise when they are read. Poses, depths and object identities are exact.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from fgslam import geometry
+from fgslam.errors import ConfigError, FrameError
+from fgslam.settings.lab import LabSettings
+from fgslam.simulation import wheel_odometry
+from fgslam.simulation.image_effects import apply_effects, is_blocked
+from fgslam.simulation.paths import Drive, plan_drive
+from fgslam.simulation.render_cache import RenderCache, content_hash
+from fgslam.simulation.world import World, camera_offsets, make_rig
+from fgslam.types import CameraRig, FloatArray, Frame, Image, IntArray, Odometry, Trajectory
+
+RENDER_VERSION = 1
+"""Part of the cache's key: raised whenever the same settings give other pixels."""
+
+_THREADS = 2
+_CLEARANCE_M = 0.12
+Progress = Callable[[int, int], None]
+
+
+class RenderedLabSequence:
+    """A drive through the rendered lab; implements :class:`fgslam.types.Sequence`.
+
+    The world frame of the ground truth is the reference camera's pose at the drive's first frame.
+    """
+
+    def __init__(
+        self,
+        settings: LabSettings,
+        seed: int,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
+        progress: Progress | None = None,
+    ) -> None:
+        """Plans the drive and renders the selected frames that the cache lacks.
+
+        Args:
+            settings: world, rig, drive, odometry and effects.
+            seed: of image noise and odometry; renders are shared between seeds.
+            start: first of the drive's frames to use.
+            stop: the frame after the last one; None for the drive's end.
+            stride: use every so many frames.
+            progress: told (frames rendered so far, frames to render) from the calling thread.
+
+        Raises:
+            ConfigError: the path cannot be driven, leads through furniture, or no frame is left.
+            DatasetError: the cache's folder cannot be written.
+            MissingDependencyError: frames must be rendered and Open3D cannot be loaded.
+        """
+        self._settings = settings
+        self._seed = seed
+        self._rig = make_rig(settings.rig)
+        self._drive = plan_drive(settings.drive)
+        self._indices = _selection(len(self._drive.timestamps), start, stop, stride)
+        self._body = self._drive.body_poses(self._drive.timestamps)
+        self._odometry = wheel_odometry.simulate(
+            settings.odometry, self._body, np.random.default_rng([seed, 1])
+        )
+        self._world: World | None = None
+        self._world_lock = threading.Lock()
+        description = _render_description(settings)
+        shape = (self._rig.cameras, self._rig.height, self._rig.width)
+        self._cache = RenderCache(content_hash(description), description, shape)
+        self._render_missing(progress)
+
+    # ---------------------------------------------------------------- the Sequence protocol
+
+    @property
+    def name(self) -> str:
+        """Short name for titles."""
+        return f"rendered lab, {self._settings.drive.path.replace('_', ' ')}"
+
+    @property
+    def rig(self) -> CameraRig:
+        """The exact calibration of the rendered cameras."""
+        return self._rig
+
+    @property
+    def timestamps(self) -> FloatArray:
+        """(n,) seconds since the drive's first frame."""
+        return self._drive.timestamps[self._indices]
+
+    @property
+    def identity(self) -> str:
+        """SHA-256 of all settings, the seed and the renderer's version."""
+        return content_hash(
+            {"settings": asdict(self._settings), "seed": self._seed, "render": RENDER_VERSION}
+        )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Which effects are on."""
+        effects = self._settings.effects
+        return tuple(
+            f"effect: {name.replace('_', ' ')}"
+            for name in ("exposure", "motion_blur", "person", "blocked_frames")
+            if getattr(effects, name) is not None
+        )
+
+    def __len__(self) -> int:
+        """Number of selected frames."""
+        return len(self._indices)
+
+    def frame(self, i: int) -> Frame:
+        """Images of selected frame ``i``, with their noise; a damaged cached file is rendered anew.
+
+        Raises:
+            FrameError: there is no frame ``i``.
+        """
+        index = self._index(i)
+        clean = self._cache.read(index)
+        if clean is None:
+            clean = self._render(index)
+            self._cache.write(index, clean)
+        images = apply_effects(clean, self._settings.effects, index, self._seed)
+        return Frame(index, float(self._drive.timestamps[index]), images)
+
+    def odometry(self, i: int) -> Odometry | None:
+        """Wheel odometry from selected frame ``i - 1`` to ``i``; None for the first.
+
+        With a stride the increments between are composed, and so are their covariances.
+        """
+        last = self._index(i)
+        if i == 0:
+            return None
+        motion, covariance = np.eye(4), np.zeros((6, 6))
+        for step in self._odometry[self._index(i - 1) : last]:
+            covariance = geometry.compose_covariance(step.motion, covariance, step.covariance)
+            motion = motion @ step.motion
+        return Odometry(motion, covariance)
+
+    @property
+    def ground_truth(self) -> Trajectory:
+        """Exact poses of the reference camera at the selected frames."""
+        poses = self.room_from_camera(self._drive.timestamps[self._indices])
+        return Trajectory(self.timestamps, geometry.inverse(self.room_from_world) @ poses)
+
+    # ---------------------------------------------------------------- exact truth
+
+    @property
+    def room_from_world(self) -> FloatArray:
+        """(4, 4) from the trajectory's world to the room (origin on the floor, z up)."""
+        return np.asarray(self._body[0] @ self._rig.bTc)
+
+    def room_from_camera(self, seconds: FloatArray) -> FloatArray:
+        """(n, 4, 4) poses of the reference camera in the room at any times of the drive."""
+        return np.asarray(self._drive.body_poses(np.atleast_1d(seconds)) @ self._rig.bTc)
+
+    @property
+    def object_names(self) -> tuple[str, ...]:
+        """Name of each object identity."""
+        return self._open_world().things
+
+    def depth(self, i: int) -> FloatArray:
+        """(height, width) depth Z in metres of the reference camera's pixels; NaN when blocked."""
+        index = self._index(i)
+        if is_blocked(self._settings.effects, index):
+            return np.full((self._rig.height, self._rig.width), np.nan)
+        world = self._open_world()
+        return world.renderer.depth([world.room], self._body[index] @ self._rig.bTc)
+
+    def object_ids(self, i: int) -> IntArray:
+        """(height, width) index into ``object_names`` of the reference camera's pixels.
+
+        -1 where the cover blocks the view.
+        """
+        index = self._index(i)
+        if is_blocked(self._settings.effects, index):
+            return np.full((self._rig.height, self._rig.width), -1, dtype=np.int64)
+        world = self._open_world()
+        return world.renderer.things([world.room], self._body[index] @ self._rig.bTc)
+
+    # ---------------------------------------------------------------- rendering
+
+    def _index(self, i: int) -> int:
+        if not 0 <= i < len(self._indices):
+            raise FrameError(f"frame {i} is outside the recording of {len(self._indices)} frames")
+        return int(self._indices[i])
+
+    def _open_world(self) -> World:
+        with self._world_lock:
+            if self._world is None:
+                self._world = World(self._rig, self._settings.room_seed, self._settings.visit)
+                _check_clearance(self._drive, self._world, self._rig)
+            return self._world
+
+    def _render_missing(self, progress: Progress | None) -> None:
+        missing = [int(i) for i in self._indices if not self._cache.present(int(i))]
+        if not missing:
+            return
+        self._open_world()
+        for done, _ in enumerate(self._rendered(missing), start=1):
+            if progress is not None:
+                progress(done, len(missing))
+        if len(self._indices) == len(self._drive.timestamps):
+            self._cache.mark_done(len(self._indices))
+
+    def _rendered(self, missing: list[int]) -> Iterator[int]:
+        """Renders and stores frames on two threads, a few at a time so that Ctrl-C is prompt."""
+        pool = ThreadPoolExecutor(_THREADS)
+        running: set[Future[int]] = set()
+        try:
+            for index in missing:
+                running.add(pool.submit(self._render_and_store, index))
+                if len(running) >= 2 * _THREADS:
+                    finished, running = wait(running, return_when=FIRST_COMPLETED)
+                    yield from (future.result() for future in finished)
+            for future in running:
+                yield future.result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+    def _render_and_store(self, index: int) -> int:
+        self._cache.write(index, self._render(index))
+        return index
+
+    def _render(self, index: int) -> Image:
+        """Clean images (cameras, height, width) of one of the drive's frames."""
+        world = self._open_world()
+        instants = self._instants(index)
+        total = np.zeros((self._rig.cameras, self._rig.height, self._rig.width))
+        for pose in self.room_from_camera(instants):
+            for k, offset in enumerate(camera_offsets(self._rig)):
+                total[k] += world.renderer.image([world.room], pose @ offset)
+        return np.clip(np.rint(total / len(instants)), 0, 255).astype(np.uint8)
+
+    def _instants(self, index: int) -> FloatArray:
+        """Times at which a frame is rendered: spread over the exposure, centred on its stamp."""
+        stamp = self._drive.timestamps[index]
+        blur = self._settings.effects.motion_blur
+        if blur is None:
+            return np.array([stamp])
+        spread = (np.arange(blur.samples) + 0.5) / blur.samples - 0.5
+        return np.asarray(stamp + blur.exposure_s * spread)
+
+
+def _selection(count: int, start: int, stop: int | None, stride: int) -> IntArray:
+    if start < 0 or stride < 1 or (stop is not None and stop < 0):
+        raise ConfigError(
+            f"start {start}, stop {stop}, stride {stride}: start and stop must not be negative "
+            "and stride must be 1 or more"
+        )
+    indices = np.arange(count, dtype=np.int64)[start:stop:stride]
+    if len(indices) == 0:
+        raise ConfigError(
+            f"start {start}, stop {stop} leave none of the drive's {count} frames; "
+            "lower dataset.start or raise dataset.stop"
+        )
+    return indices
+
+
+def _render_description(settings: LabSettings) -> dict[str, Any]:
+    """Exactly what shapes the clean images: neither noise, gain, cover, odometry nor seed."""
+    everything = asdict(settings)
+    effects = everything["effects"]
+    return {
+        "render_version": RENDER_VERSION,
+        "rig": everything["rig"],
+        "drive": everything["drive"],
+        "room_seed": everything["room_seed"],
+        "visit": everything["visit"],
+        "motion_blur": effects["motion_blur"],
+        "person": effects["person"],
+    }
+
+
+def _check_clearance(drive: Drive, world: World, rig: CameraRig) -> None:
+    """Refuses a drive whose cameras come too near to a surface."""
+    cameras = drive.body_poses(drive.timestamps) @ rig.bTc
+    distance = world.caster.distance(cameras[:, :3, 3])
+    outside = np.any(np.abs(cameras[:, :2, 3]) > 5.0, axis=1)
+    bad = np.flatnonzero((distance < _CLEARANCE_M) | outside)
+    if len(bad):
+        x, y = cameras[bad[0], :2, 3]
+        raise ConfigError(
+            f"the drive's frame {bad[0]} puts the camera at ({x:.2f}, {y:.2f}) m, into a wall or "
+            "furniture; move the points of dataset.drive.waypoints_m"
+        )

@@ -1,0 +1,188 @@
+"""Settings of the rendered lab: rig, drive, wheel odometry and effects (Se et al. 2.2 and 5)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fgslam.settings.base import STRICT
+
+PositiveFloat = Annotated[float, Field(gt=0.0)]
+NonNegativeFloat = Annotated[float, Field(ge=0.0)]
+FrameRange = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
+
+
+@dataclass(frozen=True, config=STRICT)
+class LabRigSettings:
+    """The cameras (S1): the right one is the reference, left beside it, top above it."""
+
+    width: Annotated[int, Field(ge=16, le=4096, description="image width, pixels")] = 320
+    height: Annotated[int, Field(ge=16, le=4096, description="image height, pixels")] = 240
+    horizontal_fov_deg: Annotated[
+        float, Field(gt=5.0, lt=150.0, description="width of the field of view, degrees")
+    ] = 60.0
+    baseline_m: Annotated[
+        float, Field(gt=0.0, le=2.0, description="right to left camera, metres")
+    ] = 0.10
+    vertical_baseline_m: Annotated[
+        Annotated[float, Field(gt=0.0, le=2.0)] | None,
+        Field(description="right to top camera, metres; null for a two-camera rig"),
+    ] = 0.10
+    ahead_m: Annotated[
+        float,
+        Field(ge=-1.0, le=1.0, description="reference camera ahead of the robot's centre, metres"),
+    ] = 0.25
+    aside_m: Annotated[
+        float,
+        Field(ge=-1.0, le=1.0, description="reference camera left of the robot's centre, metres"),
+    ] = 0.0
+    above_m: Annotated[
+        float, Field(gt=0.05, le=2.5, description="reference camera above the floor, metres")
+    ] = 1.0
+    tilt_deg: Annotated[
+        float, Field(ge=-45.0, le=45.0, description="upward tilt of the cameras, degrees")
+    ] = 0.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class LabDriveSettings:
+    """The robot's path and speed (S31, S32)."""
+
+    path: Annotated[
+        Literal["paper_loop", "laps", "waypoints"],
+        Field(
+            description="`paper_loop` once around the chair and back to the start; `laps` around "
+            "the room; `waypoints` a smooth curve through the given points"
+        ),
+    ] = "paper_loop"
+    frames: Annotated[
+        Annotated[int, Field(ge=2, le=100_000)] | None,
+        Field(
+            description="exact number of frames (the speed is scaled down to fit); null drives at "
+            "nine tenths of the speed limits"
+        ),
+    ] = 249
+    frame_rate_hz: Annotated[float, Field(gt=0.0, le=120.0, description="frames a second")] = 2.0
+    max_speed_m_s: Annotated[float, Field(gt=0.0, le=5.0, description="limit, metres a second")] = (
+        0.40
+    )
+    max_turn_deg_s: Annotated[
+        float, Field(gt=0.0, le=180.0, description="limit, degrees a second")
+    ] = 10.0
+    max_acceleration_m_s2: Annotated[
+        float, Field(gt=0.0, le=10.0, description="limit, metres a second squared")
+    ] = 0.30
+    laps: Annotated[int, Field(ge=1, le=1000, description="times around the room, for `laps`")] = 1
+    waypoints_m: Annotated[
+        tuple[tuple[float, float], ...],
+        Field(description="(x, y) in the room, metres from its centre, for `waypoints`"),
+    ] = ()
+    closed: Annotated[
+        bool, Field(description="for `waypoints`: return to the first point and heading")
+    ] = False
+
+
+@dataclass(frozen=True, config=STRICT)
+class WheelOdometrySettings:
+    """Drift of the wheel odometry, one standard deviation each.
+
+    Noise that grows with the root of the way makes independent increments, however the way is cut
+    into frames; the scale errors are drawn once a drive, as of worn or unequal wheels.
+    """
+
+    distance_scale: Annotated[
+        float, Field(ge=0.0, le=0.5, description="constant relative error of distance, per drive")
+    ] = 0.01
+    turn_scale: Annotated[
+        float, Field(ge=0.0, le=0.5, description="constant relative error of turns, per drive")
+    ] = 0.01
+    distance_m_sqrt_m: Annotated[
+        float, Field(ge=0.0, le=1.0, description="along the way, metres per root metre")
+    ] = 0.02
+    sideways_m_sqrt_m: Annotated[
+        float, Field(ge=0.0, le=1.0, description="across the way, metres per root metre")
+    ] = 0.01
+    height_m_sqrt_m: Annotated[
+        float, Field(ge=0.0, le=1.0, description="vertical, metres per root metre")
+    ] = 0.002
+    yaw_deg_sqrt_m: Annotated[
+        float, Field(ge=0.0, le=45.0, description="heading, degrees per root metre driven")
+    ] = 0.5
+    yaw_deg_sqrt_rad: Annotated[
+        float, Field(ge=0.0, le=45.0, description="heading, degrees per root radian turned")
+    ] = 0.8
+    tilt_deg_sqrt_m: Annotated[
+        float, Field(ge=0.0, le=45.0, description="pitch and roll, degrees per root metre")
+    ] = 0.1
+    floor_m: Annotated[
+        float, Field(gt=0.0, le=0.1, description="least position noise of an increment, metres")
+    ] = 1e-4
+    floor_deg: Annotated[
+        float, Field(gt=0.0, le=5.0, description="least angle noise of an increment, degrees")
+    ] = 0.01
+
+
+@dataclass(frozen=True, config=STRICT)
+class LabExposureSettings:
+    """A camera's automatic exposure: a slow wave of the gain and one sudden jump."""
+
+    wave: Annotated[float, Field(ge=0.0, lt=0.9, description="amplitude of the gain's wave")] = 0.15
+    wave_period_frames: Annotated[float, Field(gt=1.0, description="its period, frames")] = 60.0
+    jump: Annotated[
+        float, Field(gt=0.1, lt=5.0, description="factor of the gain after the jump")
+    ] = 0.7
+    jump_frame: Annotated[int, Field(ge=0, description="first frame after the jump")] = 125
+
+
+@dataclass(frozen=True, config=STRICT)
+class LabBlurSettings:
+    """Motion blur: the mean of several renders while the shutter is open."""
+
+    exposure_s: Annotated[float, Field(gt=0.0, le=0.5, description="shutter time, seconds")] = 0.03
+    samples: Annotated[int, Field(ge=2, le=32, description="renders a frame")] = 5
+
+
+@dataclass(frozen=True, config=STRICT)
+class LabPersonSettings:
+    """A person who walks through the cameras' view, from its right to its left."""
+
+    first_frame: Annotated[int, Field(ge=0, description="frame at which the person enters")] = 60
+    frames: Annotated[int, Field(ge=2, description="frames until the person has left")] = 12
+    distance_m: Annotated[
+        float,
+        Field(gt=0.7, le=4.0, description="from the camera at the middle of the walk, metres"),
+    ] = 1.8
+
+
+@dataclass(frozen=True, config=STRICT)
+class LabEffectsSettings:
+    """What spoils the images; each null or zero when off."""
+
+    noise_grey: Annotated[
+        float, Field(ge=0.0, le=50.0, description="Gaussian image noise, grey levels")
+    ] = 1.5
+    exposure: LabExposureSettings | None = None
+    motion_blur: LabBlurSettings | None = None
+    person: LabPersonSettings | None = None
+    blocked_frames: Annotated[
+        FrameRange | None,
+        Field(description="[first, last) frames in which a dark cover blocks all cameras"),
+    ] = None
+
+
+@dataclass(frozen=True, config=STRICT)
+class LabSettings:
+    """The rendered lab: a furnished room of 10 m x 10 m, the robot's drive, cameras, odometry."""
+
+    rig: LabRigSettings = LabRigSettings()
+    drive: LabDriveSettings = LabDriveSettings()
+    odometry: WheelOdometrySettings = WheelOdometrySettings()
+    effects: LabEffectsSettings = LabEffectsSettings()
+    room_seed: Annotated[
+        int, Field(ge=0, description="seed of the room's textures and small things")
+    ] = 0
+    visit: Annotated[
+        Literal[1, 2], Field(description="2: some furniture has been moved since the first visit")
+    ] = 1

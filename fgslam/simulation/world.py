@@ -1,0 +1,62 @@
+"""The rendered world: lab, light, cameras, and the person, put together from the settings."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam import geometry
+from fgslam.settings.lab import LabRigSettings
+from fgslam.simulation.lab import build_lab, lamps
+from fgslam.simulation.lighting import bake
+from fgslam.simulation.mipmap import TextureBank
+from fgslam.simulation.patches import stack
+from fgslam.simulation.raycaster import RayCaster
+from fgslam.simulation.renderer import Layer, Pinhole, Renderer
+from fgslam.simulation.texture_library import build_library
+from fgslam.types import CameraRig, FloatArray
+
+
+def make_rig(settings: LabRigSettings) -> CameraRig:
+    """The calibrated cameras that the settings describe (S1)."""
+    focal = settings.width / 2.0 / np.tan(np.deg2rad(settings.horizontal_fov_deg) / 2.0)
+    tilt = np.deg2rad(settings.tilt_deg)
+    bTc = geometry.BODY_FORWARD_LEFT_UP_FROM_CAMERA @ geometry.pose(
+        geometry.so3_exp(np.array([tilt, 0.0, 0.0])), np.zeros(3)
+    )
+    bTc[:3, 3] = settings.ahead_m, settings.aside_m, settings.above_m
+    return CameraRig(
+        width=settings.width,
+        height=settings.height,
+        fx=float(focal),
+        fy=float(focal),
+        cx=(settings.width - 1) / 2.0,
+        cy=(settings.height - 1) / 2.0,
+        baseline=settings.baseline_m,
+        vertical_baseline=settings.vertical_baseline_m,
+        bTc=bTc,
+    )
+
+
+def camera_offsets(rig: CameraRig) -> list[FloatArray]:
+    """Poses (4, 4) of right, left[, top] camera in the reference camera's frame."""
+    offsets = [(0.0, 0.0, 0.0), (-rig.baseline, 0.0, 0.0)]
+    if rig.vertical_baseline is not None:
+        offsets.append((0.0, -rig.vertical_baseline, 0.0))
+    return [geometry.pose(np.eye(3), np.array(offset)) for offset in offsets]
+
+
+class World:
+    """Everything that is needed to render; safe to share between threads."""
+
+    def __init__(self, rig: CameraRig, room_seed: int, visit: int) -> None:
+        """Builds textures, room and light (a few seconds). Raises MissingDependencyError."""
+        rng = np.random.default_rng([room_seed, 1])
+        things = build_lab(np.random.default_rng([room_seed, 2]), visit)
+        self.bank = TextureBank(build_library(rng))
+        self.things = tuple(thing.name for thing in things)
+        patches = stack(things)
+        self.caster = RayCaster(patches)
+        light = bake(patches, self.caster, lamps(), np.random.default_rng([room_seed, 3]))
+        self.room = Layer(patches, self.caster, light, self.bank)
+        camera = Pinhole(rig.width, rig.height, rig.fx, rig.cx, rig.cy)
+        self.renderer = Renderer(camera, self.bank)
