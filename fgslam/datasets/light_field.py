@@ -45,14 +45,6 @@ class Grid:
     files: dict[tuple[int, int], Path]
     positions: dict[tuple[int, int], FloatArray]
 
-    def pitch(self) -> FloatArray:
-        """Mean distance (2,) of neighbours along a row and along a column, gantry units."""
-        keys = np.array(list(self.positions), np.float64)
-        places = np.array(list(self.positions.values()))
-        u_per_column = np.polyfit(keys[:, 1], places[:, 0], 1)[0]
-        v_per_row = np.polyfit(keys[:, 0], places[:, 1], 1)[0]
-        return np.abs([u_per_column, v_per_row])
-
 
 @dataclass(frozen=True, eq=False)
 class Walk:
@@ -67,6 +59,13 @@ class Walk:
     grid: Grid
     views: list[tuple[tuple[int, int], ...]]
     shifts: FloatArray
+
+    def baselines(self) -> FloatArray:
+        """Mean distance (2,) of the left and of the top view from the reference, gantry units.
+
+        Without a top view the second is NaN.
+        """
+        return _mean_baselines(self.grid, self.views)
 
     def load(self, index: int) -> tuple[Image, ...]:
         """Shifted images of a frame. Raises FrameError when one is missing or damaged."""
@@ -113,7 +112,7 @@ def open_light_field(settings: LightFieldSettings) -> Recording:
     truth = _true_poses(walk, settings.metres_per_unit)
     return Recording(
         name=root.resolve().name,
-        rig=_rig(grid, settings),
+        rig=_rig(walk, settings),
         timestamps=stamps[chosen],
         identity=recording_identity(
             [root / "calib.json", root / "positions.csv"],
@@ -172,6 +171,17 @@ def _plan_walk(grid: Grid, settings: LightFieldSettings) -> Walk:
     return Walk(grid, views, _shifts(grid, views, settings))
 
 
+def _mean_baselines(grid: Grid, views: list[tuple[tuple[int, int], ...]]) -> FloatArray:
+    places = np.array([[grid.positions[view] for view in group] for group in views])
+    horizontal = float(np.mean(places[:, 0, 0] - places[:, 1, 0]))
+    vertical = float(np.mean(places[:, 0, 1] - places[:, 2, 1])) if len(views[0]) > 2 else np.nan
+    if not horizontal > 0.0 or vertical <= 0.0:
+        raise DatasetError(
+            f"{grid.root}: u must grow with the column and v fall with the row in positions.csv"
+        )
+    return np.array([horizontal, vertical])
+
+
 def _shifts(
     grid: Grid, views: list[tuple[tuple[int, int], ...]], settings: LightFieldSettings
 ) -> FloatArray:
@@ -181,27 +191,28 @@ def _shifts(
     the *nominal* spacing more: the rig's baselines are fixed although the gantry's steps vary by
     5 %, and so only the small unshifted part of the disparity carries that error.
     """
-    horizontal, vertical = grid.pitch()
-    per_unit = settings.shift_px_per_step / horizontal
+    horizontal, vertical = _mean_baselines(grid, views)
+    per_unit = settings.shift_px_per_step * settings.spacing / horizontal
     places = np.array([grid.positions[group[0]] for group in views])
     walked = places - places[0]
     shifts = np.empty((len(views), len(views[0]), 2))
     shifts[:] = -per_unit * walked[:, None, :]
-    shifts[:, 1, 0] += per_unit * horizontal * settings.spacing
+    shifts[:, 1, 0] += per_unit * horizontal
     if settings.use_top:
-        shifts[:, 2, 1] += per_unit * vertical * settings.spacing
+        shifts[:, 2, 1] += per_unit * vertical
     return shifts
 
 
-def _rig(grid: Grid, settings: LightFieldSettings) -> CameraRig:
-    horizontal, vertical = grid.pitch() * settings.spacing * settings.metres_per_unit
+def _rig(walk: Walk, settings: LightFieldSettings) -> CameraRig:
+    horizontal, vertical = walk.baselines() * settings.metres_per_unit
+    width, height = walk.grid.width, walk.grid.height
     return CameraRig(
-        width=grid.width,
-        height=grid.height,
+        width=width,
+        height=height,
         fx=settings.focal_length_px,
         fy=settings.focal_length_px,
-        cx=0.5 * (grid.width - 1),
-        cy=0.5 * (grid.height - 1),
+        cx=0.5 * (width - 1),
+        cy=0.5 * (height - 1),
         baseline=float(horizontal),
         vertical_baseline=float(vertical) if settings.use_top else None,
         bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA,

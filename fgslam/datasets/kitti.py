@@ -1,0 +1,161 @@
+"""KITTI odometry in its native layout (docs/datasets/kitti.md).
+
+``sequences/NN/{image_0,image_1,calib.txt,times.txt}`` and, for the training drives,
+``poses/NN.txt``: rectified grey pairs, camera 0 is the left one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.datasets.images import list_numbered_images
+from fgslam.datasets.recording import Recording, recording_identity
+from fgslam.datasets.selection import select_frames
+from fgslam.datasets.stereo_files import (
+    StereoFiles,
+    check_sizes,
+    missing_notes,
+    require_folder,
+    size,
+)
+from fgslam.datasets.tables import read_lines, read_table, require_increasing
+from fgslam.errors import CalibrationError, DatasetError
+from fgslam.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, right_from_left_camera
+from fgslam.settings.datasets import KittiSettings
+from fgslam.types import CameraRig, FloatArray, Trajectory
+
+_POSE_COLUMNS = tuple(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
+
+
+def open_kitti(settings: KittiSettings) -> Recording:
+    """Open one drive; ``settings.path`` is the folder that holds sequences/ and poses/.
+
+    Raises:
+        DatasetError: a folder or file is missing or malformed, or no frame is left.
+        CalibrationError: calib.txt is missing, malformed or impossible.
+    """
+    folder = Path(settings.path) / "sequences" / settings.sequence
+    require_folder(folder, "the KITTI sequence")
+    cameras = _camera_images(folder)
+    table = read_table(folder / "times.txt", ("time",))
+    stamps = table.column(0)
+    require_increasing(table, stamps)
+    chosen = select_frames(len(stamps), settings)
+    files = _files(folder, cameras, len(stamps))
+    rig = _read_rig(folder / "calib.txt", files)
+    files = StereoFiles(files.paths, rig.width, rig.height)
+    check_sizes(files, folder)
+    poses = _read_poses(Path(settings.path) / "poses" / f"{settings.sequence}.txt", len(stamps))
+    truth = None if poses is None else right_from_left_camera(poses, rig.baseline)[chosen]
+    return Recording(
+        name=f"KITTI {settings.sequence}",
+        rig=rig,
+        timestamps=stamps[chosen],
+        identity=recording_identity(
+            [folder / "calib.txt", folder / "times.txt"],
+            [path for images in cameras for path in images.values()],
+        ),
+        ground_truth=None if truth is None else Trajectory(stamps[chosen], truth),
+        notes=missing_notes(files, stamps),
+        indices=chosen,
+        load_images=files.load,
+        odometry_source=None,
+    )
+
+
+def _camera_images(folder: Path) -> list[dict[int, Path]]:
+    """Images of the right (image_1) and the left (image_0) camera by number."""
+    cameras = []
+    for name in ("image_1", "image_0"):
+        if not (folder / name).is_dir():
+            raise DatasetError(
+                f"{folder} has no {name}/: both grey cameras are needed (image_0 left, image_1 "
+                "right); unpack the grey odometry data set there"
+            )
+        cameras.append(list_numbered_images(folder / name))
+    return cameras
+
+
+def _files(folder: Path, cameras: list[dict[int, Path]], frames: int) -> StereoFiles:
+    named = list(zip(("image_1", "image_0"), cameras, strict=True))
+    paths = tuple(
+        tuple(images.get(k, folder / name / f"{k:06d}.png") for name, images in named)
+        for k in range(frames)
+    )
+    return StereoFiles(paths, 0, 0)
+
+
+def _read_rig(path: Path, files: StereoFiles) -> CameraRig:
+    """The rig of calib.txt; the image size, which it does not state, is the first frame's."""
+    left, right = (_projection(path, key) for key in ("P0", "P1"))
+    if not np.allclose(left[:, :3], right[:, :3]):
+        raise CalibrationError(
+            f"{path}: P0 and P1 differ in their intrinsics, so the pair is not rectified; use the "
+            "calibration that came with the sequence"
+        )
+    fx, fy = float(right[0, 0]), float(right[1, 1])
+    if fx <= 0.0 or fy <= 0.0:
+        raise CalibrationError(f"{path}: focal lengths {fx:g}, {fy:g} must be positive")
+    baseline = float(left[0, 3] - right[0, 3]) / fx
+    if baseline <= 0.0:
+        raise CalibrationError(
+            f"{path}: the baseline is {baseline:g} m, must be positive; P0 belongs to the left "
+            "camera (image_0), P1 to the right one (image_1): are they swapped?"
+        )
+    images = files.first_images()
+    if images is None:
+        raise DatasetError(
+            f"{path.parent}: not one frame of times.txt has a readable image in image_0/ and in "
+            "image_1/; check the unpacked files"
+        )
+    _require_same_size(path.parent, size(images[0]), size(images[1]))
+    height, width = images[0].shape
+    cx, cy = float(right[0, 2]), float(right[1, 2])
+    body = BODY_FORWARD_LEFT_UP_FROM_CAMERA
+    return CameraRig(width, height, fx, fy, cx, cy, baseline, None, body)
+
+
+def _require_same_size(folder: Path, right: str, left: str) -> None:
+    if right != left:
+        raise DatasetError(
+            f"{folder}: image_0 is {left} but image_1 is {right}; restore the original images"
+        )
+
+
+def _projection(path: Path, key: str) -> FloatArray:
+    """Projection matrix (3, 4) of a line such as ``P1: 12 numbers``."""
+    for line, text in read_lines(path, CalibrationError):
+        name, _, rest = text.partition(":")
+        if name.strip() != key:
+            continue
+        try:
+            values = np.array([float(word) for word in rest.split()])
+        except ValueError:
+            values = np.empty(0)
+        if len(values) != 12 or not np.isfinite(values).all():
+            raise CalibrationError(
+                f"{path}, line {line}: {key} must be 12 finite numbers; restore the file"
+            )
+        return values.reshape(3, 4)
+    raise CalibrationError(f"{path} has no line {key!r}; restore the file of the odometry data set")
+
+
+def _read_poses(path: Path, frames: int) -> FloatArray | None:
+    """Left-camera poses (n, 4, 4) of poses/NN.txt, or None where there is no such file."""
+    if not path.is_file():
+        return None
+    table = read_table(path, _POSE_COLUMNS)
+    if len(table) != frames:
+        raise DatasetError(
+            f"{path} has {len(table)} poses but times.txt has {frames} frames; restore the file "
+            "that belongs to this sequence"
+        )
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, :3, :] = table.values.reshape(-1, 3, 4)
+    skewed = np.abs(np.linalg.det(poses[:, :3, :3]) - 1.0) > 1e-2
+    if skewed.any():
+        line = table.lines[int(np.argmax(skewed))]
+        raise DatasetError(f"{path}, line {line}: not a rotation and translation; restore the file")
+    return poses
