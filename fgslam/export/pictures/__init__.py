@@ -1,0 +1,21 @@
+"""Pictures of a run, as PNG: the figures of Se, Lowe and Little (2001), and the errors over time.
+
+Every function takes plain arrays and a path, returns nothing, and writes one file atomically; the
+same input gives the same bytes.
+"""
+
+from fgslam.export.pictures.birds_eye import MapDrawing, draw_birds_eye
+from fgslam.export.pictures.curves import draw_errors, draw_matches
+from fgslam.export.pictures.image_overlays import draw_disparities, draw_features, draw_flow
+from fgslam.export.pictures.map_views import draw_map_views
+
+__all__ = [
+    "MapDrawing",
+    "draw_birds_eye",
+    "draw_disparities",
+    "draw_errors",
+    "draw_features",
+    "draw_flow",
+    "draw_map_views",
+    "draw_matches",
+]

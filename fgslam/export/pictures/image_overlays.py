@@ -1,0 +1,207 @@
+"""Pictures on images: features (Fig. 1), disparities (Fig. 2) and flow (Fig. 3) of Se et al."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.colors import ListedColormap, LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
+
+from fgslam.export.pictures.style import (
+    INK,
+    ORANGE,
+    SKY,
+    YELLOW,
+    add_segments,
+    colour_bar,
+    picture,
+    show_image,
+)
+from fgslam.types import Features, FloatArray, Image
+
+_CAMERAS = ("Right", "Left", "Top")
+# The descriptor looks at a window of about twelve scales; a square of four stays readable.
+_SQUARE_SIDE_IN_SCALES = 4.0
+# Wider images than this are stacked rather than set side by side.
+_PANORAMIC_ASPECT = 2.2
+_IMAGE_INCHES = 5.6
+# Without the dark end, which would be lost in the shadows of the image.
+_DISPARITY_COLOURS = ListedColormap(matplotlib.colormaps["plasma"](np.linspace(0.3, 1.0, 256)))
+
+
+def draw_features(
+    path: Path, images: tuple[Image, ...], features: tuple[Features, ...], title: str = ""
+) -> None:
+    """SIFT features as squares: side proportional to scale, turned by orientation (Fig. 1).
+
+    Args:
+        path: the PNG to write.
+        images: (height, width) uint8, in the order right, left[, top]; drawn as top, left, right.
+        features: of each image.
+        title: heading of the whole picture, e.g. the frame.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    order = (2, 1, 0) if len(images) == 3 else (1, 0)
+    stacked = images[0].shape[1] > _PANORAMIC_ASPECT * images[0].shape[0]
+    rows, columns = (len(order), 1) if stacked else (1, len(order))
+    width, height = _size(images[0], rows, columns, bool(title))
+    with picture(path, width, height) as figure:
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        for axes, camera in zip(panels, order, strict=True):
+            show_image(axes, images[camera], _CAMERAS[camera], f"{len(features[camera])} features")
+            add_segments(axes, oriented_squares(features[camera]), 1.1, color=YELLOW)
+        _heading(figure, title)
+
+
+def oriented_squares(features: Features) -> FloatArray:
+    """Outlines (n, 7, 2): once around the square, then a stroke from its centre ahead."""
+    corners = np.array([[1, 0], [1, 1], [-1, 1], [-1, -1], [1, -1], [1, 0], [0, 0]], dtype=float)
+    half = 0.5 * _SQUARE_SIDE_IN_SCALES * features.scale[:, None]
+    ahead = half * np.column_stack([np.cos(features.orientation), np.sin(features.orientation)])
+    # A quarter turn clockwise on the screen, where rows grow downwards.
+    aside = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+    offsets = corners[None, :, :1] * ahead[:, None] + corners[None, :, 1:] * aside[:, None]
+    return np.asarray(features.xy[:, None] + offsets)
+
+
+def draw_disparities(path: Path, image: Image, pixels: FloatArray, title: str = "") -> None:
+    """Matches over the cameras: lines as long as the disparities, coloured by them (Fig. 2).
+
+    Args:
+        path: the PNG to write.
+        image: the reference (right) image, (height, width) uint8.
+        pixels: (n, 3, 2) raw (column, row) in right, left and top image; NaN without a top one.
+        title: heading, e.g. the frame.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    horizontal = pixels[:, 1, 0] - pixels[:, 0, 0]
+    vertical = pixels[:, 2, 1] - pixels[:, 0, 1]
+    trinocular = bool(np.isfinite(vertical).any())
+    colours: dict[str, Any] = {"cmap": _DISPARITY_COLOURS, "norm": _disparity_norm(horizontal)}
+    width, height = _size(image, 1, 1, has_title=True, inches=9.0)
+    with picture(path, width + 1.2, height) as figure:
+        axes = figure.subplots()
+        show_image(axes, image, title or "Stereo matches", f"{len(pixels)} matches")
+        start = pixels[:, 0]
+        lines = add_segments(axes, _rays(start, horizontal, 0), 1.6, array=horizontal, **colours)
+        if trinocular:
+            add_segments(axes, _rays(start, vertical, 1), 1.6, array=horizontal, **colours)
+        axes.scatter(
+            start[:, 0],
+            start[:, 1],
+            s=16,
+            c=horizontal,
+            edgecolors="black",
+            linewidths=0.6,
+            **colours,
+        )
+        colour_bar(axes, lines, "horizontal disparity (px)")
+        if isinstance(colours["norm"], LogNorm):
+            scale = axes.child_axes[0].yaxis
+            scale.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            scale.set_major_formatter(ScalarFormatter())
+            scale.set_minor_locator(NullLocator())
+
+
+def draw_flow(
+    path: Path, image: Image, before: FloatArray, after: FloatArray, title: str = ""
+) -> None:
+    """How matched features moved between two frames: dot, line, cross (Fig. 3).
+
+    Args:
+        path: the PNG to write.
+        image: the earlier frame's reference image, (height, width) uint8.
+        before: (n, 2) (column, row) in the earlier frame, pixels.
+        after: (n, 2) in the later frame.
+        title: heading, e.g. the frames and the motion between them.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    length = np.linalg.norm(after - before, axis=1)
+    note = f"{len(before)} matches"
+    if len(before):
+        note += f", median flow {np.median(length):.1f} px"
+    width, height = _size(image, 1, 1, has_title=True, inches=9.0)
+    with picture(path, width, height + 0.15) as figure:
+        axes = figure.subplots()
+        show_image(axes, image, title or "Flow between frames", note)
+        add_segments(axes, np.stack([before, after], axis=1), 1.6, color=SKY)
+        rim = [withStroke(linewidth=3.4, foreground="black", alpha=0.6)]
+        axes.scatter(
+            before[:, 0], before[:, 1], s=26, c=YELLOW, edgecolors="black", linewidths=0.7, zorder=3
+        )
+        axes.scatter(
+            after[:, 0],
+            after[:, 1],
+            s=42,
+            c=ORANGE,
+            marker="x",
+            linewidths=1.8,
+            zorder=4,
+            path_effects=rim,
+        )
+        figure.legend(handles=_flow_legend(), loc="outside lower center", ncols=3)
+
+
+def _flow_legend() -> list[Line2D]:
+    dot: dict[str, Any] = {
+        "marker": "o",
+        "markeredgecolor": INK,
+        "color": YELLOW,
+        "linestyle": "none",
+    }
+    cross: dict[str, Any] = {
+        "marker": "x",
+        "color": ORANGE,
+        "linestyle": "none",
+        "markeredgewidth": 2.0,
+    }
+    return [
+        Line2D([], [], label="position in the earlier frame", markersize=7, **dot),
+        Line2D([], [], label="position in the later frame", markersize=8, **cross),
+        Line2D([], [], label="motion", color=SKY, linewidth=2.0),
+    ]
+
+
+def _rays(start: FloatArray, length: FloatArray, axis: int) -> FloatArray:
+    """Segments (n, 2, 2) from ``start`` along +column (0) or +row (1)."""
+    end = start.copy()
+    end[:, axis] += length
+    return np.stack([start, end], axis=1)
+
+
+def _disparity_norm(disparity: FloatArray) -> Normalize:
+    """Logarithmic where disparities span a wide range, so that far features differ too."""
+    if len(disparity) == 0:
+        return Normalize(0.0, 1.0)
+    low, high = float(disparity.min()), float(disparity.max())
+    if low > 0.0 and high > 8.0 * low:
+        return LogNorm(low, high)
+    return Normalize(low, max(high, low + 1.0))
+
+
+def _size(
+    image: Image, rows: int, columns: int, has_title: bool, inches: float = _IMAGE_INCHES
+) -> tuple[float, float]:
+    """Width and height of the figure in inches: panels of ``inches`` width, headings above."""
+    height, width = image.shape
+    if columns == 1:
+        inches = max(inches, 9.0)
+    panel = inches * height / width
+    return columns * inches + 0.2, rows * (panel + 0.42) + (0.45 if has_title and rows else 0.0)
+
+
+def _heading(figure: Figure, title: str) -> None:
+    if title:
+        figure.suptitle(title, fontsize=16, fontweight="bold", x=0.01, ha="left")

@@ -1,0 +1,140 @@
+"""How all pictures look, and how they are written: one canvas at a time, no global state kept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib.style
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patheffects import AbstractPathEffect, withStroke
+
+from fgslam.export.atomic import replacing
+from fgslam.types import FloatArray, Image
+
+# Okabe and Ito's colours, which the colour-blind can tell apart.
+ORANGE = "#E69F00"
+SKY = "#56B4E9"
+GREEN = "#009E73"
+YELLOW = "#F0E442"
+BLUE = "#0072B2"
+VERMILLION = "#D55E00"
+PURPLE = "#CC79A7"
+INK = "#222222"
+GREY = "#8A8A8A"
+FAINT = "#DDDDDD"
+
+MAP_COLOURS = "viridis"
+"""Perceptually uniform, readable without colour vision and in grey print."""
+
+DPI = 160
+
+_NO_METADATA: dict[str, Any] = {"Software": None}
+# On the screen whites become this grey, so that bright marks stand out on windows and posters.
+_WHITE = 0.78
+
+_STYLE: dict[str, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 12.0,
+    "axes.titlesize": 14.0,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelsize": 12.0,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "axes.linewidth": 0.8,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.unicode_minus": True,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.labelsize": 11.0,
+    "ytick.labelsize": 11.0,
+    "grid.color": FAINT,
+    "grid.linewidth": 0.8,
+    "legend.fontsize": 11.0,
+    "legend.frameon": False,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "path.simplify": False,
+}
+
+
+@contextmanager
+def picture(path: Path, width: float, height: float) -> Iterator[Figure]:
+    """A figure of the given size in inches, written to ``path`` when the block ends well.
+
+    Neither the user's matplotlibrc nor the state of pyplot has a say, and no date or version
+    enters the file, so that the bytes depend on the input only.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with matplotlib.style.context(_STYLE, after_reset=True):
+        figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+        FigureCanvasAgg(figure)
+        yield figure
+        with replacing(path) as partial:
+            figure.savefig(
+                partial, format="png", bbox_inches="tight", pad_inches=0.1, metadata=_NO_METADATA
+            )
+
+
+def show_image(axes: Axes, image: Image, title: str, note: str = "") -> None:
+    """A grey image, dimmed so that bright marks stand out, without axes."""
+    height, width = image.shape
+    darkest, brightest = np.percentile(image, [0.5, 99.5])
+    span = max(float(brightest - darkest), 32.0) / _WHITE
+    axes.imshow(
+        image,
+        cmap="gray",
+        vmin=darkest,
+        vmax=darkest + span,
+        interpolation="bicubic",
+        interpolation_stage="data",
+    )
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
+    axes.set_title(title)
+    if note:
+        axes.set_title(note, loc="right", fontweight="normal", fontsize=12.0)
+
+
+def colour_bar(axes: Axes, colours: ScalarMappable, label: str, extend: str = "neither") -> None:
+    """A colour bar exactly as tall as the axes, whatever their aspect."""
+    inset = axes.inset_axes((1.02, 0.0, 0.022, 1.0))
+    figure = axes.get_figure(root=True)
+    if figure is None:
+        raise ValueError("these axes belong to no figure")
+    bar = figure.colorbar(colours, cax=inset, label=label, extend=extend)
+    bar.outline.set_visible(False)
+
+
+def add_segments(axes: Axes, segments: FloatArray, width: float, **colours: Any) -> LineCollection:
+    """Polylines (n, k, 2) with a dark rim, visible on bright and dark ground alike.
+
+    ``colours`` are those of a LineCollection (`color`, or `array`, `cmap` and `norm`).
+    """
+    rim: list[AbstractPathEffect] = [
+        withStroke(linewidth=width + 1.4, foreground="black", alpha=0.55)
+    ]
+    lines = LineCollection(list(segments), linewidths=width, **colours)
+    lines.set_path_effects(rim)
+    lines.set_capstyle("round")
+    lines.set_joinstyle("round")
+    axes.add_collection(lines, autolim=False)
+    return lines
+
+
+def white_rim(linewidth: float) -> list[AbstractPathEffect]:
+    """Effect that lifts a dark line off the dots under it."""
+    return [withStroke(linewidth=linewidth + 2.0, foreground="white", alpha=0.85)]
