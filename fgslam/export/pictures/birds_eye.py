@@ -157,7 +157,7 @@ def _draw_paths(axes: Axes, drawing: MapDrawing) -> None:
         axes.plot(
             *drawing.truth[:, _GROUND, 3].T,
             color=ORANGE,
-            linewidth=3.2,
+            linewidth=5.0,
             alpha=0.75,
             label="true path",
         )

@@ -159,7 +159,7 @@ def _draw_scene(
         linewidths=0,
     )
     if drawing.truth is not None:
-        _draw_line(axes, viewer, drawing.truth, color=ORANGE, linewidth=3.0, label="true path")
+        _draw_line(axes, viewer, drawing.truth, color=ORANGE, linewidth=4.5, label="true path")
     _draw_line(
         axes,
         viewer,
