@@ -32,6 +32,21 @@ _COVARIANCE_HEADER = (
 )
 
 
+def write_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """Write a trajectory in the format that the suffix names: `.tum` or `.kitti`.
+
+    Raises:
+        OutputError: the suffix is another one, a pose is not finite, or writing failed.
+    """
+    writers = {".tum": write_tum, ".kitti": write_kitti}
+    writer = writers.get(path.suffix.lower())
+    if writer is None:
+        raise OutputError(
+            f"cannot write {path}: unknown trajectory format '{path.suffix}'; use .tum or .kitti"
+        )
+    writer(path, trajectory)
+
+
 # --------------------------------------------------------------------------------------------
 # TUM
 

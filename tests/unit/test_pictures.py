@@ -64,7 +64,8 @@ def pixels(n: int, cameras: int) -> np.ndarray:
 
 def drawing(n: int, frames: int, *, full: bool) -> MapDrawing:
     rng = np.random.default_rng(4)
-    poses = np.array([se3_exp(np.array([0, 0.03 * i, 0, 0, 0, 0.1 * i])) for i in range(frames)])
+    steps = [np.array([0, 0.03 * i, 0, 0, 0, 0.1 * i]) for i in range(frames)]
+    poses = np.array([se3_exp(xi) for xi in steps]).reshape(-1, 4, 4)
     return MapDrawing(
         rng.normal(scale=3.0, size=(n, 3)),
         poses,
@@ -82,8 +83,8 @@ def all_pictures(n: int, *, full: bool) -> dict[str, Callable[[Path], None]]:
         "features": lambda p: draw_features(p, images, (features(n),) * len(images), "Frame 1"),
         "disparities": lambda p: draw_disparities(p, grey(), pixels(n, len(images))),
         "flow": lambda p: draw_flow(p, grey(), features(n).xy, features(n, 9).xy),
-        "birds_eye": lambda p: draw_birds_eye(p, drawing(n, max(n, 1), full=full)),
-        "views": lambda p: draw_map_views(p, drawing(n, max(n, 1), full=full)),
+        "birds_eye": lambda p: draw_birds_eye(p, drawing(n, n, full=full)),
+        "views": lambda p: draw_map_views(p, drawing(n, n, full=full)),
         "errors": lambda p: draw_errors(p, 0.5 * counts, np.full((n, 3), 0.01), sigmas),
         "matches": lambda p: draw_matches(p, counts, counts + 5, counts, 10 * counts),
     }

@@ -14,6 +14,7 @@ from fgslam.export.trajectories import (
     read_tum,
     write_covariances,
     write_kitti,
+    write_trajectory,
     write_tum,
 )
 from fgslam.geometry import se3_exp
@@ -79,6 +80,15 @@ def test_kitti_there_and_back(tmp_path: Path) -> None:
     written = trajectory(2)
     write_kitti(tmp_path / "a.kitti", written)
     np.testing.assert_allclose(read_kitti(tmp_path / "a.kitti"), written.poses, rtol=1e-12)
+
+
+def test_the_suffix_chooses_the_format(tmp_path: Path) -> None:
+    for suffix, writer in ((".tum", write_tum), (".KITTI", write_kitti)):
+        write_trajectory(tmp_path / f"a{suffix}", trajectory())
+        writer(tmp_path / "b", trajectory())
+        assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / "b").read_bytes()
+    with pytest.raises(OutputError, match=r"use \.tum or \.kitti"):
+        write_trajectory(tmp_path / "a.csv", trajectory())
 
 
 def test_empty_trajectory(tmp_path: Path) -> None:

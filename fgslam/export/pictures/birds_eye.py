@@ -89,8 +89,7 @@ def view_limits(drawing: MapDrawing) -> tuple[tuple[float, float], tuple[float, 
 
     A few far landmarks of tiny disparity must not shrink the rest to a dot.
     """
-    paths = [drawing.poses] + ([] if drawing.truth is None else [drawing.truth])
-    points = np.concatenate([poses[:, :3, 3] for poses in paths])[:, _GROUND]
+    points = path_points(drawing)[:, _GROUND]
     low, high = points.min(axis=0), points.max(axis=0)
     if len(drawing.landmarks):
         ground = drawing.landmarks[:, _GROUND]
@@ -101,6 +100,12 @@ def view_limits(drawing: MapDrawing) -> tuple[tuple[float, float], tuple[float, 
     half = 1.06 * np.maximum(half, max(half.max() / 2.0, 0.5))
     left, right = centre - half, centre + half
     return (float(left[0]), float(right[0])), (float(left[1]), float(right[1]))
+
+
+def path_points(drawing: MapDrawing) -> FloatArray:
+    """Positions (m, 3) of both paths, after the world's origin, where every run starts."""
+    truth = np.empty((0, 4, 4)) if drawing.truth is None else drawing.truth
+    return np.concatenate([np.zeros((1, 3)), drawing.poses[:, :3, 3], truth[:, :3, 3]])
 
 
 def world_position_covariances(poses: FloatArray, covariances: FloatArray) -> FloatArray:
@@ -138,7 +143,7 @@ def _draw_landmarks(axes: Axes, drawing: MapDrawing) -> None:
         ground[order, 0],
         ground[order, 1],
         c=up[order],
-        s=_dot_size(len(up)),
+        s=dot_size(len(up)),
         cmap=MAP_COLOURS,
         vmin=low,
         vmax=high,
@@ -147,7 +152,7 @@ def _draw_landmarks(axes: Axes, drawing: MapDrawing) -> None:
     colour_bar(axes, dots, "height above the first camera (m)", extend="both")
 
 
-def _dot_size(count: int) -> float:
+def dot_size(count: int) -> float:
     """Area of a dot in points squared: dense maps get finer ones."""
     return float(np.clip(2.4e4 / max(count, 1), 2.0, 9.0))
 

@@ -58,7 +58,6 @@ def draw_errors(
             axes.set_title(f"rmse {rmse:.2f} {unit}", loc="right", fontweight="normal", fontsize=11)
         panels[0].set_title(title or "Position error")
         panels[-1].set_xlabel("time (s)")
-        panels[-1].margins(x=0.01)
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles[::-1], labels[::-1], loc="outside lower center", ncols=2)
 
@@ -98,7 +97,6 @@ def draw_matches(
         lower.set(xlabel="frame", ylabel="landmarks in the map", ylim=(0, None))
         for axes in (upper, lower):
             axes.grid(visible=True)
-            axes.margins(x=0.01)
             axes.yaxis.set_major_locator(MaxNLocator(nbins=5, steps=[1, 2, 5, 10], integer=True))
         figure.align_ylabels()
         figure.legend(*upper.get_legend_handles_labels(), loc="outside lower center", ncols=2)

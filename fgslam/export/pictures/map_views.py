@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PathCollection
 
-from fgslam.export.pictures.birds_eye import MapDrawing
+from fgslam.export.pictures.birds_eye import MapDrawing, dot_size, path_points
 from fgslam.export.pictures.style import (
     FAINT,
     INK,
@@ -113,12 +113,14 @@ def draw_map_views(path: Path, drawing: MapDrawing) -> None:
 
 def _bounds(drawing: MapDrawing) -> tuple[FloatArray, FloatArray]:
     """Corners (3,), (3,) of the box around the paths and the bulk of the landmarks."""
-    low = drawing.poses[:, :3, 3].min(axis=0)
-    high = drawing.poses[:, :3, 3].max(axis=0)
+    points = path_points(drawing)
+    low, high = points.min(axis=0), points.max(axis=0)
     if len(drawing.landmarks):
         low = np.minimum(low, np.percentile(drawing.landmarks, 1.5, axis=0))
         high = np.maximum(high, np.percentile(drawing.landmarks, 98.5, axis=0))
-    return low, high
+    # A robot at rest still stands on a floor of a square metre.
+    padding = np.maximum([0.5, 0.0, 0.5] - 0.5 * (high - low), 0.0)
+    return low - padding, high + padding
 
 
 def _draw_floor(axes: Axes, viewer: Viewer, low: FloatArray, high: FloatArray) -> float:
@@ -152,7 +154,7 @@ def _draw_scene(
         page[order, 0],
         page[order, 1],
         c=-landmarks[order, 1],
-        s=7.0 * np.clip(nearness[order], 0.3, 3.0) ** 2,
+        s=dot_size(len(landmarks)) * np.clip(nearness[order], 0.3, 3.0) ** 2,
         cmap=MAP_COLOURS,
         vmin=-high[1],
         vmax=max(-low[1], -high[1] + 1e-6),

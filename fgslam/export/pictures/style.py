@@ -51,6 +51,7 @@ _STYLE: dict[str, Any] = {
     "axes.labelcolor": INK,
     "axes.linewidth": 0.8,
     "axes.axisbelow": True,
+    "axes.xmargin": 0.01,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.unicode_minus": True,
