@@ -20,11 +20,13 @@ from fgslam.settings.lab import LabSettings
 from fgslam.simulation import wheel_odometry
 from fgslam.simulation.image_effects import apply_effects, is_blocked
 from fgslam.simulation.paths import Drive, plan_drive
+from fgslam.simulation.person import Stance, make_walk
 from fgslam.simulation.render_cache import RenderCache, content_hash
+from fgslam.simulation.renderer import Layer
 from fgslam.simulation.world import World, camera_offsets, make_rig
 from fgslam.types import CameraRig, FloatArray, Frame, Image, IntArray, Odometry, Trajectory
 
-RENDER_VERSION = 1
+RENDER_VERSION = 2
 """Part of the cache's key: raised whenever the same settings give other pixels."""
 
 _THREADS = 2
@@ -71,6 +73,7 @@ class RenderedLabSequence:
         self._odometry = wheel_odometry.simulate(
             settings.odometry, self._body, np.random.default_rng([seed, 1])
         )
+        self._walk = make_walk(settings, self._drive, self._rig)
         self._world: World | None = None
         self._world_lock = threading.Lock()
         description = _render_description(settings)
@@ -172,7 +175,7 @@ class RenderedLabSequence:
         if is_blocked(self._settings.effects, index):
             return np.full((self._rig.height, self._rig.width), np.nan)
         world = self._open_world()
-        return world.renderer.depth([world.room], self._body[index] @ self._rig.bTc)
+        return world.renderer.depth(self._layers(world, index), self._body[index] @ self._rig.bTc)
 
     def object_ids(self, i: int) -> IntArray:
         """(height, width) index into ``object_names`` of the reference camera's pixels.
@@ -183,7 +186,7 @@ class RenderedLabSequence:
         if is_blocked(self._settings.effects, index):
             return np.full((self._rig.height, self._rig.width), -1, dtype=np.int64)
         world = self._open_world()
-        return world.renderer.things([world.room], self._body[index] @ self._rig.bTc)
+        return world.renderer.things(self._layers(world, index), self._body[index] @ self._rig.bTc)
 
     # ---------------------------------------------------------------- rendering
 
@@ -234,10 +237,17 @@ class RenderedLabSequence:
         world = self._open_world()
         instants = self._instants(index)
         total = np.zeros((self._rig.cameras, self._rig.height, self._rig.width))
-        for pose in self.room_from_camera(instants):
+        for seconds, pose in zip(instants, self.room_from_camera(instants), strict=True):
+            layers = world.layers(self._stance(seconds))
             for k, offset in enumerate(camera_offsets(self._rig)):
-                total[k] += world.renderer.image([world.room], pose @ offset)
+                total[k] += world.renderer.image(layers, pose @ offset)
         return np.clip(np.rint(total / len(instants)), 0, 255).astype(np.uint8)
+
+    def _layers(self, world: World, index: int) -> list[Layer]:
+        return world.layers(self._stance(float(self._drive.timestamps[index])))
+
+    def _stance(self, seconds: float) -> Stance | None:
+        return None if self._walk is None else self._walk.stance(seconds)
 
     def _instants(self, index: int) -> FloatArray:
         """Times at which a frame is rendered: spread over the exposure, centred on its stamp."""

@@ -148,7 +148,7 @@ class LabBlurSettings:
 class LabPersonSettings:
     """A person who walks through the cameras' view, from its right to its left."""
 
-    first_frame: Annotated[int, Field(ge=0, description="frame at which the person enters")] = 60
+    first_frame: Annotated[int, Field(ge=0, description="frame at which the person enters")] = 20
     frames: Annotated[int, Field(ge=2, description="frames until the person has left")] = 12
     distance_m: Annotated[
         float,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.simulation.patches import Patch, Surface, box, placed, prism, rectangle
-from fgslam.simulation.texture_library import BOOK_ROWS, CARTONS, SCREENS
+from fgslam.simulation.texture_library import BINDER_ROWS, BOOK_ROWS, CARTONS, SCREENS
 
 _METAL = Surface("metal_dark", 0.8)
 _BLACK = Surface("plain_dark", 0.6)
@@ -66,7 +66,7 @@ def shelf(rng: np.random.Generator, width: float, height: float, depth: float) -
     out = box((-w, -depth, 0), (-w + 0.03, 0, height), frame)
     out += box((w - 0.03, -depth, 0), (w, 0, height), frame)
     out += box((-w, -0.02, 0), (w, 0, height), Surface("wood_dark", 0.8))
-    levels = max(int(height / 0.36), 1)
+    levels = max(int(height / 0.42), 1)
     for level in range(levels + 1):
         z = level * (height - 0.03) / levels
         out += box((-w + 0.03, -depth, z), (w - 0.03, -0.02, z + 0.03), frame)
@@ -79,13 +79,14 @@ def shelf(rng: np.random.Generator, width: float, height: float, depth: float) -
 def _shelf_load(rng: np.random.Generator, width: float, room: float, depth: float) -> list[Patch]:
     if rng.random() < 0.25:
         out = []
-        for k in range(3):
-            w, h = rng.uniform(0.2, 0.3) * width, rng.uniform(0.5, 0.95) * room
-            x = (k - 1) * width / 3 + float(rng.uniform(-0.02, 0.02))
+        for k in range(2):
+            w, h = rng.uniform(0.3, 0.45) * width, rng.uniform(0.5, 0.95) * room
+            x = (k - 0.5) * width / 2 + float(rng.uniform(-0.02, 0.02))
             size = (float(w), 0.7 * depth, float(h))
             out += placed(carton(rng, size), x, -depth / 2, 0, float(rng.uniform(-8, 8)))
         return out
-    row = Surface(_pick(rng, "books", BOOK_ROWS))
+    books = rng.random() < 0.5
+    row = Surface(_pick(rng, "books", BOOK_ROWS) if books else _pick(rng, "binders", BINDER_ROWS))
     front = -depth + float(rng.uniform(0.02, 0.09))
     w = width / 2
     return [rectangle((-w, front, room * 0.96), (width, 0, 0), (0, 0, -room * 0.96), row)]

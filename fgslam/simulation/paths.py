@@ -17,6 +17,8 @@ from fgslam.settings.lab import LabDriveSettings
 from fgslam.types import FloatArray
 
 _STEP_M = 0.004
+# Part of a turn over which its curvature rises, and again falls.
+_RAMP = 0.3
 # Speed used, as a fraction of the limits, where the number of frames is free.
 _CRUISE = 0.9
 
@@ -97,7 +99,7 @@ class Drive:
 def straights_and_turns(
     start: tuple[float, float, float], segments: Seq[tuple[float, float]], closed: bool
 ) -> PlanarPath:
-    """A curve of straights and turns whose curvature rises and falls as a raised cosine.
+    """A curve of straights and turns whose curvature rises and falls smoothly.
 
     Args:
         start: x, y, heading.
@@ -123,9 +125,26 @@ def _integrate_heading(
     for length, turn in segments:
         s = np.linspace(0.0, 1.0, max(int(np.ceil(length / _STEP_M)), 4) + 1)[1:]
         arcs.append(arcs[-1][-1] + length * s)
-        turned.append(turned[-1][-1] + turn * (s - np.sin(2 * np.pi * s) / (2 * np.pi)))
-        curvature.append(turn / length * (1.0 - np.cos(2 * np.pi * s)))
+        turned.append(turned[-1][-1] + turn * _turned_fraction(s))
+        curvature.append(turn / length * _relative_curvature(s))
     return np.concatenate(arcs), np.concatenate(turned), np.concatenate(curvature)
+
+
+def _relative_curvature(s: FloatArray) -> FloatArray:
+    """Curvature at the fraction ``s`` of a turn, its mean being 1: rises, stays, and falls."""
+    inward = np.minimum(s, 1.0 - s)
+    ramp = 0.5 * (1.0 - np.cos(np.pi * np.minimum(inward / _RAMP, 1.0)))
+    return np.asarray(ramp / (1.0 - _RAMP))
+
+
+def _turned_fraction(s: FloatArray) -> FloatArray:
+    """Integral of the relative curvature from 0 to ``s``."""
+    inward = np.minimum(s, 1.0 - s)
+    ramp = np.minimum(inward, _RAMP)
+    area = 0.5 * (ramp - _RAMP / np.pi * np.sin(np.pi * ramp / _RAMP))
+    area += np.maximum(inward - _RAMP, 0.0)
+    area /= 1.0 - _RAMP
+    return np.asarray(np.where(s <= 0.5, area, 1.0 - area))
 
 
 def through_waypoints(points: FloatArray, closed: bool) -> PlanarPath:
@@ -154,19 +173,19 @@ def through_waypoints(points: FloatArray, closed: bool) -> PlanarPath:
 
 
 def paper_loop() -> PlanarPath:
-    """Out along one side of the chair, around it and back to the start pose (S31), 17 m.
+    """Out along one side of the chair, around it and back to the start pose (S31), 17.6 m.
 
-    The robot gets 5.6 m ahead of its start, and turns through 360 degrees in all.
+    The robot gets 5.7 m ahead of its start, and turns through 360 degrees in all.
     """
-    out, turn = (4.2, 0.0), (4.4, np.pi)
-    return straights_and_turns((-2.2, -1.22, 0.0), [out, turn, out, turn], closed=True)
+    out, turn = (3.8, 0.0), (5.0, np.pi)
+    return straights_and_turns((-1.9, -1.16, 0.0), [out, turn, out, turn], closed=True)
 
 
 def room_laps(laps: int) -> PlanarPath:
-    """``laps`` times around the room between the islands and the walls, 23 m each."""
-    straight, turn = (3.2, 0.0), (2.6, np.pi / 2.0)
+    """``laps`` times around the room between the islands and the walls, 24.4 m each."""
+    straight, turn = (3.6, 0.0), (2.5, np.pi / 2.0)
     lap = [straight, turn] * 4
-    return straights_and_turns((-1.6, -3.25, 0.0), lap * laps, closed=True)
+    return straights_and_turns((-1.8, -3.3, 0.0), lap * laps, closed=True)
 
 
 # --------------------------------------------------------------------------------------------

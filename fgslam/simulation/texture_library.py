@@ -18,31 +18,34 @@ PHOTOGRAPHS = (
     "coffee",
     "chelsea",
     "rocket",
-    "grass",
     "coins",
     "hubble_deep_field",
     "page",
     "immunohistochemistry",
-    "clock",
-    "gravel",
+    "stereo_motorcycle",
+    "text",
 )
 
-BOOK_ROWS, POSTERS, SCREENS, CARTONS = 14, 8, 8, 8
+BOOK_ROWS, BINDER_ROWS, POSTERS, SCREENS, CARTONS = 14, 10, 8, 8, 8
 
 
 def build_library(rng: np.random.Generator) -> dict[str, Grey]:
     """Every texture of the lab, by name; sides are powers of two."""
     out = _materials(rng)
     for i in range(BOOK_ROWS):
-        out[f"books_{i}"] = textures.book_row(rng, 256, 1024)
+        out[f"books_{i}"] = _muted(textures.book_row(rng, 256, 1024), 0.5)
+    for i in range(BINDER_ROWS):
+        out[f"binders_{i}"] = _muted(textures.binder_row(rng, 256, 1024), 0.7)
     for i in range(POSTERS):
-        out[f"poster_{i}"] = textures.poster(rng, 512, 512)
+        out[f"poster_{i}"] = _muted(textures.poster(rng, 512, 512), 0.42)
     for i in range(SCREENS):
-        out[f"screen_{i}"] = textures.screen(rng, 256, 256)
+        out[f"screen_{i}"] = _muted(textures.screen(rng, 256, 256), 0.5)
     for i in range(CARTONS):
-        out[f"carton_{i}"] = textures.carton(rng, 256, float(rng.uniform(95.0, 165.0)))
+        out[f"carton_{i}"] = _muted(
+            textures.carton(rng, 256, float(rng.uniform(95.0, 165.0))), 0.55
+        )
     for name in PHOTOGRAPHS:
-        out[f"photo_{name}"] = photograph(name, 512)
+        out[f"photo_{name}"] = _muted(photograph(name, 512), 0.55)
     return out
 
 
@@ -55,13 +58,13 @@ def _materials(rng: np.random.Generator) -> dict[str, Grey]:
         "ceiling": textures.ceiling(rng, 1024),
         "wood_light": textures.wood(rng, 512, 150.0),
         "wood_dark": textures.wood(rng, 512, 88.0),
-        "wood_desk": textures.wood(rng, 512, 178.0),
-        "metal": textures.metal(rng, 512, 150.0),
+        "wood_desk": textures.wood(rng, 512, 145.0),
+        "metal": _muted(textures.metal(rng, 512, 150.0), 0.6),
         "metal_dark": textures.metal(rng, 512, 92.0),
         "keyboard": textures.keyboard(rng, 64, 128),
         "cloth": textures.cloth(rng, 256, 95.0),
         "shirt": textures.cloth(rng, 256, 150.0),
-        "trousers": textures.cloth(rng, 256, 60.0),
+        "trousers": _muted(textures.cloth(rng, 256, 60.0), 0.3),
         "skin": textures.plaster(rng, 64, 165.0),
         "window": textures.window_view(rng, 512, 512),
         "door": textures.panelled(rng, 512, 256, 125.0),
@@ -73,10 +76,17 @@ def _materials(rng: np.random.Generator) -> dict[str, Grey]:
 
 def photograph(name: str, side: int) -> Grey:
     """One of scikit-image's photographs as (side, side) grey levels with a white margin."""
-    image = np.asarray(getattr(import_module("skimage.data"), name)())
+    picture = getattr(import_module("skimage.data"), name)()
+    image = np.asarray(picture[0] if isinstance(picture, tuple) else picture)
     if image.ndim == 3:
         image = image[..., :3] @ np.array([0.299, 0.587, 0.114])
     return _framed(_resized(image.astype(np.float32), side))
+
+
+def _muted(image: Grey, contrast: float) -> Grey:
+    """Less contrast about the mean: prints fade, and a lab is no chessboard."""
+    mean = float(image.mean())
+    return np.asarray(mean + contrast * (image - mean), dtype=np.float32)
 
 
 def _resized(image: Grey, side: int) -> Grey:

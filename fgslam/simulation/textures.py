@@ -6,6 +6,8 @@ are tiled repeat without a seam.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
@@ -58,14 +60,14 @@ def wood(rng: np.random.Generator, size: int, base: float) -> Grey:
 def bricks(rng: np.random.Generator, size: int, rows: int) -> Grey:
     """A brick wall; each brick of its own shade, with light mortar."""
     columns = rows // 3
-    shade = 95.0 + 32.0 * rng.standard_normal((rows, columns))
+    shade = 100.0 + 15.0 * rng.standard_normal((rows, columns))
     y, x = np.mgrid[0:size, 0:size] / size
     row = (y * rows).astype(int)
     along = (x * columns + 0.5 * (row % 2)) % columns
     image = shade[row, along.astype(int)] + 9.0 * fractal_noise(rng, (size, size), 1.2)
     edge_y = np.abs((y * rows) % 1.0 - 0.5) > 0.43
     edge_x = np.abs(along % 1.0 - 0.5) > 0.475
-    image[edge_x | edge_y] = 182.0
+    image[edge_x | edge_y] = 132.0
     return _soft(image + 4.0 * fractal_noise(rng, (size, size), 0.8))
 
 
@@ -73,7 +75,7 @@ def carpet(rng: np.random.Generator, size: int) -> Grey:
     """Speckled floor tiles of two shades, with stains."""
     tiles = 10
     index = np.arange(size) * tiles // size
-    shade = 108.0 + 14.0 * rng.standard_normal((tiles, tiles)).astype(np.float32)
+    shade = 108.0 + 10.0 * rng.standard_normal((tiles, tiles)).astype(np.float32)
     image = shade[np.ix_(index, index)] + 8.0 * fractal_noise(rng, (size, size), 0.5)
     image += 9.0 * fractal_noise(rng, (size, size), 2.4)
     seam = np.diff(index, prepend=-1) != 0
@@ -104,7 +106,7 @@ def book_row(rng: np.random.Generator, height: int, width: int) -> Grey:
     image = np.full((height, width), 22.0, dtype=np.float32)
     x = 4
     while x < width - 8:
-        thick = int(rng.integers(width // 40, width // 14))
+        thick = int(rng.integers(width // 36, width // 11))
         if rng.random() < 0.08:
             x += thick
             continue
@@ -122,7 +124,7 @@ def _decorate_spine(rng: np.random.Generator, spine: Grey) -> None:
     for _ in range(int(rng.integers(1, 4))):
         row = int(rng.integers(0, max(height - 12, 1)))
         spine[row : row + int(rng.integers(3, 14))] = rng.uniform(30.0, 230.0)
-    if width > 12:
+    if width > 12 and rng.random() < 0.5:
         title = text_lines(rng, (width - 6, height), 1, 0.8)[:, : int(height * 0.6)].T
         row = int(height * 0.2)
         part = spine[row : row + title.shape[0], 3 : 3 + title.shape[1]]
@@ -130,6 +132,27 @@ def _decorate_spine(rng: np.random.Generator, spine: Grey) -> None:
         part[:] = part * (1.0 - ink) + tone * ink
     spine[:, :1] *= 0.5
     spine[:, -1:] *= 0.5
+
+
+def binder_row(rng: np.random.Generator, height: int, width: int) -> Grey:
+    """Ring binders of one make, most with a label; a gap here and there."""
+    image = np.full((height, width), 30.0, dtype=np.float32)
+    shade = float(rng.uniform(55.0, 150.0))
+    binders = int(rng.integers(9, 13))
+    edges = np.linspace(2, width - 2, binders + 1).astype(int)
+    for left, right in pairwise(edges):
+        if rng.random() < 0.12:
+            continue
+        binder = image[height // 10 :, left + 1 : right - 1]
+        binder[:] = shade + float(rng.uniform(-14.0, 14.0))
+        if rng.random() < 0.7:
+            w, h = binder.shape[1], binder.shape[0]
+            top = int(h * rng.uniform(0.15, 0.3))
+            binder[top : top + int(0.35 * h), w // 4 : w - w // 4] = rng.uniform(170.0, 220.0)
+        binder[
+            int(0.8 * height) : int(0.86 * height), binder.shape[1] // 3 : -binder.shape[1] // 3
+        ] = 35.0
+    return _soft(image + 3.0 * fractal_noise(rng, (height, width), 1.0))
 
 
 def text_lines(rng: np.random.Generator, shape: tuple[int, int], lines: int, fill: float) -> Grey:
@@ -251,7 +274,7 @@ def cloth(rng: np.random.Generator, size: int, base: float) -> Grey:
     """Patterned fabric: checks, folds and a print."""
     y, x = np.mgrid[0:size, 0:size].astype(np.float32) / size
     checks = np.sign(np.sin(2 * np.pi * 6 * x)) + np.sign(np.sin(2 * np.pi * 6 * y))
-    image = base * (1.0 + 0.16 * checks + 0.12 * fractal_noise(rng, (size, size), 2.5))
+    image = base * (1.0 + 0.08 * checks + 0.10 * fractal_noise(rng, (size, size), 2.5))
     prints = fractal_noise(rng, (size, size), 3.2) > 1.4
     image[prints] = 235.0 - image[prints]
     return _soft(image)

@@ -7,9 +7,10 @@ import numpy as np
 from fgslam import geometry
 from fgslam.settings.lab import LabRigSettings
 from fgslam.simulation.lab import build_lab, lamps
-from fgslam.simulation.lighting import bake
+from fgslam.simulation.lighting import bake, flat_light
 from fgslam.simulation.mipmap import TextureBank
 from fgslam.simulation.patches import stack
+from fgslam.simulation.person import Stance, person
 from fgslam.simulation.raycaster import RayCaster
 from fgslam.simulation.renderer import Layer, Pinhole, Renderer
 from fgslam.simulation.texture_library import build_library
@@ -46,17 +47,31 @@ def camera_offsets(rig: CameraRig) -> list[FloatArray]:
 
 
 class World:
-    """Everything that is needed to render; safe to share between threads."""
+    """Everything that is needed to render; safe to share between threads.
+
+    Attributes:
+        things: name of each object identity; the person's is the last.
+        caster: of the room without the person.
+        renderer: for the reference camera's intrinsics, which all cameras share.
+    """
 
     def __init__(self, rig: CameraRig, room_seed: int, visit: int) -> None:
         """Builds textures, room and light (a few seconds). Raises MissingDependencyError."""
         rng = np.random.default_rng([room_seed, 1])
         things = build_lab(np.random.default_rng([room_seed, 2]), visit)
-        self.bank = TextureBank(build_library(rng))
-        self.things = tuple(thing.name for thing in things)
+        self._bank = TextureBank(build_library(rng))
+        self.things = (*(thing.name for thing in things), "person")
         patches = stack(things)
         self.caster = RayCaster(patches)
         light = bake(patches, self.caster, lamps(), np.random.default_rng([room_seed, 3]))
-        self.room = Layer(patches, self.caster, light, self.bank)
+        self._room = Layer(patches, self.caster, light, self._bank)
         camera = Pinhole(rig.width, rig.height, rig.fx, rig.cx, rig.cy)
-        self.renderer = Renderer(camera, self.bank)
+        self.renderer = Renderer(camera, self._bank)
+
+    def layers(self, stance: Stance | None) -> list[Layer]:
+        """The room, and the person standing in it where there is one."""
+        if stance is None:
+            return [self._room]
+        patches = stack([person(stance)], first_thing=len(self.things) - 1)
+        light = flat_light(patches, np.array([0.3, -0.2, 1.0]))
+        return [self._room, Layer(patches, RayCaster(patches), light, self._bank)]
