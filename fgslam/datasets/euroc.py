@@ -69,7 +69,7 @@ def rectifier(right: AslCamera, left: AslCamera, alpha: float) -> Rectifier:
         right.distortion,
         size,
         rTl[:3, :3],
-        rTl[:3, 3],
+        rTl[:3, 3:],
         flags=cv2.CALIB_ZERO_DISPARITY,
         alpha=alpha,
     )

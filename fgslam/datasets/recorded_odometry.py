@@ -14,13 +14,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fgslam.datasets.tables import Table, read_table, require_increasing
-from fgslam.datasets.trajectories import covered, interpolate_poses, read_tum_table
+from fgslam.datasets.trajectories import interpolate_poses, read_tum_table
 from fgslam.errors import OdometryError
 from fgslam.geometry import inverse, rotation_angle
 from fgslam.settings.datasets import RecordedOdometrySettings
 from fgslam.types import BoolArray, FloatArray, Odometry, Trajectory
 
 SPEED_COLUMNS = ("time", "forward speed", "yaw rate")
+_POSE_HOLD_S = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,21 +74,29 @@ def _require_sane(table: Table, values: FloatArray, limit: float, what: str, uni
 def planar_poses(log: SpeedLog, at: FloatArray) -> FloatArray:
     """(x, y, yaw) (m, 3) at increasing times (m,): the path of interpolated speed and yaw rate.
 
-    Between neighbouring stamps both are linear in time, so that the trapezoid gives the exact
-    distance and turn; the chord of each piece is that of the circular arc with this length and
-    turn. Outside the log the nearest sample is held.
+    Between neighbouring stamps both are linear in time: the turn follows exactly, the path by
+    Gauss-Legendre quadrature, exact to rounding for turns below a radian between two stamps.
+    Outside the log the nearest sample is held.
     """
     times = np.union1d(log.stamps, at)
     duration = np.diff(times)
     speed, rate = (np.interp(times, log.stamps, y) for y in (log.speed, log.yaw_rate))
-    turn = duration * 0.5 * (rate[1:] + rate[:-1])
-    yaw = np.concatenate([[0.0], np.cumsum(turn)])
-    # np.sinc(x) is sin(pi x) / (pi x).
-    chord = duration * 0.5 * (speed[1:] + speed[:-1]) * np.sinc(turn / (2.0 * np.pi))
-    heading = yaw[:-1] + 0.5 * turn
-    x = np.concatenate([[0.0], np.cumsum(chord * np.cos(heading))])
-    y = np.concatenate([[0.0], np.cumsum(chord * np.sin(heading))])
+    yaw = np.concatenate([[0.0], np.cumsum(duration * 0.5 * (rate[1:] + rate[:-1]))])
+    nodes, weights = _unit_gauss_legendre()
+    speed_inside = speed[:-1, None] + np.diff(speed)[:, None] * nodes
+    turned = rate[:-1, None] * nodes + 0.5 * np.diff(rate)[:, None] * nodes**2
+    heading = yaw[:-1, None] + duration[:, None] * turned
+    x, y = (
+        np.concatenate([[0.0], np.cumsum(duration * ((speed_inside * part(heading)) @ weights))])
+        for part in (np.cos, np.sin)
+    )
     return np.column_stack([x, y, yaw])[np.searchsorted(times, at)]
+
+
+def _unit_gauss_legendre() -> tuple[FloatArray, FloatArray]:
+    """Nodes and weights (6,) of the quadrature on [0, 1]."""
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    return np.asarray(0.5 * (nodes + 1.0)), np.asarray(0.5 * weights)
 
 
 def motions_from_speed(
@@ -111,7 +120,7 @@ def motions_from_speed(
     ]
     rates = np.concatenate([np.radians(rotation), translation])
     covariances = [np.diag((rates * dt) ** 2) for dt in np.diff(frames)]
-    known = steps_covered(log.stamps, frames, settings.max_gap_s)
+    known = steps_covered(log.stamps, frames, settings.max_gap_s, settings.max_gap_s)
     return _motions(poses, covariances, known)
 
 
@@ -123,13 +132,18 @@ def _motions(
     return tuple(Odometry(m, c) if ok else None for m, c, ok in steps)
 
 
-def steps_covered(stamps: FloatArray, frames: FloatArray, max_gap: float) -> BoolArray:
-    """Which of the n - 1 steps between frames (n,) the stamps cover without a longer gap."""
-    ends = covered(stamps, frames, max_gap, max_gap)
-    gap_starts = stamps[:-1][np.diff(stamps) > max_gap]
-    # A step also fails when a gap lies wholly inside it.
-    gaps = np.diff(np.searchsorted(gap_starts, frames)) > 0
-    return np.asarray(ends[:-1] & ends[1:] & ~gaps)
+def steps_covered(stamps: FloatArray, frames: FloatArray, max_gap: float, hold: float) -> BoolArray:
+    """Which of the n - 1 steps between frames (n,) the increasing stamps (m,) cover.
+
+    A step is covered unless it overlaps a gap between stamps longer than ``max_gap`` seconds, or
+    reaches more than ``hold`` seconds beyond the first or last stamp.
+    """
+    before, after = frames[:-1], frames[1:]
+    long = np.diff(stamps) > max_gap
+    starts, ends = stamps[:-1][long], stamps[1:][long]
+    overlapped = np.searchsorted(starts, after, "left") - np.searchsorted(ends, before, "right")
+    within = (before >= stamps[0] - hold) & (after <= stamps[-1] + hold)
+    return np.asarray(within & (overlapped == 0))
 
 
 # --------------------------------------------------------------------------------------------
@@ -162,8 +176,8 @@ def motions_from_poses(
     motions = inverse(poses[:-1]) @ poses[1:]
     covariances = [_pose_noise(motion, settings) for motion in motions]
     # Unlike a speed, a pose cannot be held beyond the log's ends: that would say "no motion".
-    known = covered(log.timestamps, frames, settings.max_gap_s, 1e-3)
-    return _motions(poses, covariances, known[:-1] & known[1:])
+    known = steps_covered(log.timestamps, frames, settings.max_gap_s, _POSE_HOLD_S)
+    return _motions(poses, covariances, known)
 
 
 def _pose_noise(motion: FloatArray, settings: RecordedOdometrySettings) -> FloatArray:

@@ -27,7 +27,7 @@ CALIBRATION = {
 def picture(code: int, width: int = WIDTH, height: int = HEIGHT) -> Image:
     """An image that tells by its corner pixel which one it is; the rest is reproducible noise."""
     image = np.random.default_rng(code).integers(0, 255, (height, width), dtype=np.uint8)
-    image[0, 0] = code
+    image[0, 0] = code % 256
     return image
 
 
