@@ -30,13 +30,8 @@ def make_tracker(rig: CameraRig, settings: FrontendSettings) -> LandmarkTracker:
     """The landmark database with its matchers and the ego-motion."""
     database = LandmarkDatabase(rig, settings.database, settings.stereo.max_disparity_px)
     solver = EgoMotionSolver(rig, settings.ego_motion)
-    return LandmarkTracker(rig, database, _matchers(settings), solver)
-
-
-def _matchers(settings: FrontendSettings) -> tuple[MapMatcher, ...]:
-    """One matcher, or a wide one followed by the narrow one around the pose it gave."""
     matcher = MapMatcher(settings.matching, settings.appearance)
-    return (matcher, matcher) if settings.matching.refine else (matcher,)
+    return LandmarkTracker(rig, database, matcher, solver)
 
 
 def make_motion(sequence: Sequence, settings: OdometrySettings) -> MotionModel:

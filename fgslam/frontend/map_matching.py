@@ -34,11 +34,29 @@ class MapMatcher:
         """Takes the gates as plain values."""
         self._settings = settings
         self._appearance = appearance
+        self._limit = 0.5 * settings.max_window_px
 
     @property
     def widens(self) -> bool:
         """Whether the gates follow the predicted uncertainty."""
         return self._settings.widen_sigmas > 0.0
+
+    @property
+    def refines(self) -> bool:
+        """Whether to match a second time, around the pose found."""
+        return self._settings.refine
+
+    def match_anywhere(
+        self, expected: ExpectedLandmarks, features: StereoFeatures
+    ) -> MapMatches:
+        """Matches within the largest window, whatever the prediction claims to know."""
+        reach = np.full((len(expected), 3), self._limit)
+        return self._match_within(expected, features, reach)
+
+    @property
+    def rescues(self) -> bool:
+        """Whether :meth:`match_anywhere` is to be tried where too few match."""
+        return self._settings.rescue
 
     def match(
         self,
@@ -54,8 +72,12 @@ class MapMatcher:
             uncertainty: (v, 3) standard deviations of the predicted (column, row, disparity) by
                 which the gates are widened; None keeps the fixed window.
         """
+        return self._match_within(expected, features, self._reach(len(expected), uncertainty))
+
+    def _match_within(
+        self, expected: ExpectedLandmarks, features: StereoFeatures, reach: FloatArray
+    ) -> MapMatches:
         s = self._settings
-        reach = self._reach(len(expected), uncertainty)
         i, j = pairs_within(expected.measurement[:, 1], reach[:, 1], features.measurement[:, 1])
         offset = np.abs(features.measurement[j] - expected.measurement[i])
         near = (offset <= reach[i]).all(axis=1)
@@ -80,6 +102,4 @@ class MapMatcher:
         base = np.array([half, half, s.disparity_px])
         if uncertainty is None:
             return np.tile(base, (count, 1))
-        widened = base + s.widen_sigmas * uncertainty
-        limit = 0.5 * s.max_window_px
-        return np.minimum(widened, np.maximum(limit, base))
+        return np.minimum(base + s.widen_sigmas * uncertainty, np.maximum(self._limit, base))

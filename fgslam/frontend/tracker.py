@@ -64,30 +64,44 @@ class LandmarkTracker:
         self,
         rig: CameraRig,
         database: LandmarkDatabase,
-        matchers: tuple[MapMatcher, ...],
+        matcher: MapMatcher,
         ego_motion: EgoMotionSolver,
     ) -> None:
-        """The matchers run one after the other, each around the pose that the last one gave."""
+        """The database is shared with whoever shows or saves it."""
         self._rig = rig
         self.database = database
-        self._matchers = matchers
+        self._matcher = matcher
         self._ego_motion = ego_motion
 
     def track(
         self, prediction: Prediction, landmarks: LandmarkMap, features: StereoFeatures
     ) -> Tracked:
-        """Matches expected landmarks and solves for the pose."""
+        """Matches expected landmarks and solves for the pose; again, closer or wider, if asked to."""
         around = Prediction(self._ego_motion.constrain(prediction.wTc), prediction.covariance)
-        for matcher in self._matchers:
+        expected = self.database.expected(landmarks, around.wTc)
+        uncertainty = self._uncertainty(around, landmarks, expected)
+        matches = self._matcher.match(expected, features, uncertainty)
+        tracked = self._solve(prediction, landmarks, features, (expected, matches))
+        if self._matcher.rescues and not tracked.ego_motion.status.measured:
+            matches = self._matcher.match_anywhere(expected, features)
+            tracked = self._solve(prediction, landmarks, features, (expected, matches))
+        if self._matcher.refines and tracked.ego_motion.status.measured:
+            around = Prediction(tracked.ego_motion.wTc, tracked.ego_motion.covariance)
             expected = self.database.expected(landmarks, around.wTc)
-            uncertainty = self._uncertainty(matcher, around, landmarks, expected)
-            matches = matcher.match(expected, features, uncertainty)
-            observed = _matched(expected, matches, features)
-            problem = PoseProblem.of(landmarks, observed)
-            ego_motion = self._ego_motion.solve(prediction, problem)
-            if ego_motion.status.measured:
-                around = Prediction(ego_motion.wTc, ego_motion.covariance)
-        return Tracked(expected, matches, ego_motion)
+            uncertainty = self._uncertainty(around, landmarks, expected)
+            matches = self._matcher.match(expected, features, uncertainty)
+            tracked = self._solve(prediction, landmarks, features, (expected, matches))
+        return tracked
+
+    def _solve(
+        self,
+        prediction: Prediction,
+        landmarks: LandmarkMap,
+        features: StereoFeatures,
+        matched: tuple[ExpectedLandmarks, MapMatches],
+    ) -> Tracked:
+        problem = PoseProblem.of(landmarks, _matched(*matched, features))
+        return Tracked(*matched, self._ego_motion.solve(prediction, problem))
 
     def associate(self, tracked: Tracked, features: StereoFeatures, image: Image) -> Association:
         """Books hits and misses, starts new tracks, prunes (4.1 to 4.3)."""
@@ -111,13 +125,12 @@ class LandmarkTracker:
 
     def _uncertainty(
         self,
-        matcher: MapMatcher,
         around: Prediction,
         landmarks: LandmarkMap,
         expected: ExpectedLandmarks,
     ) -> FloatArray | None:
         """Standard deviations (v, 3) of the predicted measurements, where the matcher asks."""
-        if not matcher.widens:
+        if not self._matcher.widens:
             return None
         rows = expected.rows
         covariance = predicted_covariance(

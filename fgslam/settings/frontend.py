@@ -127,8 +127,14 @@ class MapMatchingSettings:
     refine: Annotated[
         bool,
         Field(
-            description="after a first pose from a widened search, match again around it with the "
-            "narrow window"
+            description="after a first pose, match again around it, with the smaller uncertainty"
+        ),
+    ] = False
+    rescue: Annotated[
+        bool,
+        Field(
+            description="where too few match, search the largest window (max_window_px) by "
+            "descriptor before falling back to the odometry"
         ),
     ] = False
 
