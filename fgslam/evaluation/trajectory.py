@@ -234,7 +234,12 @@ def relative_errors(
 
     Returns:
         Translations (n - delta,) in metres and rotation angles (n - delta,) in radians.
+
+    Raises:
+        ValueError: ``delta`` is less than 1.
     """
+    if delta < 1:
+        raise ValueError(f"a relative error needs a span of at least one pose, not {delta}")
     estimated_motion = inverse(estimate[:-delta]) @ estimate[delta:]
     true_motion = inverse(truth[:-delta]) @ truth[delta:]
     error = inverse(true_motion) @ estimated_motion

@@ -302,6 +302,11 @@ def test_relative_errors_do_not_depend_on_the_world() -> None:
     np.testing.assert_allclose(plain[1], aligned[1], atol=1e-12)
 
 
+def test_relative_errors_need_a_span() -> None:
+    with pytest.raises(ValueError, match="at least one pose"):
+        relative_errors(wandering(19).poses, wandering(19).poses, delta=0)
+
+
 def test_path_length_of_a_square() -> None:
     corners = [[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1], [0, 0, 0]]
     assert path_length(np.array([pose(np.eye(3), c) for c in corners])) == pytest.approx(4.0)
