@@ -186,3 +186,15 @@ class LabSettings:
     visit: Annotated[
         Literal[1, 2], Field(description="2: some furniture has been moved since the first visit")
     ] = 1
+
+
+@dataclass(frozen=True, config=STRICT)
+class RenderedLabSettings(LabSettings):
+    """The rendered lab as a recording: which of the drive's frames are used."""
+
+    kind: Literal["rendered_lab"] = "rendered_lab"
+    start: Annotated[int, Field(ge=0, description="first frame used, counted from 0")] = 0
+    stop: Annotated[
+        int | None, Field(ge=1, description="frame before which to stop; null: to the end")
+    ] = None
+    stride: Annotated[int, Field(ge=1, description="use every n-th frame")] = 1

@@ -48,6 +48,9 @@ def desk(rng: np.random.Generator, width: float, screens: int) -> list[Patch]:
         paper = Surface(f"poster_{int(rng.integers(0, 8))}")
         sheet = rectangle((-0.1, 0.14, 0.002), (0.2, 0, 0), (0, -0.28, 0), paper)
         out += placed([sheet], float(x), float(y), 0.74, float(rng.uniform(-40, 40)))
+    books = Surface(_pick(rng, "books", BOOK_ROWS))
+    row = box((-0.3, -0.09, 0.0), (0.3, 0.09, 0.25), Surface("wood_dark", 0.8), front=books)
+    out += placed(row, width / 2 - 0.34, 0.26, 0.74, float(rng.uniform(-10, 10)))
     drawers = box((-0.2, -0.3, 0.0), (0.2, 0.3, 0.6), _METAL, front=Surface("metal"))
     return out + placed(drawers, width / 2 - 0.32, 0.0, 0.0, 0.0)
 

@@ -111,6 +111,9 @@ def _on_walls(rng: np.random.Generator) -> list[Thing]:
         texture = photos.pop() if (len(out) % 2 == 0 and photos) or not prints else prints.pop()
         board = furniture.hanging(width, height, Surface(texture))
         out.append(Thing(f"poster_{len(out) + 1}", tuple(_against(board, wall, along, 0.0, z))))
+    for i, (wall, along, z, width, height) in enumerate(_PINBOARD_PLACES):
+        board = furniture.hanging(width, height, Surface(f"pinboard_{i}"))
+        out.append(Thing(f"pinboard_{i + 1}", tuple(_against(board, wall, along, 0.0, z))))
     window = furniture.hanging(1.6, 1.2, Surface("window", None, glow=1.05))
     out.append(Thing("window_1", tuple(_against(window, "south", 0.5, 0.0, 1.35))))
     door = furniture.hanging(0.95, 2.05, Surface("door"))
@@ -125,6 +128,11 @@ _POSTER_PLACES = (
     ("east", 1.7, 1.35, 1.0, 1.0), ("south", -1.2, 1.3, 0.9, 0.9), ("south", -4.0, 1.65, 0.9, 0.9),
     ("west", -3.4, 1.35, 1.0, 1.0), ("west", -2.2, 1.3, 0.9, 1.2), ("west", 0.9, 1.4, 0.9, 0.9),
     ("west", 2.2, 1.35, 1.1, 1.1), ("west", -4.4, 1.5, 0.7, 0.9), ("west", -0.3, 1.95, 1.0, 0.8),
+)  # fmt: skip
+
+_PINBOARD_PLACES = (
+    ("east", 1.03, 0.8, 0.6, 0.5), ("east", -1.65, 0.8, 0.6, 0.5), ("east", 2.55, 1.3, 0.6, 0.8),
+    ("west", 1.55, 0.8, 0.6, 0.6), ("west", -2.75, 0.8, 0.6, 0.5),
 )  # fmt: skip
 
 

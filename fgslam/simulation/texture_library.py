@@ -26,18 +26,20 @@ PHOTOGRAPHS = (
     "text",
 )
 
-BOOK_ROWS, BINDER_ROWS, POSTERS, SCREENS, CARTONS = 14, 10, 8, 8, 8
+BOOK_ROWS, BINDER_ROWS, POSTERS, PINBOARDS, SCREENS, CARTONS = 14, 10, 8, 5, 8, 8
 
 
 def build_library(rng: np.random.Generator) -> dict[str, Grey]:
     """Every texture of the lab, by name; sides are powers of two."""
     out = _materials(rng)
     for i in range(BOOK_ROWS):
-        out[f"books_{i}"] = _muted(textures.book_row(rng, 256, 1024), 0.5)
+        out[f"books_{i}"] = _muted(textures.book_row(rng, 256, 1024), 0.42)
     for i in range(BINDER_ROWS):
         out[f"binders_{i}"] = _muted(textures.binder_row(rng, 256, 1024), 0.7)
     for i in range(POSTERS):
         out[f"poster_{i}"] = _muted(textures.poster(rng, 512, 512), 0.42)
+    for i in range(PINBOARDS):
+        out[f"pinboard_{i}"] = _muted(textures.pinboard(rng, 256), 0.45)
     for i in range(SCREENS):
         out[f"screen_{i}"] = _muted(textures.screen(rng, 256, 256), 0.5)
     for i in range(CARTONS):
@@ -56,9 +58,9 @@ def _materials(rng: np.random.Generator) -> dict[str, Grey]:
         "bricks": textures.bricks(rng, 1024, 30),
         "floor": textures.carpet(rng, 2048),
         "ceiling": textures.ceiling(rng, 1024),
-        "wood_light": textures.wood(rng, 512, 150.0),
+        "wood_light": _muted(textures.wood(rng, 512, 150.0), 0.6),
         "wood_dark": textures.wood(rng, 512, 88.0),
-        "wood_desk": textures.wood(rng, 512, 145.0),
+        "wood_desk": _muted(textures.wood(rng, 512, 145.0), 0.5),
         "metal": _muted(textures.metal(rng, 512, 150.0), 0.6),
         "metal_dark": textures.metal(rng, 512, 92.0),
         "keyboard": textures.keyboard(rng, 64, 128),

@@ -204,6 +204,24 @@ def poster(rng: np.random.Generator, height: int, width: int) -> Grey:
     return _soft(paper)
 
 
+def pinboard(rng: np.random.Generator, size: int) -> Grey:
+    """Cork with pinned notes, some over others."""
+    image = 120.0 + 9.0 * fractal_noise(rng, (size, size), 0.9)
+    for _ in range(11):
+        h, w = (rng.uniform(0.16, 0.32, 2) * size).astype(int)
+        top, left = (
+            int(rng.uniform(0.03, 0.95) * (size - h)),
+            int(rng.uniform(0.03, 0.95) * (size - w)),
+        )
+        note = image[top : top + h, left : left + w]
+        note[:] = rng.uniform(150.0, 215.0)
+        note[6:, 5:] -= 90.0 * text_lines(rng, (h - 6, w - 5), max(h // 16, 1), 0.9)
+        image[top + 2 : top + 6, left + w // 2 : left + w // 2 + 4] = 35.0
+    edge = max(size // 40, 2)
+    image[:edge], image[-edge:], image[:, :edge], image[:, -edge:] = 70.0, 70.0, 70.0, 70.0
+    return _soft(image)
+
+
 def _fill_cell(rng: np.random.Generator, cell: Grey) -> None:
     kind = rng.integers(0, 3)
     if kind == 0:
