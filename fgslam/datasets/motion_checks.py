@@ -1,0 +1,134 @@
+"""Checks of odometry and ground truth: coverage, jumps, and whether the two agree."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.datasets.findings import Finding, Level, listed, share
+from fgslam.errors import DatasetError
+from fgslam.geometry import inverse, se3_log
+from fgslam.types import FloatArray, IntArray, Odometry, Sequence, Trajectory
+
+_STAMP_TOLERANCE_S = 1e-3
+_MAX_JUMP = 8.0
+_SLOWEST_JUMP_MPS = 0.5
+_MAX_NOISE_RATIO = 3.0
+_TANGENT_NAMES = (
+    "roll",
+    "pitch",
+    "yaw",
+    "forward motion",
+    "sideways motion",
+    "vertical motion",
+)
+
+
+def check_odometry(sequence: Sequence) -> tuple[Finding, ...]:
+    """Whether motions are recorded, and where they are missing."""
+    try:
+        missing = [i for i in range(1, len(sequence)) if sequence.odometry(i) is None]
+    except DatasetError as error:
+        return (Finding(Level.PROBLEM, "odometry", str(error)),)
+    steps = len(sequence) - 1
+    if len(missing) == steps:
+        text = (
+            "none recorded; set odometry.kind to constant_velocity, or synthetic if there is truth"
+        )
+        return (Finding(Level.INFO, "odometry", text),)
+    covered = Finding(Level.INFO, "odometry", f"covers {share(steps - len(missing), steps)} steps")
+    if not missing:
+        return (covered,)
+    text = f"none before frames {listed(missing)}; constant velocity stands in there"
+    return (covered, Finding(Level.WARNING, "odometry", text))
+
+
+def check_truth(sequence: Sequence) -> tuple[Finding, ...]:
+    """Whether ground truth covers the frames, its length, and jumps in it."""
+    truth = sequence.ground_truth
+    if truth is None or len(truth) == 0:
+        return (Finding(Level.INFO, "ground truth", "none, so no accuracy can be computed"),)
+    matched = int((_rows(truth.timestamps, sequence.timestamps) >= 0).sum())
+    length = float(np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1).sum())
+    found = [
+        Finding(
+            Level.INFO,
+            "ground truth",
+            f"covers {share(matched, len(sequence))} frames, path length {length:.4g} m",
+        )
+    ]
+    jumps = _jumps(truth)
+    if jumps:
+        text = (
+            f"moves suddenly before its poses {listed(jumps)}: faster than {_MAX_JUMP:g} times the "
+            "median"
+        )
+        found.append(Finding(Level.WARNING, "ground truth", text))
+    return tuple(found)
+
+
+def _jumps(truth: Trajectory) -> list[int]:
+    """Rows whose speed exceeds the median many times over."""
+    if len(truth) < 3:
+        return []
+    speed = np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1)
+    speed /= np.diff(truth.timestamps)
+    limit = max(_MAX_JUMP * float(np.median(speed)), _SLOWEST_JUMP_MPS)
+    return [int(k) + 1 for k in np.flatnonzero(speed > limit)]
+
+
+def check_odometry_against_truth(sequence: Sequence) -> tuple[Finding, ...]:
+    """Errors of the odometry's steps against the truth's, and against the stated noise.
+
+    The spread is the median absolute error, scaled to a normal distribution's standard deviation,
+    so that a few bad poses of the truth do not decide.
+    """
+    try:
+        errors, sigmas = _step_errors(sequence)
+    except DatasetError:
+        return ()  # check_odometry has told.
+    if len(errors) < 5:
+        return ()
+    spread = 1.4826 * np.median(np.abs(errors), axis=0)
+    ratio = spread / np.median(sigmas, axis=0)
+    text = (
+        f"differs from truth by {np.degrees(spread[2]):.2g} degrees in yaw and "
+        f"{100.0 * spread[3]:.2g} cm forward a step (median over {len(errors)} steps)"
+    )
+    found = [Finding(Level.INFO, "odometry against truth", text)]
+    for k in np.flatnonzero(ratio > _MAX_NOISE_RATIO):
+        text = (
+            f"the error in {_TANGENT_NAMES[k]} is {ratio[k]:.1f} times the stated noise; raise its "
+            "sigma in the odometry settings, or check mounting and time offset"
+        )
+        found.append(Finding(Level.WARNING, "odometry against truth", text))
+    return tuple(found)
+
+
+def _step_errors(sequence: Sequence) -> tuple[FloatArray, FloatArray]:
+    """Tangent errors (n, 6) of the odometry in the body's frame, and stated sigmas (n, 6)."""
+    truth = sequence.ground_truth
+    errors: list[FloatArray] = []
+    sigmas: list[FloatArray] = []
+    if truth is not None and len(truth):
+        rows = _rows(truth.timestamps, sequence.timestamps)
+        body = truth.poses @ inverse(sequence.rig.bTc)
+        for i in range(1, len(sequence)):
+            step = sequence.odometry(i)
+            if step is not None and rows[i - 1] >= 0 and rows[i] >= 0:
+                errors.append(_step_error(step, body[rows[i - 1]], body[rows[i]]))
+                sigmas.append(np.sqrt(np.diag(step.covariance)))
+    return np.array(errors).reshape(-1, 6), np.array(sigmas).reshape(-1, 6)
+
+
+def _step_error(step: Odometry, before: FloatArray, after: FloatArray) -> FloatArray:
+    return se3_log(inverse(step.motion) @ inverse(before) @ after)
+
+
+def _rows(stamps: FloatArray, frames: FloatArray) -> IntArray:
+    """Row of the stamps (m,) at each frame's stamp (n,), -1 where there is none."""
+    after = np.clip(np.searchsorted(stamps, frames), 0, len(stamps) - 1)
+    before = np.maximum(after - 1, 0)
+    closer = np.abs(stamps[before] - frames) < np.abs(stamps[after] - frames)
+    nearest = np.where(closer, before, after)
+    near = np.abs(stamps[nearest] - frames) <= _STAMP_TOLERANCE_S
+    return np.asarray(np.where(near, nearest, -1))

@@ -1,0 +1,277 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dataset_builders import curve, image_folder, picture, save, write_tum
+
+from fgslam.datasets.checks import (
+    check_calibration,
+    check_epipolar,
+    check_images,
+    check_timing,
+    inspect_sequence,
+)
+from fgslam.datasets.findings import Finding, Level
+from fgslam.datasets.image_folder import open_image_folder
+from fgslam.datasets.motion_checks import (
+    check_odometry,
+    check_odometry_against_truth,
+    check_truth,
+)
+from fgslam.datasets.recording import Recording
+from fgslam.datasets.synthetic_odometry import SyntheticOdometry
+from fgslam.settings.datasets import (
+    ImageFolderSettings,
+    RecordedOdometrySettings,
+    SyntheticOdometrySettings,
+)
+from fgslam.types import CameraRig
+
+
+def opened(root: Path, **settings: object) -> Recording:
+    return open_image_folder(ImageFolderSettings(path=str(root), **settings))  # type: ignore[arg-type]
+
+
+def texts(findings: tuple[Finding, ...], least: Level = Level.WARNING) -> str:
+    levels = [Level.INFO, Level.WARNING, Level.PROBLEM]
+    return " | ".join(f.text for f in findings if levels.index(f.level) >= levels.index(least))
+
+
+def test_sound_recording_has_facts_and_no_warning(tmp_path: Path) -> None:
+    root = image_folder(tmp_path / "sound", 20)
+    write_tum(root / "gt_right_cam.txt", 0.1 * np.arange(20), curve(20))
+    write_tum(root / "odometry.txt", 0.1 * np.arange(20), body_poses(opened(root), curve(20)))
+    inspection = inspect_sequence(opened(root))
+    assert texts(inspection.findings) == ""
+    facts = dict(inspection.facts)
+    assert facts["recording"] == "sound"
+    assert facts["frames"] == "20 over 1.9 s"
+    assert facts["rate"] == "10 Hz"
+    assert facts["cameras"] == "2, 32x24"
+    assert facts["baseline"] == "0.2 m"
+    info = texts(inspection.findings, Level.INFO)
+    assert "covers 19 of 19 (100 %) steps" in info
+    assert "covers 20 of 20 (100 %) frames, path length 9.7" in info
+    assert "differs from truth by" in info
+
+
+def body_poses(recording: Recording, cameras: np.ndarray) -> np.ndarray:
+    return cameras @ np.linalg.inv(recording.rig.bTc)
+
+
+def test_findings_come_worst_first(tmp_path: Path) -> None:
+    root = image_folder(tmp_path)
+    save(root / "left" / "000002.png", np.zeros((24, 32), np.uint8))
+    (root / "right" / "000004.png").unlink()
+    levels = [f.level for f in inspect_sequence(opened(root)).findings]
+    order = [Level.PROBLEM, Level.WARNING, Level.INFO]
+    assert levels == sorted(levels, key=order.index)
+    assert set(levels) == set(order)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (0, "the left image is all black (too dark) in 1 of 6 (16.7 %) sampled frames: 3"),
+        (255, "the left image is all white (over-exposed) in 1 of 6"),
+        (90, "the left image is all flat (without any structure) in 1 of 6"),
+    ],
+)
+def test_images_without_content(tmp_path: Path, value: int, words: str) -> None:
+    root = image_folder(tmp_path)
+    save(root / "left" / "000003.png", np.full((24, 32), value, np.uint8))
+    found = check_images(opened(root))
+    assert words in texts(found, Level.PROBLEM)
+
+
+def test_unreadable_images(tmp_path: Path) -> None:
+    root = image_folder(tmp_path)
+    (root / "right" / "000005.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    found = texts(check_images(opened(root)), Level.PROBLEM)
+    assert "1 of 6 (16.7 %) sampled frames cannot be read" in found
+    assert "right/000005.png is truncated" in found
+
+
+def test_sampling_reads_no_more_than_asked(tmp_path: Path) -> None:
+    read: list[int] = []
+    recording = opened(image_folder(tmp_path, 40))
+
+    def counted(index: int) -> tuple[np.ndarray, ...]:
+        read.append(index)
+        return recording.load_images(index)
+
+    assert check_images(replace(recording, load_images=counted), 5) == ()
+    assert read == [0, 9, 19, 29, 39]
+
+
+def test_same_camera_twice_and_unequal_brightness(tmp_path: Path) -> None:
+    root = image_folder(tmp_path)
+    for k in range(6):
+        save(root / "left" / f"{k:06d}.png", picture(10 + k))
+    assert "right and left image are identical in 6 of 6" in texts(check_images(opened(root)))
+    for k in range(6):
+        save(root / "left" / f"{k:06d}.png", picture(60 + k) // 3)
+    assert "right camera is 3" in texts(check_images(opened(root)))
+
+
+RIG = CameraRig(640, 480, 500.0, 500.0, 320.0, 240.0, 0.12, None, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("rig", "words"),
+    [
+        (replace(RIG, cx=700.0), "principal point (700.0, 240.0) lies outside the 640x480"),
+        (replace(RIG, fy=600.0), "fx and fy differ"),
+        (replace(RIG, fx=40.0, fy=40.0), "field of view of 166 degrees"),
+        (replace(RIG, fx=5e4, fy=5e4), "field of view of 1 degrees"),
+        (replace(RIG, baseline=120.0), "baseline of 120 m is unusual; is it in metres"),
+        (replace(RIG, vertical_baseline=1e-4), "vertical baseline of 0.0001 m"),
+    ],
+)
+def test_unusual_calibration(rig: CameraRig, words: str) -> None:
+    assert check_calibration(RIG) == ()
+    assert words in texts(check_calibration(rig))
+
+
+def test_gaps_in_time() -> None:
+    assert check_timing(0.1 * np.arange(9)) == ()
+    stamps = np.array([0.0, 0.1, 0.2, 0.3, 0.9, 1.0, 1.3, 1.4])
+    found = texts(check_timing(stamps))
+    assert "2 of 7 steps" in found
+    assert "0.6 s, follows frame 3" in found
+    assert "only 2 frames" in texts(check_timing(np.array([0.0, 1.0])))
+
+
+# --------------------------------------------------------------------------------------------
+# Odometry and truth
+
+
+def with_truth(root: Path, frames: int = 40) -> Path:
+    image_folder(root, frames)
+    write_tum(root / "gt_right_cam.txt", 0.1 * np.arange(frames), curve(frames))
+    return root
+
+
+def test_recording_without_odometry_and_truth(tmp_path: Path) -> None:
+    recording = opened(image_folder(tmp_path))
+    assert "none recorded; set odometry.kind" in texts(check_odometry(recording), Level.INFO)
+    assert "none, so no accuracy" in texts(check_truth(recording), Level.INFO)
+    assert check_odometry_against_truth(recording) == ()
+
+
+def test_gap_in_the_odometry(tmp_path: Path) -> None:
+    root = image_folder(tmp_path, 10)
+    (root / "odom.csv").write_text("".join(f"{t},1,0\n" for t in (0, 0.1, 0.2, 0.7, 0.8, 0.9)))
+    noise = RecordedOdometrySettings(max_gap_s=0.3)
+    recording = open_image_folder(ImageFolderSettings(path=str(root)), noise)
+    found = check_odometry(recording)
+    assert "covers 4 of 9 (44.4 %) steps" in texts(found, Level.INFO)
+    assert "none before frames 3, 4, 5, 6, 7; constant velocity" in texts(found)
+
+
+def test_broken_odometry_is_a_problem_not_an_exception(tmp_path: Path) -> None:
+    root = with_truth(tmp_path)
+    (root / "odom.csv").write_text("0,1,0\n1,nan,0\n")
+    inspection = inspect_sequence(opened(root))
+    assert "odom.csv, line 2: forward speed is nan" in texts(inspection.findings, Level.PROBLEM)
+
+
+def test_truth_that_jumps(tmp_path: Path) -> None:
+    poses = curve(30)
+    poses[12:, :3, 3] += [40.0, 0.0, 0.0]
+    root = image_folder(tmp_path, 30)
+    write_tum(root / "gt_right_cam.txt", 0.1 * np.arange(30), poses)
+    found = texts(check_truth(opened(root)))
+    assert "moves suddenly before its poses 12:" in found
+
+
+def test_sound_odometry_agrees_with_truth(tmp_path: Path) -> None:
+    recording = opened(with_truth(tmp_path))
+    synthetic = SyntheticOdometry(recording, SyntheticOdometrySettings(), 2)
+    found = check_odometry_against_truth(synthetic)
+    assert texts(found) == ""
+    assert "over 39 steps" in texts(found, Level.INFO)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "name"),
+    [
+        (lambda motion: motion @ turn(2, np.radians(4.0)), "yaw"),
+        (lambda motion: motion @ turn(0, np.radians(-4.0)), "roll"),
+        (lambda motion: motion * scaled(3, 1.3), "forward motion"),
+    ],
+)
+def test_odometry_that_contradicts_truth(
+    tmp_path: Path, spoil: Callable[[np.ndarray], np.ndarray], name: str
+) -> None:
+    recording = opened(with_truth(tmp_path))
+    synthetic = SyntheticOdometry(recording, SyntheticOdometrySettings(), 2)
+    steps = [synthetic.odometry(i) for i in range(1, 40)]
+    spoilt = tuple(replace(s, motion=spoil(s.motion)) for s in steps if s is not None)
+    bad = replace(recording, odometry_source=lambda _: spoilt)
+    assert f"the error in {name} is" in texts(check_odometry_against_truth(bad))
+
+
+def turn(axis: int, angle: float) -> np.ndarray:
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    out = np.eye(4)
+    out[a, a] = out[b, b] = np.cos(angle)
+    out[a, b], out[b, a] = -np.sin(angle), np.sin(angle)
+    return out
+
+
+def scaled(column: int, factor: float) -> np.ndarray:
+    out = np.ones((4, 4))
+    out[0, column] = factor
+    return out
+
+
+# --------------------------------------------------------------------------------------------
+# Matches
+
+
+def matches(rng: np.random.Generator, wrong: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
+    """Row offsets and disparities of 400 matches, a share of them wrong."""
+    rows, disparities = rng.normal(0.0, 0.25, 400), rng.uniform(1.0, 40.0, 400)
+    bad = rng.random(400) < wrong
+    rows[bad], disparities[bad] = rng.uniform(-90, 90, bad.sum()), rng.uniform(-90, 90, bad.sum())
+    return rows, disparities
+
+
+def test_sound_matches(rng: np.random.Generator) -> None:
+    found = check_epipolar(*matches(rng))
+    assert texts(found) == ""
+    assert "rows of 400 matches differ by" in texts(found, Level.INFO)
+
+
+def test_swapped_cameras_are_told(rng: np.random.Generator) -> None:
+    rows, disparities = matches(rng)
+    found = texts(check_epipolar(rows, -disparities), Level.PROBLEM)
+    assert "cameras look swapped: 9" in found
+    assert "swap left and right" in found
+
+
+def test_unrectified_pairs_are_told(rng: np.random.Generator) -> None:
+    rows, disparities = matches(rng)
+    found = texts(check_epipolar(rows + 2.3, disparities), Level.PROBLEM)
+    assert "rows disagree by +2.3 px" in found
+    tilted = rows + rng.uniform(-6.0, 6.0, 400)
+    assert "rows scatter by" in texts(check_epipolar(tilted, disparities), Level.PROBLEM)
+
+
+def test_negative_disparities_short_of_a_swap(rng: np.random.Generator) -> None:
+    rows, disparities = matches(rng, 0.0)
+    disparities[:120] *= -1.0
+    found = check_epipolar(rows, disparities)
+    assert texts(found, Level.PROBLEM) == ""
+    assert "30 % of matches have negative disparity" in texts(found)
+
+
+def test_too_few_matches_to_judge() -> None:
+    found = texts(check_epipolar(np.zeros(19), -np.ones(19)))
+    assert "only 19 matches" in found
+    assert "swapped" not in found
