@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from fgslam.backend.landmark_kalman import LandmarkKalman
 from fgslam.backend.protocol import Estimator
+from fgslam.config import ExperimentConfig
+from fgslam.datasets.opening import open_recording
+from fgslam.datasets.rendered_lab import RenderedLabSequence
+from fgslam.datasets.synthetic_odometry import SyntheticOdometry
 from fgslam.frontend.database import LandmarkDatabase
 from fgslam.frontend.ego_motion import EgoMotionSolver
 from fgslam.frontend.map_matching import MapMatcher
@@ -16,8 +22,35 @@ from fgslam.frontend.tracker import LandmarkTracker
 from fgslam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
 from fgslam.pipeline import SlamPipeline
 from fgslam.settings.backend import EstimatorSettings
-from fgslam.settings.datasets import ConstantVelocitySettings, OdometrySettings
+from fgslam.settings.datasets import (
+    ConstantVelocitySettings,
+    OdometrySettings,
+    RecordedOdometrySettings,
+    SyntheticOdometrySettings,
+)
+from fgslam.settings.frontend import FrontendSettings
+from fgslam.settings.lab import RenderedLabSettings
 from fgslam.types import CameraRig, Prediction, Sequence
+
+
+def open_sequence(
+    config: ExperimentConfig, progress: Callable[[int, int], None] | None = None
+) -> Sequence:
+    """Opens the recording, rendered or read, with the odometry that the configuration wants.
+
+    ``progress`` is told how many frames of a rendered recording are done, and of how many.
+    """
+    dataset = config.dataset
+    if isinstance(dataset, RenderedLabSettings):
+        sequence: Sequence = RenderedLabSequence(
+            dataset, config.seed, dataset.start, dataset.stop, dataset.stride, progress
+        )
+    else:
+        noise = config.odometry if isinstance(config.odometry, RecordedOdometrySettings) else None
+        sequence = open_recording(dataset, noise)
+    if isinstance(config.odometry, SyntheticOdometrySettings):
+        return SyntheticOdometry(sequence, config.odometry, config.seed)
+    return sequence
 
 
 def make_stream(sequence: Sequence, settings: FrontendSettings) -> FeatureStream:

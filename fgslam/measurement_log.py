@@ -6,6 +6,7 @@ rows of frame ``k`` are ``start[k]:start[k + 1]``.
 
 from __future__ import annotations
 
+import itertools
 import json
 import zipfile
 from collections.abc import Iterator
@@ -202,4 +203,4 @@ def _split_observations(arrays: StateArrays) -> list[Observations]:
         arrays["is_new"],
     )
     start = arrays["observation_start"]
-    return [everything.select(np.arange(a, b)) for a, b in zip(start[:-1], start[1:], strict=True)]
+    return [everything.select(np.arange(a, b)) for a, b in itertools.pairwise(start)]

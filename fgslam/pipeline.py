@@ -8,8 +8,6 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
-import numpy as np
-
 from fgslam.backend.protocol import Estimator
 from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
 from fgslam.frontend.stereo import StereoMatcher

@@ -91,7 +91,7 @@ class Odometry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Stamped poses of the reference camera: timestamps (n,) increasing, poses (n, 4, 4) ``wTc``."""
+    """Stamped poses of the reference camera: timestamps (n,) increasing, ``wTc`` (n, 4, 4)."""
 
     timestamps: FloatArray
     poses: FloatArray

@@ -45,7 +45,7 @@ from fgslam.types import (
 
 
 class LandmarkKalman:
-    """Estimator of kind ``landmark_kalman``; implements :class:`fgslam.backend.protocol.Estimator`."""
+    """Estimator of kind ``landmark_kalman``, on :class:`fgslam.backend.protocol.Estimator`."""
 
     kind: ClassVar[str] = "landmark_kalman"
     supports: ClassVar[frozenset[MeasurementType]] = frozenset(
@@ -110,7 +110,7 @@ class LandmarkKalman:
         return Estimate(
             Trajectory(np.array(self._timestamps), np.array(self._poses).reshape(count, 4, 4)),
             np.array(self._pose_covariances).reshape(count, 6, 6),
-            self.landmarks(),
+            LandmarkMap(self._ids, self._positions.copy(), self._covariances.copy()),
         )
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:

@@ -1,8 +1,8 @@
 """What every estimator, filter or smoother, offers.
 
-The loop is always: ``predict`` with the odometry, match against ``landmarks()``, ``update`` with the
-frame's measurements. A live run and a replay of its log call the same three, so any estimator can
-steer the front-end and any log can be given to any estimator.
+The loop is always: ``predict`` with the odometry, match against ``landmarks()``, ``update`` with
+the frame's measurements. A live run and a replay of its log call the same three, so any estimator
+can steer the front-end and any log can be given to any estimator.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from fgslam.simulation.paths import Drive, plan_drive
 from fgslam.simulation.person import Stance, make_walk
 from fgslam.simulation.render_cache import RenderCache, content_hash
 from fgslam.simulation.renderer import Layer
-from fgslam.simulation.world import World, camera_offsets, make_rig
+from fgslam.simulation.world import World, camera_offsets, make_rig, open_room
 from fgslam.types import CameraRig, FloatArray, Frame, Image, IntArray, Odometry, Trajectory
 
 RENDER_VERSION = 4
@@ -167,7 +167,7 @@ class RenderedLabSequence:
     @property
     def object_names(self) -> tuple[str, ...]:
         """Name of each object identity."""
-        return self._open_world().things
+        return self._open_world().room.things
 
     def depth(self, i: int) -> FloatArray:
         """(height, width) depth Z in metres of the reference camera's pixels; NaN when blocked."""
@@ -198,7 +198,8 @@ class RenderedLabSequence:
     def _open_world(self) -> World:
         with self._world_lock:
             if self._world is None:
-                self._world = World(self._rig, self._settings.room_seed, self._settings.visit)
+                room = open_room(self._settings.room_seed, self._settings.visit)
+                self._world = World(self._rig, room)
                 _check_clearance(self._drive, self._world, self._rig)
             return self._world
 
@@ -292,7 +293,7 @@ def _render_description(settings: LabSettings) -> dict[str, Any]:
 def _check_clearance(drive: Drive, world: World, rig: CameraRig) -> None:
     """Refuses a drive whose cameras come too near to a surface."""
     cameras = drive.body_poses(drive.timestamps) @ rig.bTc
-    distance = world.caster.distance(cameras[:, :3, 3])
+    distance = world.room.caster.distance(cameras[:, :3, 3])
     outside = np.any(np.abs(cameras[:, :2, 3]) > 5.0, axis=1)
     bad = np.flatnonzero((distance < _CLEARANCE_M) | outside)
     if len(bad):

@@ -142,8 +142,13 @@ def write_map(path: Path, points: MapPoints) -> None:
 # PLY
 
 
-def write_ply(path: Path, points: MapPoints) -> None:
+def write_ply(path: Path, points: MapPoints, remark: str = "") -> None:
     """Write a binary little-endian .ply with every property of every landmark, exactly.
+
+    Args:
+        path: the file to write, atomically.
+        points: the landmarks.
+        remark: ASCII, put into a comment of the header.
 
     Raises:
         OutputError: a landmark is not finite, an id needs more than 31 bits, or writing failed.
@@ -156,6 +161,7 @@ def write_ply(path: Path, points: MapPoints) -> None:
         records[name] = points.colours[:, column]
     _fill_bookkeeping(records, points)
     header = ["ply", "format binary_little_endian 1.0", *_PLY_COMMENTS]
+    header += [f"comment {remark}"] if remark else []
     header += [f"element vertex {len(points)}"]
     header += [
         f"property {_PLY_TYPES[_PLY_DTYPE[name].str[1:]]} {name}" for name in _PLY_DTYPE.names or ()

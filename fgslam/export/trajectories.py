@@ -51,12 +51,13 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
 # TUM
 
 
-def write_tum(path: Path, trajectory: Trajectory) -> None:
+def write_tum(path: Path, trajectory: Trajectory, remark: str = "") -> None:
     """Write lines of `timestamp tx ty tz qx qy qz qw` (seconds, metres), as evo reads them.
 
     Args:
         path: the file to write, atomically.
         trajectory: poses ``wTc``.
+        remark: put into a comment line in front.
 
     Raises:
         OutputError: a pose is not finite, or the file cannot be written.
@@ -68,7 +69,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     for row, wTc in zip(rows, trajectory.poses, strict=True):
         row[4:] = _canonical(quaternion_from_rotation(wTc[:3, :3]))
     rows[:, 1:] = _without_negative_zeros(rows[:, 1:], decimals=12)
-    write_text(path, _format_rows(rows, _TUM_FORMAT))
+    write_text(path, _comment(remark) + _format_rows(rows, _TUM_FORMAT))
 
 
 def read_tum(path: Path) -> Trajectory:
@@ -119,17 +120,21 @@ def read_kitti(path: Path) -> FloatArray:
 # Covariances
 
 
-def write_covariances(path: Path, timestamps: FloatArray, covariances: FloatArray) -> None:
+def write_covariances(
+    path: Path, timestamps: FloatArray, covariances: FloatArray, remark: str = ""
+) -> None:
     """Write the upper triangles of pose covariances, row by row, with a header naming the frame.
 
     Args:
         path: the file to write, atomically.
         timestamps: (n,) seconds.
         covariances: (n, 6, 6), [rotation, translation], in the tangent space at the estimate.
+        remark: put into a further comment line.
     """
     upper = covariances[:, _UPPER[0], _UPPER[1]]
     rows = np.column_stack([timestamps, upper + 0.0])
-    write_text(path, _COVARIANCE_HEADER + _format_rows(rows, _COVARIANCE_FORMAT))
+    header = _comment(remark) + _COVARIANCE_HEADER
+    write_text(path, header + _format_rows(rows, _COVARIANCE_FORMAT))
 
 
 def read_covariances(path: Path) -> tuple[FloatArray, FloatArray]:
@@ -150,6 +155,10 @@ def read_covariances(path: Path) -> tuple[FloatArray, FloatArray]:
 
 # --------------------------------------------------------------------------------------------
 # Rows of numbers
+
+
+def _comment(remark: str) -> str:
+    return f"# {remark}\n" if remark else ""
 
 
 def _format_rows(rows: FloatArray, row_format: str) -> str:

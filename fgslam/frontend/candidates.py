@@ -41,8 +41,7 @@ def alike(
     """Whether the pairs' scales and orientations agree within the gates (Se et al. 2.2)."""
     a, b = scale
     close = (a <= b * max_scale_ratio) & (b <= a * max_scale_ratio)
-    close &= np.abs(wrap_angle(orientation[0] - orientation[1])) <= max_angle
-    return close
+    return np.asarray(close & (np.abs(wrap_angle(orientation[0] - orientation[1])) <= max_angle))
 
 
 def descriptor_distance(a: ByteArray, b: ByteArray) -> FloatArray:
@@ -50,7 +49,7 @@ def descriptor_distance(a: ByteArray, b: ByteArray) -> FloatArray:
     # float32 represents every sum of 128 squared byte differences exactly (below 2^24).
     difference = a.astype(np.float32) - b.astype(np.float32)
     squared = np.einsum("ij,ij->i", difference, difference)
-    return np.sqrt(squared.astype(np.float64))
+    return np.asarray(np.sqrt(squared.astype(np.float64)))
 
 
 def unambiguous(i: IntArray, j: IntArray) -> BoolArray:
@@ -82,7 +81,8 @@ def choose(
     """One-to-one matches among candidate pairs that passed every gate.
 
     Args:
-        i, j: (k,) members of each pair.
+        i: (k,) first members of the pairs, indices into the first set.
+        j: (k,) second members.
         descriptors: (n, 128) and (m, 128) of both sets.
         settings: `paper` keeps unambiguous pairs; `descriptor` the mutually closest ones that
             beat the runner-up.

@@ -20,6 +20,7 @@ from fgslam.geometry import (
 )
 from fgslam.settings.frontend import DatabaseSettings
 from fgslam.types import (
+    BoolArray,
     ByteArray,
     CameraRig,
     FloatArray,
@@ -62,7 +63,7 @@ class LandmarkDatabase:
     """Landmarks' appearance and counts: hits n, misses m, consecutive misses l."""
 
     def __init__(self, rig: CameraRig, settings: DatabaseSettings, max_disparity_px: float) -> None:
-        """Starts empty (4.2). Landmarks nearer than ``max_disparity_px`` allows are not expected."""
+        """Starts empty (4.2); landmarks of more than ``max_disparity_px`` are not expected."""
         self._rig = rig
         self._settings = settings
         self._max_disparity = max_disparity_px
@@ -80,7 +81,7 @@ class LandmarkDatabase:
         return len(self.ids)
 
     @property
-    def valid(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    def valid(self) -> BoolArray:
         """(n,) landmarks seen often enough to be trusted (6.1)."""
         return self.hits >= self._settings.valid_hits
 
@@ -166,7 +167,7 @@ class LandmarkDatabase:
         for name, values in columns.items():
             setattr(self, name, np.concatenate([getattr(self, name), values]))
 
-    def _in_view(self, points: FloatArray) -> tuple[np.ndarray, FloatArray]:  # type: ignore[type-arg]
+    def _in_view(self, points: FloatArray) -> tuple[BoolArray, FloatArray]:
         depth = points[:, 2]
         front = depth > _NEAREST_DEPTH_M
         points = np.where(front[:, None], points, 1.0)
@@ -178,7 +179,7 @@ class LandmarkDatabase:
             inside = self._in_images(measurement)
         return front & inside & (measurement[:, 2] <= self._max_disparity), measurement
 
-    def _in_images(self, measurement: FloatArray) -> np.ndarray:  # type: ignore[type-arg]
+    def _in_images(self, measurement: FloatArray) -> BoolArray:
         """Whether a landmark falls inside all images of the rig, the border left out."""
         rig, border = self._rig, self._settings.border_px
         column, row, disparity = measurement.T

@@ -242,7 +242,7 @@ class EgoMotionSolver:
             information = self._information(wTc, problem)
             squared = np.einsum("ki,kij,kj->k", residual, information, residual)
             keep &= squared <= self._settings.outlier_sigmas**2
-        return keep
+        return np.asarray(keep)
 
     def _finish(
         self,
@@ -271,8 +271,8 @@ class EgoMotionSolver:
 
     def _allowed_fraction(self, correction: FloatArray) -> float:
         """Fraction of the correction that the cap lets through (section 5; S29)."""
-        rotation = np.linalg.norm(correction[:3])
-        translation = np.linalg.norm(correction[3:])
+        rotation = float(np.linalg.norm(correction[:3]))
+        translation = float(np.linalg.norm(correction[3:]))
         return float(
             min(
                 1.0,
@@ -283,7 +283,7 @@ class EgoMotionSolver:
 
     def _covariance(self, wTc: FloatArray, hessian: FloatArray) -> FloatArray:
         basis = self.basis(wTc)
-        return congruence(basis, np.linalg.inv(basis.T @ hessian @ basis))
+        return congruence(basis, _inverse_spd(basis.T @ hessian @ basis))
 
     def _fall_back(
         self, prediction: Prediction, problem: PoseProblem, status: EgoMotionStatus

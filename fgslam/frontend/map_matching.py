@@ -46,9 +46,7 @@ class MapMatcher:
         """Whether to match a second time, around the pose found."""
         return self._settings.refine
 
-    def match_anywhere(
-        self, expected: ExpectedLandmarks, features: StereoFeatures
-    ) -> MapMatches:
+    def match_anywhere(self, expected: ExpectedLandmarks, features: StereoFeatures) -> MapMatches:
         """Matches within the largest window, whatever the prediction claims to know."""
         reach = np.full((len(expected), 3), self._limit)
         return self._match_within(expected, features, reach)
@@ -102,4 +100,5 @@ class MapMatcher:
         base = np.array([half, half, s.disparity_px])
         if uncertainty is None:
             return np.tile(base, (count, 1))
-        return np.minimum(base + s.widen_sigmas * uncertainty, np.maximum(self._limit, base))
+        widened = base + s.widen_sigmas * uncertainty
+        return np.asarray(np.minimum(widened, np.maximum(self._limit, base)))

@@ -11,7 +11,7 @@ import numpy as np
 from fgslam.frontend.candidates import alike, choose, pairs_within
 from fgslam.geometry import triangulate, triangulation_covariance
 from fgslam.settings.frontend import AppearanceSettings, StereoSettings
-from fgslam.types import CameraRig, FloatArray, Features, IntArray, StereoFeatures
+from fgslam.types import CameraRig, Features, FloatArray, IntArray, StereoFeatures
 
 
 class StereoMatcher:
@@ -119,7 +119,7 @@ def measurement_map(kind: str, cameras: int, vertical_to_horizontal: float) -> F
     if cameras == 3:
         model[5, 2] = 1.0 / vertical_to_horizontal  # and the top camera's row
     if kind == "fused":
-        return np.linalg.pinv(model)
+        return np.asarray(np.linalg.pinv(model), np.float64)
     out = np.zeros((3, 2 * cameras))
     out[0, 0] = out[1, 1] = 1.0
     # Weights inverse to the variances; one half each where both baselines are equal.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -46,7 +46,7 @@ class FeatureStream:
         self._sequence = sequence
         self._extract = extract
 
-    def __call__(self, start: int = 0) -> Iterator[FeatureFrame]:
+    def __call__(self, start: int = 0) -> Generator[FeatureFrame, None, None]:
         """Yields frames ``start`` and after; stops its threads when closed."""
         pool = ThreadPoolExecutor(os.cpu_count() or 1)
         waiting: deque[tuple[int, Future[tuple[Frame | str, float]]]] = deque()

@@ -76,7 +76,7 @@ class LandmarkTracker:
     def track(
         self, prediction: Prediction, landmarks: LandmarkMap, features: StereoFeatures
     ) -> Tracked:
-        """Matches expected landmarks and solves for the pose; again, closer or wider, if asked to."""
+        """Matches expected landmarks and solves for the pose; wider or closer again if asked."""
         around = Prediction(self._ego_motion.constrain(prediction.wTc), prediction.covariance)
         expected = self.database.expected(landmarks, around.wTc)
         uncertainty = self._uncertainty(around, landmarks, expected)

@@ -72,7 +72,7 @@ class StereoSettings:
     pixel_sigma: Annotated[
         float,
         Field(gt=0.0, description="standard deviation of a SIFT coordinate, pixels"),
-    ] = 0.35
+    ] = 0.3
 
 
 @dataclass(frozen=True, config=STRICT)

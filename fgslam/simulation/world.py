@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from fgslam import geometry
@@ -46,32 +48,45 @@ def camera_offsets(rig: CameraRig) -> list[FloatArray]:
     return [geometry.pose(np.eye(3), np.array(offset)) for offset in offsets]
 
 
-class World:
-    """Everything that is needed to render; safe to share between threads.
+class Room:
+    """The furnished room with its light and textures, as at one visit; the same for every rig.
 
     Attributes:
         things: name of each object identity; the person's is the last.
         caster: of the room without the person.
-        renderer: for the reference camera's intrinsics, which all cameras share.
+        bank: all textures, the person's among them.
+        layer: the room, ready to be shaded.
     """
 
-    def __init__(self, rig: CameraRig, room_seed: int, visit: int) -> None:
-        """Builds textures, room and light (a few seconds). Raises MissingDependencyError."""
-        rng = np.random.default_rng([room_seed, 1])
+    def __init__(self, room_seed: int, visit: int) -> None:
+        """Builds textures, furniture and light. Raises MissingDependencyError without Open3D."""
         things = build_lab(np.random.default_rng([room_seed, 2]), visit)
-        self._bank = TextureBank(build_library(rng))
-        self.things = (*(thing.name for thing in things), "person")
         patches = stack(things)
+        self.things = (*(thing.name for thing in things), "person")
         self.caster = RayCaster(patches)
+        self.bank = TextureBank(build_library(np.random.default_rng([room_seed, 1])))
         light = bake(patches, self.caster, lamps(), np.random.default_rng([room_seed, 3]))
-        self._room = Layer(patches, self.caster, light, self._bank)
+        self.layer = Layer(patches, self.caster, light, self.bank)
+
+
+@lru_cache(maxsize=2)
+def open_room(room_seed: int, visit: int) -> Room:
+    """The room, kept for the next sequence that is rendered in it (some 70 MB each)."""
+    return Room(room_seed, visit)
+
+
+class World:
+    """A room seen by a rig's cameras; safe to share between threads."""
+
+    def __init__(self, rig: CameraRig, room: Room) -> None:
+        self.room = room
         camera = Pinhole(rig.width, rig.height, rig.fx, rig.cx, rig.cy)
-        self.renderer = Renderer(camera, self._bank)
+        self.renderer = Renderer(camera, room.bank)
 
     def layers(self, stance: Stance | None) -> list[Layer]:
         """The room, and the person standing in it where there is one."""
         if stance is None:
-            return [self._room]
-        patches = stack([person(stance)], first_thing=len(self.things) - 1)
+            return [self.room.layer]
+        patches = stack([person(stance)], first_thing=len(self.room.things) - 1)
         light = flat_light(patches, np.array([0.3, -0.2, 1.0]))
-        return [self._room, Layer(patches, RayCaster(patches), light, self._bank)]
+        return [self.room.layer, Layer(patches, RayCaster(patches), light, self.room.bank)]

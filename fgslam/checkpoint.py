@@ -1,0 +1,77 @@
+"""The state of a run on disk, so that it can be resumed to the same bytes."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.errors import OutputError
+from fgslam.export.atomic import write_bytes
+from fgslam.measurement_log import MeasurementLog, load_arrays
+from fgslam.pipeline import SlamPipeline
+from fgslam.recorder import RunRecorder
+from fgslam.types import StateArrays
+
+STATE_FILE = "checkpoint.npz"
+LOG_FILE = "measurements.npz"
+
+
+def save(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
+    """Writes log and state; the log first, so that it never lacks a frame of the state."""
+    save_log(folder, recorder.log)
+    parts = {
+        "database": pipeline.tracker.database.state(),
+        "estimator": pipeline.estimator.state(),
+        "motion": pipeline.motion.state(),
+        "recorder": recorder.state(),
+    }
+    write_arrays(
+        folder / STATE_FILE,
+        {
+            f"{part}/{name}": array
+            for part, arrays in parts.items()
+            for name, array in arrays.items()
+        },
+    )
+
+
+def save_log(folder: Path, log: MeasurementLog) -> None:
+    """Writes the measurement log."""
+    write_arrays(folder / LOG_FILE, log.to_arrays())
+
+
+def load(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
+    """Continues from a checkpoint; raises OutputError where there is none."""
+    if not (folder / STATE_FILE).is_file():
+        raise OutputError(
+            f"{folder}: nothing to resume (no {STATE_FILE}): the run has finished, or never got "
+            "to its first checkpoint; use --overwrite to run again"
+        )
+    state = load_arrays(folder / STATE_FILE)
+    log = MeasurementLog.load(folder / LOG_FILE)
+    pipeline.tracker.database.restore(_part(state, "database"))
+    pipeline.estimator.restore(_part(state, "estimator"))
+    pipeline.motion.restore(_part(state, "motion"))
+    recorder.restore(_part(state, "recorder"), log)
+
+
+def write_arrays(path: Path, arrays: StateArrays) -> None:
+    """Writes an uncompressed ``.npz``, atomically; the same arrays give the same bytes."""
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def _part(state: StateArrays, part: str) -> StateArrays:
+    return {
+        name.removeprefix(f"{part}/"): array
+        for name, array in state.items()
+        if name.startswith(f"{part}/")
+    }
+
+
+def remove(folder: Path) -> None:
+    """Drops the state once the run has finished."""
+    (folder / STATE_FILE).unlink(missing_ok=True)

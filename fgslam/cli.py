@@ -1,0 +1,163 @@
+"""The command line: thin commands, heavy imports inside them, errors caught once."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fgslam.errors import FgslamError
+
+if TYPE_CHECKING:
+    from fgslam.experiment import Progress
+
+EXIT_USER = 2
+EXIT_FAULT = 1
+EXIT_INTERRUPTED = 130  # as a shell reports a process that Ctrl-C ended
+
+app = typer.Typer(
+    name="fgslam",
+    help="Stereo, trinocular and omnidirectional SLAM: filters and smoothers on one log.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+@app.callback()
+def _root() -> None:
+    """Filters and smoothers on one measurement log."""
+
+
+@app.command()
+def run(
+    config: Annotated[Path, typer.Argument(help="experiment, e.g. experiments/lab_loop.yaml")],
+    out: Annotated[
+        Path | None, typer.Option(help="the run folder itself; default runs/NAME")
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="A.B=VALUE", help="override one key; may be repeated"),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier run")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="continue an interrupted run to the same bytes")
+    ] = False,
+) -> None:
+    """Run an experiment: images in, run folder out.
+
+    Ctrl-C ends it early with all files valid; --resume goes on from there.
+    """
+    from fgslam.config import load_config
+    from fgslam.console import progress_bar, show_result
+    from fgslam.errors import ConfigError
+    from fgslam.experiment import run_experiment
+
+    if overwrite and resume:
+        raise ConfigError("--overwrite and --resume exclude each other; give one of them")
+    settings = load_config(config, overrides or ())
+    folder = out or Path("runs") / settings.name
+    with _stop_flag() as stopped, progress_bar() as progress:
+        result = run_experiment(
+            settings,
+            folder,
+            "resume" if resume else "overwrite" if overwrite else "refuse",
+            _stoppable(progress, stopped),
+            stopped,
+        )
+    show_result(result, config)
+    if result.status == "interrupted":
+        raise typer.Exit(EXIT_INTERRUPTED)
+
+
+@app.command()
+def export(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="a run folder")],
+    map_file: Annotated[
+        Path | None, typer.Option("--map", help="landmarks as .ply, .pcd or .off (Geomview)")
+    ] = None,
+    trajectory: Annotated[Path | None, typer.Option(help="camera poses as .tum or .kitti")] = None,
+    estimator: Annotated[
+        str | None, typer.Option(help="which estimator's; default the only one there is")
+    ] = None,
+    valid_only: Annotated[
+        bool, typer.Option("--valid-only", help="landmarks seen in at least three frames")
+    ] = False,
+) -> None:
+    """Hand a run's map and trajectory to other tools."""
+    from fgslam.exporting import export_run
+
+    for line in export_run(run_folder, map_file, trajectory, estimator, valid_only):
+        typer.echo(line)
+
+
+@app.command()
+def inspect(
+    dataset: Annotated[
+        Path, typer.Argument(help="a recording's folder, or an experiment's .yaml for its data set")
+    ],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="A.B=VALUE", help="override one key of the experiment"),
+    ] = None,
+    frames: Annotated[
+        int, typer.Option(min=1, help="how many frames to look at, spread over the recording")
+    ] = 12,
+) -> None:
+    """Say what is in a recording, and every problem found, in words."""
+    from fgslam.console import progress_bar
+    from fgslam.inspection import inspect_recording
+
+    with _stop_flag() as stopped, progress_bar() as progress:
+        report = inspect_recording(dataset, overrides or (), frames, _stoppable(progress, stopped))
+    typer.echo(report)
+
+
+def main() -> None:
+    """Entry point: runs a command, turns FgslamError into one line and exit status 2."""
+    try:
+        app()
+    except FgslamError as error:
+        print(f"fgslam: {error}", file=sys.stderr)
+        raise SystemExit(EXIT_USER) from None
+    except KeyboardInterrupt:
+        print("fgslam: interrupted", file=sys.stderr)
+        raise SystemExit(EXIT_INTERRUPTED) from None
+    except BrokenPipeError:
+        raise SystemExit(EXIT_FAULT) from None
+
+
+@contextmanager
+def _stop_flag() -> Iterator[Callable[[], bool]]:
+    """Turns the first Ctrl-C or TERM into a flag; the second Ctrl-C ends at once."""
+    raised = False
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        nonlocal raised
+        if raised:
+            raise KeyboardInterrupt
+        raised = True
+
+    before = {n: signal.signal(n, handle) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: raised
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _stoppable(progress: Progress, stopped: Callable[[], bool]) -> Progress:
+    """While frames are rendered there is no run to save yet: stopping just ends it."""
+
+    def tell(what: str, done: int, total: int) -> None:
+        if what != "tracking" and stopped():
+            raise KeyboardInterrupt
+        progress(what, done, total)
+
+    return tell

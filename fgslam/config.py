@@ -1,0 +1,185 @@
+"""The experiment's configuration: strict, each field with its unit and meaning.
+
+Values come from one YAML file and dotted overrides. Unknown keys are refused with the nearest
+known one suggested.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
+
+from fgslam.errors import ConfigError
+from fgslam.settings.backend import EstimatorSettings, LandmarkKalmanSettings
+from fgslam.settings.datasets import (
+    EurocSettings,
+    ImageFolderSettings,
+    KittiSettings,
+    LightFieldSettings,
+    OdometrySettings,
+    RecordedOdometrySettings,
+)
+from fgslam.settings.frontend import FrontendSettings
+from fgslam.settings.lab import RenderedLabSettings
+from fgslam.settings.output import OutputSettings
+
+DatasetSettings: TypeAlias = Annotated[
+    RenderedLabSettings | ImageFolderSettings | KittiSettings | EurocSettings | LightFieldSettings,
+    Field(discriminator="kind"),
+]
+
+
+class ExperimentConfig(BaseModel):
+    """One experiment."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    name: Annotated[
+        str, Field(pattern=r"^[\w.-]+$", description="short name; the default run folder's")
+    ]
+    seed: Annotated[int, Field(ge=0, description="of everything random in the run")] = 0
+    dataset: DatasetSettings
+    odometry: OdometrySettings = RecordedOdometrySettings()
+    frontend: FrontendSettings = FrontendSettings()
+    estimator: EstimatorSettings = LandmarkKalmanSettings()
+    output: OutputSettings = OutputSettings()
+    provenance: Annotated[
+        dict[str, Any] | None,
+        Field(description="written into a run's own config.yaml: versions and data; not read"),
+    ] = None
+
+    def as_values(self) -> dict[str, Any]:
+        """Plain values for YAML or JSON, every default filled in."""
+        return self.model_dump(mode="json", exclude={"provenance"})
+
+
+def load_config(path: Path, overrides: Iterable[str] = ()) -> ExperimentConfig:
+    """Reads a configuration file and applies ``a.b=value`` overrides.
+
+    Raises:
+        ConfigError: the file is missing or no YAML mapping, or a key or value is wrong.
+    """
+    values = _read_mapping(path)
+    for override in overrides:
+        _apply(values, override)
+    return parse_config(values, str(path))
+
+
+def parse_config(values: Mapping[str, Any], where: str) -> ExperimentConfig:
+    """Checks plain values against the schema; ``where`` names their source in messages."""
+    try:
+        return ExperimentConfig.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(_describe(error.errors(), where)) from None
+
+
+def _read_mapping(path: Path) -> dict[str, Any]:
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; give a YAML file, e.g. of experiments/") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error}); give a YAML text file") from None
+    except yaml.YAMLError as error:
+        message = " ".join(str(error).split())
+        raise ConfigError(f"{path}: not valid YAML ({message}); mend that line") from None
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: holds no `key: value` pairs; see experiments/ for examples")
+    return values
+
+
+def _apply(values: dict[str, Any], override: str) -> None:
+    """Sets one dotted key, e.g. ``frontend.sift.octave_layers=3``; the value is YAML."""
+    dotted, separator, text = override.partition("=")
+    keys = dotted.strip().split(".")
+    if not separator or not all(keys):
+        raise ConfigError(f"--set {override}: not of the form a.b=value; e.g. --set seed=3")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise ConfigError(f"--set {override}: the value is not valid YAML; quote it") from None
+    at = values
+    for key in keys[:-1]:
+        inner = at.setdefault(key, {})
+        if not isinstance(inner, dict):
+            raise ConfigError(f"--set {override}: {key} holds a value, not a group of keys")
+        at = inner
+    at[keys[-1]] = value
+
+
+# --------------------------------------------------------------------------------------------
+# Messages
+
+
+def _describe(errors: list[ErrorDetails], where: str) -> str:
+    unknown = ("extra_forbidden", "unexpected_keyword_argument")
+    # A misspelt key also leaves the right one missing; the misspelling is the cause.
+    first = sorted(errors, key=lambda e: e["type"] not in unknown)[0]
+    schema = ExperimentConfig.model_json_schema()
+    names = [str(part) for part in first["loc"]]
+    key = ".".join(_without_tags(schema, names))
+    more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+    if first["type"] in unknown:
+        return f"{where}: unknown key {key}{_suggestion(schema, names)}{more}"
+    if first["type"] in ("missing", "missing_argument"):
+        return f"{where}: key {key} is missing; add it{more}"
+    if first["type"] == "union_tag_not_found":
+        return f"{where}: {key}.kind is missing; add one of {_kinds(schema, names)}{more}"
+    if first["type"] == "union_tag_invalid":
+        kinds, tag = _kinds(schema, names), first["ctx"]["tag"]
+        return f"{where}: {key}.kind is {tag!r}; use one of {kinds}{more}"
+    return f"{where}: {key} = {first['input']!r} is not usable: {first['msg']}{more}"
+
+
+def _kinds(schema: dict[str, Any], names: list[str]) -> str:
+    _, nodes = _descend(schema, names)
+    return ", ".join(str(n["properties"]["kind"]["const"]) for n in nodes)
+
+
+def _nodes(schema: dict[str, Any], node: dict[str, Any]) -> list[dict[str, Any]]:
+    """The object schemas that a schema node may stand for."""
+    if "$ref" in node:
+        return _nodes(schema, schema["$defs"][node["$ref"].rsplit("/", 1)[-1]])
+    inner = [*node.get("oneOf", []), *node.get("anyOf", []), *node.get("allOf", [])]
+    if inner:
+        return [found for part in inner for found in _nodes(schema, part)]
+    return [node]
+
+
+def _descend(schema: dict[str, Any], names: list[str]) -> tuple[list[str], list[dict[str, Any]]]:
+    """Follows a location through the schema, dropping the tags of unions on the way."""
+    nodes, kept = [schema], []
+    for name in names:
+        found = [n["properties"][name] for n in nodes if name in n.get("properties", {})]
+        if not found:
+            tagged = [n for n in nodes if _has_tag(n, name)]
+            if not tagged:
+                break
+            nodes = tagged
+            continue
+        kept.append(name)
+        nodes = [inner for node in found for inner in _nodes(schema, node)]
+    return kept, nodes
+
+
+def _has_tag(node: dict[str, Any], tag: str) -> bool:
+    kind = node.get("properties", {}).get("kind", {})
+    return bool(kind.get("const") == tag)
+
+
+def _without_tags(schema: dict[str, Any], names: list[str]) -> list[str]:
+    kept, nodes = _descend(schema, names[:-1])
+    return kept if any(_has_tag(n, names[-1]) for n in nodes) else [*kept, names[-1]]
+
+
+def _suggestion(schema: dict[str, Any], names: list[str]) -> str:
+    _, nodes = _descend(schema, names[:-1])
+    known = sorted({key for node in nodes for key in node.get("properties", {})})
+    close = difflib.get_close_matches(names[-1], known, n=1, cutoff=0.5)
+    return f"; did you mean {close[0]}?" if close else f"; known here: {', '.join(known)}"

@@ -1,0 +1,138 @@
+"""What a person sees in the terminal: progress and the summary of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from fgslam.summary import run_numbers
+
+if TYPE_CHECKING:
+    from fgslam.experiment import Progress as Tell
+    from fgslam.experiment import RunResult
+
+
+@contextmanager
+def progress_bar() -> Iterator[Tell]:
+    """A bar on standard error for each stage of the work."""
+    columns = (
+        TextColumn("{task.description:>10}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+        tasks: dict[str, int] = {}
+
+        def tell(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what] = int(bars.add_task(what, total=total))
+            bars.update(tasks[what], completed=done, total=total)  # type: ignore[arg-type]
+
+        yield tell
+
+
+def show_result(result: RunResult, config: Path) -> None:
+    """Summary table and where everything is."""
+    console = Console()
+    console.print(_table(result))
+    folder = result.folder
+    kind = result.outputs.kind
+    # Paths are printed plain, so that they can be copied whatever the terminal's width.
+    console.out(f"trajectory  {folder / kind / 'final.tum'}")
+    console.out(f"map         {folder / kind / 'map.ply'}")
+    if result.pictures:
+        console.out(f"pictures    {result.pictures[0].parent}{'/'}")
+    console.out(f"metrics     {folder / 'metrics.json'}")
+    if result.status == "interrupted":
+        command = f"fgslam run {config} --out {folder} --resume"
+        console.out(f"interrupted after {len(result.outputs.recorder)} frames; go on: {command}")
+
+
+def _table(result: RunResult) -> Table:
+    outputs, metrics = result.outputs, result.metrics
+    numbers = run_numbers(outputs.recorder)
+    remark = f"\n{outputs.remark}" if outputs.remark else ""
+    table = Table(title=f"{outputs.config.name}: {outputs.kind}{remark}", show_header=False)
+    matches = numbers["landmark_matches"]
+    rows: list[tuple[str, object]] = [
+        ("frames", f"{len(outputs.recorder)} of {len(outputs.sequence)}"),
+        ("pose found from", _counts(numbers["status_counts"])),
+        ("landmarks", metrics.landmarks),
+        ("landmarks matched, median (5 %)", _spread(matches)),
+        ("ATE rms, SE3 aligned", _metres(metrics.ate_rmse_m)),
+        ("RPE a frame", f"{_metres(metrics.rpe_trans_m)}, {_degrees(metrics.rpe_rot_deg)}"),
+        ("end error, first pose aligned", _end(result)),
+        ("end against start", _start(result)),
+        ("drift", "unknown" if metrics.drift_percent is None else f"{metrics.drift_percent:.2f} %"),
+        ("pose NEES per dof", _nees(result)),
+        ("loop without SIFT, median", _milliseconds(numbers["loop_ms"])),
+    ]
+    for name, value in rows:
+        table.add_row(name, str(value))
+    return table
+
+
+def _metres(value: float | None) -> str:
+    if value is None:
+        return "unknown"
+    return f"{100.0 * value:.2f} cm" if value < 1.0 else f"{value:.3f} m"
+
+
+def _degrees(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3f} deg"
+
+
+def _counts(counts: object) -> str:
+    if not isinstance(counts, dict):
+        return "unknown"
+    return ", ".join(f"{name} {count}" for name, count in counts.items())
+
+
+def _spread(spread: object) -> str:
+    if not isinstance(spread, dict):
+        return "none"
+    return f"{spread['median']:.0f} ({spread['p05']:.0f})"
+
+
+def _milliseconds(times: object) -> str:
+    known = isinstance(times, dict) and times["median"] is not None
+    return f"{times['median']:.1f} ms" if known and isinstance(times, dict) else "unknown"
+
+
+def _end(result: RunResult) -> str:
+    metrics = result.metrics
+    if metrics.end_error_m is None:
+        return "unknown"
+    return f"{_metres(metrics.end_error_m)}, {_degrees(metrics.end_error_deg)}"
+
+
+def _start(result: RunResult) -> str:
+    end = result.metrics.more.get("end_against_start")
+    if not isinstance(end, dict):
+        return "unknown"
+    return (
+        f"{end['x_cm']:.2f}, {end['y_cm']:.2f}, {end['z_cm']:.2f} cm; yaw {end['yaw_deg']:.2f}, "
+        f"pitch {end['pitch_deg']:.2f}, roll {end['roll_deg']:.2f} deg"
+    )
+
+
+def _nees(result: RunResult) -> str:
+    found = result.metrics.more.get("nees_pose")
+    if not isinstance(found, dict):
+        return "unknown"
+    return f"{found['per_dof']:.1f}: {found['verdict']} (band {found['lower']:.2f}-{found['upper']:.2f})"

@@ -1,0 +1,180 @@
+"""Runs one experiment: images in, run folder out; interruptible and resumable."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol, runtime_checkable
+
+import numpy as np
+
+from fgslam import checkpoint, run_pictures
+from fgslam.config import ExperimentConfig, load_config
+from fgslam.errors import ConfigError, DatasetError
+from fgslam.export.atomic import ExistingFolder, create_run_folder
+from fgslam.export.metrics import EstimatorMetrics
+from fgslam.factory import make_pipeline, make_stream, open_sequence
+from fgslam.frontend.stream import FeatureFrame
+from fgslam.measurement_log import MeasurementLog
+from fgslam.outputs import RunOutputs
+from fgslam.pipeline import FrameReport
+from fgslam.recorder import RunRecorder
+from fgslam.types import FloatArray, Sequence, StereoFeatures
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is under way, how much is done, and of how much."""
+
+_PRECISION_EVERY = 10  # frames between checks of stereo matches against rendered depth
+_PRECISION_PX = 1.5  # disparity error of a correct match; a SIFT match's noise is a tenth of it
+
+
+@runtime_checkable
+class TrueDepth(Protocol):
+    """A recording whose exact depth is known."""
+
+    def depth(self, i: int) -> FloatArray:
+        """Depth (height, width) of the reference image of frame ``i``, metres."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunResult:
+    """How a run ended."""
+
+    folder: Path
+    status: Literal["finished", "interrupted"]
+    metrics: EstimatorMetrics
+    pictures: tuple[Path, ...]
+    outputs: RunOutputs
+
+
+def run_experiment(
+    config: ExperimentConfig,
+    folder: Path,
+    existing: ExistingFolder = "refuse",
+    progress: Progress = lambda what, done, total: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> RunResult:
+    """Runs a configuration into a run folder.
+
+    Args:
+        config: the experiment.
+        folder: the run folder itself.
+        existing: what to do where it holds a run already.
+        progress: told after each frame.
+        stopped: asked after each frame; True ends the run early, resumable, with all files valid.
+
+    Raises:
+        FgslamError: of any kind, with a message for the user.
+    """
+    if existing == "resume":
+        _require_same(config, folder)
+    sequence = open_sequence(config, lambda done, total: progress("rendering", done, total))
+    _require_odometry(config, sequence)
+    create_run_folder(folder, existing)
+    pipeline = make_pipeline(sequence, config.frontend, config.odometry, config.estimator)
+    recorder = RunRecorder(MeasurementLog(sequence.rig, pipeline.motion.description()))
+    outputs = RunOutputs(folder, config, sequence, pipeline, recorder)
+    if existing == "resume":
+        checkpoint.load(folder, pipeline, recorder)
+    else:
+        outputs.write_config()
+    complete = _loop(outputs, progress, stopped)
+    return _finish(outputs, complete)
+
+
+def _loop(outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]) -> bool:
+    """Processes the remaining frames; False when stopped before the last one."""
+    sequence, recorder = outputs.sequence, outputs.recorder
+    shown = (
+        run_pictures.frames_to_show(len(sequence))
+        if outputs.config.output.pictures
+        else frozenset()
+    )
+    stream = make_stream(sequence, outputs.config.frontend)(start=len(recorder))
+    saved = waiting = time.perf_counter()
+    try:
+        for found in stream:
+            wait_ms = 1e3 * (time.perf_counter() - waiting)
+            report = _process(outputs, found)
+            recorder.add(report, wait_ms, _stereo_precision(sequence, found.i, report.stereo))
+            if found.i in shown:
+                run_pictures.draw_frame(outputs, found.i, report)
+            progress("tracking", len(recorder), len(sequence))
+            done = len(recorder) == len(sequence)
+            due = time.perf_counter() - saved >= outputs.config.output.checkpoint_seconds
+            if not done and (due or stopped()):
+                save_progress(outputs)
+                saved = time.perf_counter()
+            if stopped() and not done:
+                return False
+            waiting = time.perf_counter()
+    finally:
+        stream.close()
+    return True
+
+
+def save_progress(outputs: RunOutputs) -> None:
+    """All results so far, in valid files, and the state to resume from."""
+    outputs.write_results("interrupted")
+    checkpoint.save(outputs.folder, outputs.pipeline, outputs.recorder)
+
+
+def _process(outputs: RunOutputs, found: FeatureFrame) -> FrameReport:
+    timestamp = float(outputs.sequence.timestamps[found.i])
+    index = found.i if found.frame is None else found.frame.index
+    return outputs.pipeline.process(found, index, timestamp)
+
+
+def _finish(outputs: RunOutputs, complete: bool) -> RunResult:
+    pictures: tuple[Path, ...] = ()
+    if not complete:
+        metrics = outputs.write_results("interrupted")
+        return RunResult(outputs.folder, "interrupted", metrics, pictures, outputs)
+    metrics = outputs.write_results("finished")
+    if outputs.config.output.pictures:
+        pictures = tuple(run_pictures.draw_run(outputs))
+    checkpoint.remove(outputs.folder)
+    return RunResult(outputs.folder, "finished", metrics, pictures, outputs)
+
+
+def _stereo_precision(sequence: Sequence, i: int, stereo: StereoFeatures) -> float:
+    """Fraction of stereo matches whose disparity is the rendered one's, every tenth frame.
+
+    The nearest of the four pixels around a feature decides: at an edge of depth either side is
+    right.
+    """
+    if i % _PRECISION_EVERY or not isinstance(sequence, TrueDepth) or not len(stereo):
+        return float("nan")
+    depth = sequence.depth(i)
+    height, width = depth.shape
+    low = np.floor(stereo.measurement[:, :2]).astype(np.int64)
+    columns = np.clip(low[:, 0, None] + [0, 1, 0, 1], 0, width - 1)
+    rows = np.clip(low[:, 1, None] + [0, 0, 1, 1], 0, height - 1)
+    rig = sequence.rig
+    true = rig.fx * rig.baseline / depth[rows, columns]
+    error = np.abs(true - stereo.measurement[:, 2:]).min(axis=1)
+    return float(np.mean(error <= _PRECISION_PX))
+
+
+def _require_odometry(config: ExperimentConfig, sequence: Sequence) -> None:
+    """Says before the start, not at frame 1, that a recording lacks odometry."""
+    if config.odometry.kind != "recorded" or len(sequence) < 2:
+        return
+    if all(sequence.odometry(i) is None for i in range(1, len(sequence))):
+        raise DatasetError(
+            f"{sequence.name} has no odometry; set odometry.kind to constant_velocity, or to "
+            "synthetic where there is ground truth"
+        )
+
+
+def _require_same(config: ExperimentConfig, folder: Path) -> None:
+    """A run resumes only with the configuration that it was started with."""
+    path = folder / "config.yaml"
+    if path.is_file() and load_config(path).as_values() != config.as_values():
+        raise ConfigError(
+            f"{path}: differs from the configuration given; resume with the same one "
+            f"(fgslam run {path} --resume) or start again with --overwrite"
+        )

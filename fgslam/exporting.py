@@ -1,0 +1,53 @@
+"""Hands a run's results to other tools, from the files of its run folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fgslam.errors import ConfigError, DatasetError
+from fgslam.export.atomic import is_run_folder
+from fgslam.export.point_cloud import read_ply, write_map
+from fgslam.export.trajectories import read_tum, write_trajectory
+
+
+def export_run(
+    run: Path,
+    map_file: Path | None,
+    trajectory_file: Path | None,
+    estimator: str | None,
+    valid_only: bool,
+) -> list[str]:
+    """Writes what was asked for; returns a line about each file.
+
+    Raises:
+        FgslamError: nothing asked for, no run there, or an ending that is not known.
+    """
+    if map_file is None and trajectory_file is None:
+        raise ConfigError("nothing to export; give --map FILE.ply or --trajectory FILE.tum")
+    folder = run / _estimator_of(run, estimator)
+    lines = []
+    if map_file is not None:
+        points = read_ply(folder / "map.ply")
+        if valid_only:
+            points = points.select(points.valid)
+        write_map(map_file, points)
+        lines.append(f"{map_file}: {len(points)} landmarks")
+    if trajectory_file is not None:
+        trajectory = read_tum(folder / "final.tum")
+        write_trajectory(trajectory_file, trajectory)
+        lines.append(f"{trajectory_file}: {len(trajectory)} poses")
+    return lines
+
+
+def _estimator_of(run: Path, wanted: str | None) -> str:
+    if not is_run_folder(run):
+        raise DatasetError(f"{run}: not a run folder (no config.yaml); give what fgslam run wrote")
+    found = sorted(path.parent.name for path in run.glob("*/final.tum"))
+    if not found:
+        raise DatasetError(f"{run}: holds no results yet; resume the run first")
+    if wanted is None and len(found) == 1:
+        return found[0]
+    if wanted not in found:
+        asked = f"no estimator {wanted!r}" if wanted else "several estimators"
+        raise ConfigError(f"{run}: {asked}; give --estimator with one of {', '.join(found)}")
+    return wanted

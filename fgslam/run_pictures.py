@@ -1,0 +1,112 @@
+"""Chooses what of a run to draw: the paper's figures 1 to 6, and the curves over time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.evaluation.trajectory import to_estimate_world
+from fgslam.export.atomic import make_subfolder
+from fgslam.export.pictures import (
+    MapDrawing,
+    draw_birds_eye,
+    draw_disparities,
+    draw_errors,
+    draw_features,
+    draw_flow,
+    draw_map_views,
+    draw_matches,
+)
+from fgslam.export.pictures.birds_eye import world_position_covariances
+from fgslam.outputs import RunOutputs
+from fgslam.pipeline import FrameReport
+from fgslam.types import Increment, IntArray
+
+FOLDER = "pictures"
+_SHOWN = (0.0, 60 / 249, 120 / 249, 180 / 249)
+"""Frames shown, as parts of the run: those of the paper's Figure 4."""
+
+
+def frames_to_show(count: int) -> frozenset[int]:
+    """Which of ``count`` frames are drawn, each with the one after the first for its flow."""
+    return frozenset({round(part * count) for part in _SHOWN} | {1}) & frozenset(range(count))
+
+
+def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
+    """Features (Fig. 1), disparities (Fig. 2) and flow from the frame before (Fig. 3)."""
+    if report.found.frame is None:
+        return
+    folder = make_subfolder(outputs.folder, FOLDER)
+    images = report.found.frame.images
+    title = _title(outputs, f"frame {report.increment.index}")
+    draw_features(folder / f"features_{i:06d}.png", images, report.found.features, title)
+    draw_disparities(folder / f"disparities_{i:06d}.png", images[0], report.stereo.pixels, title)
+    if len(outputs.recorder.log) > 1:
+        earlier, now = outputs.recorder.log.increments[-2:]
+        a, b = _common(earlier, now)
+        before = earlier.observations.measurement[a, :2]
+        after = now.observations.measurement[b, :2]
+        draw_flow(folder / f"flow_{i:06d}.png", images[0], before, after, title)
+
+
+def draw_run(outputs: RunOutputs) -> list[Path]:
+    """Map from above (Fig. 5), in perspective (Fig. 6), errors and matches over time."""
+    folder = make_subfolder(outputs.folder, FOLDER)
+    drawing = _map_drawing(outputs)
+    draw_birds_eye(folder / "map_from_above.png", drawing)
+    draw_map_views(folder / "map_views.png", drawing)
+    recorder = outputs.recorder
+    frames = np.array([increment.index for increment in recorder.log])
+    draw_matches(
+        folder / "matches.png",
+        frames,
+        recorder.column("matched"),
+        recorder.column("inliers"),
+        recorder.column("landmarks"),
+        _title(outputs, "landmark matches"),
+    )
+    found = outputs.position_errors()
+    if found is not None:
+        timestamps, errors, rows = found
+        estimate = outputs.pipeline.estimator.estimate()
+        covariances = world_position_covariances(
+            estimate.trajectory.poses[rows], estimate.covariances[rows]
+        )
+        sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+        title = _title(outputs, "position error, first pose aligned")
+        draw_errors(folder / "position_error.png", timestamps, errors, sigmas, title)
+    return sorted(folder.glob("*.png"))
+
+
+def _map_drawing(outputs: RunOutputs) -> MapDrawing:
+    """Valid landmarks only (6.1), as in the paper's Figure 6; all while the run is too short."""
+    estimate = outputs.pipeline.estimator.estimate()
+    database = outputs.pipeline.tracker.database
+    valid = database.valid[database.rows(estimate.landmarks.ids)]
+    shown = valid if valid.any() else np.ones_like(valid)
+    truth = outputs.sequence.ground_truth
+    found = None if truth is None else to_estimate_world(estimate.trajectory, truth)
+    return MapDrawing(
+        landmarks=estimate.landmarks.positions[shown],
+        poses=estimate.trajectory.poses,
+        landmark_covariances=estimate.landmarks.covariances[shown],
+        pose_covariances=estimate.covariances,
+        truth=None if found is None else found[1],
+        title=_title(outputs, f"{int(shown.sum())} valid landmarks"),
+    )
+
+
+def _common(earlier: Increment, now: Increment) -> tuple[IntArray, IntArray]:
+    """Rows of the landmarks that both frames saw, rejected ones left out."""
+    _, a, b = np.intersect1d(
+        earlier.observations.ids[~earlier.rejected],
+        now.observations.ids[~now.rejected],
+        return_indices=True,
+    )
+    return np.flatnonzero(~earlier.rejected)[a], np.flatnonzero(~now.rejected)[b]
+
+
+def _title(outputs: RunOutputs, what: str) -> str:
+    synthetic = ", synthetic odometry" if outputs.remark else ""
+    return f"{outputs.config.name}: {what}{synthetic}"

@@ -1,0 +1,24 @@
+"""Settings of what a run writes."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fgslam.settings.base import STRICT
+
+
+@dataclass(frozen=True, config=STRICT)
+class OutputSettings:
+    """Pictures and checkpoints."""
+
+    pictures: Annotated[bool, Field(description="draw the pictures of the run folder")] = True
+    checkpoint_seconds: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="write all results so far this often, for --resume; 0: after each frame",
+        ),
+    ] = 2.0
