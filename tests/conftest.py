@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 from hypothesis import settings
+
+from fgslam.errors import MissingDependencyError
+from fgslam.simulation.open3d_library import load_open3d
 
 # A red test must be red again on the next run, and slow machines must not make one red.
 settings.register_profile("fgslam", derandomize=True, deadline=None, print_blob=True)
@@ -21,6 +25,15 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"no recordings at {SHARED_DATA}: this test needs real data")
     return SHARED_DATA
+
+
+@pytest.fixture(scope="session")
+def open3d() -> ModuleType:
+    """Open3D; skips the test on machines that lack a system library of it."""
+    try:
+        return load_open3d()
+    except MissingDependencyError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture

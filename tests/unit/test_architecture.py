@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -199,9 +200,13 @@ def test_every_layer_of_the_design_exists() -> None:
     assert STAGES | (BASE - {"measurement_log"}) | {"backend"} <= layers
 
 
-def test_the_lower_layers_load_no_heavy_library() -> None:
+@pytest.mark.parametrize("module", ["types", "geometry", "measurement_log", "config", "cli"])
+def test_light_modules_load_no_heavy_library(module: str) -> None:
+    # `fgslam --help` must answer at once, and work where a library cannot be loaded.
+    if importlib.util.find_spec(f"fgslam.{module}") is None:
+        pytest.skip(f"fgslam.{module} is not written yet")
     script = (
-        "import sys, fgslam.types, fgslam.geometry, fgslam.errors\n"
+        f"import sys, fgslam.{module}\n"
         "print([m for m in ('cv2', 'gtsam', 'open3d', 'matplotlib', 'scipy') if m in sys.modules])"
     )
     done = subprocess.run(  # noqa: S603 - our own interpreter and our own script
