@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.datasets.calibration import level_mounting, read_calibration
+from fgslam.datasets.calibration import level_mounting, read_calibration, read_json_object
 from fgslam.datasets.images import list_numbered_images
 from fgslam.datasets.recorded_odometry import (
     motions_from_poses,
@@ -66,7 +66,11 @@ def open_image_folder(
         timestamps=stamps[chosen],
         identity=recording_identity(defining, (p for images in listed for p in images.values())),
         ground_truth=None if truth is None else trajectory_at_frames(truth, stamps[chosen]),
-        notes=missing_notes(files, stamps) + _unlisted(folders, listed, numbers),
+        notes=(
+            missing_notes(files, stamps)
+            + _unlisted(folders, listed, numbers)
+            + _missing_top(root, settings.use_top)
+        ),
         indices=chosen,
         load_images=files.load,
         odometry_source=_odometry_source(odometry_file, odometry),
@@ -148,6 +152,14 @@ def _unlisted(
         (f.name, len(images.keys() - known)) for f, images in zip(folders, listed, strict=True)
     ]
     return tuple(f"{n} images of {name}/ are not in times.txt and unused" for name, n in extra if n)
+
+
+def _missing_top(root: Path, use_top: bool) -> tuple[str, ...]:
+    """A note where the calibration has a third camera but the folder has none."""
+    stated = "vertical_baseline_m" in read_json_object(root / "calib.json")
+    if not (use_top and stated) or (root / "top").is_dir():
+        return ()
+    return ("calib.json states a vertical baseline but there is no top/: read as two cameras",)
 
 
 def _read_truth(root: Path, baseline: float) -> Trajectory | None:

@@ -27,7 +27,7 @@ from fgslam.types import FloatArray
 
 pytestmark = pytest.mark.data
 
-# Where KITTI's calibration puts the right grey camera seen from its GPS/IMU unit.
+# Where KITTI's sensor set-up puts the right grey camera, seen from its GPS/IMU unit.
 KITTI_LEVER_ARM = (1.08, -0.86, 0.72)
 
 

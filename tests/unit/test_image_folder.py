@@ -322,6 +322,14 @@ def test_truth_with_a_bad_quaternion_names_the_line(tmp_path: Path) -> None:
     assert_one_line(str(error.value), "gt_left_cam.txt, line 3", "quaternion", "order")
 
 
+def test_calibrated_top_camera_without_images_is_noted(tmp_path: Path) -> None:
+    root = image_folder(tmp_path, top=True)
+    (root / "top").rename(root / "Top")
+    assert opened(root).rig.cameras == 2
+    assert "no top/: read as two cameras" in opened(root).notes[0]
+    assert opened(root, use_top=False).notes == ()
+
+
 def test_unlisted_images_are_noted(tmp_path: Path) -> None:
     root = image_folder(tmp_path)
     save(root / "left" / "000017.png", picture(1))
