@@ -13,7 +13,11 @@ import yaml
 
 from fgslam.datasets.calibration import is_rigid
 from fgslam.datasets.tables import Table, read_lines, read_table, require_increasing
-from fgslam.datasets.trajectories import poses_from_quaternions, require_unit_quaternions
+from fgslam.datasets.trajectories import (
+    nearest_rows,
+    poses_from_quaternions,
+    require_unit_quaternions,
+)
 from fgslam.errors import CalibrationError, DatasetError
 from fgslam.geometry import inverse
 from fgslam.types import FloatArray, IntArray, Trajectory
@@ -166,9 +170,9 @@ def pair_frames(
     Raises:
         DatasetError: no pair is left.
     """
-    partner = _nearest(left.stamps, right.stamps)
+    partner = nearest_rows(left.stamps, right.stamps)
     rows = np.arange(len(right.stamps))
-    mutual = _nearest(right.stamps, left.stamps)[partner] == rows
+    mutual = nearest_rows(right.stamps, left.stamps)[partner] == rows
     close = np.abs(left.stamps[partner] - right.stamps) <= round(tolerance / NANOSECONDS)
     kept = rows[mutual & close]
     if len(kept) == 0:
@@ -183,14 +187,6 @@ def pair_frames(
         if n
     )
     return (kept, partner[kept]), notes
-
-
-def _nearest(stamps: IntArray, at: IntArray) -> IntArray:
-    """Row of the increasing stamps (n,) nearest to each of ``at`` (m,)."""
-    after = np.clip(np.searchsorted(stamps, at), 0, len(stamps) - 1)
-    before = np.maximum(after - 1, 0)
-    closer = np.abs(stamps[before] - at) <= np.abs(stamps[after] - at)
-    return np.asarray(np.where(closer, before, after))
 
 
 def read_body_truth(folder: Path) -> Trajectory | None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.datasets.findings import Finding, Level, listed, share
+from fgslam.datasets.trajectories import rows_at
 from fgslam.errors import DatasetError
 from fgslam.geometry import inverse, se3_log
-from fgslam.types import FloatArray, IntArray, Odometry, Sequence, Trajectory
+from fgslam.types import FloatArray, Odometry, Sequence, Trajectory
 
 _STAMP_TOLERANCE_S = 1e-3
 _MAX_JUMP = 8.0
@@ -47,7 +48,7 @@ def check_truth(sequence: Sequence) -> tuple[Finding, ...]:
     truth = sequence.ground_truth
     if truth is None or len(truth) == 0:
         return (Finding(Level.INFO, "ground truth", "none, so no accuracy can be computed"),)
-    matched = int((_rows(truth.timestamps, sequence.timestamps) >= 0).sum())
+    matched = int((rows_at(truth.timestamps, sequence.timestamps, _STAMP_TOLERANCE_S) >= 0).sum())
     length = float(np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1).sum())
     found = [
         Finding(
@@ -110,7 +111,7 @@ def _step_errors(sequence: Sequence) -> tuple[FloatArray, FloatArray]:
     errors: list[FloatArray] = []
     sigmas: list[FloatArray] = []
     if truth is not None and len(truth):
-        rows = _rows(truth.timestamps, sequence.timestamps)
+        rows = rows_at(truth.timestamps, sequence.timestamps, _STAMP_TOLERANCE_S)
         body = truth.poses @ inverse(sequence.rig.bTc)
         for i in range(1, len(sequence)):
             step = sequence.odometry(i)
@@ -122,13 +123,3 @@ def _step_errors(sequence: Sequence) -> tuple[FloatArray, FloatArray]:
 
 def _step_error(step: Odometry, before: FloatArray, after: FloatArray) -> FloatArray:
     return se3_log(inverse(step.motion) @ inverse(before) @ after)
-
-
-def _rows(stamps: FloatArray, frames: FloatArray) -> IntArray:
-    """Row of the stamps (m,) at each frame's stamp (n,), -1 where there is none."""
-    after = np.clip(np.searchsorted(stamps, frames), 0, len(stamps) - 1)
-    before = np.maximum(after - 1, 0)
-    closer = np.abs(stamps[before] - frames) < np.abs(stamps[after] - frames)
-    nearest = np.where(closer, before, after)
-    near = np.abs(stamps[nearest] - frames) <= _STAMP_TOLERANCE_S
-    return np.asarray(np.where(near, nearest, -1))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.datasets.trajectories import rows_at
 from fgslam.errors import DatasetError
 from fgslam.geometry import inverse, se3_exp
 from fgslam.settings.datasets import SyntheticOdometrySettings
-from fgslam.types import CameraRig, FloatArray, Frame, IntArray, Odometry, Sequence, Trajectory
+from fgslam.types import CameraRig, FloatArray, Frame, Odometry, Sequence, Trajectory
 
 _STAMP_TOLERANCE_S = 1e-6
 
@@ -36,7 +37,9 @@ class SyntheticOdometry:
         self._seed = seed
         self._truth = sequence.ground_truth
         # Row of the truth at each frame, -1 where there is none.
-        self._rows = _rows_at(sequence.ground_truth.timestamps, sequence.timestamps)
+        self._rows = rows_at(
+            sequence.ground_truth.timestamps, sequence.timestamps, _STAMP_TOLERANCE_S
+        )
 
     @property
     def name(self) -> str:
@@ -107,12 +110,3 @@ class SyntheticOdometry:
         # Stamps identify frames whatever the selection; microseconds are what files keep.
         pair = np.round(self.timestamps[i - 1 : i + 1] * 1e6).astype(np.int64)
         return np.random.default_rng([self._seed, *(int(t) % 2**63 for t in pair)])
-
-
-def _rows_at(stamps: FloatArray, frames: FloatArray) -> IntArray:
-    """Row (n,) of the stamps (m,) that equals each frame stamp (n,), or -1."""
-    after = np.clip(np.searchsorted(stamps, frames), 0, len(stamps) - 1)
-    before = np.maximum(after - 1, 0)
-    closer = np.abs(stamps[before] - frames) < np.abs(stamps[after] - frames)
-    nearest = np.where(closer, before, after)
-    return np.where(np.abs(stamps[nearest] - frames) <= _STAMP_TOLERANCE_S, nearest, -1)

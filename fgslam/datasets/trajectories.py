@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from fgslam.datasets.tables import Table, read_table, require_increasing
 from fgslam.errors import DatasetError
-from fgslam.types import BoolArray, FloatArray, Trajectory
+from fgslam.types import BoolArray, FloatArray, IntArray, Trajectory
 
 TUM_COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 _QUATERNION_TOLERANCE = 0.01
+
+AnyStamps = TypeVar("AnyStamps", FloatArray, IntArray)
+"""Stamps in seconds, or in whole nanoseconds, which are compared without rounding."""
 
 
 def poses_from_quaternions(positions: FloatArray, quaternions: FloatArray) -> FloatArray:
@@ -51,6 +55,20 @@ def read_tum_table(
     require_unit_quaternions(table, table.values[:, 4:8], error)
     poses = poses_from_quaternions(table.values[:, 1:4], table.values[:, 4:8])
     return table, Trajectory(table.column(0), poses)
+
+
+def nearest_rows(stamps: AnyStamps, at: AnyStamps) -> IntArray:
+    """Row of the increasing stamps (n,), n >= 1, nearest to each of ``at`` (m,)."""
+    after = np.clip(np.searchsorted(stamps, at), 0, len(stamps) - 1)
+    before = np.maximum(after - 1, 0)
+    closer = np.abs(stamps[before] - at) <= np.abs(stamps[after] - at)
+    return np.asarray(np.where(closer, before, after), np.int64)
+
+
+def rows_at(stamps: FloatArray, at: FloatArray, tolerance: float) -> IntArray:
+    """Row of the stamps (n,) within ``tolerance`` seconds of each of ``at`` (m,), or -1."""
+    nearest = nearest_rows(stamps, at)
+    return np.asarray(np.where(np.abs(stamps[nearest] - at) <= tolerance, nearest, -1))
 
 
 def covered(stamps: FloatArray, at: FloatArray, max_gap: float, tolerance: float) -> BoolArray:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,34 @@ def test_gap_wholly_inside_one_step() -> None:
     stamps = np.array([0.0, 0.1, 0.9, 1.0])
     np.testing.assert_array_equal(steps_covered(stamps, np.array([0.05, 0.95]), 0.5, 0.5), [False])
     np.testing.assert_array_equal(steps_covered(stamps, np.array([0.05, 0.95]), 0.8, 0.5), [True])
+
+
+@given(
+    stamps=st.lists(st.integers(0, 60), min_size=2, max_size=12, unique=True),
+    frames=st.lists(st.integers(-10, 70), min_size=2, max_size=8, unique=True),
+    gap=st.integers(1, 20),
+    hold=st.integers(0, 10),
+)
+def test_covered_steps_are_those_without_an_unbridged_moment(
+    stamps: list[int], frames: list[int], gap: int, hold: int
+) -> None:
+    """Against the definition, moment by moment: every half second of a step must be covered."""
+    times, at = np.sort(np.array(stamps, float)), np.sort(np.array(frames, float))
+
+    def moment_covered(t: float) -> bool:
+        if t < times[0] or t > times[-1]:
+            return bool(min(abs(t - times[0]), abs(t - times[-1])) <= hold)
+        return any(a <= t <= b and b - a <= gap for a, b in pairwise(times))
+
+    expected = [
+        all(moment_covered(t) for t in np.arange(a + 0.25, b, 0.5)) and at_ends(times, a, b, hold)
+        for a, b in pairwise(at)
+    ]
+    np.testing.assert_array_equal(steps_covered(times, at, gap, hold), expected)
+
+
+def at_ends(stamps: FloatArray, before: float, after: float, hold: float) -> bool:
+    return bool(before >= stamps[0] - hold and after <= stamps[-1] + hold)
 
 
 def with_speeds(root: Path, frames: int = 6, row: str = "{t:.2f},5.0,0.1,9.9\n") -> Path:
