@@ -15,6 +15,7 @@ from dataset_builders import (
 )
 
 from fgslam.datasets.image_folder import open_image_folder
+from fgslam.datasets.images import read_grey_image
 from fgslam.datasets.recording import Recording
 from fgslam.errors import CalibrationError, DatasetError, FgslamError, FrameError
 from fgslam.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, right_from_left_camera
@@ -192,6 +193,20 @@ def test_damaged_image_is_refused(tmp_path: Path, damage: object, words: list[st
     with pytest.raises(FrameError) as error:
         recording.frame(2)
     assert_one_line(str(error.value), "right/000002.png", *words)
+
+
+def test_png_cut_between_its_data_chunks_is_refused(tmp_path: Path) -> None:
+    """The decoder would fill in grey: all chunks that are left are sound."""
+    path = tmp_path / "noise.png"
+    save(path, picture(3, 300, 200))
+    data = path.read_bytes()
+    chunks = [at for at in range(len(data)) if data[at : at + 4] == b"IDAT"]
+    assert len(chunks) > 2
+    np.testing.assert_array_equal(read_grey_image(path), picture(3, 300, 200))
+    for cut in (chunks[1] - 4, chunks[2] - 4, len(data) - 12, len(data) - 1):
+        path.write_bytes(data[:cut])
+        with pytest.raises(FrameError, match=f"truncated at {cut} bytes"):
+            read_grey_image(path)
 
 
 def test_truncated_jpeg_is_refused(tmp_path: Path) -> None:
