@@ -17,13 +17,13 @@ from fgslam.types import FloatArray, IntArray
 
 Float32 = npt.NDArray[np.float32]
 
-_SPACING_M = 0.18
-_MAX_CELLS = 56
+_SPACING_M = 0.09
+_MAX_CELLS = 120
 _AMBIENT = 0.42
 _CORNER_REACH_M = 0.7
 _CORNER_RAYS = 24
 _LAMP_SAMPLES = 3
-_LAMP_POWER = 4.2
+_LAMP_POWER = 3.6
 # Light is measured this far before a surface: a poster must not darken the wall it hangs on.
 _LIFT_M = 0.015
 

@@ -37,7 +37,8 @@ def plaster(rng: np.random.Generator, size: int, base: float) -> Grey:
         row, column = rng.integers(0, size, 2)
         height, width = rng.integers(2, 12, 2)
         marks[row : row + height, column : column + width] -= rng.uniform(15.0, 90.0)
-    return np.asarray(image + ndimage.gaussian_filter(marks, 1.0, mode="wrap"), dtype=np.float32)
+    image += ndimage.gaussian_filter(marks, 1.0, mode="wrap")
+    return np.asarray(np.clip(image, 4.0, 250.0), dtype=np.float32)
 
 
 def wood(rng: np.random.Generator, size: int, base: float) -> Grey:
