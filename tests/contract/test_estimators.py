@@ -1,0 +1,359 @@
+"""What every estimator must do, whatever its kind: the contract of ``backend.protocol.Estimator``.
+
+All settings that make a different estimator are listed in ``SETTINGS``; a new kind is added there.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from fgslam import geometry as g
+from fgslam.backend.protocol import Estimator
+from fgslam.errors import EstimatorError
+from fgslam.factory import make_estimator
+from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.motion import ConstantVelocityMotion
+from fgslam.pipeline import replay_step
+from fgslam.settings.backend import EstimatorSettings, LandmarkKalmanSettings
+from fgslam.settings.datasets import ConstantVelocitySettings
+from fgslam.settings.frontend import EgoMotionSettings
+from fgslam.types import (
+    BoolArray,
+    CameraRig,
+    EgoMotion,
+    EgoMotionStatus,
+    FloatArray,
+    Increment,
+    IntArray,
+    MeasurementType,
+    Observations,
+    Odometry,
+    Prediction,
+)
+
+SETTINGS: dict[str, EstimatorSettings] = {
+    "landmark_kalman": LandmarkKalmanSettings(),
+    "landmark_kalman, world update": LandmarkKalmanSettings(update="world"),
+    "landmark_kalman, running mean": LandmarkKalmanSettings(update="running_mean"),
+    "landmark_kalman, half": LandmarkKalmanSettings(update="half"),
+}
+RIG = CameraRig(
+    width=320,
+    height=240,
+    fx=277.0,
+    fy=277.0,
+    cx=159.5,
+    cy=119.5,
+    baseline=0.1,
+    vertical_baseline=0.1,
+    bTc=g.BODY_FORWARD_LEFT_UP_FROM_CAMERA,
+)
+NOISE_PX = np.array([0.3, 0.3, 0.2])
+STEP = g.se3_exp(np.array([0.0, 0.03, 0.0, 0.01, 0.0, 0.08]))
+ODOMETRY_SIGMA = np.array([0.005, 0.005, 0.005, 0.01, 0.01, 0.01])
+FRAMES = 12
+PRUNED = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class World:
+    """A drive past known points: the truth and the measurements that it gives."""
+
+    poses: list[FloatArray]
+    points: FloatArray
+    increments: list[Increment]
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    rng = np.random.default_rng(7)
+    depth = rng.uniform(1.5, 6.0, 150)
+    rays = np.column_stack([rng.uniform(-0.8, 1.2, 150), rng.uniform(-0.4, 0.4, 150)])
+    points = np.column_stack([rays * depth[:, None], depth])
+    poses = [np.linalg.matrix_power(STEP, k) for k in range(FRAMES)]
+    measured = [g.project(RIG, g.transform_to_camera(wTc, points)) for wTc in poses]
+    visible = np.array([inside_image(m) for m in measured])
+    seen = visible & (rng.uniform(size=visible.shape) < 0.85)
+    # Identities are given in the order of first sight, as the database does.
+    first = np.where(seen.any(axis=0), seen.argmax(axis=0), FRAMES)
+    order = np.argsort(first, kind="stable")
+    noisy = [m[order] + NOISE_PX * rng.standard_normal(m.shape) for m in measured]
+    first = first[order]
+    increments = [
+        make_increment(k, first, visible[k, order], seen[k, order], noisy[k], rng)
+        for k in range(FRAMES)
+    ]
+    return World(poses, points[order], increments)
+
+
+def inside_image(measured: FloatArray) -> BoolArray:
+    low, high = np.array([5.0, 5.0]), np.array([RIG.width - 6.0, RIG.height - 6.0])
+    return np.asarray(((measured[:, :2] > low) & (measured[:, :2] < high)).all(axis=1))
+
+
+def make_increment(
+    k: int,
+    first: IntArray,
+    visible: BoolArray,
+    seen: BoolArray,
+    noisy: FloatArray,
+    rng: np.random.Generator,
+) -> Increment:
+    """Frame ``k``; landmark ``PRUNED`` is dropped after frame 8 and never seen again."""
+    alive = np.ones(len(first), np.bool_)
+    alive[PRUNED] = k <= 8
+    matched = np.flatnonzero(seen & alive & (first < k))
+    new = np.flatnonzero(seen & (first == k))
+    drawn = g.se3_exp(ODOMETRY_SIGMA * rng.standard_normal(6))
+    return Increment(
+        index=2 * k,
+        timestamp=0.5 * k,
+        odometry=None if k == 0 else Odometry(STEP @ drawn, np.diag(ODOMETRY_SIGMA**2)),
+        observations=observations(matched, noisy, False).join(observations(new, noisy, True)),
+        rejected=np.zeros(len(matched) + len(new), np.bool_),
+        missed_ids=np.flatnonzero(visible & ~seen & alive & (first < k)),
+        pruned_ids=np.array([PRUNED] if k == 8 else [], np.int64),
+    )
+
+
+def observations(ids: IntArray, measured: FloatArray, is_new: bool) -> Observations:
+    column, row, disparity = measured[ids].T
+    right = np.column_stack([column, row])
+    left, top = right + np.outer(disparity, [1, 0]), right + np.outer(disparity, [0, 1])
+    return Observations(
+        ids,
+        measured[ids],
+        np.tile(np.diag(NOISE_PX**2), (len(ids), 1, 1)),
+        np.stack([right, left, top], axis=1),
+        np.full(len(ids), is_new),
+    )
+
+
+def play(estimator: Estimator, increments: list[Increment]) -> None:
+    """Gives increments to an estimator as a replay does."""
+    solver = EgoMotionSolver(RIG, EgoMotionSettings())
+    motion = ConstantVelocityMotion(ConstantVelocitySettings())
+    for increment in increments:
+        k = round(increment.timestamp / 0.5)
+        replay_step(increment, estimator, solver, motion, k)
+
+
+@pytest.fixture(params=SETTINGS)
+def make(request: pytest.FixtureRequest) -> Callable[[], Estimator]:
+    return lambda: make_estimator(RIG, SETTINGS[request.param])
+
+
+def everything(estimator: Estimator) -> list[FloatArray]:
+    estimate = estimator.estimate()
+    return [
+        estimate.trajectory.timestamps.copy(),
+        estimate.trajectory.poses.copy(),
+        estimate.covariances.copy(),
+        estimate.landmarks.ids.copy(),
+        estimate.landmarks.positions.copy(),
+        estimate.landmarks.covariances.copy(),
+    ]
+
+
+def assert_same_bits(first: list[FloatArray], second: list[FloatArray]) -> None:
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_every_kind_is_under_contract() -> None:
+    kinds = get_args(EstimatorSettings) or (EstimatorSettings,)
+    assert {settings.kind for settings in SETTINGS.values()} == {kind().kind for kind in kinds}
+
+
+def test_it_says_what_it_is_and_supports(make: Callable[[], Estimator]) -> None:
+    estimator = make()
+    assert estimator.kind in {settings.kind for settings in SETTINGS.values()}
+    assert estimator.supports
+    assert all(isinstance(kind, MeasurementType) for kind in estimator.supports)
+
+
+def test_it_starts_at_the_origin_with_an_empty_map(make: Callable[[], Estimator]) -> None:
+    estimator = make()
+    np.testing.assert_array_equal(estimator.predict(None).wTc, np.eye(4))
+    assert len(estimator.landmarks()) == 0
+    assert len(estimator.estimate().trajectory) == 0
+
+
+def test_predicting_changes_nothing(make: Callable[[], Estimator], world: World) -> None:
+    estimator, other = make(), make()
+    odometry = world.increments[5].odometry
+    play(estimator, world.increments[:5])
+    first, second = estimator.predict(odometry), estimator.predict(odometry)
+    np.testing.assert_array_equal(first.wTc, second.wTc)
+    np.testing.assert_array_equal(first.covariance, second.covariance)
+    play(estimator, world.increments[5:])
+    play(other, world.increments)
+    assert_same_bits(everything(estimator), everything(other))
+
+
+def test_a_prediction_is_the_pose_moved_and_less_certain(
+    make: Callable[[], Estimator], world: World
+) -> None:
+    estimator = make()
+    play(estimator, world.increments[:5])
+    odometry = world.increments[5].odometry
+    assert odometry is not None
+    before, after = estimator.predict(None), estimator.predict(odometry)
+    np.testing.assert_allclose(after.wTc, before.wTc @ odometry.motion, rtol=0, atol=1e-12)
+    moved = g.compose_covariance(odometry.motion, before.covariance, np.zeros((6, 6)))
+    assert np.linalg.eigvalsh(after.covariance - moved).min() > -1e-12
+    assert np.trace(after.covariance) > np.trace(moved)
+
+
+def test_time_must_increase(make: Callable[[], Estimator], world: World) -> None:
+    estimator = make()
+    play(estimator, world.increments[:4])
+    before = everything(estimator)
+    for timestamp in (1.5, 1.0):
+        late = dataclasses.replace(world.increments[4], timestamp=timestamp)
+        with pytest.raises(EstimatorError, match="time stamp"):
+            estimator.update(late, perfect_tracking(late, world.poses[4]))
+        assert_same_bits(everything(estimator), before)
+    play(estimator, world.increments[4:5])
+    assert len(estimator.estimate().trajectory) == 5
+
+
+def perfect_tracking(increment: Increment, wTc: FloatArray) -> EgoMotion:
+    matched = int((~increment.observations.is_new).sum())
+    return EgoMotion(
+        wTc.copy(),
+        1e-6 * np.eye(6),
+        np.ones(matched, np.bool_),
+        np.zeros(matched),
+        EgoMotionStatus.OK,
+        1,
+    )
+
+
+def test_arguments_stay_as_they_were(make: Callable[[], Estimator], world: World) -> None:
+    estimator = make()
+    for increment, wTc in zip(world.increments, world.poses, strict=True):
+        tracking = perfect_tracking(increment, wTc)
+        given = (increment, tracking)
+        kept = copy.deepcopy(given)
+        estimator.predict(increment.odometry)
+        estimator.update(*given)
+        assert_same_bits(arrays_of(given), arrays_of(kept))
+
+
+def arrays_of(value: object) -> list[FloatArray]:
+    if isinstance(value, np.ndarray):
+        return [value]
+    if isinstance(value, tuple):
+        return [array for item in value for array in arrays_of(item)]
+    if dataclasses.is_dataclass(value):
+        return arrays_of(tuple(getattr(value, f.name) for f in dataclasses.fields(value)))
+    return []
+
+
+def test_the_map_holds_what_was_seen_and_not_pruned(
+    make: Callable[[], Estimator], world: World
+) -> None:
+    estimator = make()
+    expected: set[int] = set()
+    for increment in world.increments:
+        play(estimator, [increment])
+        expected |= set(increment.observations.ids.tolist())
+        expected -= set(increment.pruned_ids.tolist())
+        landmarks = estimator.landmarks()
+        assert landmarks.ids.tolist() == sorted(expected)
+        assert landmarks.positions.shape == (len(expected), 3)
+        assert landmarks.covariances.shape == (len(expected), 3, 3)
+
+
+def test_an_unknown_landmark_is_a_key_error(make: Callable[[], Estimator], world: World) -> None:
+    estimator = make()
+    play(estimator, world.increments[:9])
+    some = estimator.landmarks().ids[[0, 4]]
+    assert estimator.landmark_covariances(some).shape == (2, 3, 3)
+    with pytest.raises(KeyError):
+        estimator.landmark_covariances(np.array([PRUNED]))
+
+
+def test_covariances_are_lawful(make: Callable[[], Estimator], world: World) -> None:
+    estimator = make()
+    play(estimator, world.increments)
+    estimate = estimator.estimate()
+    for covariances in (estimate.covariances, estimate.landmarks.covariances):
+        scale = np.abs(covariances).max()
+        swapped = np.swapaxes(covariances, 1, 2)
+        np.testing.assert_allclose(covariances, swapped, rtol=0, atol=1e-12 * scale)
+        assert np.linalg.eigvalsh(covariances).min() > -1e-12 * scale
+    assert np.linalg.eigvalsh(estimate.landmarks.covariances).min() > 0
+
+
+def test_it_finds_its_way(make: Callable[[], Estimator], world: World) -> None:
+    estimator = make()
+    play(estimator, world.increments)
+    estimate = estimator.estimate()
+    truth = np.array(world.poses)
+    errors = np.linalg.norm(estimate.trajectory.poses[:, :3, 3] - truth[:, :3, 3], axis=1)
+    dead_reckoning = np.eye(4)
+    for increment in world.increments[1:]:
+        assert increment.odometry is not None
+        dead_reckoning = dead_reckoning @ increment.odometry.motion
+    assert errors.max() < 0.03
+    assert errors[-1] < np.linalg.norm(dead_reckoning[:3, 3] - truth[-1, :3, 3])
+    offsets = estimate.landmarks.positions - world.points[estimate.landmarks.ids]
+    assert np.median(np.linalg.norm(offsets, axis=1)) < 0.1
+
+
+def test_a_restored_state_continues_to_the_same_bits(
+    make: Callable[[], Estimator], world: World
+) -> None:
+    straight, first, second = make(), make(), make()
+    play(straight, world.increments)
+    play(first, world.increments[:6])
+    # As a file does: plain arrays, copied.
+    state = {name: np.array(array) for name, array in first.state().items()}
+    assert all(array.dtype != np.object_ for array in state.values())
+    second.restore(state)
+    play(second, world.increments[6:])
+    assert_same_bits(everything(second), everything(straight))
+
+
+def test_a_frame_without_measurements_keeps_the_map(
+    make: Callable[[], Estimator], world: World
+) -> None:
+    estimator = make()
+    play(estimator, world.increments[:5])
+    before = estimator.landmarks().positions.copy()
+    nothing = np.empty(0, np.int64)
+    blind = Increment(
+        index=10,
+        timestamp=2.5,
+        odometry=world.increments[5].odometry,
+        observations=world.increments[5].observations.select(nothing),
+        rejected=np.empty(0, np.bool_),
+        missed_ids=nothing,
+        pruned_ids=nothing,
+    )
+    prediction = estimator.predict(blind.odometry)
+    stats = estimator.update(blind, unmeasured(prediction))
+    np.testing.assert_allclose(stats.wTc, prediction.wTc, rtol=0, atol=1e-12)
+    assert stats.nis_dof == 0
+    np.testing.assert_array_equal(estimator.landmarks().positions, before)
+    assert len(estimator.estimate().trajectory) == 6
+
+
+def unmeasured(prediction: Prediction) -> EgoMotion:
+    none = np.empty(0)
+    return EgoMotion(
+        prediction.wTc,
+        prediction.covariance,
+        none.astype(np.bool_),
+        none,
+        EgoMotionStatus.NO_IMAGE,
+        0,
+    )
