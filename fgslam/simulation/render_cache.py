@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import struct
+import threading
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -96,7 +97,7 @@ class RenderCache:
             raise _cannot_write(self.folder, error) from error
 
     def _replace(self, path: Path, content: bytes) -> None:
-        beside = path.with_name(f".{path.name}.{os.getpid()}")
+        beside = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
         try:
             beside.write_bytes(content)
             os.replace(beside, path)
