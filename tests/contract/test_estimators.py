@@ -293,6 +293,22 @@ def test_covariances_are_lawful(make: Callable[[], Estimator], world: World) -> 
     assert np.linalg.eigvalsh(estimate.landmarks.covariances).min() > 0
 
 
+def test_the_map_grows_more_certain_with_observations(
+    make: Callable[[], Estimator], world: World
+) -> None:
+    estimator = make()
+    play(estimator, world.increments[:1])
+    # Those seen in each of the first six frames, so that nothing but observations acts on them.
+    ids = estimator.landmarks().ids
+    for increment in world.increments[1:6]:
+        ids = np.intersect1d(ids, increment.observations.ids)
+    assert len(ids) > 10
+    first = np.trace(estimator.landmark_covariances(ids), axis1=1, axis2=2)
+    play(estimator, world.increments[1:6])
+    last = np.trace(estimator.landmark_covariances(ids), axis1=1, axis2=2)
+    assert np.median(last / first) < 0.6
+
+
 def test_it_finds_its_way(make: Callable[[], Estimator], world: World) -> None:
     estimator = make()
     play(estimator, world.increments)
