@@ -17,6 +17,8 @@ from fgslam.settings.lab import LabDriveSettings
 from fgslam.types import FloatArray
 
 _STEP_M = 0.004
+# Waypoints must not ask for tighter turns: the curve's heading would jump between its samples.
+_LEAST_RADIUS_M = 0.08
 # Part of a turn over which its curvature rises, and again falls.
 _RAMP = 0.3
 # Speed used, as a fraction of the limits, where the number of frames is free.
@@ -151,7 +153,8 @@ def through_waypoints(points: FloatArray, closed: bool) -> PlanarPath:
     """A twice differentiable curve through points (n, 2): a cubic spline over chord length.
 
     Raises:
-        ConfigError: fewer than two distinct points (three for a closed curve).
+        ConfigError: fewer than two distinct points (three for a closed curve), or points that
+            turn back on themselves.
     """
     if closed and len(points):
         points = np.vstack([points, points[:1]])
@@ -165,11 +168,25 @@ def through_waypoints(points: FloatArray, closed: bool) -> PlanarPath:
     spline = CubicSpline(knots, points, bc_type="periodic" if closed else "natural")
     t = np.linspace(0.0, knots[-1], max(int(np.ceil(knots[-1] / _STEP_M)), 8) + 1)
     first, second = spline(t, 1), spline(t, 2)
-    speed = np.linalg.norm(first, axis=1)
+    speed = np.maximum(np.linalg.norm(first, axis=1), 1e-9)
     arc = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t))])
     heading = np.unwrap(np.arctan2(first[:, 1], first[:, 0]))
     curvature = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / speed**3
+    _refuse_tight_turns(np.asarray(spline(t)), heading, curvature)
     return PlanarPath(arc, np.asarray(spline(t)), heading, curvature, closed)
+
+
+def _refuse_tight_turns(xy: FloatArray, heading: FloatArray, curvature: FloatArray) -> None:
+    # At a cusp the curvature is lost between two samples, but the heading leaps.
+    leaps = np.abs(np.diff(heading, prepend=heading[0])) / _STEP_M
+    sharpness = np.maximum(leaps, np.abs(curvature))
+    tightest = int(np.argmax(sharpness))
+    if sharpness[tightest] * _LEAST_RADIUS_M > 1.0:
+        x, y = xy[tightest]
+        raise ConfigError(
+            f"dataset.drive.waypoints_m turn back too sharply near ({x:.2f}, {y:.2f}) m: the curve "
+            f"has a radius below {_LEAST_RADIUS_M} m there; add points that lead around the turn"
+        )
 
 
 def paper_loop() -> PlanarPath:

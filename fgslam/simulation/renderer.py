@@ -24,6 +24,9 @@ Int32 = npt.NDArray[np.int32]
 # Four points a pixel where two surfaces meet: the rest is smooth by its mip-maps.
 _EDGE_SAMPLES = np.array([[-0.25, -0.375], [0.375, -0.25], [0.25, 0.375], [-0.375, 0.25]])
 
+# Keeps the rare hit on a patch seen edge-on finite; nothing is a kilometre away.
+_LEAST_INVERSE_DEPTH = 1e-3
+
 
 @dataclass(frozen=True, slots=True)
 class Pinhole:
@@ -130,7 +133,8 @@ class Renderer:
             chosen = np.flatnonzero(hits.layer == k)
             g = layer.planes(pose, self._inverse)[8:, hits.patch[chosen]]
             p = self._pixels[chosen].astype(np.float64)
-            depth[chosen] = 1.0 / (g[0] * p[:, 0] + g[1] * p[:, 1] + g[2])
+            inverse_depth = g[0] * p[:, 0] + g[1] * p[:, 1] + g[2]
+            depth[chosen] = 1.0 / np.maximum(inverse_depth, _LEAST_INVERSE_DEPTH)
         return depth.reshape(self._camera.height, self._camera.width)
 
     def things(self, layers: list[Layer], pose: FloatArray) -> IntArray:
@@ -170,7 +174,8 @@ class Renderer:
     def _shade_layer(self, layer: Layer, planes: Float32, patch: Int32, pixels: Float32) -> Float32:
         gathered = planes.take(patch, axis=1)
         column, row = np.ascontiguousarray(pixels.T)
-        depth = 1.0 / (gathered[8] * column + gathered[9] * row + gathered[10])
+        inverse_depth = gathered[8] * column + gathered[9] * row + gathered[10]
+        depth = 1.0 / np.maximum(inverse_depth, np.float32(_LEAST_INVERSE_DEPTH))
         size = layer.size.astype(np.float32)
         u, u_column, u_row = _coordinate(gathered[0:4], gathered[8:], column, row, depth)
         v, v_column, v_row = _coordinate(gathered[4:8], gathered[8:], column, row, depth)

@@ -125,3 +125,9 @@ def test_waypoints_that_make_no_path(points: tuple[tuple[float, float], ...], cl
         plan_drive(
             LabDriveSettings(path="waypoints", waypoints_m=points, closed=closed, frames=None)
         )
+
+
+def test_turning_back_on_the_spot_is_refused_and_told_where() -> None:
+    there_and_back = ((0.0, -1.0), (2.0, -1.0), (0.0, -1.0))
+    with pytest.raises(ConfigError, match=r"too sharply near \(2\.00, -1\.00\)"):
+        plan_drive(LabDriveSettings(path="waypoints", waypoints_m=there_and_back, frames=None))
