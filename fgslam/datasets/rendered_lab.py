@@ -26,7 +26,7 @@ from fgslam.simulation.renderer import Layer
 from fgslam.simulation.world import World, camera_offsets, make_rig, open_room
 from fgslam.types import CameraRig, FloatArray, Frame, Image, IntArray, Odometry, Trajectory
 
-RENDER_VERSION = 6
+RENDER_VERSION = 7
 """Part of the cache's key: raised whenever the same settings give other pixels."""
 
 _THREADS = 2

@@ -67,7 +67,7 @@ def _materials(rng: np.random.Generator) -> dict[str, Grey]:
         "cloth": textures.cloth(rng, 256, 95.0),
         "shirt": textures.cloth(rng, 256, 150.0),
         "trousers": _muted(textures.cloth(rng, 256, 60.0), 0.3),
-        "skin": textures.plaster(rng, 64, 165.0),
+        "skin": _muted(textures.plaster(rng, 64, 165.0), 0.25),
         "window": textures.window_view(rng, 512, 512),
         "door": textures.panelled(rng, 512, 256, 125.0),
         "plain_dark": textures.plaster(rng, 256, 42.0),
