@@ -6,6 +6,7 @@ known one suggested.
 
 from __future__ import annotations
 
+import copy
 import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -65,10 +66,15 @@ def load_config(path: Path, overrides: Iterable[str] = ()) -> ExperimentConfig:
     Raises:
         ConfigError: the file is missing or no YAML mapping, or a key or value is wrong.
     """
-    values = _read_mapping(path)
+    return make_config(_read_mapping(path), overrides, str(path))
+
+
+def make_config(values: dict[str, Any], overrides: Iterable[str], where: str) -> ExperimentConfig:
+    """Plain values with ``a.b=value`` overrides applied, checked; ``where`` as in parse_config."""
+    values = copy.deepcopy(values)
     for override in overrides:
         _apply(values, override)
-    return parse_config(values, str(path))
+    return parse_config(values, where)
 
 
 def parse_config(values: Mapping[str, Any], where: str) -> ExperimentConfig:

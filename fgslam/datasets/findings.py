@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -29,6 +30,12 @@ class Finding:
     level: Level
     subject: str
     text: str
+
+
+def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """The findings, the worst first, otherwise in their order."""
+    order = (Level.PROBLEM, Level.WARNING, Level.INFO)
+    return tuple(sorted(findings, key=lambda f: order.index(f.level)))
 
 
 def share(part: int, whole: int) -> str:

@@ -8,11 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.datasets.checks import check_epipolar, inspect_sequence
+from fgslam.datasets.checks import inspect_sequence
 from fgslam.datasets.findings import Level
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.kitti import open_kitti
 from fgslam.datasets.light_field import open_light_field
+from fgslam.datasets.match_checks import check_epipolar
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.synthetic_odometry import SyntheticOdometry
 from fgslam.geometry import body_to_camera_motion, inverse, se3_log

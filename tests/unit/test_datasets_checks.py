@@ -8,15 +8,11 @@ import numpy as np
 import pytest
 from dataset_builders import curve, image_folder, picture, save, write_tum
 
-from fgslam.datasets.checks import (
-    check_calibration,
-    check_epipolar,
-    check_images,
-    check_timing,
-    inspect_sequence,
-)
+from fgslam.datasets.checks import check_calibration, check_timing, inspect_sequence
 from fgslam.datasets.findings import Finding, Level
+from fgslam.datasets.image_checks import check_images
 from fgslam.datasets.image_folder import open_image_folder
+from fgslam.datasets.match_checks import check_epipolar
 from fgslam.datasets.motion_checks import (
     check_odometry,
     check_odometry_against_truth,
