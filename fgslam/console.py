@@ -135,4 +135,5 @@ def _nees(result: RunResult) -> str:
     found = result.metrics.more.get("nees_pose")
     if not isinstance(found, dict):
         return "unknown"
-    return f"{found['per_dof']:.1f}: {found['verdict']} (band {found['lower']:.2f}-{found['upper']:.2f})"
+    band = f"{found['lower']:.2f}-{found['upper']:.2f}"
+    return f"{found['per_dof']:.1f}: {found['verdict']} (band {band})"

@@ -73,7 +73,8 @@ def draw_run(outputs: RunOutputs) -> list[Path]:
         covariances = world_position_covariances(
             estimate.trajectory.poses[rows], estimate.covariances[rows]
         )
-        sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+        # A planar covariance, rotated, may round to just below zero.
+        sigmas = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
         title = _title(outputs, "position error, first pose aligned")
         draw_errors(folder / "position_error.png", timestamps, errors, sigmas, title)
     return sorted(folder.glob("*.png"))

@@ -34,7 +34,7 @@ class LandmarkKalmanSettings:
         Field(
             ge=0.0, description="standard deviation in metres added to a landmark on a miss (6.4)"
         ),
-    ] = 0.0002
+    ] = 0.0001
 
 
 EstimatorSettings: TypeAlias = LandmarkKalmanSettings

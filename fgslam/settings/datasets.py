@@ -200,10 +200,10 @@ class ConstantVelocitySettings:
     rotation_sigma_dps2: Annotated[
         PositiveVector3,
         Field(description="about the camera's axes x, y, z (right, down, forward), degrees/s^2"),
-    ] = (10.0, 6.0, 8.0)
+    ] = (12.0, 15.0, 10.0)
     translation_sigma_mps2: Annotated[
         PositiveVector3, Field(description="along the camera's axes x, y, z, m/s^2")
-    ] = (0.4, 0.4, 1.0)
+    ] = (0.5, 0.5, 1.5)
     start_speed_sigma_mps: Annotated[
         float, Field(gt=0.0, description="speed per axis before the first motion is known, m/s")
     ] = 15.0

@@ -89,7 +89,7 @@ class AppearanceSettings:
     max_distance: Annotated[
         float,
         Field(gt=0.0, description="largest distance of descriptors, whose norm is 512"),
-    ] = 250.0
+    ] = 350.0
     ratio: Annotated[
         float,
         Field(gt=0.0, le=1.0, description="best distance at most this fraction of second best"),
@@ -120,7 +120,7 @@ class MapMatchingSettings:
             description="widen window and disparity gate by this many standard deviations of the "
             "predicted measurement; 0 keeps the paper's fixed window",
         ),
-    ] = 0.0
+    ] = 3.0
     max_window_px: Annotated[
         float, Field(gt=0.0, description="side that widening may not exceed")
     ] = 80.0
