@@ -36,6 +36,9 @@ DatasetSettings: TypeAlias = Annotated[
 ]
 
 
+_GROUPS_OF_KINDS = ("dataset", "odometry", "estimator")
+
+
 class ExperimentConfig(BaseModel):
     """One experiment."""
 
@@ -72,8 +75,12 @@ def load_config(path: Path, overrides: Iterable[str] = ()) -> ExperimentConfig:
 def make_config(values: dict[str, Any], overrides: Iterable[str], where: str) -> ExperimentConfig:
     """Plain values with ``a.b=value`` overrides applied, checked; ``where`` as in parse_config."""
     values = copy.deepcopy(values)
+    before = {group: _kind(values, group) for group in _GROUPS_OF_KINDS}
     for override in overrides:
         _apply(values, override)
+    for group, kind in before.items():
+        if _kind(values, group) != kind:
+            _drop_unknown(values[group], group)
     return parse_config(values, where)
 
 
@@ -83,6 +90,23 @@ def parse_config(values: Mapping[str, Any], where: str) -> ExperimentConfig:
         return ExperimentConfig.model_validate(values)
     except ValidationError as error:
         raise ConfigError(_describe(error.errors(), where)) from None
+
+
+def _kind(values: Mapping[str, Any], group: str) -> Any:
+    inner = values.get(group)
+    return inner.get("kind") if isinstance(inner, dict) else None
+
+
+def _drop_unknown(inner: Any, group: str) -> None:
+    """Drops keys that meant something to the file's kind, not to the one an override chose."""
+    if not isinstance(inner, dict):
+        return
+    schema = ExperimentConfig.model_json_schema()
+    _, nodes = _descend(schema, [group])
+    for node in nodes:
+        if _has_tag(node, str(inner.get("kind"))):
+            for key in set(inner) - set(node["properties"]):
+                del inner[key]
 
 
 def _read_mapping(path: Path) -> dict[str, Any]:
