@@ -118,7 +118,7 @@ class LandmarkKalman:
         return self._covariances[self.landmarks().rows(ids)]
 
     def state(self) -> StateArrays:
-        """Everything needed to continue."""
+        """Everything needed to continue; a snapshot, which later updates leave alone."""
         estimate = self.estimate()
         return {
             "timestamps": estimate.trajectory.timestamps,
@@ -127,9 +127,9 @@ class LandmarkKalman:
             "current_pose": self._current.wTc,
             "current_covariance": self._current.covariance,
             "ids": self._ids,
-            "positions": self._positions,
-            "covariances": self._covariances,
-            "counts": self._counts,
+            "positions": estimate.landmarks.positions,
+            "covariances": estimate.landmarks.covariances,
+            "counts": self._counts.copy(),
         }
 
     def restore(self, state: StateArrays) -> None:

@@ -152,8 +152,8 @@ class LandmarkDatabase:
         return pruned
 
     def state(self) -> StateArrays:
-        """All entries, as arrays."""
-        out: StateArrays = {name: getattr(self, name) for name in _COLUMNS}
+        """All entries, as arrays; a snapshot."""
+        out: StateArrays = {name: getattr(self, name).copy() for name in _COLUMNS}
         out["next_id"] = np.array(self._next_id)
         return out
 

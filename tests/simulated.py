@@ -1,0 +1,263 @@
+"""A simulated drive without images: points, exact poses, noisy measurements with identities.
+
+Identities behave as the landmark database makes them: given in the order of first sight, kept
+through misses, gone after too many in a row, new when the point is seen again. With ``noise=0``
+the measurements are exact while the covariances stay, so that estimators must find the truth.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam import geometry as g
+from fgslam.backend.protocol import Estimator
+from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
+from fgslam.motion import ConstantVelocityMotion
+from fgslam.pipeline import replay_step
+from fgslam.settings.datasets import ConstantVelocitySettings
+from fgslam.settings.frontend import EgoMotionSettings
+from fgslam.types import (
+    BoolArray,
+    CameraRig,
+    EgoMotion,
+    EgoMotionStatus,
+    FloatArray,
+    Increment,
+    IntArray,
+    Observations,
+    Odometry,
+    Prediction,
+    UpdateStats,
+)
+
+RIG = CameraRig(
+    width=320,
+    height=240,
+    fx=277.0,
+    fy=277.0,
+    cx=159.5,
+    cy=119.5,
+    baseline=0.1,
+    vertical_baseline=0.1,
+    bTc=g.BODY_FORWARD_LEFT_UP_FROM_CAMERA,
+)
+"""The paper's rig: 320x240, 60 degrees, 10 cm baselines (S1)."""
+
+TURN_AND_GO = (0.0, 0.03, 0.0, 0.01, 0.0, 0.08)
+BORDER_PX = 5.0
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What to simulate; standard deviations are those of the covariances handed out."""
+
+    frames: int = 12
+    points: int = 150
+    twist: tuple[float, ...] = TURN_AND_GO
+    period_s: float = 0.5
+    sigma_px: tuple[float, float, float] = (0.3, 0.3, 0.2)
+    odometry_sigma: tuple[float, ...] = (0.005, 0.005, 0.005, 0.01, 0.01, 0.01)
+    depth_m: tuple[float, float] = (1.5, 6.0)
+    miss_rate: float = 0.15
+    prune_after: int = 20
+    noise: float = 1.0
+    rig: CameraRig = RIG
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """The truth and the measurements: poses (n, 4, 4), point (3,) of each identity (m, 3)."""
+
+    drive: Drive
+    poses: FloatArray
+    points_by_id: FloatArray
+    increments: list[Increment]
+
+
+def simulate(drive: Drive, rng: np.random.Generator) -> Simulation:
+    """Drives with a constant twist past points that are spread over all its views."""
+    step = g.se3_exp(np.array(drive.twist))
+    poses = [np.eye(4)]
+    for _ in range(drive.frames - 1):
+        poses.append(g.reorthonormalise(poses[-1] @ step))
+    points = points_in_views(drive, poses, rng)
+    book = _Identities(drive, points)
+    increments = [book.increment(k, wTc, step, rng) for k, wTc in enumerate(poses)]
+    return Simulation(drive, np.array(poses), points[book.point_of_id], increments)
+
+
+def points_in_views(drive: Drive, poses: list[FloatArray], rng: np.random.Generator) -> FloatArray:
+    """Points (n, 3), each uniformly in the image and depth range of a random pose."""
+    which = rng.integers(len(poses), size=drive.points)
+    local = points_in_view(drive.rig, drive.points, drive.depth_m, rng)
+    chosen = np.array(poses)[which]
+    return np.einsum("nij,nj->ni", chosen[:, :3, :3], local) + chosen[:, :3, 3]
+
+
+def points_in_view(
+    rig: CameraRig, count: int, depth_m: tuple[float, float], rng: np.random.Generator
+) -> FloatArray:
+    """Points (n, 3) in the camera's frame, uniform in image and depth."""
+    depth = rng.uniform(*depth_m, count)
+    column = rng.uniform(BORDER_PX + 1, rig.width - BORDER_PX - 2, count)
+    row = rng.uniform(BORDER_PX + 1, rig.height - BORDER_PX - 2, count)
+    return np.column_stack(
+        [(column - rig.cx) * depth / rig.fx, (row - rig.cy) * depth / rig.fy, depth]
+    )
+
+
+def visible(rig: CameraRig, points: FloatArray) -> BoolArray:
+    """Which points (n, 3) in the camera's frame are in front and inside the reference image."""
+    front = points[:, 2] > 0.2
+    measured = g.project(rig, np.where(front[:, None], points, 1.0))
+    low = BORDER_PX
+    high = np.array([rig.width, rig.height]) - 1 - BORDER_PX
+    inside = ((measured[:, :2] > low) & (measured[:, :2] < high)).all(axis=1)
+    return np.asarray(front & inside)
+
+
+class _Identities:
+    """Who is known, missed and forgotten, frame after frame."""
+
+    def __init__(self, drive: Drive, points: FloatArray) -> None:
+        self._drive = drive
+        self._points = points
+        self._id = np.full(len(points), -1)
+        self._missed = np.zeros(len(points), np.int64)
+        self.point_of_id: IntArray = np.empty(0, np.int64)
+
+    def increment(
+        self, k: int, wTc: FloatArray, step: FloatArray, rng: np.random.Generator
+    ) -> Increment:
+        drive = self._drive
+        local = g.transform_to_camera(wTc, self._points)
+        in_view = visible(drive.rig, local)
+        seen = in_view & (rng.uniform(size=len(in_view)) >= drive.miss_rate)
+        known = self._id >= 0
+        matched = np.flatnonzero(seen & known)
+        matched = matched[np.argsort(self._id[matched])]
+        new = np.flatnonzero(seen & ~known)
+        missed_ids = np.sort(self._id[in_view & ~seen & known])
+        self._book(matched, new, in_view & ~seen & known)
+        local[~in_view] = 1.0
+        noise = drive.noise * np.array(drive.sigma_px) * rng.standard_normal(local.shape)
+        measured = g.project(drive.rig, local) + noise
+        both = np.concatenate([matched, new])
+        is_new = np.arange(len(both)) >= len(matched)
+        return Increment(
+            index=2 * k,
+            timestamp=drive.period_s * k,
+            odometry=None if k == 0 else noisy_odometry(drive, step, rng),
+            observations=observations(
+                self._id[both], measured[both], np.array(drive.sigma_px), is_new
+            ),
+            rejected=np.zeros(len(both), np.bool_),
+            missed_ids=missed_ids,
+            pruned_ids=self._prune(),
+        )
+
+    def _book(self, matched: IntArray, new: IntArray, missed: BoolArray) -> None:
+        self._missed[matched] = 0
+        self._missed[missed] += 1
+        self._id[new] = len(self.point_of_id) + np.arange(len(new))
+        self._missed[new] = 0
+        self.point_of_id = np.concatenate([self.point_of_id, new])
+
+    def _prune(self) -> IntArray:
+        gone = (self._id >= 0) & (self._missed >= self._drive.prune_after)
+        pruned = np.sort(self._id[gone])
+        self._id[gone] = -1
+        return pruned
+
+
+def noisy_odometry(drive: Drive, step: FloatArray, rng: np.random.Generator) -> Odometry:
+    """The step with noise of the stated covariance, in the tangent space at its end."""
+    sigma = np.array(drive.odometry_sigma)
+    drawn = g.se3_exp(drive.noise * sigma * rng.standard_normal(6))
+    return Odometry(step @ drawn, np.diag(sigma**2))
+
+
+def observations(
+    ids: IntArray, measured: FloatArray, sigma_px: FloatArray, is_new: BoolArray
+) -> Observations:
+    """Observations of (column, row, disparity) (n, 3), raw pixels of equal baselines."""
+    right, disparity = measured[:, :2], measured[:, 2]
+    left = right + np.outer(disparity, [1.0, 0.0])
+    top = right + np.outer(disparity, [0.0, 1.0])
+    return Observations(
+        ids=np.asarray(ids, np.int64),
+        measurement=measured,
+        covariance=np.tile(np.diag(sigma_px**2), (len(ids), 1, 1)),
+        pixels=np.stack([right, left, top], axis=1),
+        is_new=np.asarray(is_new, np.bool_),
+    )
+
+
+def play(
+    estimator: Estimator,
+    increments: list[Increment],
+    settings: EgoMotionSettings | None = None,
+    rig: CameraRig = RIG,
+) -> list[UpdateStats]:
+    """Gives increments to an estimator as the replay of a log does."""
+    solver = EgoMotionSolver(rig, settings or EgoMotionSettings())
+    motion = ConstantVelocityMotion(ConstantVelocitySettings())
+    return [
+        replay_step(increment, estimator, solver, motion, increment.index // 2)
+        for increment in increments
+    ]
+
+
+def play_directly(
+    estimator: Estimator, increments: list[Increment], settings: EgoMotionSettings | None = None
+) -> list[UpdateStats]:
+    """The same by the estimator's own three calls: predict, landmarks, update."""
+    solver = EgoMotionSolver(RIG, settings or EgoMotionSettings())
+    stats = []
+    for increment in increments:
+        prediction = estimator.predict(increment.odometry)
+        matched = increment.observations.select(~increment.observations.is_new)
+        if increment.odometry is None:
+            tracking = tracked_at(prediction, len(matched))
+        else:
+            problem = PoseProblem.of(estimator.landmarks(), matched)
+            tracking = solver.solve(prediction, problem)
+        stats.append(estimator.update(increment, tracking))
+    return stats
+
+
+def tracked_at(prediction: Prediction, matches: int) -> EgoMotion:
+    """A tracking result at a known pose that used all matches."""
+    return EgoMotion(
+        wTc=prediction.wTc.copy(),
+        covariance=prediction.covariance.copy(),
+        inliers=np.ones(matches, np.bool_),
+        residuals=np.zeros(matches),
+        status=EgoMotionStatus.OK,
+        iterations=1,
+    )
+
+
+def arrays_of(value: object) -> list[FloatArray]:
+    """All arrays inside dataclasses, dictionaries, lists and tuples, in a fixed order."""
+    if isinstance(value, np.ndarray):
+        return [value]
+    if isinstance(value, dict):
+        return [array for key in sorted(value) for array in arrays_of(value[key])]
+    if isinstance(value, list | tuple):
+        return [array for item in value for array in arrays_of(item)]
+    if dataclasses.is_dataclass(value):
+        return arrays_of(tuple(getattr(value, f.name) for f in dataclasses.fields(value)))
+    return []
+
+
+def assert_same_bits(first: object, second: object) -> None:
+    """All arrays of both are equal to the last bit, NaN included, and there are some."""
+    a, b = arrays_of(first), arrays_of(second)
+    assert len(a) == len(b) > 0
+    for x, y in zip(a, b, strict=True):
+        assert x.dtype == y.dtype
+        np.testing.assert_array_equal(x, y)
