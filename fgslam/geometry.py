@@ -7,6 +7,8 @@ Functions over many items are vectorised over the leading axis.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from fgslam.types import CameraRig, FloatArray
@@ -52,6 +54,19 @@ def so3_exp(omega: FloatArray) -> FloatArray:
 
 def so3_log(rotation: FloatArray) -> FloatArray:
     """Rotation vector (3,) of a rotation matrix (3, 3), angle in [0, pi], stable at both ends."""
+    cosine = 0.5 * (float(np.trace(rotation)) - 1.0)
+    if cosine > 0.0:
+        # Up to a right angle the skew part has it all; the quaternion costs three times as much.
+        twice = np.array(
+            [
+                rotation[2, 1] - rotation[1, 2],
+                rotation[0, 2] - rotation[2, 0],
+                rotation[1, 0] - rotation[0, 1],
+            ]
+        )
+        sine = 0.5 * math.sqrt(float(twice @ twice))
+        ratio = math.atan2(sine, cosine) / sine if sine > _SMALL_ANGLE else 1.0 + sine * sine / 6.0
+        return np.asarray((0.5 * ratio) * twice)
     quaternion = quaternion_from_rotation(rotation)
     if quaternion[3] < 0.0:
         quaternion = -quaternion
@@ -123,6 +138,18 @@ def _so3_left_jacobian(omega: FloatArray) -> FloatArray:
     return np.asarray(np.eye(3) + b * k + c * (k @ k))
 
 
+def _so3_left_jacobian_inverse(omega: FloatArray) -> FloatArray:
+    theta2 = float(omega @ omega)
+    theta = math.sqrt(theta2)
+    if theta < _SMALL_ANGLE:
+        c = 1.0 / 12.0 + theta2 / 720.0
+    else:
+        half = 0.5 * theta
+        c = (1.0 - half * math.cos(half) / math.sin(half)) / theta2
+    k = skew(omega)
+    return np.asarray(np.eye(3) - 0.5 * k + c * (k @ k))
+
+
 def se3_exp(xi: FloatArray) -> FloatArray:
     """Rigid motion (4, 4) of a tangent vector (6,) [rotation, translation]; GTSAM's Expmap."""
     return pose(so3_exp(xi[:3]), _so3_left_jacobian(xi[:3]) @ xi[3:])
@@ -131,7 +158,10 @@ def se3_exp(xi: FloatArray) -> FloatArray:
 def se3_log(aTb: FloatArray) -> FloatArray:
     """Tangent vector (6,) [rotation, translation] of a rigid motion (4, 4); GTSAM's Logmap."""
     omega = so3_log(aTb[:3, :3])
-    return np.concatenate([omega, np.linalg.solve(_so3_left_jacobian(omega), aTb[:3, 3])])
+    out = np.empty(6)
+    out[:3] = omega
+    out[3:] = _so3_left_jacobian_inverse(omega) @ aTb[:3, 3]
+    return out
 
 
 def adjoint(aTb: FloatArray) -> FloatArray:

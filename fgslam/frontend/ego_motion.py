@@ -40,6 +40,7 @@ from fgslam.types import (
 
 _NEAREST_DEPTH_M = 1e-3  # a point nearer than this, or behind, cannot be linearised
 _STEP_TOLERANCE = 1e-9  # radians and metres; far below anything measurable
+_ROBUST_TOLERANCE = 1e-5  # the robust minimum only chooses the inliers for the exact one
 _REPEATS = 4  # minimisations with the remaining matches; two suffice on all recordings tried
 _MAX_DAMPING = 1e8
 
@@ -152,6 +153,7 @@ class EgoMotionSolver:
         information = self._information(start, problem)
         prior = _inverse_spd(prediction.covariance) if self._settings.prior else None
         best_cost, damping = np.inf, 0.0
+        tolerance = _ROBUST_TOLERANCE if robust else _STEP_TOLERANCE
         wTc = best = start
         hessian, gradient = np.eye(6), np.zeros(6)
         for iteration in range(1, self._settings.max_iterations + 1):
@@ -168,7 +170,7 @@ class EgoMotionSolver:
             step = self._step(best, hessian, gradient, damping)
             if step is None or not np.isfinite(best_cost):
                 return _Minimum(start, hessian, False, iteration)
-            if np.abs(step).max() < _STEP_TOLERANCE:
+            if np.abs(step).max() < tolerance:
                 break
             wTc = _retract(best, step)
         return _Minimum(best, hessian, True, iteration)
