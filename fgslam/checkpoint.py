@@ -42,13 +42,18 @@ def save_log(folder: Path, log: MeasurementLog) -> None:
     write_arrays(folder / LOG_FILE, log.to_arrays())
 
 
-def load(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
-    """Continues from a checkpoint; raises OutputError where there is none."""
+def require(folder: Path) -> None:
+    """Raises OutputError where there is nothing to continue from."""
     if not (folder / STATE_FILE).is_file():
         raise OutputError(
             f"{folder}: nothing to resume (no {STATE_FILE}): the run has finished, or never got "
             "to its first checkpoint; use --overwrite to run again"
         )
+
+
+def load(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
+    """Continues from a checkpoint; raises OutputError where there is none."""
+    require(folder)
     state = load_arrays(folder / STATE_FILE)
     log = MeasurementLog.load(folder / LOG_FILE)
     pipeline.tracker.database.restore(_part(state, "database"))

@@ -20,11 +20,12 @@ if TYPE_CHECKING:
 EXIT_USER = 2
 EXIT_FAULT = 1
 EXIT_INTERRUPTED = 130  # as a shell reports a process that Ctrl-C ended
+# Typer exports only the child; its parent's home differs from one Typer to the next.
+_UsageError: type[typer.BadParameter] = typer.BadParameter.__bases__[0]
 
 app = typer.Typer(
     name="fgslam",
     help="Stereo, trinocular and omnidirectional SLAM: filters and smoothers on one log.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
@@ -57,7 +58,7 @@ def run(
     from fgslam.config import load_config
     from fgslam.console import progress_bar, show_result
     from fgslam.errors import ConfigError
-    from fgslam.experiment import run_experiment
+    from fgslam.experiment import resume_command, run_experiment
 
     if overwrite and resume:
         raise ConfigError("--overwrite and --resume exclude each other; give one of them")
@@ -71,7 +72,7 @@ def run(
             _stoppable(progress, stopped),
             stopped,
         )
-    show_result(result, config)
+    show_result(result, resume_command(folder))
     if result.status == "interrupted":
         raise typer.Exit(EXIT_INTERRUPTED)
 
@@ -120,13 +121,19 @@ def inspect(
 
 
 def main() -> None:
-    """Entry point: runs a command, turns FgslamError into one line and exit status 2."""
+    """Entry point: runs a command, turns a user's mistake into one line and exit status 2."""
+    arguments = sys.argv[1:] or ["--help"]
     try:
-        app()
+        raise SystemExit(app(arguments, prog_name="fgslam", standalone_mode=False))
+    except _UsageError as error:
+        command = error.ctx.command_path if error.ctx else "fgslam"
+        message = " ".join(error.format_message().split()).rstrip(".")
+        print(f"{command}: {message}; see {command} --help", file=sys.stderr)
+        raise SystemExit(EXIT_USER) from None
     except FgslamError as error:
         print(f"fgslam: {error}", file=sys.stderr)
         raise SystemExit(EXIT_USER) from None
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, typer.Abort):  # the first becomes the second on its way
         print("fgslam: interrupted", file=sys.stderr)
         raise SystemExit(EXIT_INTERRUPTED) from None
     except BrokenPipeError:

@@ -74,13 +74,14 @@ def load_config(path: Path, overrides: Iterable[str] = ()) -> ExperimentConfig:
 
 def make_config(values: dict[str, Any], overrides: Iterable[str], where: str) -> ExperimentConfig:
     """Plain values with ``a.b=value`` overrides applied, checked; ``where`` as in parse_config."""
-    values = copy.deepcopy(values)
+    values, overrides = copy.deepcopy(values), tuple(overrides)
     before = {group: _kind(values, group) for group in _GROUPS_OF_KINDS}
     for override in overrides:
         _apply(values, override)
+    given = {override.partition("=")[0].strip() for override in overrides}
     for group, kind in before.items():
         if _kind(values, group) != kind:
-            _drop_unknown(values[group], group)
+            _drop_unknown(values[group], group, given)
     return parse_config(values, where)
 
 
@@ -97,8 +98,11 @@ def _kind(values: Mapping[str, Any], group: str) -> Any:
     return inner.get("kind") if isinstance(inner, dict) else None
 
 
-def _drop_unknown(inner: Any, group: str) -> None:
-    """Drops keys that meant something to the file's kind, not to the one an override chose."""
+def _drop_unknown(inner: Any, group: str, given: set[str]) -> None:
+    """Drops keys that meant something to the file's kind, not to the one an override chose.
+
+    Keys that are overrides themselves (``given``, dotted) stay: a misspelt one must be told.
+    """
     if not isinstance(inner, dict):
         return
     schema = ExperimentConfig.model_json_schema()
@@ -106,7 +110,8 @@ def _drop_unknown(inner: Any, group: str) -> None:
     for node in nodes:
         if _has_tag(node, str(inner.get("kind"))):
             for key in set(inner) - set(node["properties"]):
-                del inner[key]
+                if f"{group}.{key}" not in given:
+                    del inner[key]
 
 
 def _read_mapping(path: Path) -> dict[str, Any]:

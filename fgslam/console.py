@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -18,11 +17,13 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from fgslam.summary import run_numbers
+from fgslam.summary import frame_problems, run_numbers
 
 if TYPE_CHECKING:
     from fgslam.experiment import Progress as Tell
     from fgslam.experiment import RunResult
+
+_PROBLEMS_SHOWN = 5
 
 
 @contextmanager
@@ -35,21 +36,29 @@ def progress_bar() -> Iterator[Tell]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True)) as bars:
-        tasks: dict[str, int] = {}
+    bars = Progress(*columns, console=Console(stderr=True))
+    tasks: dict[str, int] = {}
 
-        def tell(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                tasks[what] = int(bars.add_task(what, total=total))
-            bars.update(tasks[what], completed=done, total=total)  # type: ignore[arg-type]
+    def tell(what: str, done: int, total: int) -> None:
+        if not tasks:
+            bars.start()  # not before: a mistake found at once shall be all there is to read
+        if what not in tasks:
+            tasks[what] = int(bars.add_task(what, total=total))
+        bars.update(tasks[what], completed=done, total=total)  # type: ignore[arg-type]
 
+    try:
         yield tell
+    finally:
+        if tasks:
+            bars.stop()
 
 
-def show_result(result: RunResult, config: Path) -> None:
-    """Summary table and where everything is."""
+def show_result(result: RunResult, resume: str) -> None:
+    """Summary table and where everything is; ``resume`` is what to type where it is unfinished."""
     console = Console()
     console.print(_table(result))
+    for line in _remarks(result):
+        console.out(line)
     folder = result.folder
     kind = result.outputs.kind
     # Paths are printed plain, so that they can be copied whatever the terminal's width.
@@ -59,8 +68,7 @@ def show_result(result: RunResult, config: Path) -> None:
         console.out(f"pictures    {result.pictures[0].parent}{'/'}")
     console.out(f"metrics     {folder / 'metrics.json'}")
     if result.status == "interrupted":
-        command = f"fgslam run {config} --out {folder} --resume"
-        console.out(f"interrupted after {len(result.outputs.recorder)} frames; go on: {command}")
+        console.out(f"interrupted after {len(result.outputs.recorder)} frames; go on: {resume}")
 
 
 def _table(result: RunResult) -> Table:
@@ -85,6 +93,15 @@ def _table(result: RunResult) -> Table:
     for name, value in rows:
         table.add_row(name, str(value))
     return table
+
+
+def _remarks(result: RunResult) -> list[str]:
+    """What was tolerated: notes on the recording, and frames that could not be used."""
+    problems = frame_problems(result.outputs.recorder)
+    lines = [*result.outputs.sequence.notes, *problems[:_PROBLEMS_SHOWN]]
+    if len(problems) > _PROBLEMS_SHOWN:
+        lines.append(f"and {len(problems) - _PROBLEMS_SHOWN} more such frames, see metrics.json")
+    return [f"note        {line}" for line in lines]
 
 
 def _metres(value: float | None) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import shlex
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +15,7 @@ import numpy as np
 from fgslam import checkpoint, run_pictures
 from fgslam.config import ExperimentConfig, load_config
 from fgslam.errors import ConfigError, DatasetError
-from fgslam.export.atomic import ExistingFolder, create_run_folder
+from fgslam.export.atomic import RUN_MARKER, ExistingFolder, create_run_folder
 from fgslam.export.metrics import EstimatorMetrics
 from fgslam.factory import make_pipeline, make_stream, open_sequence
 from fgslam.frontend.stream import FeatureFrame
@@ -69,7 +71,10 @@ def run_experiment(
     Raises:
         FgslamError: of any kind, with a message for the user.
     """
+    if existing == "resume" or (existing == "refuse" and folder.exists()):
+        create_run_folder(folder, existing)  # refuses now, not after minutes of rendering
     if existing == "resume":
+        checkpoint.require(folder)
         _require_same(config, folder)
     sequence = open_sequence(config, lambda done, total: progress("rendering", done, total))
     _require_odometry(config, sequence)
@@ -78,6 +83,7 @@ def run_experiment(
     recorder = RunRecorder(MeasurementLog(sequence.rig, pipeline.motion.description()))
     outputs = RunOutputs(folder, config, sequence, pipeline, recorder)
     if existing == "resume":
+        _require_same_recording(sequence, folder)
         checkpoint.load(folder, pipeline, recorder)
     else:
         outputs.write_config()
@@ -94,7 +100,8 @@ def _loop(outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]) 
         else frozenset()
     )
     stream = make_stream(sequence, outputs.config.frontend)(start=len(recorder))
-    saved = waiting = time.perf_counter()
+    waiting = time.perf_counter()
+    saved = -math.inf  # the first frame is saved at once: from then on any end can be resumed
     try:
         for found in stream:
             wait_ms = 1e3 * (time.perf_counter() - waiting)
@@ -105,12 +112,18 @@ def _loop(outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]) 
             progress("tracking", len(recorder), len(sequence))
             done = len(recorder) == len(sequence)
             due = time.perf_counter() - saved >= outputs.config.output.checkpoint_seconds
-            if not done and (due or stopped()):
+            stop = stopped()  # asked once: a signal may arrive between two questions
+            if not done and (due or stop):
                 save_progress(outputs)
                 saved = time.perf_counter()
-            if stopped() and not done:
+            if stop and not done:
                 return False
             waiting = time.perf_counter()
+    except DatasetError:
+        # The recording failed before its frame touched any state: all up to it can be kept.
+        if len(recorder):
+            save_progress(outputs)
+        raise
     finally:
         stream.close()
     return True
@@ -124,7 +137,9 @@ def save_progress(outputs: RunOutputs) -> None:
 
 def _process(outputs: RunOutputs, found: FeatureFrame) -> FrameReport:
     timestamp = float(outputs.sequence.timestamps[found.i])
-    index = found.i if found.frame is None else found.frame.index
+    # A frame without images has a number, too: the one that the selection gives it.
+    dataset = outputs.config.dataset
+    index = dataset.start + found.i * dataset.stride
     return outputs.pipeline.process(found, index, timestamp)
 
 
@@ -172,9 +187,26 @@ def _require_odometry(config: ExperimentConfig, sequence: Sequence) -> None:
 
 def _require_same(config: ExperimentConfig, folder: Path) -> None:
     """A run resumes only with the configuration that it was started with."""
-    path = folder / "config.yaml"
-    if path.is_file() and load_config(path).as_values() != config.as_values():
+    path = folder / RUN_MARKER
+    if load_config(path).as_values() != config.as_values():
         raise ConfigError(
             f"{path}: differs from the configuration given; resume with the same one "
-            f"(fgslam run {path} --resume) or start again with --overwrite"
+            f"({resume_command(folder)}) or start again with --overwrite"
         )
+
+
+def _require_same_recording(sequence: Sequence, folder: Path) -> None:
+    """A run resumes only on the recording that it was started on."""
+    path = folder / RUN_MARKER
+    started_on = ((load_config(path).provenance or {}).get("dataset") or {}).get("identity")
+    if started_on != sequence.identity:
+        raise DatasetError(
+            f"{sequence.name}: the recording has changed since {path} was written; restore it, or "
+            "start again with --overwrite"
+        )
+
+
+def resume_command(folder: Path) -> str:
+    """What to type to continue the run in ``folder``, whatever overrides it was started with."""
+    run = shlex.quote(str(folder))
+    return f"fgslam run {shlex.quote(str(folder / RUN_MARKER))} --out {run} --resume"

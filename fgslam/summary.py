@@ -63,9 +63,19 @@ def run_numbers(recorder: RunRecorder) -> dict[str, JsonValue]:
         "mean_residual_px": _median(recorder.column("mean_residual_px")),
         "stereo_precision": _mean(recorder.column("stereo_precision")),
         "frames_without_image": int(np.count_nonzero(recorder.column("problem") != "")),
+        "frame_problems": frame_problems(recorder),
         "loop_ms": asdict(UpdateTime.of(_stage_sum(times, _LOOP_STAGES))),
         "sift_ms": asdict(UpdateTime.of(_stage_sum(times, ("sift",)))),
     }
+
+
+def frame_problems(recorder: RunRecorder) -> list[str]:
+    """A line for each frame whose images could not be used: which and why."""
+    return [
+        f"frame {increment.index}: {row.problem}"
+        for increment, row in zip(recorder.log, recorder.rows, strict=True)
+        if row.problem
+    ]
 
 
 def _stage_sum(times: FloatArray, stages: tuple[str, ...]) -> FloatArray:
