@@ -41,8 +41,9 @@ from fgslam.types import (
 _NEAREST_DEPTH_M = 1e-3  # a point nearer than this, or behind, cannot be linearised
 _STEP_TOLERANCE = 1e-9  # radians and metres; far below anything measurable
 _ROBUST_TOLERANCE = 1e-5  # the robust minimum only chooses the inliers for the exact one
-_REPEATS = 4  # minimisations with the remaining matches; two suffice on all recordings tried
+_REPEATS = 10  # minimisations with the remaining matches; two suffice on all recordings tried
 _MAX_DAMPING = 1e8
+_LEAST_CURVATURE = 1e-10  # of the Hessian with unit diagonal; below it the pose is undetermined
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,7 +174,16 @@ class EgoMotionSolver:
             if np.abs(step).max() < tolerance:
                 break
             wTc = _retract(best, step)
-        return _Minimum(best, hessian, True, iteration)
+        return _Minimum(best, hessian, self._determined(best, hessian), iteration)
+
+    def _determined(self, wTc: FloatArray, hessian: FloatArray) -> bool:
+        """Whether the matches (and the prior) fix all degrees of freedom, beyond rounding."""
+        basis = self.basis(wTc)
+        reduced = basis.T @ hessian @ basis
+        size = np.sqrt(np.diagonal(reduced))
+        if not (size > 0.0).all():
+            return False
+        return bool(np.linalg.eigvalsh(reduced / np.outer(size, size))[0] > _LEAST_CURVATURE)
 
     def _information(self, wTc: FloatArray, problem: PoseProblem) -> FloatArray:
         """Inverse covariances (k, 3, 3) of the residuals; the disparity's row 0 if unused."""
@@ -234,17 +244,15 @@ class EgoMotionSolver:
             return None
 
     def _inliers(self, wTc: FloatArray, problem: PoseProblem) -> BoolArray:
-        points = transform_to_camera(wTc, problem.points)
-        in_front = points[:, 2] > _NEAREST_DEPTH_M
-        points[~in_front, 2] = np.inf
-        residual = project(self._rig, points) - problem.measurement
-        keep = in_front & (np.linalg.norm(residual[:, :2], axis=1) <= self._settings.outlier_px)
+        near = self.image_residuals(wTc, problem) <= self._settings.outlier_px  # so in front, too
         if self._settings.outlier_sigmas > 0.0 and self._settings.weighting != "uniform":
-            points[~in_front, 2] = 1.0
-            information = self._information(wTc, problem)
+            candidates = problem.select(near)
+            points = transform_to_camera(wTc, candidates.points)
+            residual = project(self._rig, points) - candidates.measurement
+            information = self._information(wTc, candidates)
             squared = np.einsum("ki,kij,kj->k", residual, information, residual)
-            keep &= squared <= self._settings.outlier_sigmas**2
-        return np.asarray(keep)
+            near[near] = squared <= self._settings.outlier_sigmas**2
+        return near
 
     def _finish(
         self,
