@@ -10,11 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.datasets.findings import Finding
+from fgslam.datasets.findings import Finding, Level
 from fgslam.datasets.image_checks import spread_over
 from fgslam.datasets.match_checks import (
     LEFT_RIGHT,
     TOP_RIGHT,
+    Pair,
     camera_order_is_wrong,
     check_disparity_agreement,
     check_disparity_gates,
@@ -22,6 +23,7 @@ from fgslam.datasets.match_checks import (
     check_features,
     check_steadiness,
     check_stereo_counts,
+    fit_turn,
 )
 from fgslam.errors import FrameError
 from fgslam.frontend.descriptor_matching import mutual_nearest
@@ -33,6 +35,7 @@ from fgslam.types import CameraRig, Features, FloatArray, IntArray, Sequence, St
 _FEWEST_FOR_MEDIAN = 10
 _NEAR_LINE_PX = 2.0
 _LISTED = 14
+_FEWEST_FOR_DEPTH = 10  # a frame; fewer are mostly wrong ones
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,11 +46,13 @@ class Free:
         right: (k,) the right features.
         across: (k,) offset across the epipolar line, other minus right, pixels.
         along: (k,) disparity along it, other minus right, pixels, of either sign.
+        places: (k, 2) column and row in the right image.
     """
 
     right: IntArray
     across: FloatArray
     along: FloatArray
+    places: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,13 +102,16 @@ def look_at_frames(
 
 
 def _look(index: int, features: tuple[Features, ...], matcher: StereoMatcher) -> Look:
+    right, left = features[:2]
+    pairs = matcher.match_left(right, left)
+    kept = matcher.match_top(right, left, features[2], pairs)[0] if len(features) > 2 else pairs[0]
     return Look(
         index=index,
         features=tuple(len(found) for found in features),
-        pairs=len(matcher.match_left(features[0], features[1])[0]),
-        stereo=matcher.match(features),
-        left=_free(features[0], features[1], 0),
-        top=_free(features[0], features[2], 1) if len(features) > 2 else None,
+        pairs=len(pairs[0]),
+        stereo=matcher.match(features) if len(kept) else StereoFeatures.empty(),
+        left=_free(right, left, 0),
+        top=_free(right, features[2], 1) if len(features) > 2 else None,
     )
 
 
@@ -111,7 +119,7 @@ def _free(right: Features, other: Features, axis: int) -> Free:
     """Ungated matches whose disparity runs along ``axis``: 0 columns, 1 rows."""
     i, j = mutual_nearest(right.descriptors, other.descriptors)
     difference = other.xy[j] - right.xy[i]
-    return Free(i, difference[:, 1 - axis], difference[:, axis])
+    return Free(i, difference[:, 1 - axis], difference[:, axis], right.xy[i])
 
 
 # --------------------------------------------------------------------------------------------
@@ -125,34 +133,44 @@ def judge_matches(
     if not looks:
         return ()
     frames = np.array([look.index for look in looks], np.int64)
+    counts = np.array([len(look.stereo) for look in looks], np.int64)
     left = [look.left for look in looks]
     across, along = _joined(left)
-    counts = np.array([len(look.stereo) for look in looks], np.int64)
     findings = (
         *check_features(np.array([look.features for look in looks], np.int64)),
-        *check_epipolar(across, along, LEFT_RIGHT),
-        *check_steadiness(_medians(left), frames, LEFT_RIGHT),
-        *check_stereo_counts(counts, frames),
+        *_judge_pair(left, frames, LEFT_RIGHT),
     )
     if camera_order_is_wrong(along):
-        return findings  # The rest would only follow from that.
-    near = np.abs(across - np.median(across)) < _NEAR_LINE_PX if len(across) else across > 0
+        return findings  # All else would only follow from that.
+    near = np.abs(across - np.median(across)) < _NEAR_LINE_PX if len(across) else across > 0.0
     return (
         *findings,
+        *check_stereo_counts(counts, frames),
         *check_disparity_gates(along[near], settings.min_disparity_px, settings.max_disparity_px),
         *_judge_top(looks, frames, rig),
     )
 
 
+def _judge_pair(matches: list[Free], frames: IntArray, pair: Pair) -> tuple[Finding, ...]:
+    across, along = _joined(matches)
+    places = np.concatenate([free.places for free in matches])
+    found = check_epipolar(across, along, pair, places)
+    if not len(across):
+        return found
+    # A turned camera would give each frame its own median, by where its features are.
+    steady = fit_turn(across, places, pair).residuals
+    cuts = np.cumsum([len(free.across) for free in matches])[:-1]
+    return (*found, *check_steadiness(_medians(np.split(steady, cuts)), frames, pair))
+
+
 def _judge_top(looks: tuple[Look, ...], frames: IntArray, rig: CameraRig) -> tuple[Finding, ...]:
     top = [look.top for look in looks if look.top is not None]
-    if len(top) < len(looks):
+    if not top:
         return ()
-    return (
-        *check_epipolar(*_joined(top), TOP_RIGHT),
-        *check_steadiness(_medians(top), frames, TOP_RIGHT),
-        *check_disparity_agreement(*_both_disparities(looks, rig)),
-    )
+    found = _judge_pair(top, frames, TOP_RIGHT)
+    if any(finding.level is Level.PROBLEM for finding in found):
+        return found
+    return (*found, *check_disparity_agreement(*_both_disparities(looks, rig)))
 
 
 def _joined(matches: list[Free]) -> tuple[FloatArray, FloatArray]:
@@ -161,13 +179,10 @@ def _joined(matches: list[Free]) -> tuple[FloatArray, FloatArray]:
     return across, np.concatenate([free.along for free in matches])
 
 
-def _medians(matches: list[Free]) -> FloatArray:
+def _medians(offsets: list[FloatArray]) -> FloatArray:
     """Median offset (n,) of each frame, NaN where too few matched."""
     return np.array(
-        [
-            np.median(free.across) if len(free.across) >= _FEWEST_FOR_MEDIAN else np.nan
-            for free in matches
-        ]
+        [np.median(found) if len(found) >= _FEWEST_FOR_MEDIAN else np.nan for found in offsets]
     )
 
 
@@ -211,14 +226,14 @@ def match_facts(
         all_three = np.array([len(look.stereo) for look in looks])
         facts.append(("three-camera matches", f"{_spread(all_three)} a frame"))
     measurement = np.concatenate([look.stereo.measurement for look in looks])
-    return (*facts, *_depth_facts(measurement[:, 2], rig, settings))
+    return (*facts, *_depth_facts(measurement[:, 2], len(looks), rig, settings))
 
 
 def _depth_facts(
-    disparity: FloatArray, rig: CameraRig, settings: StereoSettings
+    disparity: FloatArray, frames: int, rig: CameraRig, settings: StereoSettings
 ) -> tuple[tuple[str, str], ...]:
-    if not len(disparity):
-        return (("depth", "unknown: nothing matched"),)
+    if len(disparity) < _FEWEST_FOR_DEPTH * frames:
+        return (("depth", "unknown: too few matches"),)
     low, middle, high = np.percentile(disparity, [5.0, 50.0, 95.0])
     scale = rig.fx * rig.baseline
     # First order: dZ = Z^2 / (f B) * sigma of the disparity, a difference of two positions.

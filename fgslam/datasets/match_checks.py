@@ -16,6 +16,12 @@ from fgslam.types import FloatArray, IntArray
 _FEWEST_MATCHES = 20
 _SIGNIFICANT_DISPARITY_PX = 0.5
 _MAX_ROW_OFFSET_PX, _MAX_ROW_SPREAD_PX = 0.75, 1.5
+_MAX_EDGE_PX = 1.0
+_FIT_STEPS = 20
+_SCATTER = (
+    "(lens distortion, cameras turned against each other) or not taken at one time; rectify them "
+    "with the cameras' calibration, trigger the cameras together"
+)
 _MAX_FRAME_DRIFT_PX = 0.75
 _MAX_BASELINE_ERROR = 0.03
 _MAX_COUNT_RATIO = 1.5
@@ -28,6 +34,7 @@ class Pair:
     """How to speak of two cameras whose disparity runs along rows or along columns.
 
     Attributes:
+        axis: along which the disparity runs: 0 columns, 1 rows.
         subject: of the findings.
         names: the two cameras.
         lines: what must agree between them: rows or columns.
@@ -35,6 +42,7 @@ class Pair:
         crossed: what it means when the disparity runs the other way, and the mend.
     """
 
+    axis: int
     subject: str
     names: str
     lines: str
@@ -43,6 +51,7 @@ class Pair:
 
 
 LEFT_RIGHT = Pair(
+    0,
     "epipolar",
     "left and right",
     "rows",
@@ -51,6 +60,7 @@ LEFT_RIGHT = Pair(
     "camera at the right one's left",
 )
 TOP_RIGHT = Pair(
+    1,
     "epipolar, top",
     "top and right",
     "columns",
@@ -73,7 +83,10 @@ def robust_spread(values: FloatArray) -> float:
 
 
 def check_epipolar(
-    offsets: FloatArray, disparities: FloatArray, pair: Pair = LEFT_RIGHT
+    offsets: FloatArray,
+    disparities: FloatArray,
+    pair: Pair = LEFT_RIGHT,
+    places: FloatArray | None = None,
 ) -> tuple[Finding, ...]:
     """What matches between two cameras' images say about rectification and order.
 
@@ -86,6 +99,8 @@ def check_epipolar(
         disparities: (n,) column in the left minus column in the right image, pixels; for the top
             camera row in the top minus row in the right image.
         pair: which two cameras.
+        places: (n, 2) the right features' (column, row), pixels, from which the cause of unequal
+            rows is told; None where it need not be.
     """
     count = len(disparities)
     if count < _FEWEST_MATCHES:
@@ -94,18 +109,19 @@ def check_epipolar(
             "more frames, or check that both cameras show one scene at one time"
         )
         return (Finding(Level.WARNING, pair.subject, text),)
-    offset, spread = float(np.median(offsets)), robust_spread(offsets)
+    offset, spread = round(float(np.median(offsets)), 3) + 0.0, robust_spread(offsets)
     low, high = np.percentile(disparities, [5.0, 95.0])
     within = float(np.percentile(np.abs(offsets), 95.0))
     summary = (
-        f"{pair.lines} of {count} matches differ by {round(offset, 2) + 0.0:+.2f} px (median), spread "
+        f"{pair.lines} of {count} matches differ by {offset:+.2f} px (median), spread "
         f"{spread:.2f} px, 95 % within {within:.2f} px; disparities {low:.1f} to {high:.1f} px"
     )
     found = [Finding(Level.INFO, pair.subject, summary)]
     if _crossed(offsets, disparities):
         found.append(Finding(Level.PROBLEM, pair.subject, pair.crossed))
         return tuple(found)
-    found.extend(_rectification(offset, spread, pair))
+    turn = None if places is None else fit_turn(offsets, places, pair)
+    found.extend(_rectification(offset, spread, pair, turn))
     found.extend(_camera_order(disparities, pair))
     return tuple(found)
 
@@ -123,7 +139,46 @@ def _crossed(offsets: FloatArray, disparities: FloatArray) -> bool:
     return still and (big or across > _MAX_ROW_SPREAD_PX)
 
 
-def _rectification(offset: float, spread: float, pair: Pair) -> list[Finding]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Turn:
+    """The offsets across the lines as a linear function of the place in the image.
+
+    Attributes:
+        roll: slope along the lines: the angle in radians by which one image is turned.
+        growth: slope across the lines: the fraction by which one image is larger.
+        residuals: (n,) offsets in pixels without the part of the two slopes.
+        at_edge: (2,) offsets in pixels that the two slopes make at the outermost matches.
+    """
+
+    roll: float
+    growth: float
+    residuals: FloatArray
+    at_edge: FloatArray
+
+    @property
+    def roll_matters(self) -> bool:
+        """Whether the turn moves the outermost matches more than the size does."""
+        return bool(self.at_edge[0] >= self.at_edge[1])
+
+
+def fit_turn(offsets: FloatArray, places: FloatArray, pair: Pair = LEFT_RIGHT) -> Turn:
+    """Robust fit (Cauchy weights) of offsets (n,) to places (n, 2) as in check_epipolar."""
+    centred = places - np.median(places, axis=0)
+    along, across = centred[:, pair.axis], centred[:, 1 - pair.axis]
+    design = np.column_stack([np.ones(len(offsets)), along, across])
+    target = offsets - np.median(offsets)
+    slopes: FloatArray = np.zeros(3)
+    for _ in range(_FIT_STEPS):
+        left = target - design @ slopes
+        weight = 1.0 / (1.0 + (left / max(robust_spread(left), 0.1)) ** 2)
+        solution = np.linalg.lstsq(design * weight[:, None], target * weight, rcond=None)[0]
+        slopes = np.asarray(solution, np.float64)
+    edge = np.percentile(np.abs(design[:, 1:]), 95.0, axis=0) * np.abs(slopes[1:])
+    residuals = offsets - design[:, 1:] @ slopes[1:]
+    return Turn(float(slopes[1]), float(slopes[2]), residuals, edge)
+
+
+def _rectification(offset: float, spread: float, pair: Pair, turn: Turn | None) -> list[Finding]:
     found = []
     if abs(offset) > _MAX_ROW_OFFSET_PX:
         text = (
@@ -131,14 +186,32 @@ def _rectification(offset: float, spread: float, pair: Pair) -> list[Finding]:
             "rectify again, or shift one camera's images"
         )
         found.append(Finding(Level.PROBLEM, pair.subject, text))
+    explained = turn is not None and robust_spread(turn.residuals) < 0.6 * spread
     if spread > _MAX_ROW_SPREAD_PX:
-        text = (
-            f"{pair.lines} scatter by {spread:.1f} px: the images are not rectified (lens "
-            "distortion, or cameras turned against each other); rectify them with the cameras' "
-            "calibration"
-        )
+        cause = _cause(turn, pair) if turn is not None and explained else _SCATTER
+        text = f"{pair.lines} scatter by {spread:.1f} px: the images are not rectified {cause}"
         found.append(Finding(Level.PROBLEM, pair.subject, text))
+    elif turn is not None and float(turn.at_edge.max()) > _MAX_EDGE_PX:
+        text = (
+            f"{pair.lines} disagree by {turn.at_edge.max():.1f} px at the images' edges: they are "
+            f"not quite rectified {_cause(turn, pair)}"
+        )
+        found.append(Finding(Level.WARNING, pair.subject, text))
     return found
+
+
+def _cause(turn: Turn, pair: Pair) -> str:
+    """The slope that matters, in words, with the mend."""
+    other = pair.names.split(" ", maxsplit=1)[0]
+    if turn.roll_matters:
+        # Columns grow against the sense in which rows do when an image is turned.
+        angle = np.degrees(turn.roll) * (1.0 if pair.axis == 0 else -1.0)
+        sense = "clockwise" if angle > 0.0 else "anticlockwise"
+        cause = f"the {other} image is turned {sense} by about {abs(angle):.2g} degrees"
+    else:
+        size = "larger" if turn.growth > 0.0 else "smaller"
+        cause = f"the {other} image is {size} by about {100.0 * abs(turn.growth):.2g} %"
+    return f"({cause} against the right one); rectify them with the cameras' calibration"
 
 
 def _negative_share(disparities: FloatArray) -> float:
