@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import json
 import zipfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,6 +31,34 @@ from fgslam.types import (
 FORMAT = "fgslam measurement log"
 VERSION = 1
 _UPPER = np.triu_indices(3)
+_UNREADABLE = (
+    OSError,
+    ValueError,
+    EOFError,
+    KeyError,
+    TypeError,
+    NotImplementedError,
+    MemoryError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What NumPy and zipfile raise on truncated, damaged and foreign files."""
+
+# Arrays by the count that their first axis has, with type and the shape of an item.
+_PER_FRAME: dict[str, tuple[str, tuple[int, ...]]] = {
+    "frame_index": ("i", ()),
+    "timestamp": ("f", ()),
+    "odometry_motion": ("f", (4, 4)),
+    "odometry_covariance": ("f", (6, 6)),
+}
+_PER_OBSERVATION: dict[str, tuple[str, tuple[int, ...]]] = {
+    "observation_id": ("i", ()),
+    "measurement": ("f", (3,)),
+    "measurement_covariance": ("f", (6,)),
+    "pixels": ("f", (3, 2)),
+    "is_new": ("b", ()),
+    "rejected": ("b", ()),
+}
 _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline")
 
 
@@ -97,6 +126,7 @@ class MeasurementLog:
     def from_arrays(arrays: StateArrays, where: str) -> MeasurementLog:
         """The log back from its arrays; ``where`` names the source in messages."""
         header = _read_header(arrays, where)
+        _require_consistent(arrays, where)
         rig = CameraRig(**header["rig"], bTc=arrays["rig_bTc"])
         log = MeasurementLog(rig, header["motion"])
         observed = _split_observations(arrays)
@@ -128,11 +158,14 @@ def load_arrays(path: Path) -> StateArrays:
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
+    except IsADirectoryError:
+        raise MeasurementLogError(f"{path}: is a folder; give the .npz file itself") from None
     except FileNotFoundError:
         raise MeasurementLogError(f"{path}: no such file; give the run folder's own") from None
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
+    except _UNREADABLE as error:
+        cause = " ".join(str(error).split()) or type(error).__name__
         raise MeasurementLogError(
-            f"{path}: not a readable .npz file ({error}); it may be truncated, run again"
+            f"{path}: not a readable .npz file ({cause}); it may be truncated, run again"
         ) from None
 
 
@@ -143,12 +176,41 @@ def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
         header = {}
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise MeasurementLogError(f"{where}: not an fgslam measurement log; give measurements.npz")
-    if header["version"] != VERSION:
+    if header.get("version") != VERSION:
         raise MeasurementLogError(
-            f"{where}: measurement log of version {header['version']}, this fgslam reads version "
-            f"{VERSION}; repeat the run or use the matching fgslam"
+            f"{where}: measurement log of version {header.get('version')}, this fgslam reads "
+            f"version {VERSION}; repeat the run or use the matching fgslam"
         )
+    rig = header.get("rig")
+    if not isinstance(rig, dict) or set(rig) != {*_RIG, "vertical_baseline"}:
+        raise MeasurementLogError(f"{where}: the log's header names no cameras; run again")
+    if not isinstance(header.get("motion"), dict):
+        raise MeasurementLogError(f"{where}: the log's header has no motion model; run again")
     return header
+
+
+def _require_consistent(arrays: StateArrays, where: str) -> None:
+    """Raises MeasurementLogError unless all arrays are there, of the right type and size."""
+    frames = len(arrays["frame_index"]) if "frame_index" in arrays else 0
+    seen = len(arrays["observation_id"]) if "observation_id" in arrays else 0
+    expected: dict[str, tuple[str, tuple[int, ...]]] = {"rig_bTc": ("f", (4, 4))}
+    expected |= {name: (kind, (frames, *item)) for name, (kind, item) in _PER_FRAME.items()}
+    expected |= {name: (kind, (seen, *item)) for name, (kind, item) in _PER_OBSERVATION.items()}
+    for name in ("observation", "missed", "pruned"):
+        expected[f"{name}_start"] = ("i", (frames + 1,))
+    for name, (kind, shape) in expected.items():
+        array = arrays.get(name)
+        if array is None or array.dtype.kind != kind or array.shape != shape:
+            raise MeasurementLogError(f"{where}: array {name} is absent or damaged; run again")
+    for name in ("observation", "missed", "pruned"):
+        start, ids = arrays[f"{name}_start"], arrays.get(f"{name}_id", np.empty(0))
+        if ids.dtype.kind != "i" or not _covers(start, len(ids)):
+            raise MeasurementLogError(f"{where}: array {name}_id is absent or damaged; run again")
+
+
+def _covers(start: IntArray, count: int) -> bool:
+    """Whether the offsets run from 0 to ``count`` without a step back."""
+    return bool(start[0] == 0 and start[-1] == count and (np.diff(start) >= 0).all())
 
 
 def _motion(increment: Increment) -> FloatArray:

@@ -104,9 +104,7 @@ def _drifting_body_poses(poses: FloatArray, rng: np.random.Generator) -> FloatAr
     return np.array(out)
 
 
-def _texture(
-    rng: np.random.Generator, width_m: float, height_m: float
-) -> npt.NDArray[np.float32]:
+def _texture(rng: np.random.Generator, width_m: float, height_m: float) -> npt.NDArray[np.float32]:
     """Blobs of several sizes, none below what the farthest view resolves."""
     shape = (round(height_m / _CELL_M), round(width_m / _CELL_M))
     total = np.zeros(shape)

@@ -1,0 +1,205 @@
+"""The measurement log keeps every bit, and refuses files that are not one."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fgslam.checkpoint import save_log, write_arrays
+from fgslam.errors import MeasurementLogError
+from fgslam.measurement_log import MeasurementLog, load_arrays
+from fgslam.types import CameraRig, Increment, Observations, Odometry
+
+RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
+
+
+def increment(k: int, rng: np.random.Generator, seen: int, with_odometry: bool) -> Increment:
+    noise = rng.standard_normal((seen, 3, 3))
+    covariance = noise + np.swapaxes(noise, 1, 2)
+    step = rng.standard_normal((6, 6))
+    return Increment(
+        index=3 * k,
+        timestamp=0.1 + k / 3.0,
+        odometry=Odometry(rng.standard_normal((4, 4)), step @ step.T) if with_odometry else None,
+        observations=Observations(
+            rng.permutation(1000)[:seen].astype(np.int64),
+            rng.standard_normal((seen, 3)),
+            covariance,
+            np.where(rng.random((seen, 3, 2)) < 0.2, np.nan, rng.standard_normal((seen, 3, 2))),
+            rng.random(seen) < 0.5,
+        ),
+        rejected=rng.random(seen) < 0.3,
+        missed_ids=rng.integers(0, 2**40, k % 3),
+        pruned_ids=rng.integers(0, 2**40, (k + 1) % 4),
+    )
+
+
+@pytest.fixture
+def log(rng: np.random.Generator) -> MeasurementLog:
+    """Frames with many, one and no observation, with and without odometry."""
+    out = MeasurementLog(RIG, {"kind": "recorded", "stand_in": {"sigma": [0.1, 1e-17]}})
+    for k, seen in enumerate((7, 0, 1, 0, 12, 0)):
+        out.append(increment(k, rng, seen, with_odometry=k > 0 and k != 3))
+    return out
+
+
+@pytest.fixture
+def file(log: MeasurementLog, tmp_path: Path) -> Path:
+    save_log(tmp_path, log)
+    return tmp_path / "measurements.npz"
+
+
+def assert_same(a: object, b: object) -> None:
+    """Equal to the bit, NaN included, however deep."""
+    assert type(a) is type(b)
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
+    elif hasattr(a, "__dataclass_fields__"):
+        for item in fields(a):  # type: ignore[arg-type]
+            assert_same(getattr(a, item.name), getattr(b, item.name))
+    else:
+        assert a == b
+
+
+def test_every_bit_survives(log: MeasurementLog, file: Path) -> None:
+    loaded = MeasurementLog.load(file)
+    assert_same(loaded.rig, log.rig)
+    assert loaded.motion_model == log.motion_model
+    assert len(loaded) == len(log) == 6
+    for before, after in zip(log, loaded, strict=True):
+        assert_same(after, before)
+
+
+def test_the_same_log_gives_the_same_bytes(file: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    again.mkdir()
+    save_log(again, MeasurementLog.load(file))
+    assert (again / "measurements.npz").read_bytes() == file.read_bytes()
+
+
+def test_a_two_camera_rig_and_an_empty_log(tmp_path: Path) -> None:
+    rig = CameraRig(64, 48, 50.0, 50.0, 31.5, 23.5, 0.2, None, np.eye(4))
+    save_log(tmp_path, MeasurementLog(rig, {}))
+    loaded = MeasurementLog.load(tmp_path / "measurements.npz")
+    assert len(loaded) == 0
+    assert loaded.rig.vertical_baseline is None
+    assert loaded.rig.cameras == 2
+
+
+def test_time_may_not_run_backwards(log: MeasurementLog, rng: np.random.Generator) -> None:
+    late = increment(5, rng, 2, with_odometry=True)
+    with pytest.raises(MeasurementLogError, match=r"does not come after .*; sort"):
+        log.append(late)
+    assert len(log) == 6
+
+
+def test_a_file_with_times_backwards_is_refused(file: Path) -> None:
+    arrays = load_arrays(file)
+    arrays["timestamp"][3] = arrays["timestamp"][2]
+    with pytest.raises(MeasurementLogError, match="does not come after"):
+        MeasurementLog.from_arrays(arrays, "x.npz")
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.1, 0.5, 0.9, 0.999])
+def test_a_truncated_file_is_refused(file: Path, keep: float) -> None:
+    data = file.read_bytes()
+    file.write_bytes(data[: int(keep * len(data))])
+    with pytest.raises(MeasurementLogError, match=re.escape(str(file)) + r".*truncated, run again"):
+        MeasurementLog.load(file)
+
+
+def test_damage_is_refused_or_harmless(file: Path, rng: np.random.Generator) -> None:
+    """Any flipped byte: either one clear refusal, or a spot that carries no measurement."""
+    data, whole = file.read_bytes(), MeasurementLog.load(file)
+    refused = 0
+    for at in rng.integers(0, len(data), 150):
+        broken = bytearray(data)
+        broken[at] ^= 0xFF
+        file.write_bytes(bytes(broken))
+        try:
+            loaded = MeasurementLog.load(file)
+        except MeasurementLogError as error:
+            refused += 1
+            assert "\n" not in str(error)
+            assert str(file) in str(error)
+        else:
+            for before, after in zip(whole, loaded, strict=True):
+                assert_same(after, before)
+    assert refused > 100
+
+
+def test_missing_file_folder_and_foreign_files(tmp_path: Path) -> None:
+    with pytest.raises(MeasurementLogError, match="no such file"):
+        MeasurementLog.load(tmp_path / "measurements.npz")
+    with pytest.raises(MeasurementLogError, match="is a folder"):
+        MeasurementLog.load(tmp_path)
+    text = tmp_path / "text.npz"
+    text.write_text("hello", encoding="utf-8")
+    with pytest.raises(MeasurementLogError, match=r"not a readable \.npz"):
+        MeasurementLog.load(text)
+    bare = tmp_path / "bare.npz"
+    with bare.open("wb") as stream:
+        np.save(stream, np.eye(3))
+    with pytest.raises(MeasurementLogError, match=r"not a readable \.npz"):
+        MeasurementLog.load(bare)
+    foreign = tmp_path / "foreign.npz"
+    write_arrays(foreign, {"a": np.eye(3)})
+    with pytest.raises(MeasurementLogError, match="not an fgslam measurement log"):
+        MeasurementLog.load(foreign)
+
+
+def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
+    class Bomb:
+        def __reduce__(self) -> tuple[object, tuple[str]]:
+            return Path.touch, (tmp_path / "exploded",)  # type: ignore[return-value]
+
+    evil = tmp_path / "evil.npz"
+    buffer = io.BytesIO()
+    np.savez(buffer, header=np.array([Bomb()], dtype=object))
+    evil.write_bytes(buffer.getvalue())
+    with pytest.raises(MeasurementLogError, match=r"not a readable \.npz"):
+        MeasurementLog.load(evil)
+    assert not (tmp_path / "exploded").exists()
+
+
+@pytest.mark.parametrize("version", [2, 99, "1", None])
+def test_another_version_is_refused(file: Path, version: object) -> None:
+    arrays = load_arrays(file)
+    header = json.loads(str(arrays["header"])) | {"version": version}
+    arrays["header"] = np.array(json.dumps(header))
+    with pytest.raises(MeasurementLogError, match=rf"version {version}, this fgslam reads .* 1"):
+        MeasurementLog.from_arrays(arrays, "x.npz")
+
+
+@pytest.mark.parametrize("change", [{"rig": None}, {"rig": {"width": 3}}, {"motion": 7}])
+def test_a_header_that_lacks_something_is_refused(file: Path, change: dict[str, object]) -> None:
+    arrays = load_arrays(file)
+    arrays["header"] = np.array(json.dumps(json.loads(str(arrays["header"])) | change))
+    with pytest.raises(MeasurementLogError, match="header"):
+        MeasurementLog.from_arrays(arrays, "x.npz")
+
+
+def test_each_array_must_be_there_whole_and_of_its_type(file: Path) -> None:
+    whole = load_arrays(file)
+    for name in whole.keys() - {"header"}:
+        broken: list[dict[str, np.ndarray]] = [
+            {k: v for k, v in whole.items() if k != name},
+            whole | {name: whole[name][:-1]},
+            whole | {name: np.full(whole[name].shape, "x")},
+        ]
+        for arrays in broken:
+            with pytest.raises(MeasurementLogError, match=r"x\.npz: array .* absent or damaged"):
+                MeasurementLog.from_arrays(arrays, "x.npz")
+
+
+def test_offsets_that_step_back_are_refused(file: Path) -> None:
+    arrays = load_arrays(file)
+    arrays["observation_start"][1] = 15
+    with pytest.raises(MeasurementLogError, match="observation_id"):
+        MeasurementLog.from_arrays(arrays, "x.npz")
