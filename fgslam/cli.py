@@ -108,10 +108,13 @@ def inspect(
         typer.Option("--set", metavar="A.B=VALUE", help="override one key of the experiment"),
     ] = None,
     frames: Annotated[
-        int, typer.Option(min=1, help="how many frames to look at, spread over the recording")
+        int, typer.Option(min=1, help="in how many frames, evenly spread, features are matched")
     ] = 12,
 ) -> None:
-    """Say what is in a recording, and every problem found, in words."""
+    """Say what is in a recording, and every problem found, in words.
+
+    Exits with 0 whatever the report says, with 2 where the recording cannot be opened at all.
+    """
     from fgslam.console import progress_bar
     from fgslam.inspection import inspect_recording
 

@@ -14,7 +14,7 @@ def mutual_nearest(a: ByteArray, b: ByteArray, ratio: float = 0.8) -> tuple[IntA
     Args:
         a: (n, 128) descriptors.
         b: (m, 128) descriptors.
-        ratio: the distance is at most this fraction of that to the second nearest in ``b``.
+        ratio: the distance is less than this fraction of that to the second nearest in ``b``.
 
     Returns:
         Indices (k,) into ``a``, ascending, and (k,) into ``b``.
@@ -27,7 +27,7 @@ def mutual_nearest(a: ByteArray, b: ByteArray, ratio: float = 0.8) -> tuple[IntA
     best = squared[i, j]
     mutual = np.argmin(squared, axis=0)[j] == i
     squared[i, j] = np.inf
-    keep = mutual & (best <= ratio * ratio * squared.min(axis=1))
+    keep = mutual & (best < ratio * ratio * squared.min(axis=1))
     return i[keep], j[keep]
 
 

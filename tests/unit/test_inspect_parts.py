@@ -1,0 +1,262 @@
+"""Parts of `fgslam inspect`: recognising layouts, matching by descriptors, telling causes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dataset_builders import euroc, image_folder, kitti, picture, save
+
+from fgslam.datasets.findings import Finding, Level
+from fgslam.datasets.layouts import kitti_drives, recognise_layout
+from fgslam.datasets.match_checks import (
+    LEFT_RIGHT,
+    TOP_RIGHT,
+    Pair,
+    check_disparity_agreement,
+    check_disparity_gates,
+    check_epipolar,
+    check_features,
+    check_steadiness,
+    check_stereo_counts,
+    fit_turn,
+)
+from fgslam.errors import DatasetError
+from fgslam.frontend.descriptor_matching import mutual_nearest
+from fgslam.geometry import pose
+from fgslam.inspection import inspect_recording
+from fgslam.inspection_report import render_report
+
+AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+# --------------------------------------------------------------------------------------------
+# Layouts
+
+
+def test_image_folder_is_recognised(tmp_path: Path) -> None:
+    root = image_folder(tmp_path)
+    assert recognise_layout(root) == {"kind": "image_folder", "path": str(root)}
+
+
+def test_euroc_is_recognised_from_both_folders(tmp_path: Path) -> None:
+    cameras = (pose(AHEAD, np.zeros(3)), pose(AHEAD, np.array([0.0, -0.1, 0.0])))
+    root = euroc(tmp_path, cameras)
+    for folder in (root, root / "mav0"):
+        assert recognise_layout(folder) == {"kind": "euroc", "path": str(folder)}
+
+
+def test_light_field_is_recognised(tmp_path: Path) -> None:
+    (tmp_path / "positions.csv").write_text("", encoding="utf-8")
+    (tmp_path / "calib.json").write_text("{}", encoding="utf-8")
+    assert recognise_layout(tmp_path)["kind"] == "light_field"
+
+
+def test_kitti_is_recognised_from_its_root_and_from_a_drive(tmp_path: Path) -> None:
+    root, _ = kitti(tmp_path, 3, "06")
+    (root / "sequences" / "11").mkdir()
+    (root / "sequences" / "notes").mkdir()
+    assert kitti_drives(root) == ("06", "11")
+    expected = {"kind": "kitti", "path": str(root), "sequence": "06"}
+    assert recognise_layout(root) == expected
+    assert recognise_layout(root / "sequences" / "06") == expected
+
+
+def test_report_on_kitti_names_the_drive_and_the_others(tmp_path: Path) -> None:
+    root, _ = kitti(tmp_path, 4, "06")
+    (root / "sequences" / "07").mkdir()
+    report = " ".join(inspect_recording(root).split())
+    assert "recording KITTI 06" in report
+    assert 'dataset.sequence "06"' in report
+    assert f"other drives 07: inspect {root}/sequences/NN" in report
+
+
+def test_kitti_drive_out_of_place_is_told_how_to_be_given(tmp_path: Path) -> None:
+    root, _ = kitti(tmp_path / "a", 3)
+    moved = tmp_path / "drive"
+    (root / "sequences" / "06").rename(moved)
+    with pytest.raises(DatasetError, match="move it to ROOT/sequences/00"):
+        recognise_layout(moved)
+
+
+def test_half_an_image_folder_gets_its_readers_message(tmp_path: Path) -> None:
+    save(tmp_path / "left" / "000000.png", picture(1))
+    with pytest.raises(DatasetError, match="has no folder right: a recording of one camera"):
+        inspect_recording(tmp_path)
+
+
+def test_unknown_layout_lists_what_is_missing(tmp_path: Path) -> None:
+    (tmp_path / "calib.json").write_text("{}", encoding="utf-8")
+    with pytest.raises(DatasetError) as caught:
+        recognise_layout(tmp_path)
+    text = str(caught.value)
+    assert "image folder (lacks left, right, times.txt)" in text
+    assert "light field (lacks positions.csv)" in text
+    assert "KITTI (lacks sequences/NN)" in text
+    assert "EuRoC (lacks mav0/cam0, mav0/cam1)" in text
+    assert "\n" not in text
+
+
+def test_run_folder_and_missing_folder(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("name: a", encoding="utf-8")
+    with pytest.raises(DatasetError, match=r"is a run folder.*inspect .*config\.yaml"):
+        recognise_layout(tmp_path)
+    with pytest.raises(DatasetError, match="no such folder or experiment file"):
+        recognise_layout(tmp_path / "nowhere")
+
+
+# --------------------------------------------------------------------------------------------
+# Matching by descriptors
+
+
+def descriptors(rng: np.random.Generator, count: int) -> np.ndarray:
+    return rng.integers(0, 120, (count, 128), dtype=np.uint8)
+
+
+def test_noisy_copies_find_each_other(rng: np.random.Generator) -> None:
+    a = descriptors(rng, 60)
+    order = rng.permutation(60)
+    b = np.clip(a[order].astype(int) + rng.integers(-9, 10, a.shape), 0, 255).astype(np.uint8)
+    i, j = mutual_nearest(a, b)
+    np.testing.assert_array_equal(i, np.arange(60))
+    np.testing.assert_array_equal(order[j], np.arange(60))
+
+
+def test_matches_equal_those_of_exhaustive_search(rng: np.random.Generator) -> None:
+    a, b = descriptors(rng, 40), descriptors(rng, 50)
+    b[:15] = a[10:25] // 2 + descriptors(rng, 15) // 2
+    distance = np.linalg.norm(a[:, None].astype(float) - b[None].astype(float), axis=2)
+    expected = []
+    for i, row in enumerate(distance):
+        first, second = np.argsort(row)[:2]
+        if distance[:, first].argmin() == i and row[first] < 0.9 * row[second]:
+            expected.append((i, int(first)))
+    found = list(zip(*(index.tolist() for index in mutual_nearest(a, b, 0.9)), strict=True))
+    assert found == expected
+    assert 10 <= len(found) < 40
+
+
+def test_ambiguous_and_absent_descriptors_do_not_match(rng: np.random.Generator) -> None:
+    a = descriptors(rng, 3)
+    i, _ = mutual_nearest(a, np.concatenate([a, a[:1]]))
+    np.testing.assert_array_equal(i, [1, 2])
+    for first, second in ((a[:0], a), (a, a[:0])):
+        i, j = mutual_nearest(first, second)
+        assert len(i) == len(j) == 0
+
+
+# --------------------------------------------------------------------------------------------
+# Causes
+
+
+def told(findings: tuple[Finding, ...], level: Level) -> str:
+    return " | ".join(f.text for f in findings if f.level is level)
+
+
+@pytest.mark.parametrize("pair", [LEFT_RIGHT, TOP_RIGHT])
+def test_turn_and_growth_are_recovered_among_outliers(rng: np.random.Generator, pair: Pair) -> None:
+    places = rng.uniform(0.0, 400.0, (600, 2))
+    along, across = places[:, pair.axis] - 200.0, places[:, 1 - pair.axis] - 200.0
+    offsets = 0.4 + 0.02 * along - 0.01 * across + rng.normal(0.0, 0.2, 600)
+    wrong = rng.random(600) < 0.15
+    offsets[wrong] = rng.uniform(-150.0, 150.0, wrong.sum())
+    turn = fit_turn(offsets, places, pair)
+    assert turn.roll == pytest.approx(0.02, abs=5e-4)
+    assert turn.growth == pytest.approx(-0.01, abs=5e-4)
+    assert turn.roll_matters
+    assert np.median(np.abs(turn.residuals[~wrong] - np.median(turn.residuals))) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("roll", "level"), [(0.0, None), (np.radians(0.5), Level.WARNING), (0.03, Level.PROBLEM)]
+)
+def test_small_turns_warn_and_large_ones_are_problems(
+    rng: np.random.Generator, roll: float, level: Level | None
+) -> None:
+    places = rng.uniform(0.0, 300.0, (400, 2))
+    offsets = roll * (places[:, 0] - 150.0) + rng.normal(0.0, 0.2, 400)
+    found = check_epipolar(offsets, rng.uniform(2.0, 30.0, 400), LEFT_RIGHT, places)
+    worst = [f for f in found if f.level is not Level.INFO]
+    assert [f.level for f in worst] == ([] if level is None else [level])
+    if level is not None:
+        assert "the left image is turned clockwise by about" in worst[0].text
+
+
+def test_scatter_without_a_pattern_is_not_called_a_turn(rng: np.random.Generator) -> None:
+    places = rng.uniform(0.0, 300.0, (400, 2))
+    offsets = rng.uniform(-6.0, 6.0, 400)
+    found = told(check_epipolar(offsets, np.full(400, 9.0), LEFT_RIGHT, places), Level.PROBLEM)
+    assert "turned clockwise" not in found
+    assert "lens distortion" in found
+
+
+def test_crossed_disparity_is_not_called_unrectified(rng: np.random.Generator) -> None:
+    found = check_epipolar(rng.uniform(3.0, 30.0, 200), rng.normal(0.0, 0.2, 200), TOP_RIGHT)
+    problems = told(found, Level.PROBLEM)
+    assert "the top camera seems to lie beside the right one" in problems
+    assert "rectified" not in problems
+
+
+def test_steady_offsets_are_no_finding_and_jumps_name_their_frames() -> None:
+    frames = np.array([0, 5, 10, 15, 20])
+    steady = np.array([0.1, 0.2, np.nan, 0.1, 0.15])
+    assert check_steadiness(steady, frames) == ()
+    found = told(check_steadiness(steady + np.array([0, 0, 0, 2, 0]), frames), Level.WARNING)
+    assert "(+0.10 to +2.10 px), most in frames 15:" in found
+    assert check_steadiness(np.array([0.0, 9.0]), frames[:2]) == ()
+
+
+def test_disparities_of_three_cameras(rng: np.random.Generator) -> None:
+    horizontal = rng.uniform(3.0, 30.0, 300)
+    vertical = horizontal + rng.normal(0.0, 0.2, 300)
+    assert told(check_disparity_agreement(horizontal, vertical), Level.WARNING) == ""
+    found = told(check_disparity_agreement(horizontal, 0.9 * vertical), Level.WARNING)
+    assert "is 0.90" in found
+    few = told(check_disparity_agreement(horizontal[:9], vertical[:9]), Level.WARNING)
+    assert "only 9 features are matched in all three images" in few
+
+
+def test_feature_counts() -> None:
+    assert check_features(np.array([[300, 320], [310, 290]])) == ()
+    found = told(check_features(np.array([[300, 20], [310, 30]])), Level.WARNING)
+    assert "the left images have only 25 SIFT features" in found
+    assert "the right images have 305 features but the left ones 25" in found
+
+
+def test_too_few_stereo_matches_name_their_frames() -> None:
+    frames = np.array([3, 6, 9])
+    assert check_stereo_counts(np.array([15, 90, 40]), frames) == ()
+    found = told(check_stereo_counts(np.array([15, 14, 0]), frames), Level.WARNING)
+    assert "2 of 3 frames have fewer than 15 matches: 6, 9" in found
+
+
+def test_disparity_gates() -> None:
+    disparities = np.linspace(2.0, 38.0, 100)
+    assert check_disparity_gates(disparities, 1.0, 40.0) == ()
+    near = told(check_disparity_gates(disparities, 1.0, 30.0), Level.WARNING)
+    assert "22 % of matches have more than frontend.stereo.max_disparity_px = 30" in near
+    assert "raise it to 40" in near
+    far = told(check_disparity_gates(disparities, 25.0, 40.0), Level.WARNING)
+    assert "64 % of matches have less than frontend.stereo.min_disparity_px = 25" in far
+
+
+# --------------------------------------------------------------------------------------------
+# The report
+
+
+def test_report_puts_told_facts_above_and_findings_below() -> None:
+    findings = (
+        Finding(Level.PROBLEM, "images", "bad. " * 30),
+        Finding(Level.WARNING, "time", "gap"),
+        Finding(Level.INFO, "odometry", "covers all"),
+        Finding(Level.INFO, "epipolar", "fine"),
+    )
+    blocks = render_report((("frames", "9"),), (("SIFT features", "many"),), findings).split("\n\n")
+    assert blocks[0] == "frames         9"
+    assert blocks[1] == "odometry       covers all"
+    assert blocks[2] == "SIFT features  many\nepipolar       fine"
+    lines = blocks[3].splitlines()
+    assert lines[0].startswith("PROBLEM  images: bad.")
+    assert lines[1].startswith("         bad.")
+    assert lines[-1] == "WARNING  time: gap"
+    assert blocks[4] == "1 problem and 1 warning: problems spoil a run, or the frames named."
