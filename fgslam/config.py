@@ -116,7 +116,9 @@ def _drop_unknown(inner: Any, group: str, given: set[str]) -> None:
 
 def _read_mapping(path: Path) -> dict[str, Any]:
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        values = yaml.safe_load(text)
+        repeated = _repeated_key(yaml.SafeLoader(text).get_single_node())
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give a YAML file, e.g. of experiments/") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -124,9 +126,31 @@ def _read_mapping(path: Path) -> dict[str, Any]:
     except yaml.YAMLError as error:
         message = " ".join(str(error).split())
         raise ConfigError(f"{path}: not valid YAML ({message}); mend that line") from None
+    except RecursionError:
+        raise ConfigError(f"{path}: not valid YAML (nested too deeply); mend it") from None
+    if repeated is not None:
+        line = repeated.start_mark.line + 1
+        raise ConfigError(f"{path}, line {line}: key {repeated.value} is given twice; remove one")
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: holds no `key: value` pairs; see experiments/ for examples")
     return values
+
+
+def _repeated_key(node: Any) -> Any:
+    """First key node that repeats one of its mapping, or None: YAML forbids it, PyYAML does not."""
+    if node is None or node.id == "scalar":
+        return None
+    if node.id == "sequence":
+        return next(filter(None, map(_repeated_key, node.value)), None)
+    known: set[Any] = set()
+    for key, value in node.value:
+        if key.id == "scalar" and key.value in known:
+            return key
+        known.add(key.value if key.id == "scalar" else None)
+        inner = _repeated_key(value)
+        if inner is not None:
+            return inner
+    return None
 
 
 def _apply(values: dict[str, Any], override: str) -> None:

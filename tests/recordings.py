@@ -6,6 +6,7 @@ fraction of a second, with the exact path as truth and an odometry that drifts.
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 
@@ -97,7 +98,7 @@ def experiment(root: Path, **changes: object) -> dict[str, object]:
 def _drifting_body_poses(poses: FloatArray, rng: np.random.Generator) -> FloatArray:
     bTc = BODY_FORWARD_LEFT_UP_FROM_CAMERA
     out = [np.eye(4)]
-    for before, after in zip(poses[:-1], poses[1:], strict=True):
+    for before, after in itertools.pairwise(poses):
         motion = bTc @ np.linalg.inv(before) @ after @ np.linalg.inv(bTc)
         noise = rng.standard_normal(6) * np.repeat([np.radians(0.1), 0.002], 3)
         out.append(out[-1] @ motion @ se3_exp(noise))
