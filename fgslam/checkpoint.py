@@ -19,8 +19,7 @@ LOG_FILE = "measurements.npz"
 
 
 def save(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
-    """Writes log and state; the log first, so that it never lacks a frame of the state."""
-    save_log(folder, recorder.log)
+    """Writes the state. The log must have been written before: it may not lack a frame of it."""
     parts = {
         "database": pipeline.tracker.database.state(),
         "estimator": pipeline.estimator.state(),

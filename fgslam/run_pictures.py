@@ -94,7 +94,7 @@ def _map_drawing(outputs: RunOutputs) -> MapDrawing:
         landmark_covariances=estimate.landmarks.covariances[shown],
         pose_covariances=estimate.covariances,
         truth=None if found is None else found[1],
-        title=_title(outputs, f"{int(shown.sum())} valid landmarks"),
+        title=_title(outputs, "valid landmarks" if valid.any() else "landmarks"),
     )
 
 
