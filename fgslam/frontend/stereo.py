@@ -87,7 +87,7 @@ class StereoMatcher:
         pixels = np.full((len(matches[0]), 3, 2), np.nan)
         for camera, (found, index) in enumerate(zip(features, matches, strict=True)):
             pixels[:, camera] = found.xy[index]
-        used = pixels[:, : len(features)].reshape(len(pixels), -1)
+        used = pixels[:, : len(features)].reshape(len(pixels), 2 * len(features))
         measurement = used @ self._map.T
         variance = self._settings.pixel_sigma**2
         covariance = np.tile(variance * (self._map @ self._map.T), (len(pixels), 1, 1))
@@ -144,4 +144,5 @@ def _average(
     scale = np.mean([f.scale[m] for f, m in pairs], axis=0)
     angles = np.array([f.orientation[m] for f, m in pairs])
     orientation = np.arctan2(np.sin(angles).sum(axis=0), np.cos(angles).sum(axis=0))
-    return scale, orientation % (2.0 * np.pi)
+    # The remainder of a tiny negative angle rounds up to the full turn itself.
+    return scale, orientation % (2.0 * np.pi) % (2.0 * np.pi)
