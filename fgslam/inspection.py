@@ -67,7 +67,9 @@ def _configure(dataset: Path, overrides: Sequence[str]) -> ExperimentConfig:
     """The experiment's configuration, or the default one for a folder in a known layout."""
     if dataset.suffix.lower() in _YAML:
         return load_config(dataset, overrides)
-    values = {"name": "inspect", "dataset": recognise_layout(dataset)}
+    # The kind is named so that an override of one of its keys finds it.
+    odometry = {"kind": "recorded"}
+    values = {"name": "inspect", "dataset": recognise_layout(dataset), "odometry": odometry}
     return make_config(values, overrides, str(dataset))
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.datasets.clock_check import check_clock
 from fgslam.datasets.findings import Finding, Level, by_severity
 from fgslam.datasets.image_checks import Told, check_images
 from fgslam.datasets.motion_checks import check_odometry, check_odometry_against_truth, check_truth
@@ -42,6 +43,7 @@ def inspect_sequence(
         *check_odometry(sequence),
         *check_truth(sequence),
         *check_odometry_against_truth(sequence),
+        *check_clock(sequence),
     )
     return Inspection(facts(sequence), by_severity(findings))
 

@@ -6,9 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dataset_builders import euroc, image_folder, kitti, picture, save
+from dataset_builders import euroc, image_folder, kitti, picture, save, write_tum
+from scipy.spatial.transform import Rotation
 
+from fgslam.datasets.clock_check import check_clock
 from fgslam.datasets.findings import Finding, Level
+from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.layouts import kitti_drives, recognise_layout
 from fgslam.datasets.match_checks import (
     LEFT_RIGHT,
@@ -27,6 +30,7 @@ from fgslam.frontend.descriptor_matching import mutual_nearest
 from fgslam.geometry import pose
 from fgslam.inspection import inspect_recording
 from fgslam.inspection_report import render_report
+from fgslam.settings.datasets import ImageFolderSettings, RecordedOdometrySettings
 
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -238,6 +242,42 @@ def test_disparity_gates() -> None:
     assert "raise it to 40" in near
     far = told(check_disparity_gates(disparities, 25.0, 40.0), Level.WARNING)
     assert "64 % of matches have less than frontend.stereo.min_disparity_px = 25" in far
+
+
+# --------------------------------------------------------------------------------------------
+# The odometry's clock
+
+
+def winding_drive(root: Path, late: float, turning: float = 1.0) -> Path:
+    """60 frames in 6 s of a body that turns to and fro; the odometry is stamped ``late`` s late."""
+    image_folder(root, 60)
+    stamps, fine = 0.1 * np.arange(60), 0.02 * np.arange(-50, 400)
+    yaw = 0.4 * turning * (1.0 - np.cos(1.5 * stamps))
+    rotations = [Rotation.from_euler("z", angle).as_matrix() @ AHEAD for angle in yaw]
+    poses = np.array([pose(rotation, np.zeros(3)) for rotation in rotations])
+    write_tum(root / "gt_right_cam.txt", stamps, poses)
+    rates = 0.6 * turning * np.sin(1.5 * fine)
+    rows = [f"{t + late:.3f},0,{rate:.9f}" for t, rate in zip(fine, rates, strict=True)]
+    (root / "odom.csv").write_text("\n".join(rows), encoding="utf-8")
+    return root
+
+
+def clock(root: Path, offset: float = 0.0) -> str:
+    odometry = RecordedOdometrySettings(time_offset_s=offset)
+    recording = open_image_folder(ImageFolderSettings(path=str(root)), odometry)
+    return told(check_clock(recording), Level.WARNING)
+
+
+@pytest.mark.parametrize("late", [0.06, -0.12])
+def test_shifted_clock_is_measured_and_its_mend_mends_it(tmp_path: Path, late: float) -> None:
+    root = winding_drive(tmp_path, late)
+    assert f"shifted by {-late:+.2f} s" in clock(root)
+    assert clock(root, -late) == ""
+
+
+def test_sound_clock_and_straight_drive_give_no_finding(tmp_path: Path) -> None:
+    assert clock(winding_drive(tmp_path / "sound", 0.0)) == ""
+    assert clock(winding_drive(tmp_path / "straight", 0.1, turning=0.0)) == ""
 
 
 # --------------------------------------------------------------------------------------------
