@@ -101,7 +101,11 @@ def export(
 @app.command()
 def inspect(
     dataset: Annotated[
-        Path, typer.Argument(help="a recording's folder, or an experiment's .yaml for its data set")
+        Path,
+        typer.Argument(
+            metavar="DATASET",
+            help="a recording's folder, or an experiment's .yaml for its data set",
+        ),
     ],
     overrides: Annotated[
         list[str] | None,

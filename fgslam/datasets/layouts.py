@@ -19,6 +19,10 @@ def recognise_layout(folder: Path) -> dict[str, str]:
     Raises:
         DatasetError: there is no such folder, or it has none of the known layouts.
     """
+    if folder.is_file():
+        raise DatasetError(
+            f"{folder} is neither a folder nor an experiment's .yaml; give the recording's folder"
+        )
     if not folder.is_dir():
         raise DatasetError(
             f"{folder}: no such folder or experiment file; give the folder of a recording, or an "

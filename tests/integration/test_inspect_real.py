@@ -78,5 +78,5 @@ def test_experiment_on_a_real_recording(shared_data: Path, tmp_path: Path) -> No
     text = f"name: drive\ndataset: {{kind: image_folder, path: {root}, stop: 20}}\n"
     experiment.write_text(text + "odometry: {kind: constant_velocity}\n", encoding="utf-8")
     assert "frames 20 over" in flat(inspect_recording(experiment, (), 2))
-    with pytest.raises(DatasetError, match="does not exist; check dataset.path"):
+    with pytest.raises(DatasetError, match=r"does not exist; check dataset\.path"):
         inspect_recording(experiment, [f"dataset.path={tmp_path / 'absent'}"])

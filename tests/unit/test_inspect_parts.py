@@ -107,6 +107,13 @@ def test_run_folder_and_missing_folder(tmp_path: Path) -> None:
         recognise_layout(tmp_path)
     with pytest.raises(DatasetError, match="no such folder or experiment file"):
         recognise_layout(tmp_path / "nowhere")
+    with pytest.raises(DatasetError, match="is neither a folder nor an experiment"):
+        recognise_layout(picture_file(tmp_path))
+
+
+def picture_file(folder: Path) -> Path:
+    save(folder / "000000.png", picture(1))
+    return folder / "000000.png"
 
 
 # --------------------------------------------------------------------------------------------
