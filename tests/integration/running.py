@@ -1,0 +1,136 @@
+"""Runs experiments for the integration tests: in this process, or as a user would."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from fgslam import cli
+from fgslam.config import parse_config
+from fgslam.experiment import RunResult, run_experiment
+from fgslam.export.atomic import ExistingFolder
+from fgslam.export.point_cloud import read_ply
+from fgslam.export.trajectories import read_covariances, read_tum
+from fgslam.measurement_log import MeasurementLog
+
+KIND = "landmark_kalman"
+SAME_BYTES = (
+    "measurements.npz",
+    "ground_truth.tum",
+    f"{KIND}/online.tum",
+    f"{KIND}/final.tum",
+    f"{KIND}/covariance.csv",
+    f"{KIND}/map.ply",
+)
+"""What the same configuration and seed must give to the byte."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A run, with the values that it was made from."""
+
+    values: dict[str, Any]
+    folder: Path
+    result: RunResult
+
+
+def run_values(
+    values: dict[str, Any],
+    folder: Path,
+    existing: ExistingFolder = "refuse",
+    stopped: Callable[[], bool] = lambda: False,
+) -> Finished:
+    config = parse_config(values, "test")
+    return Finished(values, folder, run_experiment(config, folder, existing, stopped=stopped))
+
+
+def stop_after(frames: int) -> Callable[[], bool]:
+    """Says stop once it has been asked for the ``frames``-th time."""
+    asked = 0
+
+    def stopped() -> bool:
+        nonlocal asked
+        asked += 1
+        return asked >= frames
+
+    return stopped
+
+
+def bytes_of(folder: Path, names: tuple[str, ...] = SAME_BYTES) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in names}
+
+
+def metrics_of(folder: Path) -> dict[str, Any]:
+    document = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    assert isinstance(document, dict)
+    return document
+
+
+def assert_valid_results(folder: Path, frames: int | None = None) -> int:
+    """Every file reads back and they agree on the number of frames, which is returned."""
+    metrics = metrics_of(folder)
+    count = int(metrics["frames"])
+    assert frames in (None, count)
+    log = MeasurementLog.load(folder / "measurements.npz")
+    final = read_tum(folder / KIND / "final.tum")
+    online = read_tum(folder / KIND / "online.tum")
+    stamps, covariances = read_covariances(folder / KIND / "covariance.csv")
+    points = read_ply(folder / KIND / "map.ply")
+    assert len(log) >= count  # written first: a kill in between leaves it ahead
+    assert len(final) == len(online) == len(stamps) == count
+    assert np.isfinite(covariances).all()
+    assert len(points) == metrics["estimators"][KIND]["landmarks"] > 100
+    rows = (folder / "timing.csv").read_text(encoding="utf-8").splitlines()
+    assert len(rows) == 1 + 7 * count
+    assert yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))["name"]
+    return count
+
+
+# --------------------------------------------------------------------------------------------
+# The command line
+
+
+def write_config(path: Path, values: Mapping[str, Any]) -> Path:
+    path.write_text(yaml.safe_dump(dict(values)), encoding="utf-8")
+    return path
+
+
+def main(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    """Exit status of a command run in this process (subprocesses take seconds to import)."""
+    monkeypatch.setattr(sys, "argv", ["fgslam", *map(str, arguments)])
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    code = caught.value.code
+    return code if isinstance(code, int) else 0
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-c", "from fgslam.cli import main; main()", *map(str, arguments)]
+
+
+def start(*arguments: object, **environment: str) -> subprocess.Popen[str]:
+    """The command as a process of its own."""
+    return subprocess.Popen(  # noqa: S603
+        command(*arguments),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | environment,
+    )
+
+
+def call(*arguments: object, **environment: str) -> tuple[int, str, str]:
+    """Exit status, standard output and standard error of the command."""
+    process = start(*arguments, **environment)
+    out, error = process.communicate(timeout=120)
+    return process.returncode, out, error

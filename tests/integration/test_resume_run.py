@@ -1,0 +1,219 @@
+"""A run that ends early leaves valid files, and goes on to the bytes of an uninterrupted one."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from recordings import experiment, write_calibration, write_recording
+from running import (
+    KIND,
+    Finished,
+    assert_valid_results,
+    bytes_of,
+    main,
+    metrics_of,
+    run_values,
+    start,
+    stop_after,
+    write_config,
+)
+
+from fgslam.datasets.image_folder import open_image_folder
+from fgslam.datasets.recording import Recording
+from fgslam.errors import ConfigError, DatasetError, OdometryError, OutputError
+from fgslam.experiment import resume_command
+from fgslam.settings.datasets import ImageFolderSettings
+from fgslam.types import Odometry
+
+
+@pytest.mark.parametrize("frames", [1, 2, 7, 11])
+def test_stopped_after_some_frames(
+    frames: int, recording: Path, finished: Finished, tmp_path: Path
+) -> None:
+    values = experiment(recording)
+    partial = run_values(values, tmp_path / "run", stopped=stop_after(frames))
+    assert partial.result.status == "interrupted"
+    assert metrics_of(partial.folder)["status"] == "interrupted"
+    assert_valid_results(partial.folder, frames)
+    resumed = run_values(values, partial.folder, "resume")
+    assert resumed.result.status == "finished"
+    assert_valid_results(partial.folder, 12)
+    assert bytes_of(partial.folder) == bytes_of(finished.folder)
+    assert not (partial.folder / "checkpoint.npz").exists()
+
+
+def test_stopped_again_and_again(recording: Path, finished: Finished, tmp_path: Path) -> None:
+    values = experiment(recording)
+    run = run_values(values, tmp_path / "run", stopped=stop_after(2))
+    for done in (4, 6, 8, 10):
+        run = run_values(values, run.folder, "resume", stop_after(2))
+        assert_valid_results(run.folder, done)
+    run = run_values(values, run.folder, "resume")
+    assert bytes_of(run.folder) == bytes_of(finished.folder)
+    metrics = metrics_of(run.folder)
+    expected = metrics_of(finished.folder)
+    for name in ("status_counts", "features", "stereo_matches", "landmark_matches"):
+        assert metrics[name] == expected[name]
+    assert metrics["estimators"][KIND]["ate_rmse_m"] == expected["estimators"][KIND]["ate_rmse_m"]
+
+
+def test_stopping_after_the_last_frame_is_finishing(recording: Path, tmp_path: Path) -> None:
+    run = run_values(experiment(recording), tmp_path / "run", stopped=stop_after(12))
+    assert run.result.status == "finished"
+
+
+@pytest.mark.parametrize("kind", ["constant_velocity", "synthetic"])
+def test_resumed_with_other_odometry(kind: str, recording: Path, tmp_path: Path) -> None:
+    """The motion model's own state, and noise drawn from the seed, go on as well."""
+    values = experiment(recording, odometry={"kind": kind}, seed=5)
+    straight = run_values(values, tmp_path / "straight")
+    run_values(values, tmp_path / "run", stopped=stop_after(5))
+    run_values(values, tmp_path / "run", "resume")
+    assert bytes_of(tmp_path / "run") == bytes_of(straight.folder)
+
+
+def test_killed_between_the_files_of_a_checkpoint(
+    recording: Path, finished: Finished, tmp_path: Path
+) -> None:
+    """Log and results may be newer than the state: resuming starts from the state."""
+    values = experiment(recording)
+    older = run_values(values, tmp_path / "older", stopped=stop_after(4)).folder
+    newer = run_values(values, tmp_path / "newer", stopped=stop_after(7)).folder
+    (older / "checkpoint.npz").replace(newer / "checkpoint.npz")
+    run_values(values, newer, "resume")
+    assert bytes_of(newer) == bytes_of(finished.folder)
+
+
+# --------------------------------------------------------------------------------------------
+# What is refused
+
+
+def test_another_configuration_is_refused(recording: Path, tmp_path: Path) -> None:
+    values = experiment(recording)
+    run = run_values(values, tmp_path / "run", stopped=stop_after(3))
+    with pytest.raises(ConfigError, match="differs from the configuration given") as caught:
+        run_values(values | {"seed": 1}, run.folder, "resume")
+    assert resume_command(run.folder) in str(caught.value)
+    assert_valid_results(run.folder, 3)
+
+
+def test_another_recording_is_refused(own_recording: Path, tmp_path: Path) -> None:
+    values = experiment(own_recording)
+    run = run_values(values, tmp_path / "run", stopped=stop_after(3))
+    write_calibration(own_recording, baseline_m=0.11)
+    with pytest.raises(DatasetError, match="the recording has changed since"):
+        run_values(values, run.folder, "resume")
+    assert_valid_results(run.folder, 3)
+
+
+def test_a_finished_run_and_no_run_at_all(finished: Finished, tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"nothing to resume .* has finished"):
+        run_values(finished.values, finished.folder, "resume")
+    with pytest.raises(OutputError, match="it holds no run"):
+        run_values(finished.values, tmp_path / "absent", "resume")
+    assert not (tmp_path / "absent").exists()
+
+
+def test_refusals_come_before_the_recording_is_opened(finished: Finished, tmp_path: Path) -> None:
+    """Rendering takes minutes; a run folder that exists is known at once."""
+    values = experiment(tmp_path / "no such recording")
+    with pytest.raises(OutputError, match="holds a run already"):
+        run_values(values, finished.folder)
+    with pytest.raises(OutputError, match="nothing to resume"):
+        run_values(values, finished.folder, "resume")
+
+
+# --------------------------------------------------------------------------------------------
+# A recording that fails in mid-run
+
+
+def test_a_recording_that_fails_loses_nothing(
+    recording: Path, finished: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a reader would that decodes its odometry on the way: frames so far are kept."""
+    probe = open_image_folder(ImageFolderSettings(path=str(recording)))
+    intact = type(probe).odometry
+
+    def broken(self: Recording, i: int) -> Odometry | None:
+        if i == 6:
+            raise OdometryError("odometry.txt, line 7: speed is not finite; correct the line")
+        return intact(self, i)
+
+    values = experiment(recording)
+    with monkeypatch.context() as patch:
+        patch.setattr(Recording, "odometry", broken)
+        with pytest.raises(OdometryError, match="line 7"):
+            run_values(values, tmp_path / "run")
+    assert_valid_results(tmp_path / "run", 6)
+    run_values(values, tmp_path / "run", "resume")
+    assert bytes_of(tmp_path / "run") == bytes_of(finished.folder)
+
+
+# --------------------------------------------------------------------------------------------
+# Signals
+
+
+def wait_for_frames(folder: Path, frames: int, process: subprocess.Popen[str]) -> None:
+    """Until the run has written results of so many frames."""
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline:
+        if (folder / "metrics.json").is_file() and metrics_of(folder)["frames"] >= frames:
+            return
+        assert process.poll() is None, process.communicate()[1]
+        time.sleep(0.005)
+    raise AssertionError(f"no {frames} frames within a minute")
+
+
+@pytest.fixture(scope="module")
+def long_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Long enough to be interrupted for certain."""
+    return write_recording(tmp_path_factory.mktemp("recordings") / "long", frames=40)
+
+
+@pytest.fixture(scope="module")
+def long_values(long_recording: Path) -> dict[str, Any]:
+    output = {"pictures": False, "checkpoint_seconds": 0.0}
+    return experiment(long_recording, output=output)
+
+
+@pytest.fixture(scope="module")
+def long_bytes(
+    long_values: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, bytes]:
+    return bytes_of(run_values(long_values, tmp_path_factory.mktemp("runs") / "long").folder)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_signals(
+    number: signal.Signals,
+    long_values: dict[str, Any],
+    long_bytes: dict[str, bytes],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    folder = tmp_path / "a run"
+    process = start("run", write_config(tmp_path / "c.yaml", long_values), "--out", folder)
+    wait_for_frames(folder, 5, process)
+    os.kill(process.pid, number)
+    out, error = process.communicate(timeout=60)
+    assert "Traceback" not in error
+    done = assert_valid_results(folder)
+    assert 5 <= done < 40
+    if number == signal.SIGKILL:
+        assert process.returncode == -signal.SIGKILL
+    else:
+        assert process.returncode == 130
+        assert metrics_of(folder)["status"] == "interrupted"
+        assert f"interrupted after {done} frames; go on: {resume_command(folder)}" in out
+    # The printed command's own words: the run folder's config.yaml is enough to go on.
+    assert main(monkeypatch, "run", folder / "config.yaml", "--out", folder, "--resume") == 0
+    assert "40 of 40" in capfd.readouterr().out
+    assert bytes_of(folder) == long_bytes
+    assert not list(folder.rglob("*partial*"))
