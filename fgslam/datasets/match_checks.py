@@ -109,7 +109,7 @@ def check_epipolar(
             "more frames, or check that both cameras show one scene at one time"
         )
         return (Finding(Level.WARNING, pair.subject, text),)
-    offset, spread = round(float(np.median(offsets)), 3) + 0.0, robust_spread(offsets)
+    offset, spread = round(float(np.median(offsets)), 2) + 0.0, robust_spread(offsets)
     low, high = np.percentile(disparities, [5.0, 95.0])
     within = float(np.percentile(np.abs(offsets), 95.0))
     summary = (
