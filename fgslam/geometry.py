@@ -324,6 +324,15 @@ def congruence(a: FloatArray, s: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (out + np.swapaxes(out, -1, -2)))
 
 
+def rotate_covariances(aRb: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Covariances (n, 3, 3) of vectors in b, expressed in a, by one rotation ``aRb`` (3, 3).
+
+    One matrix product for all of them: ``vec(R C R^T) = (R kron R) vec(C)``.
+    """
+    flat = covariances.reshape(-1, 9) @ np.kron(aRb, aRb).T
+    return np.asarray(flat.reshape(-1, 3, 3))
+
+
 def inverse_spd3(matrices: FloatArray) -> FloatArray:
     """Inverses (n, 3, 3) of symmetric positive definite matrices, by their L D L^T factors.
 

@@ -57,13 +57,14 @@ def draw_run(outputs: RunOutputs) -> list[Path]:
     draw_birds_eye(folder / "map_from_above.png", drawing)
     draw_map_views(folder / "map_views.png", drawing)
     recorder = outputs.recorder
-    frames = np.array([increment.index for increment in recorder.log])
+    # The first frame has no landmarks to match.
+    frames = np.array([increment.index for increment in recorder.log][1:], np.int64)
     draw_matches(
         folder / "matches.png",
         frames,
-        recorder.column("matched"),
-        recorder.column("inliers"),
-        recorder.column("landmarks"),
+        recorder.column("matched")[1:],
+        recorder.column("inliers")[1:],
+        recorder.column("landmarks")[1:],
         _title(outputs, "landmark matches"),
     )
     found = outputs.position_errors()

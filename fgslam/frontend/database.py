@@ -16,6 +16,7 @@ from fgslam.geometry import (
     point_pose_jacobian,
     project,
     projection_jacobian,
+    rotate_covariances,
     transform_to_camera,
 )
 from fgslam.settings.frontend import DatabaseSettings
@@ -205,6 +206,8 @@ def predicted_covariance(
         covariances: (v, 3, 3) theirs.
     """
     points = transform_to_camera(prediction.wTc, positions)
-    jacobian = projection_jacobian(rig, points)
-    out = congruence(jacobian @ prediction.wTc[:3, :3].T, covariances)
-    return out + congruence(jacobian @ point_pose_jacobian(points), prediction.covariance)
+    by_pose = point_pose_jacobian(points)
+    weighted = (by_pose.reshape(-1, 6) @ prediction.covariance).reshape(by_pose.shape)
+    in_camera = rotate_covariances(prediction.wTc[:3, :3].T, covariances)
+    in_camera += weighted @ np.swapaxes(by_pose, 1, 2)
+    return congruence(projection_jacobian(rig, points), in_camera)

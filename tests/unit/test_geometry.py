@@ -431,3 +431,12 @@ def test_inverse_spd3_survives_long_thin_ellipsoids(rng: np.random.Generator) ->
     matrices = 0.5 * (matrices + np.swapaxes(matrices, 1, 2))
     product = g.inverse_spd3(matrices) @ matrices
     np.testing.assert_allclose(product, np.tile(np.eye(3), (50, 1, 1)), rtol=0, atol=1e-6)
+
+
+def test_rotate_covariances_equals_the_product_for_each() -> None:
+    rng = np.random.default_rng(5)
+    roots = rng.normal(size=(20, 3, 3))
+    covariances = roots @ roots.swapaxes(1, 2)
+    aRb = g.so3_exp(np.array([0.3, -1.2, 0.7]))
+    expected = np.array([aRb @ c @ aRb.T for c in covariances])
+    np.testing.assert_allclose(g.rotate_covariances(aRb, covariances), expected, rtol=0, atol=1e-12)
