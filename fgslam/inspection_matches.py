@@ -103,13 +103,11 @@ def look_at_frames(
 
 def _look(index: int, features: tuple[Features, ...], matcher: StereoMatcher) -> Look:
     right, left = features[:2]
-    pairs = matcher.match_left(right, left)
-    kept = matcher.match_top(right, left, features[2], pairs)[0] if len(features) > 2 else pairs[0]
     return Look(
         index=index,
         features=tuple(len(found) for found in features),
-        pairs=len(pairs[0]),
-        stereo=matcher.match(features) if len(kept) else StereoFeatures.empty(),
+        pairs=len(matcher.match_left(right, left)[0]),
+        stereo=matcher.match(features),
         left=_free(right, left, 0),
         top=_free(right, features[2], 1) if len(features) > 2 else None,
     )
