@@ -1,6 +1,6 @@
 """Opening Open3D on machines that lack one of its system libraries.
 
-Open3D's wheel links against libusb, OpenGL, X11 and OpenMP even where only its ray caster is
+Open3D's wheel links against libusb, OpenGL, X11 and others even where only its ray caster is
 used. libusb also lives on PyPI, so its absence is mended here; for the others the user is told
 what to install.
 """
@@ -17,18 +17,9 @@ from pathlib import Path
 from types import ModuleType
 
 from fgslam.errors import MissingDependencyError
+from fgslam.system_check import DEBIAN_PACKAGES
 
 _LIBUSB = "libusb-1.0.so.0"
-
-# Shared object -> Debian/Ubuntu package that holds it.
-_APT_PACKAGES = {
-    "libusb-1.0.so.0": "libusb-1.0-0",
-    "libGL.so.1": "libgl1",
-    "libEGL.so.1": "libegl1",
-    "libX11.so.6": "libx11-6",
-    "libgomp.so.1": "libgomp1",
-    "libgl": "libgl1",
-}
 
 
 def load_open3d(
@@ -73,7 +64,7 @@ def explain_missing_library(message: str) -> str:
             f"Open3D cannot be loaded: {message.splitlines()[0] if message else 'no reason given'}"
         )
     library = found.group(1)
-    package = _APT_PACKAGES.get(library)
+    package = DEBIAN_PACKAGES.get(library)
     if package is None:
         return f"Open3D needs the system library {library}: install the package that holds it"
     return f"Open3D needs the system library {library}: sudo apt-get install -y {package}"

@@ -11,12 +11,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-BASE = frozenset({"types", "geometry", "errors", "settings", "measurement_log"})
+BASE = frozenset({"types", "geometry", "errors", "settings", "measurement_log", "system_check"})
 STAGES = frozenset({"datasets", "simulation", "frontend", "factors", "evaluation", "export"})
 PACKAGES = BASE | STAGES | {"config", "backend", "pipeline", "cli"}
 
 FOUNDATION_ALLOWS: dict[str, frozenset[str]] = {
     "errors": frozenset(),
+    "system_check": frozenset(),
     "types": frozenset({"errors"}),
     "geometry": frozenset({"types", "errors"}),
     "settings": frozenset({"types", "errors"}),
