@@ -1,0 +1,231 @@
+"""The command line as a user meets it: help, exit statuses, one line for each mistake, exports."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import experiment
+from running import (
+    KIND,
+    Finished,
+    assert_valid_results,
+    call,
+    command,
+    main,
+    run_values,
+    stop_after,
+    write_config,
+)
+
+from fgslam.export.point_cloud import read_ply
+from fgslam.export.trajectories import read_kitti, read_tum
+
+Capture = pytest.CaptureFixture[str]
+Patch = pytest.MonkeyPatch
+
+
+def mistake(capfd: Capture, monkeypatch: Patch, *arguments: object) -> str:
+    """The one line that a command prints which must fail."""
+    assert main(monkeypatch, *arguments) == 2
+    said = capfd.readouterr()
+    assert said.out == ""
+    (line,) = said.err.splitlines()
+    return line
+
+
+# --------------------------------------------------------------------------------------------
+# Help and usage
+
+
+def test_help_of_the_whole(monkeypatch: Patch, capfd: Capture) -> None:
+    for arguments in ((), ("--help",)):
+        assert main(monkeypatch, *arguments) == 0
+        out = capfd.readouterr().out
+        for verb in ("run", "export", "inspect"):
+            assert verb in out
+
+
+@pytest.mark.parametrize(
+    ("verb", "words"),
+    [
+        ("run", ("experiments/lab_loop.yaml", "--out", "--set", "--overwrite", "--resume")),
+        ("export", ("--map", ".ply", ".pcd", ".off", "--trajectory", ".tum", ".kitti")),
+        ("inspect", ("recording's folder", "--frames")),
+    ],
+)
+def test_help_of_a_verb(
+    verb: str, words: tuple[str, ...], monkeypatch: Patch, capfd: Capture
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    assert main(monkeypatch, verb, "--help") == 0
+    out = capfd.readouterr().out
+    for word in words:
+        assert word in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("run",), "fgslam run: Missing argument 'config'; see fgslam run --help"),
+        (("run", "c.yaml", "--outt", "x"), "fgslam run: No such option: --outt"),
+        (("rum",), "fgslam: No such command 'rum'"),
+        (("--version-please",), "fgslam: No such option: --version-please"),
+        (("inspect", "x", "--frames", "many"), "fgslam inspect: Invalid value for '--frames'"),
+        (("run", "c.yaml", "--resume", "--overwrite"), "exclude each other; give one of them"),
+        (("run", "absent.yaml"), "absent.yaml: no such file"),
+    ],
+)
+def test_mistyped_commands(
+    arguments: tuple[str, ...], expected: str, monkeypatch: Patch, capfd: Capture
+) -> None:
+    assert expected in mistake(capfd, monkeypatch, *arguments)
+
+
+# --------------------------------------------------------------------------------------------
+# run
+
+
+def test_run_as_a_process(recording: Path, tmp_path: Path) -> None:
+    """Statuses, streams and the lines that name the results."""
+    config = write_config(tmp_path / "c.yaml", experiment(recording))
+    folder = tmp_path / "run"
+    status, out, error = call("run", config, "--out", folder, "--set", "dataset.stop=8")
+    assert status == 0, error
+    assert_valid_results(folder, 8)
+    for name in (f"{KIND}/final.tum", f"{KIND}/map.ply", "metrics.json"):
+        assert str(folder / name) in out
+    assert "8 of 8" in out
+    assert "tracking" in error
+    status, out, error = call("run", config, "--out", folder)
+    assert (status, out) == (2, "")
+    assert error.count("\n") == 1
+    assert "add --overwrite or --resume" in error
+    assert call("run", config, "--out", folder, "--overwrite")[0] == 0
+    assert_valid_results(folder, 12)
+
+
+def test_the_default_folder_is_named_by_the_experiment(
+    recording: Path, tmp_path: Path, monkeypatch: Patch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = write_config(tmp_path / "c.yaml", experiment(recording))
+    assert main(monkeypatch, "run", config, "--set", "dataset.stop=2") == 0
+    assert_valid_results(tmp_path / "runs" / "boards", 2)
+
+
+def test_synthetic_odometry_is_marked_everywhere(
+    recording: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    config = write_config(tmp_path / "c.yaml", experiment(recording))
+    folder = tmp_path / "run"
+    options = ("--set", "odometry.kind=synthetic", "--out", folder)
+    assert main(monkeypatch, "run", config, *options) == 0
+    assert "SYNTHETIC" in capfd.readouterr().out
+    for name in ("metrics.json", f"{KIND}/final.tum", f"{KIND}/covariance.csv", f"{KIND}/map.ply"):
+        assert b"SYNTHETIC" in (folder / name).read_bytes(), name
+
+
+def test_a_closed_pipe_is_no_fault() -> None:
+    """``fgslam --help | head -1`` ends quietly."""
+    process = subprocess.Popen(  # noqa: S603
+        command("--help"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=dict(os.environ)
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    error = process.stderr.read()
+    process.stderr.close()
+    process.wait(timeout=60)
+    assert b"Traceback" not in error
+
+
+def test_the_resolved_configuration_repeats_the_run(finished: Finished, tmp_path: Path) -> None:
+    status, _, error = call("run", finished.folder / "config.yaml", "--out", tmp_path / "again")
+    assert status == 0, error
+    for name in (f"{KIND}/final.tum", "measurements.npz"):
+        assert (tmp_path / "again" / name).read_bytes() == (finished.folder / name).read_bytes()
+
+
+# --------------------------------------------------------------------------------------------
+# export
+
+
+@pytest.mark.parametrize("suffix", ["ply", "pcd", "off", "PLY"])
+def test_export_of_the_map(
+    suffix: str, finished: Finished, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    file = tmp_path / f"map.{suffix}"
+    count = len(read_ply(finished.folder / KIND / "map.ply"))
+    assert main(monkeypatch, "export", finished.folder, "--map", file) == 0
+    assert capfd.readouterr().out == f"{file}: {count} landmarks\n"
+    head = file.read_bytes()[:400]
+    expected = {
+        "ply": f"element vertex {count}\n",
+        "pcd": f"POINTS {count}\n",
+        "off": f"OFF\n{count} ",
+    }
+    assert expected[suffix.lower()].encode() in head
+
+
+def test_export_of_valid_landmarks_only(
+    finished: Finished, tmp_path: Path, monkeypatch: Patch
+) -> None:
+    points = read_ply(finished.folder / KIND / "map.ply")
+    file = tmp_path / "map.ply"
+    assert main(monkeypatch, "export", finished.folder, "--map", file, "--valid-only") == 0
+    kept = read_ply(file)
+    assert 0 < len(kept) == int(points.valid.sum()) < len(points)
+    assert kept.valid.all()
+    assert (kept.hits >= 3).all()
+
+
+def test_export_of_the_trajectory(finished: Finished, tmp_path: Path, monkeypatch: Patch) -> None:
+    tum, kitti = tmp_path / "t.tum", tmp_path / "t.kitti"
+    assert main(monkeypatch, "export", finished.folder, "--trajectory", tum) == 0
+    assert main(monkeypatch, "export", finished.folder, "--trajectory", kitti) == 0
+    truth = read_tum(finished.folder / KIND / "final.tum")
+    np.testing.assert_allclose(read_tum(tum).poses, truth.poses, atol=1e-11)
+    np.testing.assert_allclose(read_kitti(kitti), truth.poses, atol=1e-11)
+
+
+def test_export_of_an_interrupted_run(
+    recording: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    run = run_values(experiment(recording), tmp_path / "run", stopped=stop_after(5))
+    assert main(monkeypatch, "export", run.folder, "--trajectory", tmp_path / "t.tum") == 0
+    assert capfd.readouterr().out.endswith("t.tum: 5 poses\n")
+
+
+def test_mistakes_of_export(
+    finished: Finished, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    def told(*arguments: object) -> str:
+        return mistake(capfd, monkeypatch, "export", *arguments)
+
+    run = finished.folder
+    assert "nothing to export; give --map FILE.ply or --trajectory FILE.tum" in told(run)
+    assert "use .tum or .kitti" in told(run, "--trajectory", tmp_path / "t.csv")
+    line = told(run, "--map", tmp_path / "map.xyz")
+    assert all(suffix in line for suffix in (".ply", ".pcd", ".off", "xyz"))
+    absent = tmp_path / "absent"
+    assert f"{absent}: not a run folder" in told(absent, "--map", tmp_path / "m.ply")
+    line = told(run, "--map", tmp_path / "m.ply", "--estimator", "isam2")
+    assert f"no estimator 'isam2'; give --estimator with one of {KIND}" in line
+    assert "its folder does not exist" in told(run, "--map", tmp_path / "absent" / "m.ply")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_export_of_damaged_results(
+    recording: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    run = run_values(experiment(recording), tmp_path / "run", stopped=stop_after(2)).folder
+    (run / KIND / "map.ply").write_bytes((run / KIND / "map.ply").read_bytes()[:700])
+    line = mistake(capfd, monkeypatch, "export", run, "--map", tmp_path / "m.ply")
+    assert str(run / KIND / "map.ply") in line
+    (run / KIND / "final.tum").write_text("1 2 3\n", encoding="utf-8")
+    line = mistake(capfd, monkeypatch, "export", run, "--trajectory", tmp_path / "t.tum")
+    assert f"{run / KIND / 'final.tum'}, line 1" in line
