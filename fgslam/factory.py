@@ -12,6 +12,7 @@ from fgslam.config import ExperimentConfig
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.datasets.synthetic_odometry import SyntheticOdometry
+from fgslam.errors import ConfigError
 from fgslam.frontend.database import LandmarkDatabase
 from fgslam.frontend.ego_motion import EgoMotionSolver
 from fgslam.frontend.map_matching import MapMatcher
@@ -30,7 +31,7 @@ from fgslam.settings.datasets import (
 )
 from fgslam.settings.frontend import FrontendSettings
 from fgslam.settings.lab import RenderedLabSettings
-from fgslam.types import CameraRig, Prediction, Sequence
+from fgslam.types import CameraRig, MeasurementType, Prediction, Sequence
 
 
 def open_sequence(
@@ -87,12 +88,27 @@ def make_pipeline(
     sequence: Sequence,
     frontend: FrontendSettings,
     odometry: OdometrySettings,
-    estimator: EstimatorSettings,
+    estimator_settings: EstimatorSettings,
 ) -> SlamPipeline:
     """The whole system for one sequence."""
+    estimator = make_estimator(sequence.rig, estimator_settings)
+    require_support(estimator, measured_odometry=odometry.kind != "constant_velocity")
     return SlamPipeline(
         stereo=StereoMatcher(sequence.rig, frontend.stereo, frontend.appearance),
         tracker=make_tracker(sequence.rig, frontend),
         motion=make_motion(sequence, odometry),
-        estimator=make_estimator(sequence.rig, estimator),
+        estimator=estimator,
     )
+
+
+def require_support(estimator: Estimator, measured_odometry: bool) -> None:
+    """Refuses, before a run starts, an estimator that cannot use what the run will measure."""
+    needed = {MeasurementType.STEREO}
+    if measured_odometry:
+        needed.add(MeasurementType.ODOMETRY)
+    lacking = sorted(kind.value for kind in needed - estimator.supports)
+    if lacking:
+        raise ConfigError(
+            f"estimator.kind {estimator.kind} cannot use {' and '.join(lacking)} measurements; "
+            "choose another estimator"
+        )

@@ -1,0 +1,26 @@
+from __future__ import annotations
+
+import pytest
+
+from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.errors import ConfigError
+from fgslam.factory import make_estimator, require_support
+from fgslam.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
+from fgslam.settings.backend import LandmarkKalmanSettings
+from fgslam.types import CameraRig, MeasurementType
+
+RIG = CameraRig(320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, 0.1, BODY_FORWARD_LEFT_UP_FROM_CAMERA)
+
+
+def test_the_filter_takes_stereo_and_odometry() -> None:
+    require_support(make_estimator(RIG, LandmarkKalmanSettings()), measured_odometry=True)
+
+
+def test_an_estimator_without_odometry_is_refused_only_where_there_is_some(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(LandmarkKalman, "supports", frozenset({MeasurementType.STEREO}))
+    estimator = make_estimator(RIG, LandmarkKalmanSettings())
+    require_support(estimator, measured_odometry=False)
+    with pytest.raises(ConfigError, match="landmark_kalman cannot use odometry measurements"):
+        require_support(estimator, measured_odometry=True)
