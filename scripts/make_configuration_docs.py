@@ -51,7 +51,7 @@ def _sections(schema: Node, node: Node, dotted: str, level: int) -> Iterator[str
         told = " ".join(group.get("description", "").split())
         lines = [f"{'#' * level} {title}", "", *([told, ""] if told else [])]
         table = _table(schema, group)
-        yield "\n".join([*lines, *(table or ["No keys."])])
+        yield "\n".join([*lines, *(table or ["Groups of keys:"])])
         for name, inner in group["properties"].items():
             if name not in _UNWRITTEN:
                 yield from _sections(schema, inner, f"{dotted}.{name}", min(level + 1, 4))
