@@ -51,14 +51,30 @@ def require(folder: Path) -> None:
 
 
 def load(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
-    """Continues from a checkpoint; raises OutputError where there is none."""
+    """Continues from a checkpoint.
+
+    Raises:
+        OutputError: there is none, or state and log do not belong to each other or to this fgslam.
+        MeasurementLogError: one of the two files cannot be read.
+    """
     require(folder)
     state = load_arrays(folder / STATE_FILE)
     log = MeasurementLog.load(folder / LOG_FILE)
-    pipeline.tracker.database.restore(_part(state, "database"))
-    pipeline.estimator.restore(_part(state, "estimator"))
-    pipeline.motion.restore(_part(state, "motion"))
-    recorder.restore(_part(state, "recorder"), log)
+    try:
+        pipeline.tracker.database.restore(_part(state, "database"))
+        pipeline.estimator.restore(_part(state, "estimator"))
+        pipeline.motion.restore(_part(state, "motion"))
+        recorder.restore(_part(state, "recorder"), log)
+    except (KeyError, ValueError, IndexError) as error:
+        raise OutputError(
+            f"{folder / STATE_FILE}: not a state that this fgslam wrote ({error}); start again "
+            "with --overwrite"
+        ) from None
+    if len(recorder.log) < len(recorder):
+        raise OutputError(
+            f"{folder / LOG_FILE}: holds {len(log)} frames, the checkpoint {len(recorder)}; "
+            "restore it, or start again with --overwrite"
+        )
 
 
 def write_arrays(path: Path, arrays: StateArrays) -> None:

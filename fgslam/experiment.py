@@ -28,6 +28,7 @@ from fgslam.types import FloatArray, Sequence, StereoFeatures
 Progress = Callable[[str, int, int], None]
 """Called with what is under way, how much is done, and of how much."""
 
+_SAVING_SHARE = 10.0  # the loop runs at least this many times as long as it saves
 _PRECISION_EVERY = 10  # frames between checks of stereo matches against rendered depth
 _PRECISION_PX = 1.5  # disparity error of a correct match; a SIFT match's noise is a tenth of it
 
@@ -101,6 +102,7 @@ def _loop(outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]) 
     )
     stream = make_stream(sequence, outputs.config.frontend)(start=len(recorder))
     waiting = time.perf_counter()
+    interval = outputs.config.output.checkpoint_seconds
     saved = -math.inf  # the first frame is saved at once: from then on any end can be resumed
     try:
         for found in stream:
@@ -111,10 +113,10 @@ def _loop(outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]) 
                 run_pictures.draw_frame(outputs, found.i, report)
             progress("tracking", len(recorder), len(sequence))
             done = len(recorder) == len(sequence)
-            due = time.perf_counter() - saved >= outputs.config.output.checkpoint_seconds
+            due = time.perf_counter() - saved >= interval
             stop = stopped()  # asked once: a signal may arrive between two questions
             if not done and (due or stop):
-                save_progress(outputs)
+                interval = _save_timed(outputs)
                 saved = time.perf_counter()
             if stop and not done:
                 return False
@@ -127,6 +129,14 @@ def _loop(outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]) 
     finally:
         stream.close()
     return True
+
+
+def _save_timed(outputs: RunOutputs) -> float:
+    """Saves; returns the seconds until the next time: long runs shall not drown in saving."""
+    start = time.perf_counter()
+    save_progress(outputs)
+    wanted = outputs.config.output.checkpoint_seconds
+    return max(wanted, _SAVING_SHARE * (time.perf_counter() - start)) if wanted else 0.0
 
 
 def save_progress(outputs: RunOutputs) -> None:

@@ -24,10 +24,18 @@ from running import (
     write_config,
 )
 
+from fgslam.checkpoint import write_arrays
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.recording import Recording
-from fgslam.errors import ConfigError, DatasetError, OdometryError, OutputError
+from fgslam.errors import (
+    ConfigError,
+    DatasetError,
+    MeasurementLogError,
+    OdometryError,
+    OutputError,
+)
 from fgslam.experiment import resume_command
+from fgslam.measurement_log import load_arrays
 from fgslam.settings.datasets import ImageFolderSettings
 from fgslam.types import Odometry
 
@@ -120,6 +128,31 @@ def test_a_finished_run_and_no_run_at_all(finished: Finished, tmp_path: Path) ->
     assert not (tmp_path / "absent").exists()
 
 
+def test_a_checkpoint_that_does_not_fit_is_refused(recording: Path, tmp_path: Path) -> None:
+    values = experiment(recording)
+    run = run_values(values, tmp_path / "run", stopped=stop_after(5)).folder
+    whole = load_arrays(run / "checkpoint.npz")
+    for name in whole:
+        others = {key: array for key, array in whole.items() if key != name}
+        write_arrays(run / "checkpoint.npz", others)
+        with pytest.raises(OutputError, match="not a state that this fgslam wrote") as caught:
+            run_values(values, run, "resume")
+        assert "\n" not in str(caught.value)
+    (run / "checkpoint.npz").write_bytes(b"PK\x03\x04 half a file")
+    with pytest.raises(MeasurementLogError, match=r"checkpoint\.npz: not a readable"):
+        run_values(values, run, "resume")
+    assert_valid_results(run, 5)
+
+
+def test_a_log_that_lacks_frames_is_refused(recording: Path, tmp_path: Path) -> None:
+    values = experiment(recording)
+    short = run_values(values, tmp_path / "short", stopped=stop_after(3)).folder
+    run = run_values(values, tmp_path / "run", stopped=stop_after(5)).folder
+    (short / "measurements.npz").replace(run / "measurements.npz")
+    with pytest.raises(OutputError, match="holds 3 frames, the checkpoint 5"):
+        run_values(values, run, "resume")
+
+
 def test_refusals_come_before_the_recording_is_opened(finished: Finished, tmp_path: Path) -> None:
     """Rendering takes minutes; a run folder that exists is known at once."""
     values = experiment(tmp_path / "no such recording")
@@ -204,7 +237,7 @@ def test_signals(
     os.kill(process.pid, number)
     out, error = process.communicate(timeout=60)
     assert "Traceback" not in error
-    done = assert_valid_results(folder)
+    done = assert_valid_results(folder, torn=int(number == signal.SIGKILL))
     assert 5 <= done < 40
     if number == signal.SIGKILL:
         assert process.returncode == -signal.SIGKILL
@@ -217,3 +250,20 @@ def test_signals(
     assert "40 of 40" in capfd.readouterr().out
     assert bytes_of(folder) == long_bytes
     assert not list(folder.rglob("*partial*"))
+
+
+def test_a_second_ctrl_c_ends_at_once(long_values: dict[str, Any], tmp_path: Path) -> None:
+    """Whatever it hits, files are whole and the run can go on."""
+    folder = tmp_path / "run"
+    process = start("run", write_config(tmp_path / "c.yaml", long_values), "--out", folder)
+    wait_for_frames(folder, 3, process)
+    for _ in range(3):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.001)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in error
+    done = assert_valid_results(folder, torn=1)
+    resumed = run_values(long_values, folder, "resume", stop_after(1))
+    # The state may be one save behind the results.
+    assert done <= assert_valid_results(resumed.folder) <= done + 1
