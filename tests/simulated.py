@@ -24,6 +24,7 @@ from fgslam.types import (
     CameraRig,
     EgoMotion,
     EgoMotionStatus,
+    Features,
     FloatArray,
     Increment,
     IntArray,
@@ -261,3 +262,46 @@ def assert_same_bits(first: object, second: object) -> None:
     for x, y in zip(a, b, strict=True):
         assert x.dtype == y.dtype
         np.testing.assert_array_equal(x, y)
+
+
+class FeatureWorld:
+    """Points with an appearance, as ideal SIFT features of the rig's images.
+
+    Each point has its own descriptor, orientation and physical size; coordinates carry
+    independent normal noise.
+    """
+
+    def __init__(self, points: FloatArray, rng: np.random.Generator, rig: CameraRig = RIG) -> None:
+        count = len(points)
+        self.points = points
+        self._rig = rig
+        self._rng = rng
+        self._descriptors = rng.integers(0, 120, (count, 128)).astype(np.uint8)
+        self._orientation = rng.uniform(0.0, 2.0 * np.pi, count)
+        self._size = rng.uniform(4.0, 12.0, count)
+
+    def features(
+        self, wTc: FloatArray, sigma_px: float = 0.0, hidden: IntArray | None = None
+    ) -> tuple[Features, ...]:
+        """Features of right, left[, top] image; the ``hidden`` points are not there."""
+        local = g.transform_to_camera(wTc, self.points)
+        shown = visible(self._rig, local)
+        if hidden is not None:
+            shown[hidden] = False
+        which = np.flatnonzero(shown)
+        column, row, disparity = g.project(self._rig, local[which]).T
+        places = [(column, row), (column + disparity, row)]
+        if self._rig.vertical_baseline is not None:
+            ratio = self._rig.vertical_baseline / self._rig.baseline
+            places.append((column, row + ratio * disparity))
+        return tuple(self._image(np.column_stack(at), which, local, sigma_px) for at in places)
+
+    def _image(
+        self, xy: FloatArray, which: IntArray, local: FloatArray, sigma_px: float
+    ) -> Features:
+        return Features(
+            xy=xy + sigma_px * self._rng.standard_normal(xy.shape),
+            scale=self._size[which] / local[which, 2],
+            orientation=self._orientation[which],
+            descriptors=self._descriptors[which],
+        )

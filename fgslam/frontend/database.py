@@ -47,6 +47,8 @@ class ExpectedLandmarks:
         scale: (v,) predicted scale, pixels.
         orientation: (v,) radians.
         descriptors: (v, 128).
+        certain: (v,) well inside the view, so that no match is a miss; those at its border may be
+            matched (else each frame would start them anew) but are not missed.
     """
 
     ids: IntArray
@@ -55,6 +57,7 @@ class ExpectedLandmarks:
     scale: FloatArray
     orientation: FloatArray
     descriptors: ByteArray
+    certain: BoolArray
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -87,9 +90,9 @@ class LandmarkDatabase:
         return self.hits >= self._settings.valid_hits
 
     def expected(self, landmarks: LandmarkMap, wTc: FloatArray) -> ExpectedLandmarks:
-        """Landmarks of the map that should be in view from ``wTc`` (4.4)."""
+        """Landmarks of the map that should or may be in view from ``wTc`` (4.4)."""
         points = transform_to_camera(wTc, landmarks.positions)
-        in_view, measurement = self._in_view(points)
+        in_view, certain, measurement = self._in_view(points)
         rows = np.flatnonzero(in_view)
         ids = landmarks.ids[rows]
         own = self.rows(ids)
@@ -100,6 +103,7 @@ class LandmarkDatabase:
             scale=self.size[own] / points[rows, 2],
             orientation=self.orientation[own],
             descriptors=self.descriptors[own],
+            certain=certain[rows],
         )
 
     def rows(self, ids: IntArray) -> IntArray:
@@ -168,21 +172,24 @@ class LandmarkDatabase:
         for name, values in columns.items():
             setattr(self, name, np.concatenate([getattr(self, name), values]))
 
-    def _in_view(self, points: FloatArray) -> tuple[BoolArray, FloatArray]:
+    def _in_view(self, points: FloatArray) -> tuple[BoolArray, BoolArray, FloatArray]:
+        """Which points may be in view, which are well inside it, and where they project to."""
         depth = points[:, 2]
         front = depth > _NEAREST_DEPTH_M
         points = np.where(front[:, None], points, 1.0)
         measurement = project(self._rig, points)
         if self._settings.field_of_view == "cone":
             tangent = np.tan(np.deg2rad(self._settings.cone_deg))
-            inside = (np.abs(points[:, :2]) < tangent * points[:, 2:]).all(axis=1)
+            possible = certain = (np.abs(points[:, :2]) < tangent * points[:, 2:]).all(axis=1)
         else:
-            inside = self._in_images(measurement)
-        return front & inside & (measurement[:, 2] <= self._max_disparity), measurement
+            possible = self._in_images(measurement, -self._settings.border_px)
+            certain = self._in_images(measurement, self._settings.border_px)
+        possible = possible & front & (measurement[:, 2] <= self._max_disparity)
+        return possible, certain, measurement
 
-    def _in_images(self, measurement: FloatArray) -> BoolArray:
+    def _in_images(self, measurement: FloatArray, border: float) -> BoolArray:
         """Whether a landmark falls inside all images of the rig, the border left out."""
-        rig, border = self._rig, self._settings.border_px
+        rig = self._rig
         column, row, disparity = measurement.T
         vertical = (
             0.0

@@ -110,7 +110,7 @@ class LandmarkTracker:
         matched = _matched(expected, matches, features)
         hit = np.zeros(len(expected), np.bool_)
         hit[matches.landmarks[inliers]] = True
-        missed_ids = expected.ids[~hit]
+        missed_ids = expected.ids[expected.certain & ~hit]
         self.database.record_hits(matched.ids[inliers], features, matches.features[inliers])
         self.database.record_misses(missed_ids)
         fresh = np.flatnonzero(~matches.had_candidates)

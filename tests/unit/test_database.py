@@ -59,7 +59,8 @@ def at_pixels(rows: list[tuple[float, float, float]]) -> FloatArray:
 
 def expected_ids(points: FloatArray, settings: DatabaseSettings, rig: CameraRig = RIG) -> list[int]:
     database = database_of(points, settings, rig)
-    return database.expected(landmark_map(points), np.eye(4)).ids.tolist()
+    expected = database.expected(landmark_map(points), np.eye(4))
+    return expected.ids[expected.certain].tolist()
 
 
 # --------------------------------------------------------------------------------------------
@@ -104,11 +105,26 @@ BOUNDS = {
     "lower edge, by the top camera": ((100, 220.99, 10), (100, 221.01, 10)),
     "nearest": ((100, 100, 39.99), (100, 100, 40.01)),
 }
+POSSIBLE = {
+    # the same with 8 px beyond the images
+    "left edge": ((-7.99, 100, 10), (-8.01, 100, 10)),
+    "right edge, by the left camera": ((316.99, 100, 10), (317.01, 100, 10)),
+    "upper edge": ((100, -7.99, 10), (100, -8.01, 10)),
+    "lower edge, by the top camera": ((100, 236.99, 10), (100, 237.01, 10)),
+}
 
 
 @pytest.mark.parametrize("edge", BOUNDS)
 def test_the_images_bounds(edge: str) -> None:
     assert expected_ids(at_pixels(list(BOUNDS[edge])), BORDER) == [0]
+
+
+@pytest.mark.parametrize("edge", POSSIBLE)
+def test_at_the_border_a_landmark_may_be_matched_but_is_not_missed(edge: str) -> None:
+    points = at_pixels(list(POSSIBLE[edge]))
+    expected = database_of(points, BORDER).expected(landmark_map(points), np.eye(4))
+    assert expected.ids.tolist() == [0]
+    assert expected.certain.tolist() == [False]
 
 
 def test_without_a_top_camera_the_lower_edge_is_the_images_own() -> None:

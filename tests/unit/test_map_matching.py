@@ -43,7 +43,8 @@ def landmarks(
 ) -> ExpectedLandmarks:
     measured, scales, orientations, described = _columns(rows, scale, orientation_deg, descriptors)
     ids = 10 + np.arange(len(measured))
-    return ExpectedLandmarks(ids, ids - 10, measured, scales, orientations, described)
+    certain = np.ones(len(ids), np.bool_)
+    return ExpectedLandmarks(ids, ids - 10, measured, scales, orientations, described, certain)
 
 
 def features(rows: object, scale=2.0, orientation_deg=30.0, descriptors=None) -> StereoFeatures:

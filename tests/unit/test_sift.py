@@ -239,9 +239,9 @@ def test_features_move_with_the_image(
     assert np.median(ratio[same]) == pytest.approx(1.0, abs=0.03)
     offset = (after.xy[which] - moved[inside])[same]
     assert np.abs(np.median(offset, axis=0)).max() < 0.1
-    turned = np.rad2deg(
-        wrap_angle(after.orientation[which] - before.orientation[inside] - np.deg2rad(angle_deg))
-    )[same]
-    # A key point may have a second orientation: the nearest of the two need not be the same one.
-    assert np.median(np.abs(turned)) < 3.0
-    assert (np.abs(turned) < 10.0).mean() > 0.6
+    # A key point may have two orientations: two features at one place, the better one counts.
+    turned = after.orientation - before.orientation[inside, None] - np.deg2rad(angle_deg)
+    here = np.linalg.norm(moved[inside, None] - after.xy, axis=2) < 1.5
+    best = np.where(here, np.abs(np.rad2deg(wrap_angle(turned))), np.inf).min(axis=1)[same]
+    assert np.median(best) < 5.0
+    assert (best < 10.0).mean() > 0.8
