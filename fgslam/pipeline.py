@@ -85,7 +85,7 @@ class SlamPipeline:
         self, prediction: Prediction, found: FeatureFrame, stereo: StereoFeatures
     ) -> tuple[EgoMotion, Association]:
         if found.frame is None:
-            return unmeasured(prediction, EgoMotionStatus.NO_IMAGE), Association.nothing()
+            return self.tracker.track_blind(prediction), Association.nothing()
         tracked = self.tracker.track(prediction, self.estimator.landmarks(), stereo)
         association = self.tracker.associate(tracked, stereo, found.frame.images[0])
         if found.i == 0:

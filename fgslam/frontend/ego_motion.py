@@ -76,6 +76,12 @@ class PoseProblem:
             observed.covariance,
         )
 
+    @staticmethod
+    def empty() -> PoseProblem:
+        """No match at all."""
+        vectors, matrices = np.empty((0, 3)), np.empty((0, 3, 3))
+        return PoseProblem(vectors, matrices, vectors, matrices)
+
     def select(self, keep: BoolArray) -> PoseProblem:
         """The chosen matches."""
         return PoseProblem(

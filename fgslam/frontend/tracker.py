@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from fgslam.types import (
     ByteArray,
     CameraRig,
     EgoMotion,
+    EgoMotionStatus,
     FloatArray,
     Image,
     IntArray,
@@ -92,6 +93,12 @@ class LandmarkTracker:
             matches = self._matcher.match(expected, features, uncertainty)
             tracked = self._solve(prediction, landmarks, features, (expected, matches))
         return tracked
+
+    def track_blind(self, prediction: Prediction) -> EgoMotion:
+        """The odometry's pose, for a frame without images; the same that its replay will find."""
+        nothing = PoseProblem.empty()
+        found = self._ego_motion.solve(prediction, nothing)
+        return replace(found, status=EgoMotionStatus.NO_IMAGE)
 
     def _solve(
         self,

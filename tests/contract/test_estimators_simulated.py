@@ -1,0 +1,213 @@
+"""More of the contract: truth without noise, moved priors, and replays that repeat live runs.
+
+The estimators are those that ``test_estimators.SETTINGS`` lists; how to build one of a kind at a
+prior of one's choice is said in ``build``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from simulated import (
+    RIG,
+    TURN_AND_GO,
+    Drive,
+    FeatureWorld,
+    assert_same_bits,
+    play,
+    play_directly,
+    points_in_views,
+    simulate,
+)
+from test_estimators import SETTINGS
+
+from fgslam import geometry as g
+from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.backend.protocol import Estimator
+from fgslam.factory import make_estimator, make_tracker
+from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.stream import FeatureFrame
+from fgslam.motion import ConstantVelocityMotion, OdometryMotion
+from fgslam.pipeline import FrameReport, SlamPipeline, replay_step
+from fgslam.settings.backend import EstimatorSettings
+from fgslam.settings.datasets import ConstantVelocitySettings
+from fgslam.settings.frontend import EgoMotionSettings, FrontendSettings
+from fgslam.types import FloatArray, Frame, Odometry, Prediction
+
+DRIVE = Drive(frames=10)
+SIXDOF = EgoMotionSettings(dof=6)
+
+
+def build(settings: EstimatorSettings, prior: Prediction) -> Estimator:
+    """An estimator that starts at the prior."""
+    match settings.kind:
+        case "landmark_kalman":
+            return LandmarkKalman(RIG, settings, prior)
+
+
+@pytest.fixture(params=SETTINGS)
+def settings(request: pytest.FixtureRequest) -> EstimatorSettings:
+    return SETTINGS[request.param]
+
+
+def at_origin(settings: EstimatorSettings) -> Estimator:
+    return make_estimator(RIG, settings)
+
+
+def test_exact_measurements_give_the_exact_truth(settings: EstimatorSettings) -> None:
+    simulation = simulate(dataclasses.replace(DRIVE, noise=0.0), np.random.default_rng(1))
+    estimator = at_origin(settings)
+    stats = play(estimator, simulation.increments, SIXDOF)
+    estimate = estimator.estimate()
+    np.testing.assert_allclose(estimate.trajectory.poses, simulation.poses, rtol=0, atol=1e-6)
+    truth = simulation.points_by_id[estimate.landmarks.ids]
+    np.testing.assert_allclose(estimate.landmarks.positions, truth, rtol=0, atol=1e-5)
+    assert max(s.nis for s in stats if s.nis_dof) < 1e-3
+
+
+def test_perfect_measurements_correct_poor_odometry(settings: EstimatorSettings) -> None:
+    simulation = simulate(dataclasses.replace(DRIVE, noise=0.0), np.random.default_rng(2))
+    rng = np.random.default_rng(3)
+    wobbly = [
+        dataclasses.replace(
+            increment,
+            odometry=increment.odometry
+            and dataclasses.replace(
+                increment.odometry,
+                motion=increment.odometry.motion @ g.se3_exp(0.01 * rng.standard_normal(6)),
+            ),
+        )
+        for increment in simulation.increments
+    ]
+    estimator = at_origin(settings)
+    play(estimator, wobbly, SIXDOF)
+    found = estimator.estimate().trajectory.poses
+    dead_reckoning = [np.eye(4)]
+    for increment in wobbly[1:]:
+        assert increment.odometry is not None
+        dead_reckoning.append(dead_reckoning[-1] @ increment.odometry.motion)
+    error = np.linalg.norm(found[-1, :3, 3] - simulation.poses[-1, :3, 3])
+    alone = np.linalg.norm(dead_reckoning[-1][:3, 3] - simulation.poses[-1, :3, 3])
+    assert error < 0.25 * alone
+
+
+def test_two_runs_give_the_same_bits(settings: EstimatorSettings) -> None:
+    increments = simulate(DRIVE, np.random.default_rng(4)).increments
+    first, second = at_origin(settings), at_origin(settings)
+    assert_same_bits(play(first, increments), play(second, increments))
+    assert_same_bits(first.estimate(), second.estimate())
+    assert_same_bits(first.state(), second.state())
+
+
+def test_a_moved_prior_moves_everything_rigidly(settings: EstimatorSettings) -> None:
+    increments = simulate(DRIVE, np.random.default_rng(5)).increments
+    moved_by = g.se3_exp(np.array([0.4, -0.7, 0.2, 5.0, -3.0, 2.0]))
+    covariance = 1e-6 * np.eye(6)
+    here = build(settings, Prediction(np.eye(4), covariance))
+    there = build(settings, Prediction(moved_by, covariance))
+    play(here, increments, SIXDOF)
+    play(there, increments, SIXDOF)
+    a, b = here.estimate(), there.estimate()
+    np.testing.assert_allclose(b.trajectory.poses, moved_by @ a.trajectory.poses, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(b.covariances, a.covariances, rtol=1e-3, atol=1e-9)
+    np.testing.assert_array_equal(b.landmarks.ids, a.landmarks.ids)
+    expected = g.transform_to_world(moved_by, a.landmarks.positions)
+    np.testing.assert_allclose(b.landmarks.positions, expected, rtol=0, atol=1e-6)
+    turned = g.congruence(moved_by[:3, :3], a.landmarks.covariances)
+    np.testing.assert_allclose(b.landmarks.covariances, turned, rtol=1e-3, atol=1e-7)
+
+
+def test_a_replay_is_the_three_calls(settings: EstimatorSettings) -> None:
+    increments = simulate(DRIVE, np.random.default_rng(6)).increments
+    replayed, direct = at_origin(settings), at_origin(settings)
+    assert_same_bits(play(replayed, increments), play_directly(direct, increments))
+    assert_same_bits(replayed.state(), direct.state())
+
+
+# --------------------------------------------------------------------------------------------
+# A live run, from ideal features on, against the replay of its log
+
+
+class Recorded:
+    """A recording's odometry, with a gap in it."""
+
+    rig = RIG
+
+    def __init__(self, steps: list[Odometry | None]) -> None:
+        self._steps = steps
+
+    def odometry(self, i: int) -> Odometry | None:
+        return self._steps[i]
+
+
+FRAMES = 14
+NO_IMAGE, NO_ODOMETRY = (5, 6), (4, 9)
+
+
+def camera_odometry(rng: np.random.Generator) -> list[Odometry | None]:
+    """Body motion of the drive's twist, with noise in all six degrees of freedom."""
+    sigma = np.array(DRIVE.odometry_sigma)
+    step = RIG.bTc @ g.se3_exp(np.array(TURN_AND_GO)) @ g.inverse(RIG.bTc)
+    noisy = [step @ g.se3_exp(sigma * rng.standard_normal(6)) for _ in range(FRAMES)]
+    return [
+        None if i in (0, *NO_ODOMETRY) else Odometry(motion, np.diag(sigma**2))
+        for i, motion in enumerate(noisy)
+    ]
+
+
+def live_run(
+    settings: EstimatorSettings, frontend: FrontendSettings
+) -> tuple[Estimator, list[FrameReport], FloatArray]:
+    rng = np.random.default_rng(7)
+    poses = [np.eye(4)]
+    for _ in range(FRAMES - 1):
+        poses.append(poses[-1] @ g.se3_exp(np.array(TURN_AND_GO)))
+    world = FeatureWorld(points_in_views(dataclasses.replace(DRIVE, points=250), poses, rng), rng)
+    stand_in = ConstantVelocityMotion(ConstantVelocitySettings())
+    pipeline = SlamPipeline(
+        stereo=StereoMatcher(RIG, frontend.stereo, frontend.appearance),
+        tracker=make_tracker(RIG, frontend),
+        motion=OdometryMotion(Recorded(camera_odometry(rng)), "recorded", stand_in),
+        estimator=at_origin(settings),
+    )
+    image = np.zeros((RIG.height, RIG.width), np.uint8)
+    reports = []
+    for i, wTc in enumerate(poses):
+        features = world.features(wTc, sigma_px=0.2, hidden=rng.choice(250, 25))
+        frame = Frame(i, 0.5 * i, (image,) * 3)
+        found = FeatureFrame(i, frame, features, "", 0.0, 0.0)
+        if i in NO_IMAGE:
+            found = FeatureFrame(i, None, (), "not there", 0.0, 0.0)
+        reports.append(pipeline.process(found, i, 0.5 * i))
+    return pipeline.estimator, reports, np.array(poses)
+
+
+def frontend_settings(dof: int, rescue: bool) -> FrontendSettings:
+    default = FrontendSettings()
+    return dataclasses.replace(
+        default,
+        ego_motion=dataclasses.replace(default.ego_motion, dof=dof),
+        matching=dataclasses.replace(default.matching, rescue=rescue, refine=rescue),
+    )
+
+
+@pytest.mark.parametrize(("dof", "rescue"), [(6, False), (6, True), (5, False), (3, False)])
+def test_a_replay_repeats_the_live_run(settings: EstimatorSettings, dof: int, rescue: bool) -> None:
+    """To the last bit, over missing images and missing odometry."""
+    frontend = frontend_settings(dof, rescue)
+    live, reports, truth = live_run(settings, frontend)
+    error = live.estimate().trajectory.poses[:, :3, 3] - truth[:, :3, 3]
+    assert np.linalg.norm(error, axis=1).max() < 0.2
+    assert sum(r.tracking.status.measured for r in reports) >= FRAMES - len(NO_IMAGE) - 1
+    replayed = at_origin(settings)
+    solver = EgoMotionSolver(RIG, frontend.ego_motion)
+    motion = ConstantVelocityMotion(ConstantVelocitySettings())
+    stats = [
+        replay_step(report.increment, replayed, solver, motion, k)
+        for k, report in enumerate(reports)
+    ]
+    assert_same_bits([s.wTc for s in stats], [r.stats.wTc for r in reports])
+    assert_same_bits(replayed.state(), live.state())
