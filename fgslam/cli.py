@@ -150,11 +150,15 @@ def main() -> None:
 @contextmanager
 def _stop_flag() -> Iterator[Callable[[], bool]]:
     """Turns the first Ctrl-C or TERM into a flag; the second Ctrl-C ends at once."""
-    raised = False
+    raised = ending = False
 
     def handle(number: int, frame: FrameType | None) -> None:
-        nonlocal raised
+        nonlocal raised, ending
         if raised:
+            ending = True
+            # A third one would cut short the end of the threads, which aborts the process.
+            for each in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(each, signal.SIG_IGN)
             raise KeyboardInterrupt
         raised = True
 
@@ -162,8 +166,9 @@ def _stop_flag() -> Iterator[Callable[[], bool]]:
     try:
         yield lambda: raised
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        if not ending:
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
 
 def _stoppable(progress: Progress, stopped: Callable[[], bool]) -> Progress:
