@@ -183,7 +183,8 @@ def _make_room(path: Path, *, overwrite: bool) -> None:
 
 def _delete_run_files(path: Path) -> None:
     files = {file for pattern in _RUN_FILES for file in path.glob(pattern) if file.is_file()}
-    for file in sorted(files):
+    # The marker goes last: killed in the middle, the folder is still known for a run.
+    for file in sorted(files, key=lambda file: (file == path / RUN_MARKER, file)):
         file.unlink()
     for folder in sorted({file.parent for file in files} - {path}, reverse=True):
         if not any(folder.iterdir()):
