@@ -289,7 +289,7 @@ def triangulate(rig: CameraRig, measurement: FloatArray) -> FloatArray:
     Se et al. 2.2; the inverse of :func:`project`.
     """
     depth = rig.fx * rig.baseline / measurement[:, 2]
-    out = np.empty_like(measurement)
+    out = np.empty(measurement.shape)
     out[:, 0] = (measurement[:, 0] - rig.cx) * depth / rig.fx
     out[:, 1] = (measurement[:, 1] - rig.cy) * depth / rig.fy
     out[:, 2] = depth

@@ -52,9 +52,7 @@ class LandmarkKalman:
         {MeasurementType.ODOMETRY, MeasurementType.STEREO}
     )
 
-    def __init__(
-        self, rig: CameraRig, settings: LandmarkKalmanSettings, prior: Prediction
-    ) -> None:
+    def __init__(self, rig: CameraRig, settings: LandmarkKalmanSettings, prior: Prediction) -> None:
         """Starts at the prior pose with an empty map.
 
         Args:

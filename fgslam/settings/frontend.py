@@ -161,7 +161,10 @@ class DatabaseSettings:
     ] = 30.0
     border_px: Annotated[
         float,
-        Field(ge=0.0, description="margin inside the image within which none is expected"),
+        Field(
+            ge=0.0,
+            description="this near to an image's edge a landmark may be matched but is not missed",
+        ),
     ] = 8.0
 
 
