@@ -1,0 +1,1 @@
+"""The evidence behind docs/results.md: `python -m scripts.results WHAT [--out FILE.json]`."""

@@ -1,0 +1,83 @@
+"""The paper's drive: tables of Section 5 beside ours (design S31 to S33)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.types import IntArray
+from scripts.results.report import Cell, Table
+from scripts.results.runs import Run, experiment, run_whole
+
+# Frames that Figure 4 of the paper shows, and the last one.
+_SHOWN = (1, 60, 120, 180, 249)
+_VARIANTS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("3 degrees of freedom (default)", ()),
+    ("5 (the paper's)", ("frontend.ego_motion.dof=5",)),
+    ("6", ("frontend.ego_motion.dof=6",)),
+    ("3, `appearance: paper`", ("frontend.appearance.mode=paper",)),
+    ("5, `appearance: paper`", ("frontend.appearance.mode=paper", "frontend.ego_motion.dof=5")),
+)
+
+
+def tables() -> list[Table]:
+    """End pose and accuracy; landmarks and matches. One row a variant, the paper's first."""
+    runs = [(name, run_whole(experiment("lab_loop", options))) for name, options in _VARIANTS]
+    return [_end_poses(runs), _maps(runs), _growth(runs)]
+
+
+def _end_poses(runs: list[tuple[str, Run]]) -> Table:
+    columns = (
+        "degrees of freedom", "X cm", "Y cm", "Z cm", "distance cm",
+        "yaw deg", "pitch deg", "roll deg", "ATE cm", "NEES per dof",
+    )  # fmt: skip
+    rows: list[tuple[Cell, ...]] = [
+        ("paper (5)", -2.09, 0.0, -3.91, 4.43, 0.30, 2.10, -2.02, None, None)
+    ]
+    rows += [_end_row(name, run) for name, run in runs]
+    return Table("End pose against the start (S33)", columns, rows)
+
+
+def _end_row(name: str, run: Run) -> tuple[Cell, ...]:
+    end = run.estimator["end_against_start"]
+    keys = ("x_cm", "y_cm", "z_cm", "distance_cm", "yaw_deg", "pitch_deg", "roll_deg")
+    accuracy = (100.0 * run.estimator["ate_rmse_m"], run.estimator["nees_pose_per_dof"])
+    return (name, *(end[key] + 0.0 for key in keys), *accuracy)
+
+
+def _maps(runs: list[tuple[str, Run]]) -> Table:
+    columns = (
+        "degrees of freedom", "landmarks", "valid (3 hits)", "stereo matches, median",
+        "matched to the map: 5 %", "median", "95 %", "frames with more than 30, %", "mean E px",
+        "stereo precision",
+    )  # fmt: skip
+    rows: list[tuple[Cell, ...]] = [
+        ("paper (5)", 3590, None, 60, "40", None, "60", None, None, None)
+    ]
+    rows += [_map_row(name, run) for name, run in runs]
+    return Table("Landmarks and matches (S31, S32)", columns, rows)
+
+
+def _map_row(name: str, run: Run) -> tuple[Cell, ...]:
+    outputs, matched = run.result.outputs, run.metrics["landmark_matches"]
+    inliers: IntArray = outputs.recorder.column("inliers")[1:]
+    return (
+        name,
+        run.estimator["landmarks"],
+        int(outputs.pipeline.tracker.database.valid.sum()),
+        run.metrics["stereo_matches"]["median"],
+        matched["p05"],
+        matched["median"],
+        matched["p95"],
+        100.0 * float(np.mean(inliers > 30)),
+        run.metrics["mean_residual_px"],
+        run.metrics["stereo_precision"],
+    )
+
+
+def _growth(runs: list[tuple[str, Run]]) -> Table:
+    columns = ("degrees of freedom", *(f"frame {frame}" for frame in _SHOWN))
+    rows: list[tuple[Cell, ...]] = []
+    for name, run in runs:
+        counts = run.result.outputs.recorder.column("landmarks")
+        rows.append((name, *(int(counts[frame - 1]) for frame in _SHOWN)))
+    return Table("Landmarks in the map over the drive (S31)", columns, rows)

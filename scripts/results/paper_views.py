@@ -1,0 +1,309 @@
+"""Tables of Sections 2 and 3 of the paper beside ours (design S3, S9, S10, S14, S18)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgslam.config import ExperimentConfig
+from fgslam.evaluation.trajectory import end_pose
+from fgslam.factory import make_pipeline
+from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.stream import FeatureFrame
+from fgslam.pipeline import FrameReport
+from fgslam.settings.frontend import AppearanceSettings, StereoSettings
+from fgslam.types import EgoMotion, FloatArray, Trajectory
+from scripts.results.report import Cell, Table
+from scripts.results.runs import experiment, say
+from scripts.results.views import LabViews, View, ViewPair, make_pair
+
+STARTS = range(0, 250, 10)
+"""Frames of the drive from which the two small motions start; the first one is the example."""
+
+PAPER_EGO_MOTION = (
+    "frontend.ego_motion.dof=6",
+    "frontend.ego_motion.residuals=image",
+    "frontend.ego_motion.weighting=uniform",
+    "frontend.ego_motion.prior=false",
+    "frontend.ego_motion.kernel=none",
+    "frontend.ego_motion.outlier_sigmas=0",
+)
+PAPER_MATCHING = (
+    "frontend.appearance.mode=paper",
+    "frontend.stereo.measurement=paper",
+    "frontend.matching.widen_sigmas=0",
+)
+_MODES = {
+    "`descriptor` (default)": ("frontend.ego_motion.dof=6",),
+    "as the paper": (*PAPER_MATCHING, *PAPER_EGO_MOTION),
+}
+_WIDTHS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+_COMPONENTS = ("X cm", "Y cm", "Z cm", "yaw deg", "pitch deg", "roll deg")
+
+Triple = tuple[View, View, View]
+
+
+def tables() -> list[Table]:
+    """All five, from the same rendered views."""
+    say(f"rendering {3 * len(STARTS)} views")
+    lab = LabViews(experiment("lab_loop"))
+    triples = [lab.triple(i) for i in STARTS if i < len(lab.sequence)]
+    moves = {name: _moves(lab, triples, options) for name, options in _MODES.items()}
+    return [
+        features_table([triple[0] for triple in triples]),
+        matches_table(lab, triples),
+        sweep_table(lab, [view for triple in triples for view in triple]),
+        frames_table(moves),
+        *(estimates_table(name, both) for name, both in moves.items()),
+    ]
+
+
+# ----------------------------------------------------------------------------------------------
+# S3, S9, S10: one view
+
+
+def features_table(views: list[View]) -> Table:
+    """S3: how many features the three images have."""
+    counts = np.array([[len(f) for f in view.features] for view in views])
+    spread = counts.max(axis=1) / counts.min(axis=1)
+    columns = ("image", "paper", "start of the drive", "drive: median", "least", "most")
+    rows: list[tuple[Cell, ...]] = []
+    for name, paper, camera in (("top", 193, 2), ("left", 166, 1), ("right", 189, 0)):
+        n = counts[:, camera]
+        rows.append((name, paper, int(n[0]), float(np.median(n)), int(n.min()), int(n.max())))
+    note = (
+        f"most over least of the three counts: paper {193 / 166:.2f}, ours "
+        f"{np.median(spread):.2f} (median of {len(views)} places), at worst {spread.max():.2f}"
+    )
+    return Table("SIFT features of one frame (S3)", columns, rows, (note,))
+
+
+def matches_table(lab: LabViews, triples: list[Triple]) -> Table:
+    """S9: matches right-left, then confirmed by the top image, in three neighbouring views."""
+    columns = ("", "paper", *_modes_twice())
+    found = {mode: _stereo_counts(lab, triples, mode) for mode in ("descriptor", "paper")}
+    both = [found["descriptor"], found["paper"]]
+    names = (
+        ("right-left, initial view", 106, lambda n: n[:, 0, 0]),
+        ("all three images, initial view", 59, lambda n: n[:, 0, 1]),
+        ("after 10 cm forward", 66, lambda n: n[:, 1, 1]),
+        ("then 5 deg clockwise", 60, lambda n: n[:, 2, 1]),
+        ("right-left / fewest features", 106 / 166, lambda n: n[:, 0, 0] / n[:, 0, 2]),
+        ("three images / right-left", 59 / 106, lambda n: n[:, 0, 1] / n[:, 0, 0]),
+    )
+    rows: list[tuple[Cell, ...]] = []
+    for name, paper, take in names:
+        cells: list[Cell] = [name, paper]
+        for counts in both:
+            values = take(counts)
+            cells += [values[0].item(), float(np.median(values))]
+        rows.append(tuple(cells))
+    return Table("Stereo matches, three views at small motions (S9)", columns, rows)
+
+
+def _modes_twice() -> tuple[str, ...]:
+    return tuple(
+        f"`{mode}`: {what}" for mode in ("descriptor", "paper") for what in ("start", "median")
+    )
+
+
+def _stereo_counts(lab: LabViews, triples: list[Triple], mode: str) -> FloatArray:
+    """(n, 3, 3) per triple and view: right-left matches, final ones, fewest features."""
+    settings = experiment("lab_loop", [f"frontend.appearance.mode={mode}"]).frontend
+    matcher = StereoMatcher(lab.rig, settings.stereo, settings.appearance)
+    return np.array([[_counts(matcher, view) for view in triple] for triple in triples])
+
+
+def _counts(matcher: StereoMatcher, view: View) -> tuple[int, int, int]:
+    pairs, _ = matcher.match_left(view.features[0], view.features[1])
+    return len(pairs), len(matcher.match(view.features)), min(len(f) for f in view.features)
+
+
+def sweep_table(lab: LabViews, views: list[View]) -> Table:
+    """S10: wider gates need not give more matches where ambiguity discards."""
+    stereo = experiment("lab_loop").frontend.stereo
+    columns = (
+        "all gates, times", "right-left", "right-left, start", "three images",
+        "three images, start", "`descriptor`, three images",
+    )  # fmt: skip
+    rows: list[tuple[Cell, ...]] = []
+    for width in _WIDTHS:
+        counts = {
+            mode: np.array([_counts(_widened(lab, stereo, mode, width), view) for view in views])
+            for mode in ("paper", "descriptor")
+        }
+        paper, other = counts["paper"], counts["descriptor"]
+        mean = paper.mean(axis=0)
+        start = (int(paper[0, 0]), int(paper[0, 1]))
+        rows.append(
+            (width, float(mean[0]), start[0], float(mean[1]), start[1], float(other[:, 1].mean()))
+        )
+    note = (
+        f"`appearance: paper`, means of {len(views)} views; epipolar, disparity agreement, scale "
+    )
+    return Table(
+        "Width of the gates against the number of matches (S10)",
+        columns,
+        rows,
+        (note + "and orientation gates scaled together",),
+    )
+
+
+def _widened(lab: LabViews, stereo: StereoSettings, mode: str, width: float) -> StereoMatcher:
+    wider = replace(
+        stereo,
+        epipolar_px=stereo.epipolar_px * width,
+        disparity_agreement_px=stereo.disparity_agreement_px * width,
+        scale_ratio=stereo.scale_ratio**width,
+        orientation_deg=min(180.0, stereo.orientation_deg * width),
+    )
+    appearance = AppearanceSettings(mode="paper" if mode == "paper" else "descriptor")
+    return StereoMatcher(lab.rig, wider, appearance)
+
+
+# ----------------------------------------------------------------------------------------------
+# S14, S18: two views
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """One of the two small motions, tracked."""
+
+    pair: ViewPair
+    reports: tuple[FrameReport, FrameReport]
+
+    @property
+    def tracking(self) -> EgoMotion:
+        """The least-squares pose of the second view."""
+        return self.reports[1].tracking
+
+    @property
+    def matches(self) -> int:
+        """Features of the second view matched to those of the first, before outliers go."""
+        return len(self.tracking.inliers)
+
+    @property
+    def measured(self) -> bool:
+        """Whether the matches sufficed for a least-squares motion."""
+        return self.tracking.status.measured
+
+    @property
+    def share(self) -> float:
+        """Matches over the lesser of both views' stereo features (design E-S2)."""
+        return self.matches / min(len(report.stereo) for report in self.reports)
+
+    @property
+    def mean_residual_px(self) -> float:
+        """The paper's mean E."""
+        used = self.tracking.residuals[self.tracking.inliers]
+        return float(used.mean()) if len(used) else float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class BothMoves:
+    """The two motions from many places."""
+
+    forward: list[Move]
+    clockwise: list[Move]
+
+
+def _moves(lab: LabViews, triples: list[Triple], options: tuple[str, ...]) -> BothMoves:
+    config = experiment("lab_loop", options)
+    forward, clockwise = [], []
+    for number, (start, ahead, turned) in enumerate(triples):
+        rng = np.random.default_rng([lab.seed, number])
+        forward.append(_move(config, make_pair(lab, (start, ahead), rng)))
+        clockwise.append(_move(config, make_pair(lab, (ahead, turned), rng)))
+    return BothMoves(forward, clockwise)
+
+
+def _move(config: ExperimentConfig, pair: ViewPair) -> Move:
+    pipeline = make_pipeline(pair, config.frontend, config.odometry, config.estimator)
+    reports = [
+        pipeline.process(FeatureFrame(i, view.frame, view.features, "", 0.0, 0.0), i, float(i))
+        for i, view in enumerate(pair.views)
+    ]
+    return Move(pair, (reports[0], reports[1]))
+
+
+def frames_table(moves: dict[str, BothMoves]) -> Table:
+    """S14: how many features are found again after each motion."""
+    columns = ("motion", "mode", "matches", "% of the lesser view", "median matches", "median %")
+    rows: list[tuple[Cell, ...]] = [
+        ("10 cm forward", "paper", 43, 73.0, None, None),
+        ("5 deg clockwise", "paper", 41, 68.0, None, None),
+    ]
+    for name, both in moves.items():
+        for motion, found in (("10 cm forward", both.forward), ("5 deg clockwise", both.clockwise)):
+            matches = float(np.median([move.matches for move in found]))
+            share = 100.0 * float(np.median([move.share for move in found]))
+            first = found[0]
+            rows.append((motion, name, first.matches, 100.0 * first.share, matches, share))
+    return Table("Matches between those views (S14)", columns, rows)
+
+
+def estimates_table(name: str, both: BothMoves) -> Table:
+    """S18: least-squares motion of both moves, its 1 sigma and its error."""
+    columns = ("", *_COMPONENTS, "mean E px")
+    paper_forward = (1.353, -0.534, 11.136, 0.059, -0.055, -0.029, 1.328)
+    rows: list[tuple[Cell, ...]] = [("paper, 10 cm forward", *paper_forward)]
+    rows += _motion_rows("10 cm forward", both.forward)
+    rows.append(("paper, 5 deg clockwise", *[None] * 6, 1.693))
+    rows += _motion_rows("5 deg clockwise", both.clockwise)
+    moves = [*both.forward, *both.clockwise]
+    lost = sum(not move.measured for move in moves)
+    notes = (
+        f"{lost} of {len(moves)} motions had too few matches in the search window around the "
+        "odometry's prediction and are left out of the statistics",
+    )
+    return Table(f"Ego-motion of the two small motions, {name} (S18)", columns, rows, notes)
+
+
+def _motion_rows(motion: str, moves: list[Move]) -> list[tuple[Cell, ...]]:
+    first, found = moves[0], [move for move in moves if move.measured]
+    errors = np.array([_components(m.tracking.wTc) - _components(m.pair.motion) for m in found])
+    wheels = np.array(
+        [_components(_camera_odometry(m)) - _components(m.pair.motion) for m in found]
+    )
+    sigmas = np.array([_sigmas(m.tracking) for m in found])
+    residual = float(np.mean([m.mean_residual_px for m in found]))
+    known = first.measured
+    estimate = _components(first.tracking.wTc).tolist() if known else [None] * 6
+    places = f"{len(found)} places"
+    return [
+        (f"truth, {motion}", *_components(first.pair.motion).tolist(), None),
+        ("ours at the start", *estimate, first.mean_residual_px),
+        ("its 1 sigma", *(_sigmas(first.tracking).tolist() if known else [None] * 6), None),
+        (f"our rms error, {places}", *_rms(errors), residual),
+        (f"our median 1 sigma, {places}", *np.median(sigmas, axis=0).tolist(), None),
+        ("largest error over its sigma", *np.abs(errors / sigmas).max(axis=0).tolist(), None),
+        ("rms error of the odometry", *_rms(wheels), None),
+    ]
+
+
+def _camera_odometry(move: Move) -> FloatArray:
+    odometry = move.reports[1].increment.odometry
+    if odometry is None:
+        raise ValueError("the second view has odometry by construction")
+    return odometry.motion
+
+
+def _components(motion: FloatArray) -> FloatArray:
+    """(6,) X, Y, Z in cm, yaw, pitch and roll in degrees, as the paper gives them."""
+    end = end_pose(Trajectory(np.array([0.0, 1.0]), np.array([np.eye(4), motion])))
+    if end is None:
+        raise ValueError("a trajectory of two poses has an end")
+    return np.array([end.x_cm, end.y_cm, end.z_cm, end.yaw_deg, end.pitch_deg, end.roll_deg])
+
+
+def _sigmas(tracking: EgoMotion) -> FloatArray:
+    """(6,) standard deviations in the units and order of :func:`_components`."""
+    rotation = tracking.wTc[:3, :3]
+    translation = np.diagonal(rotation @ tracking.covariance[3:, 3:] @ rotation.T)
+    pitch, yaw, roll = np.degrees(np.sqrt(np.diagonal(tracking.covariance)[:3]))
+    return np.array([*(100.0 * np.sqrt(translation)), yaw, pitch, roll])
+
+
+def _rms(errors: FloatArray) -> list[float]:
+    return [float(value) for value in np.sqrt(np.mean(errors**2, axis=0))]

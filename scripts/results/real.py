@@ -1,0 +1,62 @@
+"""The real recordings (issue 2, sections 7.3 and 7.4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from scripts.results.report import Cell, Table
+from scripts.results.runs import DATA, Run, experiment, run_whole
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A run on a real recording and what it must reach."""
+
+    experiment: str
+    overrides: tuple[str, ...]
+    ate_m: float
+    drift_percent: float | None
+    plain_pnp: str
+    """What frame-to-frame PnP on plain SIFT reaches: the recordings' README."""
+
+
+GOALS = (
+    Goal("euroc_v101", (), 0.10, None, "ATE 2.5 m"),
+    Goal("kitti_raw_0926", (), 0.40, None, "-"),
+    Goal(
+        "kitti_raw_0926", ("odometry.kind=constant_velocity",), 0.50, 1.1, "ATE 0.64 m, drift 1.40"
+    ),
+    Goal("kitti06", (), 0.15, None, "ATE 0.20 m, drift 1.41"),
+)
+
+
+def reach(goal: Goal, data: Path = DATA) -> Run:
+    """Runs one of the goals."""
+    return run_whole(experiment(goal.experiment, goal.overrides, data))
+
+
+def table(data: Path = DATA) -> Table:
+    """All goals, each with its bounds and a plain method's figure."""
+    columns = (
+        "experiment", "odometry", "tracked", "ATE m", "bound", "drift %", "bound ",
+        "plain PnP without odometry", "RPE m", "RPE deg", "NEES per dof",
+    )  # fmt: skip
+    return Table("Real recordings", columns, [_row(goal, reach(goal, data)) for goal in GOALS])
+
+
+def _row(goal: Goal, run: Run) -> tuple[Cell, ...]:
+    numbers = run.estimator
+    return (
+        goal.experiment,
+        run.metrics["odometry"],
+        f"{run.tracked} of {run.metrics['frames_in_recording']}",
+        numbers["ate_rmse_m"],
+        f"<= {goal.ate_m:.2f}",
+        numbers["drift_percent"],
+        "-" if goal.drift_percent is None else f"<= {goal.drift_percent}",
+        goal.plain_pnp,
+        numbers["rpe_trans_m"],
+        numbers["rpe_rot_deg"],
+        numbers["nees_pose_per_dof"],
+    )

@@ -1,0 +1,78 @@
+"""Tables of results: Markdown for people, JSON for machines."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+Cell: TypeAlias = str | int | float | None
+
+_DIGITS = 3
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table: floats are kept in full for JSON and shown with three digits."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: list[tuple[Cell, ...]]
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Every row fills every column. Raises ValueError otherwise."""
+        for row in self.rows:
+            if len(row) != len(self.columns):
+                raise ValueError(
+                    f"table '{self.title}': {len(row)} cells for {len(self.columns)} columns: {row}"
+                )
+
+    def column(self, name: str) -> list[Cell]:
+        """All cells of the column called ``name``. Raises ValueError where there is none."""
+        at = self.columns.index(name)
+        return [row[at] for row in self.rows]
+
+    def markdown(self) -> str:
+        """A Markdown table under its title, the notes below."""
+        lines = [f"### {self.title}", "", _line(self.columns), _line("---" for _ in self.columns)]
+        lines += [_line(map(shown, row)) for row in self.rows]
+        lines += [""] + [f"- {note}" for note in self.notes]
+        return "\n".join(lines).rstrip() + "\n"
+
+    def as_json(self) -> dict[str, Any]:
+        """Rows as lists, not finite numbers as null."""
+        rows = [[_finite(cell) for cell in row] for row in self.rows]
+        return {
+            "title": self.title,
+            "columns": list(self.columns),
+            "rows": rows,
+            "notes": list(self.notes),
+        }
+
+
+def shown(cell: Cell) -> str:
+    """A cell as people read it; a dash where nothing is known."""
+    if cell is None or (isinstance(cell, float) and not math.isfinite(cell)):
+        return "-"
+    if isinstance(cell, float):
+        decimals = _DIGITS - 1 - (math.floor(math.log10(abs(cell))) if cell else 0)
+        return f"{cell:.{max(0, min(decimals, 4))}f}"
+    return str(cell)
+
+
+def write_json(path: Path, tables: Iterable[Table]) -> None:
+    """All tables into one JSON file."""
+    text = json.dumps([table.as_json() for table in tables], indent=2)
+    path.write_text(text + "\n", encoding="utf-8")
+
+
+def _line(cells: Iterable[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _finite(cell: Cell) -> Cell:
+    return None if isinstance(cell, float) and not math.isfinite(cell) else cell

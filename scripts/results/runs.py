@@ -1,0 +1,116 @@
+"""Runs of the committed experiments, whole or with their features found only once."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fgslam.config import ExperimentConfig, load_config
+from fgslam.evaluation.trajectory import Alignment, TrajectoryError, evaluate_trajectory
+from fgslam.experiment import RunResult, run_experiment
+from fgslam.factory import make_pipeline, make_stream, open_sequence
+from fgslam.frontend.stream import FeatureFrame
+from fgslam.pipeline import FrameReport, SlamPipeline
+from fgslam.types import Sequence
+
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+DATA = Path(__file__).parents[3] / "shared" / "data"
+"""Where the real recordings are looked for, one folder beside the checkout."""
+
+_FOLDERS = {
+    "euroc_v101": "euroc_v101_kf100",
+    "kitti_raw_0926": "kitti_raw_0926_5hz",
+    "kitti06": "kitti06",
+    "chess_trinocular": "stanford_chess_grid",
+}
+# Evidence needs neither pictures nor checkpoints.
+_QUIET = ("output.pictures=false", "output.checkpoint_seconds=3600")
+
+
+def experiment(name: str, overrides: Iterable[str] = (), data: Path = DATA) -> ExperimentConfig:
+    """The committed experiment ``name`` with ``a.b=value`` overrides.
+
+    Raises:
+        ConfigError: there is no such experiment or key.
+    """
+    where = [f"dataset.path={data / _FOLDERS[name]}"] if name in _FOLDERS else []
+    return load_config(EXPERIMENTS / f"{name}.yaml", [*where, *_QUIET, *overrides])
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A finished run: what it computed, and its metrics.json."""
+
+    result: RunResult
+    metrics: dict[str, Any]
+
+    @property
+    def estimator(self) -> dict[str, Any]:
+        """Metrics of the live estimator."""
+        found: dict[str, Any] = self.metrics["estimators"][self.result.outputs.kind]
+        return found
+
+    @property
+    def tracked(self) -> int:
+        """Frames whose pose the landmarks determined, the first (the origin) among them."""
+        counts = self.metrics["status_counts"]
+        return sum(counts.get(status, 0) for status in ("first", "ok", "capped"))
+
+
+def run_whole(config: ExperimentConfig) -> Run:
+    """Exactly what `fgslam run` does, into a folder that is thrown away afterwards."""
+    say(f"running {config.name} (seed {config.seed})")
+    with tempfile.TemporaryDirectory() as folder:
+        result = run_experiment(config, Path(folder) / "run")
+        text = (result.folder / "metrics.json").read_text(encoding="utf-8")
+    return Run(result, json.loads(text))
+
+
+@dataclass(frozen=True, eq=False)
+class FoundFeatures:
+    """A recording with the features of all its frames, to be used by many variants."""
+
+    sequence: Sequence
+    frames: list[FeatureFrame]
+
+
+def find_features(config: ExperimentConfig) -> FoundFeatures:
+    """Opens the recording and finds the features of all frames."""
+    say(f"finding the features of {config.name} (seed {config.seed})")
+    sequence = open_sequence(config)
+    stream = make_stream(sequence, config.frontend)()
+    try:
+        return FoundFeatures(sequence, list(stream))
+    finally:
+        stream.close()
+
+
+def make_system(config: ExperimentConfig, sequence: Sequence) -> SlamPipeline:
+    """A fresh system for the sequence."""
+    return make_pipeline(sequence, config.frontend, config.odometry, config.estimator)
+
+
+def process(found: FoundFeatures, pipeline: SlamPipeline) -> Iterator[FrameReport]:
+    """The SLAM loop over features found before."""
+    for frame in found.frames:
+        timestamp = float(found.sequence.timestamps[frame.i])
+        yield pipeline.process(frame, frame.i, timestamp)
+
+
+def trajectory_error(
+    pipeline: SlamPipeline, sequence: Sequence, alignment: Alignment = Alignment.SE3
+) -> TrajectoryError:
+    """Errors of the system's trajectory so far."""
+    estimate = pipeline.estimator.estimate().trajectory
+    return evaluate_trajectory(estimate, sequence.ground_truth, alignment)
+
+
+def say(text: str) -> None:
+    """Progress, on standard error, so that tables alone go to standard output."""
+    sys.stderr.write(text + "\n")
+    sys.stderr.flush()
