@@ -12,6 +12,7 @@ from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.settings.datasets import LightFieldSettings
+from fgslam.settings.frontend import Appearance
 from fgslam.types import BoolArray, FloatArray, IntArray, Sequence
 from scripts.results import epi
 from scripts.results.report import Cell, Table
@@ -20,7 +21,7 @@ from scripts.results.runs import DATA, experiment, find_features, say
 LEAST_LANDMARKS = 400
 CORRECT_PX = 1.0
 """Largest error of a correct match's disparity."""
-MODES = ("descriptor", "paper")
+MODES: tuple[Appearance, ...] = ("descriptor", "paper")
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +58,7 @@ def tables(data: Path = DATA) -> list[Table]:
     ]
 
 
-def _matcher(sequence: Sequence, config: ExperimentConfig, mode: str) -> StereoMatcher:
+def _matcher(sequence: Sequence, config: ExperimentConfig, mode: Appearance) -> StereoMatcher:
     appearance = replace(config.frontend.appearance, mode=mode)
     return StereoMatcher(sequence.rig, config.frontend.stereo, appearance)
 
@@ -81,7 +82,7 @@ def landmarks_table(
 
 
 def judge_chess(
-    config: ExperimentConfig, sequence: Sequence, frames: list[FeatureFrame], mode: str
+    config: ExperimentConfig, sequence: Sequence, frames: list[FeatureFrame], mode: Appearance
 ) -> Judged:
     """Right-left matches of all frames, judged by the views of their row that they did not use."""
     settings, truth = config.dataset, sequence.ground_truth
@@ -130,7 +131,7 @@ def _verdict(
     return Judged(error <= CORRECT_PX, verdict.decided, confirmed)
 
 
-def judge_lab(mode: str) -> Judged:
+def judge_lab(mode: Appearance) -> Judged:
     """Right-left matches of the rendered lab, judged by the exact depth at the feature."""
     config = experiment("lab_loop", ["dataset.stride=6"])
     found = find_features(config)

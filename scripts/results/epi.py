@@ -14,7 +14,7 @@ import numpy as np
 
 from fgslam.datasets.opening import open_recording
 from fgslam.settings.datasets import LightFieldSettings
-from fgslam.types import FloatArray, IntArray
+from fgslam.types import BoolArray, FloatArray, IntArray
 
 HALF_PATCH = 3
 _KEEP = 0.6  # share of the views that must see the point: the best ones count
@@ -57,7 +57,7 @@ class Verdict:
     """
 
     slope: FloatArray
-    decided: FloatArray
+    decided: BoolArray
 
 
 def judge(

@@ -38,6 +38,14 @@ _MODES = {
     "`descriptor` (default)": ("frontend.ego_motion.dof=6",),
     "as the paper": (*PAPER_MATCHING, *PAPER_EGO_MOTION),
 }
+_PAPER_STEREO: dict[str, Cell] = {
+    "right-left, initial view": 106,
+    "all three images, initial view": 59,
+    "after 10 cm forward": 66,
+    "then 5 deg clockwise": 60,
+    "right-left / fewest features": 106 / 166,
+    "three images / right-left": 59 / 106,
+}
 _WIDTHS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 _COMPONENTS = ("X cm", "Y cm", "Z cm", "yaw deg", "pitch deg", "roll deg")
 
@@ -82,24 +90,32 @@ def features_table(views: list[View]) -> Table:
 def matches_table(lab: LabViews, triples: list[Triple]) -> Table:
     """S9: matches right-left, then confirmed by the top image, in three neighbouring views."""
     columns = ("", "paper", *_modes_twice())
-    found = {mode: _stereo_counts(lab, triples, mode) for mode in ("descriptor", "paper")}
-    both = [found["descriptor"], found["paper"]]
-    names = (
-        ("right-left, initial view", 106, lambda n: n[:, 0, 0]),
-        ("all three images, initial view", 59, lambda n: n[:, 0, 1]),
-        ("after 10 cm forward", 66, lambda n: n[:, 1, 1]),
-        ("then 5 deg clockwise", 60, lambda n: n[:, 2, 1]),
-        ("right-left / fewest features", 106 / 166, lambda n: n[:, 0, 0] / n[:, 0, 2]),
-        ("three images / right-left", 59 / 106, lambda n: n[:, 0, 1] / n[:, 0, 0]),
-    )
+    found = [_quantities(_stereo_counts(lab, triples, mode)) for mode in ("descriptor", "paper")]
     rows: list[tuple[Cell, ...]] = []
-    for name, paper, take in names:
+    for name, paper in _PAPER_STEREO.items():
         cells: list[Cell] = [name, paper]
-        for counts in both:
-            values = take(counts)
-            cells += [values[0].item(), float(np.median(values))]
+        for values in found:
+            cells += [_number(values[name][0]), float(np.median(values[name]))]
         rows.append(tuple(cells))
     return Table("Stereo matches, three views at small motions (S9)", columns, rows)
+
+
+def _quantities(counts: FloatArray) -> dict[str, FloatArray]:
+    """What the paper tells of the three views, (n,) each, under the names of _PAPER_STEREO."""
+    pairs, final, features = np.moveaxis(counts, 2, 0)
+    values = (
+        pairs[:, 0],
+        final[:, 0],
+        final[:, 1],
+        final[:, 2],
+        pairs[:, 0] / features[:, 0],
+        final[:, 0] / pairs[:, 0],
+    )
+    return dict(zip(_PAPER_STEREO, values, strict=True))
+
+
+def _number(value: float) -> Cell:
+    return int(value) if float(value).is_integer() else float(value)
 
 
 def _modes_twice() -> tuple[str, ...]:
@@ -112,7 +128,8 @@ def _stereo_counts(lab: LabViews, triples: list[Triple], mode: str) -> FloatArra
     """(n, 3, 3) per triple and view: right-left matches, final ones, fewest features."""
     settings = experiment("lab_loop", [f"frontend.appearance.mode={mode}"]).frontend
     matcher = StereoMatcher(lab.rig, settings.stereo, settings.appearance)
-    return np.array([[_counts(matcher, view) for view in triple] for triple in triples])
+    counts = [[_counts(matcher, view) for view in triple] for triple in triples]
+    return np.array(counts, np.float64)
 
 
 def _counts(matcher: StereoMatcher, view: View) -> tuple[int, int, int]:
