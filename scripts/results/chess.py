@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -168,7 +169,7 @@ def _joined(parts: list[Judged]) -> Judged:
     )
 
 
-def _precision_table(title: str, judged: dict[str, Judged]) -> Table:
+def _precision_table(title: str, judged: Mapping[Appearance, Judged]) -> Table:
     columns = (
         "mode", "right-left matches", "judge undecided", "precision before",
         "kept by the top image", "precision after", "precision of those dropped",

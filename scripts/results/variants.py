@@ -35,7 +35,7 @@ PAPER_LITERALLY = (
 )
 """Sections 2 to 4 as printed; averaging and degrees of freedom are added where they are used."""
 
-_ONE_CHANGE: dict[str, tuple[str, ...]] = {
+VARIANTS: dict[str, tuple[str, ...]] = {
     "default": (),
     "`appearance: paper`": ("frontend.appearance.mode=paper",),
     "`update: world`": ("estimator.update=world",),
@@ -93,7 +93,7 @@ def table(data: Path = DATA) -> Table:
     """One row a variant, one column a course: ATE in centimetres."""
     results = [_on_course(course, data) for course in COURSES]
     rows: list[tuple[Cell, ...]] = [
-        (name, *(result[name].shown() for result in results)) for name in _ONE_CHANGE
+        (name, *(result[name].shown() for result in results)) for name in VARIANTS
     ]
     notes = (
         "in brackets: share of frames whose pose was measured, where it is not all of them; the "
@@ -105,11 +105,11 @@ def table(data: Path = DATA) -> Table:
 
 
 def _on_course(course: Course, data: Path) -> dict[str, Outcome]:
-    outcomes: dict[str, list[Outcome]] = {name: [] for name in _ONE_CHANGE}
+    outcomes: dict[str, list[Outcome]] = {name: [] for name in VARIANTS}
     for seed in course.seeds:
         base = (*course.overrides, f"seed={seed}")
         found = find_features(experiment(course.experiment, base, data))
-        for name, changes in _ONE_CHANGE.items():
+        for name, changes in VARIANTS.items():
             outcomes[name].append(outcome(course.experiment, [*base, *changes], found, data))
         say(f"{course.title}, seed {seed}: done")
     return {name: _mean(of_seeds) for name, of_seeds in outcomes.items()}
