@@ -60,7 +60,8 @@ def shown(cell: Cell) -> str:
         return "-"
     if isinstance(cell, float):
         decimals = _DIGITS - 1 - (math.floor(math.log10(abs(cell))) if cell else 0)
-        return f"{cell:.{max(0, min(decimals, 4))}f}"
+        text = f"{cell:.{max(0, min(decimals, 4))}f}"
+        return text if text.strip("-0.") else text.removeprefix("-")
     return str(cell)
 
 

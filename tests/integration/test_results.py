@@ -50,7 +50,7 @@ def test_table_refuses_a_row_of_another_length() -> None:
 @pytest.mark.parametrize(
     ("value", "text"),
     [(193, "193"), (0.0, "0.00"), (0.99564, "0.996"), (11.136, "11.1"), (3404.0, "3404"),
-     (1e-7, "0.0000"), (-2.09, "-2.09"), (float("inf"), "-"), ("<= 5", "<= 5")],
+     (1e-7, "0.0000"), (-0.0, "0.00"), (-1e-7, "0.0000"), (-2.09, "-2.09"), (float("inf"), "-"), ("<= 5", "<= 5")],
 )  # fmt: skip
 def test_cells_are_shown_with_three_digits(value: float | str, text: str) -> None:
     assert shown(value) == text
@@ -183,10 +183,17 @@ def test_sift_noise_is_covered_by_the_experiment_s_pixel_sigma() -> None:
     within, between = noise.tables()
     sigma = experiment("lab_loop").frontend.stereo.pixel_sigma
     name = "sigma of one coordinate (MAD), px"
-    measured = [float(v) for t in (within, between) for v in t.column(name) if v is not None]
-    assert len(measured) == 4 + 2 * len(noise.APART)
-    assert min(measured) > 0.03
-    assert max(measured) <= sigma
+    in_a_frame = [v for v in within.column(name) if isinstance(v, float)]
+    # Twenty frames are two metres of driving; over four the sightings get few and differ more.
+    near = [
+        sigma_of
+        for pair, sigma_of in zip(between.column("landmark's"), between.column(name), strict=True)
+        if isinstance(sigma_of, float) and "40 frames" not in str(pair)
+    ]
+    assert len(in_a_frame) == 4
+    assert len(near) == 2 * len(noise.APART) - 2
+    assert min(in_a_frame) > 0.03
+    assert max(in_a_frame) <= 0.12 < max(near) <= sigma
 
 
 @pytest.mark.slow
