@@ -25,8 +25,8 @@ class MotionModel(Protocol):
         """Camera motion to frame ``i``, None for the first; and whether it was measured."""
         ...
 
-    def observe(self, timestamp: float, wTc: FloatArray) -> None:
-        """Learns the pose that was estimated for the last frame."""
+    def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
+        """Learns the last frame's pose, and whether landmarks or odometry had a say in it."""
         ...
 
     def description(self) -> dict[str, Any]:
@@ -66,9 +66,9 @@ class OdometryMotion:
         motion = body_to_camera_motion(body.motion, self._bTc)
         return Odometry(motion, change_tangent_frame(self._cTb, body.covariance)), True
 
-    def observe(self, timestamp: float, wTc: FloatArray) -> None:
+    def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
         """Keeps the stand-in's velocity fresh."""
-        self._stand_in.observe(timestamp, wTc)
+        self._stand_in.observe(timestamp, wTc, measured)
 
     def description(self) -> dict[str, Any]:
         """The kind of odometry and what bridges its gaps."""
@@ -99,33 +99,44 @@ class ConstantVelocityMotion:
             [np.deg2rad(settings.start_rotation_sigma_dps), settings.start_speed_sigma_mps], 3
         )
         self._timestamp: float | None = None
+        self._measured_at = 0.0
         self._pose = np.eye(4)
         self._velocity: FloatArray | None = None
 
     def between(self, i: int, timestamp: float) -> tuple[Odometry | None, bool]:
-        """The last velocity over the new interval; standard deviation ``sigma * dt^2``."""
+        """The last velocity over the new interval ``dt``.
+
+        The velocity has wandered by ``sigma * T`` over the time T since it was last measured, so
+        the step's standard deviation is ``sigma * T * dt``: ``sigma * dt^2`` from frame to frame,
+        and growing while the camera is blind.
+        """
         if self._timestamp is None:
             return None, False
         dt = timestamp - self._timestamp
         if self._velocity is None:
             return Odometry(np.eye(4), np.diag((self._start_sigma * dt) ** 2)), False
-        return Odometry(se3_exp(self._velocity * dt), np.diag((self._sigma * dt**2) ** 2)), False
+        sigma = self._sigma * (timestamp - self._measured_at) * dt
+        return Odometry(se3_exp(self._velocity * dt), np.diag(sigma**2)), False
 
-    def observe(self, timestamp: float, wTc: FloatArray) -> None:
-        """Updates the velocity from the last two poses."""
-        if self._timestamp is not None:
-            dt = timestamp - self._timestamp
+    def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
+        """Updates the velocity from the last two measured poses; the first pose counts as one."""
+        if self._timestamp is None:
+            self._measured_at, self._pose = timestamp, wTc
+        elif measured:
+            dt = timestamp - self._measured_at
             self._velocity = se3_log(inverse(self._pose) @ wTc) / dt
-        self._timestamp, self._pose = timestamp, wTc
+            self._measured_at, self._pose = timestamp, wTc
+        self._timestamp = timestamp
 
     def description(self) -> dict[str, Any]:
         """Kind and numbers."""
         return asdict(self._settings)
 
     def state(self) -> StateArrays:
-        """Last pose, time and velocity; NaN where unknown."""
+        """Last time, last measured pose and its time, velocity; NaN where unknown."""
         return {
             "timestamp": np.array(np.nan if self._timestamp is None else self._timestamp),
+            "measured_at": np.array(self._measured_at),
             "pose": self._pose,
             "velocity": np.full(6, np.nan) if self._velocity is None else self._velocity,
         }
@@ -134,5 +145,6 @@ class ConstantVelocityMotion:
         """Continues from :meth:`state`."""
         timestamp = float(state["timestamp"])
         self._timestamp = None if np.isnan(timestamp) else timestamp
+        self._measured_at = float(state["measured_at"])
         self._pose = state["pose"]
         self._velocity = None if np.isnan(state["velocity"][0]) else state["velocity"]

@@ -74,7 +74,7 @@ class SlamPipeline:
         watch.lap("track")
         increment = _increment(index, timestamp, odometry if measured else None, association)
         stats = self.estimator.update(increment, tracking)
-        self.motion.observe(timestamp, stats.wTc)
+        self.motion.observe(timestamp, stats.wTc, measured or tracking.status.measured)
         watch.lap("update")
         return FrameReport(found, stereo, increment, tracking, stats, watch.ms)
 
@@ -111,7 +111,8 @@ def replay_step(
     else:
         tracking = _solve(estimator, ego_motion, prediction, matched)
     stats = estimator.update(increment, tracking)
-    motion.observe(increment.timestamp, stats.wTc)
+    measured = increment.odometry is not None or tracking.status.measured
+    motion.observe(increment.timestamp, stats.wTc, measured)
     return stats
 
 

@@ -260,6 +260,21 @@ class EgoMotion:
     status: EgoMotionStatus
     iterations: int
 
+    @property
+    def correlation(self) -> FloatArray:
+        """(6, 6) correlations of the pose, [rotation, translation]; 0 where motion is excluded.
+
+        The known one is that of sideways motion and yaw (Se et al. 5; S28).
+        """
+        return correlation(self.covariance)
+
+
+def correlation(covariance: FloatArray) -> FloatArray:
+    """Correlations (..., n, n) of covariances (..., n, n); 0 for what has no variance."""
+    sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
+    scale = np.divide(1.0, sigma, out=np.zeros_like(sigma), where=sigma > 0.0)
+    return np.asarray(covariance * scale[..., :, None] * scale[..., None, :])
+
 
 # --------------------------------------------------------------------------------------------
 # Measurements, as every estimator consumes them and as the log keeps them

@@ -72,31 +72,45 @@ def _wins(group: IntArray, cost: FloatArray, ratio: float) -> BoolArray:
     return wins
 
 
+def resembling(
+    i: IntArray,
+    j: IntArray,
+    descriptors: tuple[ByteArray, ByteArray],
+    settings: AppearanceSettings,
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """The pairs (k,) whose descriptors are close enough, and their distances.
+
+    In `paper` mode there are no descriptors: every pair stays, at distance zero.
+    """
+    if settings.mode == "paper":
+        return i, j, np.zeros(len(i))
+    cost = descriptor_distance(descriptors[0][i], descriptors[1][j])
+    near = cost <= settings.max_distance
+    return i[near], j[near], cost[near]
+
+
+def pick(
+    pairs: tuple[IntArray, IntArray, FloatArray], settings: AppearanceSettings
+) -> tuple[IntArray, IntArray]:
+    """One-to-one matches among resembling pairs, ascending in the first set.
+
+    `paper` keeps unambiguous pairs; `descriptor` the mutually closest ones that beat the runner-up.
+    """
+    i, j, cost = pairs
+    if settings.mode == "paper":
+        keep = unambiguous(i, j)
+    elif not len(i):
+        return i, j
+    else:
+        keep = _wins(i, cost, settings.ratio) & _wins(j, cost, settings.ratio)
+    return i[keep], j[keep]
+
+
 def choose(
     i: IntArray,
     j: IntArray,
     descriptors: tuple[ByteArray, ByteArray],
     settings: AppearanceSettings,
 ) -> tuple[IntArray, IntArray]:
-    """One-to-one matches among candidate pairs that passed every gate.
-
-    Args:
-        i: (k,) first members of the pairs, indices into the first set.
-        j: (k,) second members.
-        descriptors: (n, 128) and (m, 128) of both sets.
-        settings: `paper` keeps unambiguous pairs; `descriptor` the mutually closest ones that
-            beat the runner-up.
-
-    Returns:
-        Matched indices, ascending in the first set.
-    """
-    if settings.mode == "paper":
-        keep = unambiguous(i, j)
-        return i[keep], j[keep]
-    cost = descriptor_distance(descriptors[0][i], descriptors[1][j])
-    near = cost <= settings.max_distance
-    i, j, cost = i[near], j[near], cost[near]
-    if not len(i):
-        return i, j
-    keep = _wins(i, cost, settings.ratio) & _wins(j, cost, settings.ratio)
-    return i[keep], j[keep]
+    """One-to-one matches among candidate pairs (k,) that passed every other gate."""
+    return pick(resembling(i, j, descriptors, settings), settings)

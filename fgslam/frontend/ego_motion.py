@@ -124,7 +124,7 @@ class EgoMotionSolver:
         """Pose with covariance, inliers, residuals and a status; the odometry's where it fails."""
         prediction = Prediction(self.constrain(prediction.wTc), prediction.covariance)
         start = prediction.wTc
-        inliers = transform_to_camera(start, problem.points)[:, 2] > _NEAREST_DEPTH_M
+        used = inliers = transform_to_camera(start, problem.points)[:, 2] > _NEAREST_DEPTH_M
         iterations = 0
         wTc, robust = start, self._settings.kernel != "none"
         for _ in range(_REPEATS):
@@ -138,7 +138,9 @@ class EgoMotionSolver:
             kept = self._inliers(wTc, problem)
             if not robust and np.array_equal(kept, inliers):
                 break
-            inliers, robust = kept, False
+            used, inliers, robust = inliers, kept, False
+        else:
+            inliers = used  # the set did not come to rest: the pose is that of the last one used
         return self._finish(prediction, problem, minimum, inliers, iterations)
 
     def basis(self, wTc: FloatArray) -> FloatArray:
@@ -275,7 +277,10 @@ class EgoMotionSolver:
         if allowed < 1.0:
             status = EgoMotionStatus.CAPPED
             wTc = self.constrain(prediction.wTc @ se3_exp(allowed * correction))
-            covariance = prediction.covariance
+            # The matches belong to another pose; what of it was cut off is the least we may err.
+            inliers = inliers & self._inliers(wTc, problem)
+            cut_off = (1.0 - allowed) * correction
+            covariance = self._allowed_part(wTc, prediction.covariance + np.outer(cut_off, cut_off))
         return EgoMotion(
             wTc=reorthonormalise(wTc),
             covariance=covariance,
@@ -301,13 +306,18 @@ class EgoMotionSolver:
         basis = self.basis(wTc)
         return congruence(basis, _inverse_spd(basis.T @ hessian @ basis))
 
+    def _allowed_part(self, wTc: FloatArray, covariance: FloatArray) -> FloatArray:
+        """A covariance (6, 6) without the directions that the degrees of freedom exclude."""
+        basis = self.basis(wTc)
+        return congruence(basis @ basis.T, covariance)
+
     def _fall_back(
         self, prediction: Prediction, problem: PoseProblem, status: EgoMotionStatus
     ) -> EgoMotion:
         """The odometry as the frame's ego-motion (4.1); no match is used."""
         return EgoMotion(
             wTc=reorthonormalise(prediction.wTc),
-            covariance=prediction.covariance,
+            covariance=self._allowed_part(prediction.wTc, prediction.covariance),
             inliers=np.zeros(len(problem), np.bool_),
             residuals=self.image_residuals(prediction.wTc, problem),
             status=status,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.frontend.candidates import alike, choose, pairs_within
+from fgslam.frontend.candidates import alike, pairs_within, pick, resembling
 from fgslam.frontend.database import ExpectedLandmarks
 from fgslam.settings.frontend import AppearanceSettings, MapMatchingSettings
 from fgslam.types import BoolArray, FloatArray, IntArray, StereoFeatures
@@ -19,7 +19,8 @@ class MapMatches:
     Attributes:
         landmarks: (k,) indices into the expected landmarks, ascending.
         features: (k,) indices into the features.
-        had_candidates: (n,) features near any landmark, matched or ambiguous: not new ones.
+        had_candidates: (n,) features that resemble a landmark near by, matched or ambiguous: they
+            start no landmark, which would make the ambiguity worse.
     """
 
     landmarks: IntArray
@@ -53,8 +54,11 @@ class MapMatcher:
 
     @property
     def rescues(self) -> bool:
-        """Whether :meth:`match_anywhere` is to be tried where too few match."""
-        return self._settings.rescue
+        """Whether :meth:`match_anywhere` is to be tried where too few match.
+
+        Never without descriptors: in so large a window all would be ambiguous.
+        """
+        return self._settings.rescue and self._appearance.mode == "descriptor"
 
     def match(
         self,
@@ -86,12 +90,11 @@ class MapMatcher:
             s.scale_ratio,
             np.deg2rad(s.orientation_deg),
         )
-        i, j = i[same], j[same]
-        had_candidates = np.zeros(len(features), np.bool_)
-        had_candidates[j] = True
         descriptors = (expected.descriptors, features.descriptors)
-        landmarks, matched = choose(i, j, descriptors, self._appearance)
-        return MapMatches(landmarks, matched, had_candidates)
+        pairs = resembling(i[same], j[same], descriptors, self._appearance)
+        had_candidates = np.zeros(len(features), np.bool_)
+        had_candidates[pairs[1]] = True
+        return MapMatches(*pick(pairs, self._appearance), had_candidates)
 
     def _reach(self, count: int, uncertainty: FloatArray | None) -> FloatArray:
         """Half widths (v, 3) of the gates in column, row and disparity."""

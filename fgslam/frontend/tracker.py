@@ -79,19 +79,14 @@ class LandmarkTracker:
     ) -> Tracked:
         """Matches expected landmarks and solves for the pose; wider or closer again if asked."""
         around = Prediction(self._ego_motion.constrain(prediction.wTc), prediction.covariance)
-        expected = self.database.expected(landmarks, around.wTc)
-        uncertainty = self._uncertainty(around, landmarks, expected)
-        matches = self._matcher.match(expected, features, uncertainty)
-        tracked = self._solve(prediction, landmarks, features, (expected, matches))
+        tracked = self._attempt(prediction, around, landmarks, features)
         if self._matcher.rescues and not tracked.ego_motion.status.measured:
-            matches = self._matcher.match_anywhere(expected, features)
-            tracked = self._solve(prediction, landmarks, features, (expected, matches))
+            rescued = self._attempt(prediction, around, landmarks, features, anywhere=True)
+            # A failed rescue proves nothing about what is new: the first attempt stands.
+            tracked = rescued if rescued.ego_motion.status.measured else tracked
         if self._matcher.refines and tracked.ego_motion.status.measured:
             around = Prediction(tracked.ego_motion.wTc, tracked.ego_motion.covariance)
-            expected = self.database.expected(landmarks, around.wTc)
-            uncertainty = self._uncertainty(around, landmarks, expected)
-            matches = self._matcher.match(expected, features, uncertainty)
-            tracked = self._solve(prediction, landmarks, features, (expected, matches))
+            tracked = self._attempt(prediction, around, landmarks, features)
         return tracked
 
     def track_blind(self, prediction: Prediction) -> EgoMotion:
@@ -100,15 +95,23 @@ class LandmarkTracker:
         found = self._ego_motion.solve(prediction, nothing)
         return replace(found, status=EgoMotionStatus.NO_IMAGE)
 
-    def _solve(
+    def _attempt(
         self,
         prediction: Prediction,
+        around: Prediction,
         landmarks: LandmarkMap,
         features: StereoFeatures,
-        matched: tuple[ExpectedLandmarks, MapMatches],
+        anywhere: bool = False,
     ) -> Tracked:
-        problem = PoseProblem.of(landmarks, _matched(*matched, features))
-        return Tracked(*matched, self._ego_motion.solve(prediction, problem))
+        """Matches in the neighbourhood of ``around``, then solves, stabilised to the prediction."""
+        expected = self.database.expected(landmarks, around.wTc)
+        if anywhere:
+            matches = self._matcher.match_anywhere(expected, features)
+        else:
+            uncertainty = self._uncertainty(around, landmarks, expected)
+            matches = self._matcher.match(expected, features, uncertainty)
+        problem = PoseProblem.of(landmarks, _matched(expected, matches, features))
+        return Tracked(expected, matches, self._ego_motion.solve(prediction, problem))
 
     def associate(self, tracked: Tracked, features: StereoFeatures, image: Image) -> Association:
         """Books hits and misses, starts new tracks, prunes (4.1 to 4.3)."""

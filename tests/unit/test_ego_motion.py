@@ -471,10 +471,49 @@ def test_the_cap_shortens_the_correction_along_itself(dof: int) -> None:
     else:
         assert abs(height(rig, found.wTc)) < 1e-15
         np.testing.assert_allclose(part, 0.5 * full, rtol=0, atol=2e-3)
-    np.testing.assert_array_equal(found.covariance, PRIOR)
+    # The matches speak of another pose: none that is off by more than the gate may move the map,
+    # and what was cut off is stated as uncertainty, along the allowed directions only.
+    assert (found.residuals[found.inliers] <= free.outlier_px).all()
+    cut_off = full - 0.5 * full
+    allowed = solver.basis(found.wTc) @ solver.basis(found.wTc).T
+    stated = allowed @ (PRIOR + np.outer(cut_off, cut_off)) @ allowed.T
+    np.testing.assert_allclose(found.covariance, stated, rtol=0, atol=1e-6)
     # A cap just beyond what is wanted does nothing.
     loose = change(free, max_correction_m=1.001 * float(np.linalg.norm(full[3:])))
     assert solve(problem, predicted, loose, rig).status is EgoMotionStatus.OK
+
+
+def test_a_capped_pose_hands_no_far_off_match_to_the_map() -> None:
+    """The odometry slipped by 0.6 m: the cap stops at 0.3 m, where all matches are far off."""
+    rng = np.random.default_rng(31)
+    problem = scene(FORWARD, rng, noise=0.0)
+    slipped = FORWARD @ g.se3_exp(np.array([0.0, 0.0, 0.0, 0.6, 0.0, 0.0]))
+    found = solve(problem, slipped, EgoMotionSettings(prior=False, max_correction_m=0.3))
+    assert found.status is EgoMotionStatus.CAPPED
+    assert found.residuals.min() > 3.0
+    assert not found.inliers.any()
+
+
+@pytest.mark.parametrize("dof", [5, 3])
+def test_a_fallback_is_certain_of_what_is_held_fixed(dof: int) -> None:
+    solver = EgoMotionSolver(RIG, change(dof=dof))
+    found = solver.solve(Prediction(FORWARD, PRIOR), PoseProblem.empty())
+    assert found.status is EgoMotionStatus.TOO_FEW_MATCHES
+    assert np.linalg.matrix_rank(found.covariance, tol=1e-12) == dof
+    assert found.covariance[4, 4] == pytest.approx(0.0, abs=1e-18)  # height, camera y
+
+
+def test_correlation_of_a_pose() -> None:
+    rng = np.random.default_rng(32)
+    for dof in (6, 3):
+        found = solve(scene(FORWARD, rng), FORWARD, change(dof=dof))
+        sigma = np.sqrt(np.diag(found.covariance))
+        free = sigma > 0
+        np.testing.assert_allclose(np.diag(found.correlation)[free], 1.0, atol=1e-12)
+        assert not found.correlation[~free].any()
+        assert found.correlation[1, 3] * sigma[1] * sigma[3] == pytest.approx(
+            found.covariance[1, 3], rel=1e-12
+        )
 
 
 @pytest.mark.parametrize("count", [0, 1, 7])

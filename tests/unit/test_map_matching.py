@@ -196,7 +196,21 @@ def test_nothing_against_nothing() -> None:
 def test_what_the_settings_switch_on() -> None:
     plain = MapMatcher(FIXED, PAPER)
     assert [plain.widens, plain.refines, plain.rescues] == [False, False, False]
-    full = MapMatcher(dataclasses.replace(FIXED, widen_sigmas=1.0, refine=True, rescue=True), PAPER)
+    everything = dataclasses.replace(FIXED, widen_sigmas=1.0, refine=True, rescue=True)
+    full = MapMatcher(everything, DESCRIPTOR)
     assert full.widens
     assert full.refines
     assert full.rescues
+    # Without descriptors a large window is all ambiguity.
+    assert not MapMatcher(everything, PAPER).rescues
+
+
+def test_a_feature_that_resembles_no_landmark_is_new() -> None:
+    other = np.full((1, 128), 200, np.uint8)
+    found = match(
+        landmarks(descriptors=np.zeros((1, 128), np.uint8)),
+        features(AT, descriptors=other),
+        DESCRIPTOR,
+    )
+    assert len(found.features) == 0
+    assert not found.had_candidates.any()

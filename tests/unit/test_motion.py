@@ -119,15 +119,15 @@ def test_constant_velocity_bridges_a_gap() -> None:
     for k, t in enumerate((0.0, 0.5)):
         wTc = g.se3_exp(TWIST * t)
         assert motion.between(k, t)[1] is (k > 0)
-        motion.observe(t, wTc)
-        alone.observe(t, wTc)
+        motion.observe(t, wTc, measured=True)
+        alone.observe(t, wTc, measured=True)
     bridged, measured = motion.between(2, 1.5)
     assert not measured
     assert_same_bits(bridged, alone.between(2, 1.5)[0])
     assert bridged is not None
     np.testing.assert_allclose(bridged.motion, g.se3_exp(TWIST), atol=1e-12)
     # After the gap the odometry is back.
-    motion.observe(1.5, g.se3_exp(TWIST * 1.5))
+    motion.observe(1.5, g.se3_exp(TWIST * 1.5), measured=True)
     assert motion.between(3, 2.0)[1]
 
 
@@ -148,14 +148,14 @@ def test_constant_twists_are_predicted_exactly(start: FloatArray) -> None:
             assert step is not None
             predicted = origin @ g.se3_exp(TWIST * times[k - 1]) @ step.motion
             np.testing.assert_allclose(predicted, origin @ g.se3_exp(TWIST * t), atol=1e-12)
-        motion.observe(t, origin @ g.se3_exp(TWIST * t))
+        motion.observe(t, origin @ g.se3_exp(TWIST * t), measured=True)
 
 
 def test_uncertainty_grows_with_the_square_of_the_interval() -> None:
     """A random change of velocity: sigma dt^2, about and along the camera's axes."""
     motion = ConstantVelocityMotion(SETTINGS)
-    motion.observe(0.0, np.eye(4))
-    motion.observe(0.5, g.se3_exp(0.5 * TWIST))
+    motion.observe(0.0, np.eye(4), measured=True)
+    motion.observe(0.5, g.se3_exp(0.5 * TWIST), measured=True)
     for dt in (0.1, 0.2, 1.0):
         step, _ = motion.between(2, 0.5 + dt)
         assert step is not None
@@ -165,9 +165,38 @@ def test_uncertainty_grows_with_the_square_of_the_interval() -> None:
         )
 
 
+def test_blind_frames_keep_the_velocity_and_lose_certainty() -> None:
+    motion = ConstantVelocityMotion(SETTINGS)
+    motion.observe(0.0, np.eye(4), measured=True)
+    motion.observe(0.5, g.se3_exp(0.5 * TWIST), measured=True)
+    fresh, _ = motion.between(2, 1.0)
+    motion.observe(1.0, np.eye(4), measured=False)  # a pose that nobody measured
+    motion.observe(1.5, np.eye(4), measured=False)
+    blind, _ = motion.between(4, 2.0)
+    assert fresh is not None
+    assert blind is not None
+    np.testing.assert_array_equal(blind.motion, fresh.motion)
+    ratio = np.sqrt(np.diag(blind.covariance) / np.diag(fresh.covariance))
+    np.testing.assert_allclose(ratio, 3.0, rtol=1e-12)
+    # Seeing again, the velocity is the mean one since it was last measured.
+    motion.observe(2.0, g.se3_exp(2.0 * TWIST), measured=True)
+    again, _ = motion.between(5, 2.5)
+    assert again is not None
+    np.testing.assert_allclose(again.motion, g.se3_exp(0.5 * TWIST), atol=1e-12)
+
+
+def test_an_unmeasured_start_teaches_no_standstill() -> None:
+    motion = ConstantVelocityMotion(SETTINGS)
+    motion.observe(0.0, np.eye(4), measured=False)
+    motion.observe(0.1, np.eye(4), measured=False)
+    step, _ = motion.between(2, 0.2)
+    assert step is not None
+    assert step.covariance[3, 3] == pytest.approx((0.1 * SETTINGS.start_speed_sigma_mps) ** 2)
+
+
 def test_at_first_it_rests_and_knows_little() -> None:
     motion = ConstantVelocityMotion(SETTINGS)
-    motion.observe(3.0, g.se3_exp(TWIST))
+    motion.observe(3.0, g.se3_exp(TWIST), measured=True)
     for dt in (0.1, 0.5):
         step, measured = motion.between(1, 3.0 + dt)
         assert step is not None
@@ -182,8 +211,8 @@ def test_at_first_it_rests_and_knows_little() -> None:
 
 def test_asking_changes_nothing() -> None:
     motion = ConstantVelocityMotion(SETTINGS)
-    motion.observe(0.0, np.eye(4))
-    motion.observe(0.5, g.se3_exp(0.5 * TWIST))
+    motion.observe(0.0, np.eye(4), measured=True)
+    motion.observe(0.5, g.se3_exp(0.5 * TWIST), measured=True)
     first = motion.between(2, 1.0)
     motion.between(2, 7.0)
     assert_same_bits(first[0], motion.between(2, 1.0)[0])
@@ -199,7 +228,7 @@ def test_a_restored_motion_continues_to_the_same_bits(seen: int, kind: str) -> N
 
     first, second = make(), make()
     for k in range(seen):
-        first.observe(0.5 * k, g.se3_exp(0.5 * k * TWIST))
+        first.observe(0.5 * k, g.se3_exp(0.5 * k * TWIST), measured=True)
     state = first.state()
     kept = copy.deepcopy(state)
     second.restore({name: np.array(array) for name, array in state.items()})
@@ -208,8 +237,8 @@ def test_a_restored_motion_continues_to_the_same_bits(seen: int, kind: str) -> N
         assert (a[0] is None) == (b[0] is None)
         if a[0] is not None:
             assert_same_bits(a[0], b[0])
-        first.observe(0.5 * k, g.se3_exp(0.5 * k * TWIST))
-        second.observe(0.5 * k, g.se3_exp(0.5 * k * TWIST))
+        first.observe(0.5 * k, g.se3_exp(0.5 * k * TWIST), measured=True)
+        second.observe(0.5 * k, g.se3_exp(0.5 * k * TWIST), measured=True)
     assert_same_bits(state, kept)
     assert_same_bits(first.state(), second.state())
 
