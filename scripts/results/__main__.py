@@ -18,6 +18,7 @@ WHAT: dict[str, Callable[[Path], Iterable[Table]]] = {
     "person": lambda data: person.tables(),
     "chess": lambda data: chess.tables(data),
     "variants": lambda data: [variants.table(data)],
+    "paired": lambda data: [variants.paired_table()],
     "real": lambda data: [real.table(data)],
     "noise": lambda data: noise.tables(),
 }

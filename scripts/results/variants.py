@@ -53,6 +53,14 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "the paper literally, `running_mean`": (*PAPER_LITERALLY, "estimator.update=running_mean"),
     "the paper literally, `half`": (*PAPER_LITERALLY, "estimator.update=half"),
 }
+_PAIRED = (
+    "default",
+    "`appearance: paper`",
+    "`update: world`",
+    "`update: running_mean`",
+    "`update: half`",
+    "`field_of_view: cone`",
+)
 _FIXED_HEIGHT = "frontend.ego_motion.dof=5"
 _NO_ODOMETRY = "odometry.kind=constant_velocity"
 
@@ -102,6 +110,25 @@ def table(data: Path = DATA) -> Table:
     )
     columns = ("variant, ATE cm", *(course.title for course in COURSES))
     return Table("One change at a time", columns, rows, notes)
+
+
+def paired_table(seeds: Iterable[int] = range(1, 11)) -> Table:
+    """Are the differences in the lab more than chance? The same ten seeds for each variant."""
+    ates: dict[str, list[float]] = {name: [] for name in _PAIRED}
+    for seed in seeds:
+        base = [f"seed={seed}"]
+        found = find_features(experiment("lab_loop", base))
+        for name in _PAIRED:
+            changes = [*base, *VARIANTS[name]]
+            ates[name].append(100.0 * outcome("lab_loop", changes, found).ate_m)
+    default = np.array(ates["default"])
+    rows: list[tuple[Cell, ...]] = []
+    for name, values in ates.items():
+        less = np.array(values) - default
+        error = float(less.std(ddof=1) / np.sqrt(len(less)))
+        rows.append((name, float(np.mean(values)), float(max(values)), float(less.mean()), error))
+    columns = ("variant", "mean ATE cm", "worst", "less the default's", "its standard error")
+    return Table("Ten seeds, paired", columns, rows)
 
 
 def _on_course(course: Course, data: Path) -> dict[str, Outcome]:
