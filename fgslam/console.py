@@ -133,19 +133,21 @@ def _milliseconds(times: object) -> str:
 
 def _end(result: RunResult) -> str:
     metrics = result.metrics
-    if metrics.end_error_m is None:
+    if metrics.end_error_m is None or len(result.outputs.recorder) < 2:
         return "unknown"
     return f"{_metres(metrics.end_error_m)}, {_degrees(metrics.end_error_deg)}"
 
 
 def _start(result: RunResult) -> str:
     end = result.metrics.more.get("end_against_start")
-    if not isinstance(end, dict):
+    if not isinstance(end, dict) or len(result.outputs.recorder) < 2:
         return "unknown"
-    return (
-        f"{end['x_cm']:.2f}, {end['y_cm']:.2f}, {end['z_cm']:.2f} cm; yaw {end['yaw_deg']:.2f}, "
-        f"pitch {end['pitch_deg']:.2f}, roll {end['roll_deg']:.2f} deg"
+    # Adding zero turns -0.00 into 0.00.
+    x, y, z = (f"{round(end[name], 2) + 0.0:.2f}" for name in ("x_cm", "y_cm", "z_cm"))
+    yaw, pitch, roll = (
+        f"{round(end[name], 2) + 0.0:.2f}" for name in ("yaw_deg", "pitch_deg", "roll_deg")
     )
+    return f"{x}, {y}, {z} cm\nyaw {yaw}, pitch {pitch}, roll {roll} deg"
 
 
 def _nees(result: RunResult) -> str:

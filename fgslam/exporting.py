@@ -6,6 +6,7 @@ from pathlib import Path
 
 from fgslam.errors import ConfigError, DatasetError
 from fgslam.export.atomic import is_run_folder
+from fgslam.export.metrics import read_metrics
 from fgslam.export.point_cloud import read_ply, write_map
 from fgslam.export.trajectories import read_tum, write_trajectory
 
@@ -25,16 +26,17 @@ def export_run(
     if map_file is None and trajectory_file is None:
         raise ConfigError("nothing to export; give --map FILE.ply or --trajectory FILE.tum")
     folder = run / _estimator_of(run, estimator)
-    lines = []
+    remark = read_metrics(run / "metrics.json").get("remark") or ""
+    lines = [f"note: {remark}"] if remark else []
     if map_file is not None:
         points = read_ply(folder / "map.ply")
         if valid_only:
             points = points.select(points.valid)
-        write_map(map_file, points)
+        write_map(map_file, points, remark)
         lines.append(f"{map_file}: {len(points)} landmarks")
     if trajectory_file is not None:
         trajectory = read_tum(folder / "final.tum")
-        write_trajectory(trajectory_file, trajectory)
+        write_trajectory(trajectory_file, trajectory, remark)
         lines.append(f"{trajectory_file}: {len(trajectory)} poses")
     return lines
 

@@ -43,6 +43,7 @@ def open_sequence(
     """
     dataset = config.dataset
     if isinstance(dataset, RenderedLabSettings):
+        _require_own_noise(config.odometry)
         sequence: Sequence = RenderedLabSequence(
             dataset, config.seed, dataset.start, dataset.stop, dataset.stride, progress
         )
@@ -52,6 +53,17 @@ def open_sequence(
     if isinstance(config.odometry, SyntheticOdometrySettings):
         return SyntheticOdometry(sequence, config.odometry, config.seed)
     return sequence
+
+
+def _require_own_noise(odometry: OdometrySettings) -> None:
+    """The rendered robot's odometry has its noise among the data set's keys: no key may be idle."""
+    if not isinstance(odometry, RecordedOdometrySettings):
+        return
+    if odometry != RecordedOdometrySettings(gap=odometry.gap):
+        raise ConfigError(
+            "keys of `odometry` other than kind and gap mean nothing to the rendered lab; set the "
+            "noise of its wheels under dataset.odometry"
+        )
 
 
 def make_stream(sequence: Sequence, settings: FrontendSettings) -> FeatureStream:
@@ -72,7 +84,8 @@ def make_motion(sequence: Sequence, settings: OdometrySettings) -> MotionModel:
     """What predicts the camera's motion."""
     if isinstance(settings, ConstantVelocitySettings):
         return ConstantVelocityMotion(settings)
-    stand_in = ConstantVelocityMotion(ConstantVelocitySettings())
+    gap = settings.gap if isinstance(settings, RecordedOdometrySettings) else None
+    stand_in = ConstantVelocityMotion(gap or ConstantVelocitySettings())
     return OdometryMotion(sequence, settings.kind, stand_in)
 
 

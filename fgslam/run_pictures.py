@@ -29,7 +29,7 @@ _SHOWN = (0.0, 60 / 249, 120 / 249, 180 / 249)
 
 
 def frames_to_show(count: int) -> frozenset[int]:
-    """Which of ``count`` frames are drawn, each with the one after the first for its flow."""
+    """Which of ``count`` frames are drawn; the second is among them for the first flow."""
     return frozenset({round(part * count) for part in _SHOWN} | {1}) & frozenset(range(count))
 
 

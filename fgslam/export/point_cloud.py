@@ -123,8 +123,13 @@ class MapPoints:
         )
 
 
-def write_map(path: Path, points: MapPoints) -> None:
+def write_map(path: Path, points: MapPoints, remark: str = "") -> None:
     """Write a map in the format that the suffix names: `.ply`, `.pcd` or `.off`.
+
+    Args:
+        path: the file to write, atomically.
+        points: the landmarks.
+        remark: ASCII, put into a comment of the file.
 
     Raises:
         OutputError: the suffix is another one, a landmark is not finite, or writing failed.
@@ -135,7 +140,7 @@ def write_map(path: Path, points: MapPoints) -> None:
         raise OutputError(
             f"cannot write {path}: unknown map format '{path.suffix}'; use .ply, .pcd or .off"
         )
-    writer(path, points)
+    writer(path, points, remark)
 
 
 # --------------------------------------------------------------------------------------------
@@ -243,8 +248,13 @@ def _from_records(records: Records) -> MapPoints:
 # PCD and OFF
 
 
-def write_pcd(path: Path, points: MapPoints) -> None:
+def write_pcd(path: Path, points: MapPoints, remark: str = "") -> None:
     """Write a binary .pcd 0.7 (PCL, Open3D, CloudCompare), single precision.
+
+    Args:
+        path: the file to write, atomically.
+        points: the landmarks.
+        remark: ASCII, put into a comment line.
 
     Raises:
         OutputError: as :func:`write_ply`.
@@ -260,6 +270,7 @@ def write_pcd(path: Path, points: MapPoints) -> None:
     kinds = [_PCD_DTYPE[name] for name in names]
     header = [
         "# .PCD v0.7 - Point Cloud Data file format",
+        *([f"# {remark}"] if remark else []),
         "VERSION 0.7",
         f"FIELDS {' '.join(names)}",
         f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}",
@@ -274,11 +285,16 @@ def write_pcd(path: Path, points: MapPoints) -> None:
     write_bytes(path, "\n".join(header).encode("ascii") + records.tobytes())
 
 
-def write_off(path: Path, points: MapPoints) -> None:
+def write_off(path: Path, points: MapPoints, remark: str = "") -> None:
     """Write an ASCII Geomview .off: every landmark a vertex and a coloured face of one corner.
 
     Geomview, which the paper used, draws faces only, and one of a single corner as a dot; Open3D
     refuses a file without faces. Colours are therefore those of the faces.
+
+    Args:
+        path: the file to write, atomically.
+        points: the landmarks.
+        remark: ASCII, put into a comment line.
 
     Raises:
         OutputError: as :func:`write_ply`.
@@ -286,7 +302,7 @@ def write_off(path: Path, points: MapPoints) -> None:
     _require_writable(path, points)
     n = len(points)
     buffer = io.StringIO()
-    buffer.write(f"OFF\n{n} {n} 0\n")
+    buffer.write("OFF\n" + (f"# {remark}\n" if remark else "") + f"{n} {n} 0\n")
     np.savetxt(buffer, np.round(points.positions, 9) + 0.0, fmt="%.9f")
     faces = np.column_stack([np.ones(n, np.int64), np.arange(n), points.colours])
     np.savetxt(buffer, faces, fmt="%d")

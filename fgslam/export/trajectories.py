@@ -32,19 +32,26 @@ _COVARIANCE_HEADER = (
 )
 
 
-def write_trajectory(path: Path, trajectory: Trajectory) -> None:
+def write_trajectory(path: Path, trajectory: Trajectory, remark: str = "") -> None:
     """Write a trajectory in the format that the suffix names: `.tum` or `.kitti`.
+
+    Args:
+        path: the file to write, atomically.
+        trajectory: poses ``wTc``.
+        remark: put into a comment line of `.tum`; `.kitti` knows no comments.
 
     Raises:
         OutputError: the suffix is another one, a pose is not finite, or writing failed.
     """
-    writers = {".tum": write_tum, ".kitti": write_kitti}
-    writer = writers.get(path.suffix.lower())
-    if writer is None:
+    suffix = path.suffix.lower()
+    if suffix == ".tum":
+        write_tum(path, trajectory, remark)
+    elif suffix == ".kitti":
+        write_kitti(path, trajectory)
+    else:
         raise OutputError(
             f"cannot write {path}: unknown trajectory format '{path.suffix}'; use .tum or .kitti"
         )
-    writer(path, trajectory)
 
 
 # --------------------------------------------------------------------------------------------

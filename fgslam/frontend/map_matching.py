@@ -32,7 +32,7 @@ class MapMatcher:
     """Search window, disparity, scale and orientation gates, then the appearance."""
 
     def __init__(self, settings: MapMatchingSettings, appearance: AppearanceSettings) -> None:
-        """Takes the gates as plain values."""
+        """Takes the gates and the use of descriptors."""
         self._settings = settings
         self._appearance = appearance
         self._limit = 0.5 * settings.max_window_px

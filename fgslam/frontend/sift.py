@@ -36,7 +36,7 @@ class SiftExtractor:
         )
 
     def extract(self, image: Image) -> Features:
-        """Features of one grey image (height, width), in a canonical order."""
+        """Features of one grey image (height, width), in OpenCV's order, which is repeatable."""
         # One call for both: two calls would build the pyramid twice.
         if self._describe:
             keypoints, computed = self._sift.detectAndCompute(image, None)

@@ -127,6 +127,33 @@ class LightFieldSettings(RecordingSettings):
 
 
 @dataclass(frozen=True, config=STRICT)
+class ConstantVelocitySettings:
+    """No odometry: the camera is expected to keep its velocity, with this random acceleration.
+
+    Over a step of ``dt`` seconds the prediction's standard deviation is ``sigma * dt**2``.
+    Defaults: the change of velocity between frames of the cars of KITTI, rounded (standard
+    deviation per camera axis; KITTI raw 2011_09_26 at 5 Hz: 12, 6, 8 degrees/s^2 and 0.35, 0.43,
+    2.3 m/s^2, without outliers 9, 3, 6 and 0.22, 0.23, 0.57; KITTI 06 at 10 Hz: 5, 2, 5 and 0.12,
+    0.11, 0.18).
+    """
+
+    kind: Literal["constant_velocity"] = "constant_velocity"
+    rotation_sigma_dps2: Annotated[
+        PositiveVector3,
+        Field(description="about the camera's axes x, y, z (right, down, forward), degrees/s^2"),
+    ] = (12.0, 15.0, 10.0)
+    translation_sigma_mps2: Annotated[
+        PositiveVector3, Field(description="along the camera's axes x, y, z, m/s^2")
+    ] = (0.5, 0.5, 1.5)
+    start_speed_sigma_mps: Annotated[
+        float, Field(gt=0.0, description="speed per axis before the first motion is known, m/s")
+    ] = 15.0
+    start_rotation_sigma_dps: Annotated[
+        float, Field(gt=0.0, description="turn per axis before the first motion is known, deg/s")
+    ] = 20.0
+
+
+@dataclass(frozen=True, config=STRICT)
 class RecordedOdometrySettings:
     """Use the recording's own odometry, with this noise.
 
@@ -136,6 +163,10 @@ class RecordedOdometrySettings:
     """
 
     kind: Literal["recorded"] = "recorded"
+    gap: Annotated[
+        ConstantVelocitySettings,
+        Field(description="what stands in over steps without odometry"),
+    ] = ConstantVelocitySettings()
     time_offset_s: Annotated[
         float, Field(ge=-10.0, le=10.0, description="added to the odometry's time stamps, seconds")
     ] = 0.0
@@ -183,33 +214,6 @@ class RecordedOdometrySettings:
     rotation_floor_deg: Annotated[
         float, Field(gt=0.0, description="poses: least noise per axis and step, degrees")
     ] = 0.1
-
-
-@dataclass(frozen=True, config=STRICT)
-class ConstantVelocitySettings:
-    """No odometry: the camera is expected to keep its velocity, with this random acceleration.
-
-    Over a step of ``dt`` seconds the prediction's standard deviation is ``sigma * dt**2``.
-    Defaults: the change of velocity between frames of the cars of KITTI, rounded (standard
-    deviation per camera axis; KITTI raw 2011_09_26 at 5 Hz: 12, 6, 8 degrees/s^2 and 0.35, 0.43,
-    2.3 m/s^2, without outliers 9, 3, 6 and 0.22, 0.23, 0.57; KITTI 06 at 10 Hz: 5, 2, 5 and 0.12,
-    0.11, 0.18).
-    """
-
-    kind: Literal["constant_velocity"] = "constant_velocity"
-    rotation_sigma_dps2: Annotated[
-        PositiveVector3,
-        Field(description="about the camera's axes x, y, z (right, down, forward), degrees/s^2"),
-    ] = (12.0, 15.0, 10.0)
-    translation_sigma_mps2: Annotated[
-        PositiveVector3, Field(description="along the camera's axes x, y, z, m/s^2")
-    ] = (0.5, 0.5, 1.5)
-    start_speed_sigma_mps: Annotated[
-        float, Field(gt=0.0, description="speed per axis before the first motion is known, m/s")
-    ] = 15.0
-    start_rotation_sigma_dps: Annotated[
-        float, Field(gt=0.0, description="turn per axis before the first motion is known, deg/s")
-    ] = 20.0
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -122,7 +122,8 @@ class MapMatchingSettings:
         ),
     ] = 3.0
     max_window_px: Annotated[
-        float, Field(gt=0.0, description="side that widening may not exceed")
+        float,
+        Field(gt=0.0, description="side that widening may not exceed, also of the disparity gate"),
     ] = 80.0
     refine: Annotated[
         bool,
@@ -134,7 +135,7 @@ class MapMatchingSettings:
         bool,
         Field(
             description="where too few match, search the largest window (max_window_px) by "
-            "descriptor before falling back to the odometry"
+            "descriptor before falling back to the odometry; needs appearance.mode descriptor"
         ),
     ] = False
 

@@ -127,6 +127,13 @@ def test_synthetic_odometry_is_marked_everywhere(
     assert "SYNTHETIC" in capfd.readouterr().out
     for name in ("metrics.json", f"{KIND}/final.tum", f"{KIND}/covariance.csv", f"{KIND}/map.ply"):
         assert b"SYNTHETIC" in (folder / name).read_bytes(), name
+    for suffix in (".ply", ".pcd", ".off", ".tum", ".kitti"):
+        file = tmp_path / f"exported{suffix}"
+        option = "--trajectory" if suffix in (".tum", ".kitti") else "--map"
+        assert main(monkeypatch, "export", folder, option, file) == 0
+        assert "SYNTHETIC" in capfd.readouterr().out
+        # KITTI's format has no comments; the line printed has to do there.
+        assert (b"SYNTHETIC" in file.read_bytes()) is (suffix != ".kitti"), suffix
 
 
 def test_a_closed_pipe_is_no_fault() -> None:

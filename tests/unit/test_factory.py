@@ -3,8 +3,9 @@ from __future__ import annotations
 import pytest
 
 from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.config import parse_config
 from fgslam.errors import ConfigError
-from fgslam.factory import make_estimator, require_support
+from fgslam.factory import make_estimator, open_sequence, require_support
 from fgslam.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
 from fgslam.settings.backend import LandmarkKalmanSettings
 from fgslam.types import CameraRig, MeasurementType
@@ -24,3 +25,10 @@ def test_an_estimator_without_odometry_is_refused_only_where_there_is_some(
     require_support(estimator, measured_odometry=False)
     with pytest.raises(ConfigError, match="landmark_kalman cannot use odometry measurements"):
         require_support(estimator, measured_odometry=True)
+
+
+def test_noise_of_recorded_odometry_is_not_silently_idle_in_the_lab() -> None:
+    lab = {"kind": "rendered_lab"}
+    noisy = {"kind": "recorded", "speed_sigma_mps": 9.0}
+    with pytest.raises(ConfigError, match=r"dataset\.odometry"):
+        open_sequence(parse_config({"name": "x", "dataset": lab, "odometry": noisy}, "x"))
