@@ -18,7 +18,7 @@ from fgslam.evaluation.trajectory import (
 )
 from fgslam.export.metrics import EstimatorMetrics, JsonValue, UpdateTime
 from fgslam.recorder import STAGES, RunRecorder
-from fgslam.types import Estimate, FloatArray, IntArray, Trajectory
+from fgslam.types import Estimate, FloatArray, IntArray, Trajectory, correlation
 
 _ESTIMATOR_STAGES = ("predict", "update")
 _LOOP_STAGES = ("predict", "stereo", "track", "update")
@@ -62,6 +62,7 @@ def run_numbers(recorder: RunRecorder) -> dict[str, JsonValue]:
         "landmark_matches": _spread(recorder.column("inliers")[1:]),
         "mean_residual_px": _median(recorder.column("mean_residual_px")),
         "stereo_precision": _mean(recorder.column("stereo_precision")),
+        "correlation_x_yaw": _sideways_yaw(recorder),
         "frames_without_image": int(np.count_nonzero(recorder.column("problem") != "")),
         "frame_problems": frame_problems(recorder),
         "loop_ms": asdict(UpdateTime.of(_stage_sum(times, _LOOP_STAGES))),
@@ -123,6 +124,14 @@ def _spread(counts: IntArray) -> JsonValue:
         "p95": float(high),
         "max": int(counts.max()),
     }
+
+
+def _sideways_yaw(recorder: RunRecorder) -> float | None:
+    """Median correlation of sideways motion and yaw (Se et al. 5; S28); None before frame 1."""
+    if len(recorder) < 2:
+        return None
+    found = correlation(np.array(recorder.online_covariances[1:]))
+    return float(np.median(found[:, 1, 3]))
 
 
 def _median(values: FloatArray) -> float | None:

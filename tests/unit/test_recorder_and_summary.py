@@ -170,6 +170,14 @@ def test_counts_of_a_run() -> None:
     assert numbers["sift_ms"] == {"median": 10.0, "p95": 10.0, "max": 10.0}
 
 
+def test_sideways_motion_and_yaw_hang_together_as_the_covariances_say() -> None:
+    recorder = recorder_of(4)
+    for covariance, wanted in zip(recorder.online_covariances[1:], (-0.9, -0.5, 0.1), strict=True):
+        covariance[1, 3] = covariance[3, 1] = wanted * 1e-4
+    assert run_numbers(recorder)["correlation_x_yaw"] == pytest.approx(-0.5)
+    assert run_numbers(recorder_of(1))["correlation_x_yaw"] is None
+
+
 def test_no_frame_at_all_is_unknown_not_an_error() -> None:
     numbers = run_numbers(recorder_of(0))
     assert numbers["features"] is None
