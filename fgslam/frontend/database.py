@@ -33,7 +33,17 @@ from fgslam.types import (
 )
 
 _NEAREST_DEPTH_M = 0.1
-_COLUMNS = ("ids", "size", "orientation", "descriptors", "hits", "misses", "missed", "colour")
+_COLUMNS = (
+    "ids",
+    "size",
+    "orientation",
+    "descriptors",
+    "hits",
+    "misses",
+    "missed",
+    "seen",
+    "colour",
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,6 +82,7 @@ class LandmarkDatabase:
         self._settings = settings
         self._max_disparity = max_disparity_px
         self._next_id = 0
+        self._frame = 0
         self.ids: IntArray = np.empty(0, np.int64)
         self.size: FloatArray = np.empty(0)
         self.orientation: FloatArray = np.empty(0)
@@ -79,6 +90,7 @@ class LandmarkDatabase:
         self.hits: IntArray = np.empty(0, np.int64)
         self.misses: IntArray = np.empty(0, np.int64)
         self.missed: IntArray = np.empty(0, np.int64)
+        self.seen: IntArray = np.empty(0, np.int64)
         self.colour: ByteArray = np.empty(0, np.uint8)
 
     def __len__(self) -> int:
@@ -118,6 +130,7 @@ class LandmarkDatabase:
         """Type III: a match resets l and refreshes the appearance."""
         rows = self.rows(ids)
         self.missed[rows] = 0
+        self.seen[rows] = self._frame
         self.hits[rows] += 1
         self.size[rows] = features.scale[which] * features.position[which, 2]
         self.orientation[rows] = features.orientation[which]
@@ -142,13 +155,21 @@ class LandmarkDatabase:
             hits=zeros + 1,
             misses=zeros,
             missed=zeros,
+            seen=zeros + self._frame,
             colour=colour,
         )
         return ids
 
     def prune(self) -> IntArray:
-        """Drops landmarks missed N times in a row (4.3); returns their identities."""
+        """Ends a frame: drops landmarks missed N times in a row (4.3); returns their identities.
+
+        On request also those that were never confirmed and not seen for long, in view or not.
+        """
         gone = self.missed >= self._settings.prune_after_misses
+        forget_after = self._settings.forget_unconfirmed_after
+        if forget_after is not None:
+            gone |= ~self.valid & (self._frame >= self.seen + forget_after)
+        self._frame += 1
         if not gone.any():
             return np.empty(0, np.int64)
         pruned = self.ids[gone]
@@ -160,6 +181,7 @@ class LandmarkDatabase:
         """All entries, as arrays; a snapshot."""
         out: StateArrays = {name: getattr(self, name).copy() for name in _COLUMNS}
         out["next_id"] = np.array(self._next_id)
+        out["frame"] = np.array(self._frame)
         return out
 
     def restore(self, state: StateArrays) -> None:
@@ -167,6 +189,7 @@ class LandmarkDatabase:
         for name in _COLUMNS:
             setattr(self, name, state[name].copy())
         self._next_id = int(state["next_id"])
+        self._frame = int(state["frame"])
 
     def _extend(self, **columns: FloatArray | IntArray | ByteArray) -> None:
         for name, values in columns.items():

@@ -150,6 +150,15 @@ class DatabaseSettings:
     valid_hits: Annotated[
         int, Field(ge=1, description="hits until a landmark counts as valid; 3 in 6.1")
     ] = 3
+    forget_unconfirmed_after: Annotated[
+        int | None,
+        Field(
+            ge=1,
+            description="frames after which a landmark with fewer than valid_hits hits that was "
+            "not seen again is dropped, in view or not: what a passer-by leaves behind; null keeps "
+            "it until it is missed in view, as the paper",
+        ),
+    ] = None
     field_of_view: Annotated[
         Literal["image", "cone"],
         Field(

@@ -248,6 +248,30 @@ def test_pruned_exactly_at_the_last_miss_in_a_row(limit: int) -> None:
     assert database.new_ids(1).tolist() == [2]
 
 
+def test_an_unconfirmed_landmark_is_forgotten_in_view_or_not() -> None:
+    """Three landmarks: never seen again, confirmed by two more hits, seen again once and late."""
+    points = at_pixels([(80, 60, 8), (100, 110, 12), (200, 100, 9)])
+    features = stereo_features(points)
+    database = database_of(points, DatabaseSettings(forget_unconfirmed_after=4))
+    gone: list[tuple[int, int]] = []
+    for frame in range(12):
+        if frame in (1, 2):
+            database.record_hits(np.array([1]), features, np.array([1]))
+        if frame == 3:
+            database.record_hits(np.array([2]), features, np.array([2]))
+        gone += [(frame, int(i)) for i in database.prune()]
+    assert gone == [(4, 0), (7, 2)]
+    assert database.ids.tolist() == [1]
+
+
+def test_by_default_what_is_out_of_view_stays() -> None:
+    """The paper's Type I: its miss count remains unchanged."""
+    database = database_of(at_pixels([(80, 60, 8)]))
+    for _ in range(500):
+        assert len(database.prune()) == 0
+    assert database.ids.tolist() == [0]
+
+
 def test_the_paper_prunes_after_20() -> None:
     assert DatabaseSettings().prune_after_misses == 20
     assert DatabaseSettings().valid_hits == 3
@@ -288,7 +312,7 @@ def test_a_hit_refreshes_the_appearance() -> None:
     np.testing.assert_array_equal(database.descriptors[1], seen.descriptors[1])
     others = np.array([0, 2])
     for name in before:
-        if name != "next_id":
+        if name not in ("next_id", "frame"):
             np.testing.assert_array_equal(database.state()[name][others], before[name][others])
 
 

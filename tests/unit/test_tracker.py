@@ -185,7 +185,9 @@ def test_landmarks_out_of_view_are_left_alone() -> None:
     for _ in range(10):
         _, association = scene.step(away)
         assert len(association.missed_ids) == len(association.pruned_ids) == 0
-    assert_same_bits(scene.tracker.database.state(), before)
+    after = scene.tracker.database.state()
+    assert int(after.pop("frame")) == int(before.pop("frame")) + 10  # frames counted, no entry
+    assert_same_bits(after, before)
 
 
 def test_outliers_count_as_misses_and_are_marked() -> None:
