@@ -50,7 +50,8 @@ def test_table_refuses_a_row_of_another_length() -> None:
 @pytest.mark.parametrize(
     ("value", "text"),
     [(193, "193"), (0.0, "0.00"), (0.99564, "0.996"), (11.136, "11.1"), (3404.0, "3404"),
-     (1e-7, "0.0000"), (-0.0, "0.00"), (-1e-7, "0.0000"), (-2.09, "-2.09"), (float("inf"), "-"), ("<= 5", "<= 5")],
+     (1e-7, "0.0000"), (-0.0, "0.00"), (-1e-7, "0.0000"), (-2.09, "-2.09"),
+     (float("inf"), "-"), ("<= 5", "<= 5")],
 )  # fmt: skip
 def test_cells_are_shown_with_three_digits(value: float | str, text: str) -> None:
     assert shown(value) == text
