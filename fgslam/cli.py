@@ -15,7 +15,7 @@ import typer
 from fgslam.errors import FgslamError
 
 if TYPE_CHECKING:
-    from fgslam.experiment import Progress
+    from fgslam.runs.experiment import Progress
 
 EXIT_USER = 2
 EXIT_FAULT = 1
@@ -58,7 +58,7 @@ def run(
     from fgslam.config import load_config
     from fgslam.console import progress_bar, show_result
     from fgslam.errors import ConfigError
-    from fgslam.experiment import resume_command, run_experiment
+    from fgslam.runs.experiment import resume_command, run_experiment
 
     if overwrite and resume:
         raise ConfigError("--overwrite and --resume exclude each other; give one of them")
@@ -92,7 +92,7 @@ def export(
     ] = False,
 ) -> None:
     """Hand a run's map and trajectory to other tools."""
-    from fgslam.exporting import export_run
+    from fgslam.runs.exporting import export_run
 
     for line in export_run(run_folder, map_file, trajectory, estimator, valid_only):
         typer.echo(line)
@@ -120,7 +120,7 @@ def inspect(
     Exits with 0 whatever the report says, with 2 where the recording cannot be opened at all.
     """
     from fgslam.console import progress_bar
-    from fgslam.inspection import inspect_recording
+    from fgslam.inspection.recording import inspect_recording
 
     with _stop_flag() as stopped, progress_bar() as progress:
         report = inspect_recording(dataset, overrides or (), frames, _stoppable(progress, stopped))

@@ -17,11 +17,11 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from fgslam.summary import frame_problems, run_numbers
+from fgslam.runs.summary import frame_problems, run_numbers
 
 if TYPE_CHECKING:
-    from fgslam.experiment import Progress as Tell
-    from fgslam.experiment import RunResult
+    from fgslam.runs.experiment import Progress as Tell
+    from fgslam.runs.experiment import RunResult
 
 _PROBLEMS_SHOWN = 5
 

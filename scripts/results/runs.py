@@ -12,10 +12,10 @@ from typing import Any
 
 from fgslam.config import ExperimentConfig, load_config
 from fgslam.evaluation.trajectory import Alignment, TrajectoryError, evaluate_trajectory
-from fgslam.experiment import RunResult, run_experiment
 from fgslam.factory import make_pipeline, make_stream, open_sequence
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.pipeline import FrameReport, SlamPipeline
+from fgslam.runs.experiment import RunResult, run_experiment
 from fgslam.types import Sequence
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"

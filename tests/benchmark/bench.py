@@ -29,7 +29,7 @@ from fgslam.factory import make_pipeline, make_stream, open_sequence
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.measurement_log import MeasurementLog
 from fgslam.pipeline import SlamPipeline
-from fgslam.recorder import RunRecorder
+from fgslam.runs.recorder import RunRecorder
 from fgslam.types import CameraRig, FloatArray, Frame, Odometry, Sequence, Trajectory
 
 BLOCK = 40

@@ -15,7 +15,7 @@ import pytest
 
 from fgslam import cli
 from fgslam.errors import CalibrationError, ConfigError, DatasetError
-from fgslam.inspection import inspect_recording
+from fgslam.inspection.recording import inspect_recording
 from fgslam.types import Image
 
 WIDTH, HEIGHT, FRAMES = 240, 180, 6

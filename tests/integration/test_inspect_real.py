@@ -8,7 +8,7 @@ import cv2
 import pytest
 
 from fgslam.errors import DatasetError
-from fgslam.inspection import inspect_recording
+from fgslam.inspection.recording import inspect_recording
 
 pytestmark = pytest.mark.data
 

@@ -24,7 +24,6 @@ from running import (
     write_config,
 )
 
-from fgslam.checkpoint import write_arrays
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.recording import Recording
 from fgslam.errors import (
@@ -34,8 +33,9 @@ from fgslam.errors import (
     OdometryError,
     OutputError,
 )
-from fgslam.experiment import resume_command
 from fgslam.measurement_log import load_arrays
+from fgslam.runs.checkpoint import write_arrays
+from fgslam.runs.experiment import resume_command
 from fgslam.settings.datasets import ImageFolderSettings
 from fgslam.types import Odometry
 

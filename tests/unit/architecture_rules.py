@@ -13,7 +13,8 @@ from pathlib import Path
 
 BASE = frozenset({"types", "geometry", "errors", "settings", "measurement_log", "system_check"})
 STAGES = frozenset({"datasets", "simulation", "frontend", "factors", "evaluation", "export"})
-PACKAGES = BASE | STAGES | {"config", "backend", "pipeline", "cli"}
+COMPOSITION = frozenset({"runs", "inspection"})
+PACKAGES = BASE | STAGES | COMPOSITION | {"config", "backend", "pipeline", "cli"}
 
 FOUNDATION_ALLOWS: dict[str, frozenset[str]] = {
     "errors": frozenset(),

@@ -28,8 +28,8 @@ from fgslam.datasets.match_checks import (
 from fgslam.errors import DatasetError
 from fgslam.frontend.descriptor_matching import mutual_nearest
 from fgslam.geometry import pose
-from fgslam.inspection import inspect_recording
-from fgslam.inspection_report import render_report
+from fgslam.inspection.recording import inspect_recording
+from fgslam.inspection.report import render_report
 from fgslam.settings.datasets import ImageFolderSettings, RecordedOdometrySettings
 
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.checkpoint import save_log, write_arrays
 from fgslam.errors import MeasurementLogError
 from fgslam.measurement_log import MeasurementLog, load_arrays
+from fgslam.runs.checkpoint import save_log, write_arrays
 from fgslam.types import CameraRig, Increment, Observations, Odometry
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgslam.checkpoint import write_arrays
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.geometry import se3_exp
 from fgslam.measurement_log import MeasurementLog, load_arrays
 from fgslam.pipeline import FrameReport
-from fgslam.recorder import STAGES, FrameRow, RunRecorder
-from fgslam.summary import estimator_metrics, frame_problems, run_numbers
+from fgslam.runs.checkpoint import write_arrays
+from fgslam.runs.recorder import STAGES, FrameRow, RunRecorder
+from fgslam.runs.summary import estimator_metrics, frame_problems, run_numbers
 from fgslam.types import (
     CameraRig,
     EgoMotion,

@@ -19,7 +19,7 @@ from fgslam.export.pictures import (
     draw_matches,
 )
 from fgslam.export.pictures.birds_eye import world_position_covariances
-from fgslam.outputs import RunOutputs
+from fgslam.runs.outputs import RunOutputs
 from fgslam.pipeline import FrameReport
 from fgslam.types import Increment, IntArray
 

@@ -10,8 +10,8 @@ from fgslam.datasets.checks import inspect_sequence
 from fgslam.datasets.findings import Finding, by_severity, share
 from fgslam.datasets.layouts import kitti_drives, recognise_layout
 from fgslam.factory import open_sequence
-from fgslam.inspection_matches import judge_matches, look_at_frames, match_facts
-from fgslam.inspection_report import Facts, render_report
+from fgslam.inspection.matches import judge_matches, look_at_frames, match_facts
+from fgslam.inspection.report import Facts, render_report
 from fgslam.settings.datasets import KittiSettings
 from fgslam.settings.lab import RenderedLabSettings
 

@@ -17,7 +17,7 @@ from fgslam.evaluation.trajectory import (
     to_estimate_world,
 )
 from fgslam.export.metrics import EstimatorMetrics, JsonValue, UpdateTime
-from fgslam.recorder import STAGES, RunRecorder
+from fgslam.runs.recorder import STAGES, RunRecorder
 from fgslam.types import Estimate, FloatArray, IntArray, Trajectory, correlation
 
 _ESTIMATOR_STAGES = ("predict", "update")

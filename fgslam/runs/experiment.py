@@ -12,7 +12,8 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from fgslam import checkpoint, run_pictures
+from fgslam.runs import checkpoint
+from fgslam.runs.pictures import draw_frame, draw_run, frames_to_show
 from fgslam.config import ExperimentConfig, load_config
 from fgslam.errors import ConfigError, DatasetError
 from fgslam.export.atomic import RUN_MARKER, ExistingFolder, create_run_folder
@@ -20,9 +21,9 @@ from fgslam.export.metrics import EstimatorMetrics
 from fgslam.factory import make_pipeline, make_stream, open_sequence
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.measurement_log import MeasurementLog
-from fgslam.outputs import RunOutputs
+from fgslam.runs.outputs import RunOutputs
 from fgslam.pipeline import FrameReport
-from fgslam.recorder import RunRecorder
+from fgslam.runs.recorder import RunRecorder
 from fgslam.types import FloatArray, Sequence, StereoFeatures
 
 Progress = Callable[[str, int, int], None]
@@ -96,7 +97,7 @@ def _loop(outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]) 
     """Processes the remaining frames; False when stopped before the last one."""
     sequence, recorder = outputs.sequence, outputs.recorder
     shown = (
-        run_pictures.frames_to_show(len(sequence))
+        frames_to_show(len(sequence))
         if outputs.config.output.pictures
         else frozenset()
     )
@@ -110,7 +111,7 @@ def _loop(outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]) 
             report = _process(outputs, found)
             recorder.add(report, wait_ms, _stereo_precision(sequence, found.i, report.stereo))
             if found.i in shown:
-                run_pictures.draw_frame(outputs, found.i, report)
+                draw_frame(outputs, found.i, report)
             progress("tracking", len(recorder), len(sequence))
             done = len(recorder) == len(sequence)
             due = time.perf_counter() - saved >= interval
@@ -160,7 +161,7 @@ def _finish(outputs: RunOutputs, complete: bool) -> RunResult:
         return RunResult(outputs.folder, "interrupted", metrics, pictures, outputs)
     metrics = outputs.write_results("finished")
     if outputs.config.output.pictures:
-        pictures = tuple(run_pictures.draw_run(outputs))
+        pictures = tuple(draw_run(outputs))
     checkpoint.remove(outputs.folder)
     return RunResult(outputs.folder, "finished", metrics, pictures, outputs)
 

@@ -11,7 +11,7 @@ from fgslam.errors import OutputError
 from fgslam.export.atomic import write_bytes
 from fgslam.measurement_log import MeasurementLog, load_arrays
 from fgslam.pipeline import SlamPipeline
-from fgslam.recorder import RunRecorder
+from fgslam.runs.recorder import RunRecorder
 from fgslam.types import StateArrays
 
 STATE_FILE = "checkpoint.npz"
