@@ -228,7 +228,7 @@ def _life_column(run: PersonRun) -> dict[str, Cell]:
         "frames of the run": frames,
         "landmarks initiated on the person": len(run.lives),
         "last frame that shows the person": run.last,
-        f"pruned after {n} expected misses in a row": len(died),
+        "dropped by the end": len(died),
         f"pruned at latest {n} frames after the person's last": int(np.sum(died <= run.last + n)),
         "frame of the last pruning": int(died.max()) if len(died) else None,
         "in the map at the end": len(stayed),
