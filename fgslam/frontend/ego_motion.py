@@ -245,7 +245,7 @@ class EgoMotionSolver:
         """The correction (6,), to be applied on the right; None where it is undetermined."""
         basis = self.basis(wTc)
         reduced = basis.T @ hessian @ basis
-        reduced[np.diag_indices_from(reduced)] *= 1.0 + damping
+        reduced.flat[:: len(reduced) + 1] *= 1.0 + damping
         try:
             return np.asarray(-(basis @ np.linalg.solve(reduced, basis.T @ gradient)))
         except np.linalg.LinAlgError:
