@@ -42,6 +42,7 @@ _NEAREST_DEPTH_M = 1e-3  # a point nearer than this, or behind, cannot be linear
 _STEP_TOLERANCE = 1e-9  # radians and metres; far below anything measurable
 _ROBUST_TOLERANCE = 1e-5  # the robust minimum only chooses the inliers for the exact one
 _REPEATS = 10  # minimisations with the remaining matches; two suffice on all recordings tried
+_EXACT_SIGMA = 1e-6  # radians and metres; stands for zero where a covariance is singular
 _MAX_DAMPING = 1e8
 _LEAST_CURVATURE = 1e-10  # of the Hessian with unit diagonal; below it the pose is undetermined
 
@@ -160,7 +161,7 @@ class EgoMotionSolver:
         self, start: FloatArray, prediction: Prediction, problem: PoseProblem, robust: bool
     ) -> _Minimum:
         information = self._information(start, problem)
-        prior = _inverse_spd(prediction.covariance) if self._settings.prior else None
+        prior = _prior_information(prediction.covariance) if self._settings.prior else None
         best_cost, damping = np.inf, 0.0
         tolerance = _ROBUST_TOLERANCE if robust else _STEP_TOLERANCE
         wTc = best = start
@@ -353,6 +354,14 @@ def unmeasured(prediction: Prediction, status: EgoMotionStatus) -> EgoMotion:
     return EgoMotion(
         prediction.wTc, prediction.covariance, np.empty(0, np.bool_), np.empty(0), status, 0
     )
+
+
+def _prior_information(covariance: FloatArray) -> FloatArray:
+    """Information of the prediction; a direction known exactly counts as known to a micrometre."""
+    try:
+        return _inverse_spd(covariance)
+    except np.linalg.LinAlgError:
+        return _inverse_spd(covariance + _EXACT_SIGMA**2 * np.eye(6))
 
 
 def _inverse_spd(matrix: FloatArray) -> FloatArray:

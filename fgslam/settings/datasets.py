@@ -130,7 +130,8 @@ class LightFieldSettings(RecordingSettings):
 class ConstantVelocitySettings:
     """No odometry: the camera is expected to keep its velocity, with this random acceleration.
 
-    Over a step of ``dt`` seconds the prediction's standard deviation is ``sigma * dt**2``.
+    Over a step of ``dt`` seconds the prediction's standard deviation is ``sigma * dt**2``, more
+    while the camera is blind: ``sigma * T * dt``, T since the velocity was last measured.
     Defaults: the change of velocity between frames of the cars of KITTI, rounded (standard
     deviation per camera axis; KITTI raw 2011_09_26 at 5 Hz: 12, 6, 8 degrees/s^2 and 0.35, 0.43,
     2.3 m/s^2, without outliers 9, 3, 6 and 0.22, 0.23, 0.57; KITTI 06 at 10 Hz: 5, 2, 5 and 0.12,

@@ -712,3 +712,12 @@ def test_unmeasured_is_the_prediction(status: EgoMotionStatus) -> None:
     np.testing.assert_array_equal(found.wTc, FORWARD)
     np.testing.assert_array_equal(found.covariance, PRIOR)
     assert len(found.inliers) == len(found.residuals) == 0
+
+
+def test_an_exact_prediction_is_kept() -> None:
+    """Odometry without noise has a singular covariance; that is no reason to fail."""
+    rng = np.random.default_rng(33)
+    solver = EgoMotionSolver(RIG, EgoMotionSettings())
+    found = solver.solve(Prediction(FORWARD, np.zeros((6, 6))), scene(FORWARD, rng))
+    assert found.status is EgoMotionStatus.OK
+    np.testing.assert_allclose(found.wTc, FORWARD, rtol=0, atol=1e-5)
