@@ -21,7 +21,7 @@ from fgslam.export.metrics import EstimatorMetrics
 from fgslam.factory import make_pipeline, make_stream, open_sequence
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.measurement_log import MeasurementLog
-from fgslam.runs.outputs import RunOutputs
+from fgslam.runs.outputs import RunOutputs, versions
 from fgslam.pipeline import FrameReport
 from fgslam.runs.recorder import RunRecorder
 from fgslam.types import FloatArray, Sequence, StereoFeatures
@@ -85,7 +85,7 @@ def run_experiment(
     recorder = RunRecorder(MeasurementLog(sequence.rig, pipeline.motion.description()))
     outputs = RunOutputs(folder, config, sequence, pipeline, recorder)
     if existing == "resume":
-        _require_same_recording(sequence, folder)
+        _require_same_ground(sequence, folder)
         checkpoint.load(folder, pipeline, recorder)
     else:
         outputs.write_config()
@@ -206,14 +206,21 @@ def _require_same(config: ExperimentConfig, folder: Path) -> None:
         )
 
 
-def _require_same_recording(sequence: Sequence, folder: Path) -> None:
-    """A run resumes only on the recording that it was started on."""
+def _require_same_ground(sequence: Sequence, folder: Path) -> None:
+    """A run resumes to the same bytes only on its own recording and with its own packages."""
     path = folder / RUN_MARKER
-    started_on = ((load_config(path).provenance or {}).get("dataset") or {}).get("identity")
-    if started_on != sequence.identity:
+    provenance = load_config(path).provenance or {}
+    if (provenance.get("dataset") or {}).get("identity") != sequence.identity:
         raise DatasetError(
             f"{sequence.name}: the recording has changed since {path} was written; restore it, or "
             "start again with --overwrite"
+        )
+    before, now = provenance.get("versions") or {}, versions()
+    changed = [f"{name} {before.get(name)} -> {now[name]}" for name in now if name in before and before[name] != now[name]]
+    if changed:
+        raise ConfigError(
+            f"{path}: started with other versions ({', '.join(changed)}), which would not give the "
+            "same bytes; restore them, or start again with --overwrite"
         )
 
 

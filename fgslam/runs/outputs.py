@@ -132,11 +132,15 @@ class RunOutputs:
 
     def _provenance(self) -> dict[str, Any]:
         return {
-            "fgslam": __version__,
-            "python": platform.python_version(),
-            "packages": {name: _version(name) for name in _VERSIONS_OF},
+            "versions": versions(),
             "dataset": {"name": self.sequence.name, "identity": self.sequence.identity},
         }
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of this program, of Python and of the packages that shape the numbers."""
+    own = {"fgslam": __version__, "python": platform.python_version()}
+    return own | {name: _version(name) for name in _VERSIONS_OF}
 
 
 def map_points(landmarks: LandmarkMap, database: LandmarkDatabase) -> MapPoints:

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from recordings import experiment, write_calibration, write_recording
 from running import (
@@ -118,6 +119,20 @@ def test_another_recording_is_refused(own_recording: Path, tmp_path: Path) -> No
     with pytest.raises(DatasetError, match="the recording has changed since"):
         run_values(values, run.folder, "resume")
     assert_valid_results(run.folder, 3)
+
+
+def test_other_versions_are_refused(recording: Path, tmp_path: Path) -> None:
+    """They would not give the bytes of an uninterrupted run."""
+    values = experiment(recording)
+    run = run_values(values, tmp_path / "run", stopped=stop_after(3))
+    config = run.folder / "config.yaml"
+    text = config.read_text()
+    assert f"numpy: {np.__version__}" in text
+    config.write_text(text.replace(f"numpy: {np.__version__}", "numpy: 1.0.0"))
+    with pytest.raises(ConfigError, match=r"started with other versions \(numpy 1\.0\.0 -> "):
+        run_values(values, run.folder, "resume")
+    config.write_text(text)
+    assert run_values(values, run.folder, "resume").result.status == "finished"
 
 
 def test_a_finished_run_and_no_run_at_all(finished: Finished, tmp_path: Path) -> None:
