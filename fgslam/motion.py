@@ -26,7 +26,7 @@ class MotionModel(Protocol):
         ...
 
     def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
-        """Learns the last frame's pose, and whether landmarks or odometry had a say in it."""
+        """Learns the last frame's pose; ``measured``: tied to odometry or the map, or its first."""
         ...
 
     def description(self) -> dict[str, Any]:
@@ -100,6 +100,7 @@ class ConstantVelocityMotion:
         )
         self._timestamp: float | None = None
         self._measured_at = 0.0
+        self._founded = False
         self._pose = np.eye(4)
         self._velocity: FloatArray | None = None
 
@@ -119,13 +120,17 @@ class ConstantVelocityMotion:
         return Odometry(se3_exp(self._velocity * dt), np.diag(sigma**2)), False
 
     def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
-        """Updates the velocity from the last two measured poses; the first pose counts as one."""
-        if self._timestamp is None:
-            self._measured_at, self._pose = timestamp, wTc
-        elif measured:
+        """Updates the velocity from the last two measured poses.
+
+        The frame that founds the map counts as one, whatever its pose: what follows is measured
+        against it. Until then the start moves on with the frames.
+        """
+        if measured and self._founded:
             dt = timestamp - self._measured_at
             self._velocity = se3_log(inverse(self._pose) @ wTc) / dt
+        if measured or not self._founded:
             self._measured_at, self._pose = timestamp, wTc
+        self._founded |= measured
         self._timestamp = timestamp
 
     def description(self) -> dict[str, Any]:
@@ -137,6 +142,7 @@ class ConstantVelocityMotion:
         return {
             "timestamp": np.array(np.nan if self._timestamp is None else self._timestamp),
             "measured_at": np.array(self._measured_at),
+            "founded": np.array(self._founded),
             "pose": self._pose,
             "velocity": np.full(6, np.nan) if self._velocity is None else self._velocity,
         }
@@ -146,5 +152,6 @@ class ConstantVelocityMotion:
         timestamp = float(state["timestamp"])
         self._timestamp = None if np.isnan(timestamp) else timestamp
         self._measured_at = float(state["measured_at"])
+        self._founded = bool(state["founded"])
         self._pose = state["pose"]
         self._velocity = None if np.isnan(state["velocity"][0]) else state["velocity"]

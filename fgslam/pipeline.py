@@ -74,7 +74,7 @@ class SlamPipeline:
         watch.lap("track")
         increment = _increment(index, timestamp, odometry if measured else None, association)
         stats = self.estimator.update(increment, tracking)
-        self.motion.observe(timestamp, stats.wTc, measured or tracking.status.measured)
+        self.motion.observe(timestamp, stats.wTc, _anchored(increment, tracking, stats))
         watch.lap("update")
         return FrameReport(found, stereo, increment, tracking, stats, watch.ms)
 
@@ -111,8 +111,7 @@ def replay_step(
     else:
         tracking = _solve(estimator, ego_motion, prediction, matched)
     stats = estimator.update(increment, tracking)
-    measured = increment.odometry is not None or tracking.status.measured
-    motion.observe(increment.timestamp, stats.wTc, measured)
+    motion.observe(increment.timestamp, stats.wTc, _anchored(increment, tracking, stats))
     return stats
 
 
@@ -123,6 +122,12 @@ def _solve(
     matched: Observations,
 ) -> EgoMotion:
     return ego_motion.solve(prediction, PoseProblem.of(estimator.landmarks(), matched))
+
+
+def _anchored(increment: Increment, tracking: EgoMotion, stats: UpdateStats) -> bool:
+    """Whether odometry or the map had a say in the pose, or the frame founds the map."""
+    founding = stats.landmarks > 0 and stats.landmarks == int(increment.observations.is_new.sum())
+    return increment.odometry is not None or tracking.status.measured or founding
 
 
 def _increment(

@@ -51,6 +51,8 @@ def read_json_object(path: Path) -> Mapping[str, Any]:
             f"calibration {path} cannot be read: {cause.strerror}; put it there (its keys are in "
             "docs/datasets/image_folder.md), and check dataset.path"
         ) from cause
+    except RecursionError:
+        raise CalibrationError(f"{path} is nested too deeply; correct the file") from None
     except ValueError as cause:
         raise CalibrationError(f"{path} is not JSON: {cause}; correct the file") from cause
     if not isinstance(values, dict):

@@ -94,6 +94,8 @@ def interpolate_poses(trajectory: Trajectory, at: FloatArray) -> FloatArray:
     Times outside the trajectory get its first or last pose.
     """
     stamps = trajectory.timestamps
+    if len(at) == 0:
+        return np.empty((0, 4, 4))
     if len(stamps) == 1:
         return np.repeat(trajectory.poses, len(at), axis=0)
     clipped = np.clip(at, stamps[0], stamps[-1])

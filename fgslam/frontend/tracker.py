@@ -86,7 +86,8 @@ class LandmarkTracker:
             tracked = rescued if rescued.ego_motion.status.measured else tracked
         if self._matcher.refines and tracked.ego_motion.status.measured:
             around = Prediction(tracked.ego_motion.wTc, tracked.ego_motion.covariance)
-            tracked = self._attempt(prediction, around, landmarks, features)
+            refined = self._attempt(prediction, around, landmarks, features)
+            tracked = refined if refined.ego_motion.status.measured else tracked
         return tracked
 
     def track_blind(self, prediction: Prediction) -> EgoMotion:

@@ -12,8 +12,6 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from fgslam.runs import checkpoint
-from fgslam.runs.pictures import draw_frame, draw_run, frames_to_show
 from fgslam.config import ExperimentConfig, load_config
 from fgslam.errors import ConfigError, DatasetError
 from fgslam.export.atomic import RUN_MARKER, ExistingFolder, create_run_folder
@@ -21,8 +19,10 @@ from fgslam.export.metrics import EstimatorMetrics
 from fgslam.factory import make_pipeline, make_stream, open_sequence
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.measurement_log import MeasurementLog
-from fgslam.runs.outputs import RunOutputs, versions
 from fgslam.pipeline import FrameReport
+from fgslam.runs import checkpoint
+from fgslam.runs.outputs import RunOutputs, versions
+from fgslam.runs.pictures import draw_frame, draw_run, frames_to_show
 from fgslam.runs.recorder import RunRecorder
 from fgslam.types import FloatArray, Sequence, StereoFeatures
 
@@ -96,11 +96,7 @@ def run_experiment(
 def _loop(outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]) -> bool:
     """Processes the remaining frames; False when stopped before the last one."""
     sequence, recorder = outputs.sequence, outputs.recorder
-    shown = (
-        frames_to_show(len(sequence))
-        if outputs.config.output.pictures
-        else frozenset()
-    )
+    shown = frames_to_show(len(sequence)) if outputs.config.output.pictures else frozenset()
     stream = make_stream(sequence, outputs.config.frontend)(start=len(recorder))
     waiting = time.perf_counter()
     interval = outputs.config.output.checkpoint_seconds
@@ -216,7 +212,8 @@ def _require_same_ground(sequence: Sequence, folder: Path) -> None:
             "start again with --overwrite"
         )
     before, now = provenance.get("versions") or {}, versions()
-    changed = [f"{name} {before.get(name)} -> {now[name]}" for name in now if name in before and before[name] != now[name]]
+    differing = [name for name in now if name in before and before[name] != now[name]]
+    changed = [f"{name} {before[name]} -> {now[name]}" for name in differing]
     if changed:
         raise ConfigError(
             f"{path}: started with other versions ({', '.join(changed)}), which would not give the "

@@ -12,7 +12,6 @@ import numpy as np
 import yaml
 
 from fgslam import __version__
-from fgslam.runs.checkpoint import save_log
 from fgslam.config import ExperimentConfig
 from fgslam.evaluation.trajectory import to_estimate_world
 from fgslam.export.atomic import make_subfolder, write_text
@@ -27,6 +26,7 @@ from fgslam.export.point_cloud import MapPoints, write_ply
 from fgslam.export.trajectories import write_covariances, write_tum
 from fgslam.frontend.database import LandmarkDatabase
 from fgslam.pipeline import SlamPipeline
+from fgslam.runs.checkpoint import save_log
 from fgslam.runs.recorder import STAGES, RunRecorder
 from fgslam.runs.summary import estimator_metrics, run_numbers
 from fgslam.types import Estimate, LandmarkMap, Sequence, Trajectory

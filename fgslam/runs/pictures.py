@@ -19,8 +19,8 @@ from fgslam.export.pictures import (
     draw_matches,
 )
 from fgslam.export.pictures.birds_eye import world_position_covariances
-from fgslam.runs.outputs import RunOutputs
 from fgslam.pipeline import FrameReport
+from fgslam.runs.outputs import RunOutputs
 from fgslam.types import Increment, IntArray
 
 FOLDER = "pictures"

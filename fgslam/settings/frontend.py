@@ -35,7 +35,10 @@ class SiftSettings:
         float, Field(gt=0.5, le=3.0, description="Gaussian of the first level, doubled image")
     ] = 1.6
     max_features: Annotated[
-        int, Field(ge=0, description="keep this many of the strongest features; 0 keeps all")
+        int,
+        Field(
+            ge=0, le=1_000_000, description="keep this many of the strongest features; 0 keeps all"
+        ),
     ] = 0
 
 

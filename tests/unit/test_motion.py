@@ -185,6 +185,17 @@ def test_blind_frames_keep_the_velocity_and_lose_certainty() -> None:
     np.testing.assert_allclose(again.motion, g.se3_exp(0.5 * TWIST), atol=1e-12)
 
 
+def test_a_motion_that_nobody_saw_is_no_part_of_the_velocity() -> None:
+    """Frame 0 was blind, frame 1 founded the map where the camera had got to unseen."""
+    motion = ConstantVelocityMotion(SETTINGS)
+    motion.observe(0.0, np.eye(4), measured=False)
+    motion.observe(0.1, np.eye(4), measured=True)
+    motion.observe(0.2, g.se3_exp(0.1 * TWIST), measured=True)
+    step, _ = motion.between(3, 0.3)
+    assert step is not None
+    np.testing.assert_allclose(step.motion, g.se3_exp(0.1 * TWIST), atol=1e-12)
+
+
 def test_an_unmeasured_start_teaches_no_standstill() -> None:
     motion = ConstantVelocityMotion(SETTINGS)
     motion.observe(0.0, np.eye(4), measured=False)
