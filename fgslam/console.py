@@ -101,6 +101,8 @@ def _remarks(result: RunResult) -> list[str]:
     lines = [*result.outputs.sequence.notes, *problems[:_PROBLEMS_SHOWN]]
     if len(problems) > _PROBLEMS_SHOWN:
         lines.append(f"and {len(problems) - _PROBLEMS_SHOWN} more such frames, see metrics.json")
+    if not result.metrics.landmarks:
+        lines.append("there is no landmark in the map; fgslam inspect says what ails the recording")
     return [f"note        {line}" for line in lines]
 
 

@@ -26,6 +26,7 @@ def export_run(
     if map_file is None and trajectory_file is None:
         raise ConfigError("nothing to export; give --map FILE.ply or --trajectory FILE.tum")
     folder = run / _estimator_of(run, estimator)
+    _require_elsewhere(run, (map_file, trajectory_file))
     remark = read_metrics(run / "metrics.json").get("remark") or ""
     lines = [f"note: {remark}"] if remark else []
     if map_file is not None:
@@ -39,6 +40,14 @@ def export_run(
         write_trajectory(trajectory_file, trajectory, remark)
         lines.append(f"{trajectory_file}: {len(trajectory)} poses")
     return lines
+
+
+def _require_elsewhere(run: Path, targets: tuple[Path | None, ...]) -> None:
+    """The run's own files are what a run is judged by: an export may not replace them."""
+    own = {file.resolve() for file in run.rglob("*") if file.is_file()}
+    for target in targets:
+        if target is not None and target.resolve() in own:
+            raise ConfigError(f"{target}: is one of the run's own files; export to another name")
 
 
 def _estimator_of(run: Path, wanted: str | None) -> str:

@@ -18,7 +18,7 @@ from fgslam.evaluation.trajectory import (
 )
 from fgslam.export.metrics import EstimatorMetrics, JsonValue, UpdateTime
 from fgslam.runs.recorder import STAGES, RunRecorder
-from fgslam.types import Estimate, FloatArray, IntArray, Trajectory, correlation
+from fgslam.types import EgoMotionStatus, Estimate, FloatArray, IntArray, Trajectory, correlation
 
 _ESTIMATOR_STAGES = ("predict", "update")
 _LOOP_STAGES = ("predict", "stereo", "track", "update")
@@ -71,12 +71,18 @@ def run_numbers(recorder: RunRecorder) -> dict[str, JsonValue]:
 
 
 def frame_problems(recorder: RunRecorder) -> list[str]:
-    """A line for each frame whose images could not be used: which and why."""
-    return [
-        f"frame {increment.index}: {row.problem}"
-        for increment, row in zip(recorder.log, recorder.rows, strict=True)
-        if row.problem
-    ]
+    """A line for each frame that the landmarks did not locate: which and why."""
+    lines = []
+    for increment, row in zip(recorder.log, recorder.rows, strict=True):
+        status = EgoMotionStatus(row.status)
+        if row.problem:
+            lines.append(f"frame {increment.index}: {row.problem}")
+        elif not status.measured and status is not EgoMotionStatus.FIRST:
+            lines.append(
+                f"frame {increment.index}: pose predicted only ({status.value}; {row.features} "
+                f"features, {row.stereo} stereo matches, {row.matched} landmarks matched)"
+            )
+    return lines
 
 
 def _stage_sum(times: FloatArray, stages: tuple[str, ...]) -> FloatArray:

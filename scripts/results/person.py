@@ -1,4 +1,4 @@
-"""A person in the lab (issue 2, section 7.6): does the pose jump, does the map forget them?"""
+"""A person in the lab (docs/results.md, section 6): does the pose jump, are they forgotten?"""
 
 from __future__ import annotations
 

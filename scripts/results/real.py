@@ -1,4 +1,4 @@
-"""The real recordings (issue 2, sections 7.3 and 7.4)."""
+"""The real recordings (docs/results.md, sections 3 and 4)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ten other seeds of image noise and odometry on the paper's drive (issue 2, section 7.2)."""
+"""Ten other seeds of image noise and odometry on the paper's drive (docs/results.md, section 2)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def table(seeds: Iterable[int] = range(1, 11)) -> Table:
 
 
 def row(run: Run) -> tuple[Cell, ...]:
-    """The numbers that issue 2 bounds, of one run of the lab loop."""
+    """The numbers that are bounded, of one run of the lab loop."""
     end = run.estimator["end_against_start"]
     return (
         run.result.outputs.config.seed,

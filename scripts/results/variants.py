@@ -1,4 +1,4 @@
-"""Variants of the system against each other (issue 2, section 4): ATE on the same features."""
+"""Variants of the system against each other (docs/results.md, section 8), on equal features."""
 
 from __future__ import annotations
 

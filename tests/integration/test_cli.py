@@ -199,6 +199,16 @@ def test_export_of_the_trajectory(finished: Finished, tmp_path: Path, monkeypatc
     np.testing.assert_allclose(read_kitti(kitti), truth.poses, atol=1e-11)
 
 
+def test_an_export_never_replaces_the_run_itself(
+    finished: Finished, monkeypatch: Patch, capfd: Capture
+) -> None:
+    own = finished.folder / KIND / "map.ply"
+    before = own.read_bytes()
+    text = mistake(capfd, monkeypatch, "export", finished.folder, "--map", own, "--valid-only")
+    assert "is one of the run's own files; export to another name" in text
+    assert own.read_bytes() == before
+
+
 def test_export_of_an_interrupted_run(
     recording: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:

@@ -1,4 +1,4 @@
-"""What docs/results.md claims, as regression tests with the bounds of issue 2, section 7."""
+"""What docs/results.md claims, as regression tests with their bounds."""
 
 from __future__ import annotations
 

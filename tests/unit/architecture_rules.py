@@ -119,8 +119,18 @@ def check_package(root: Path) -> list[Violation]:
         found += library_violations(module, imports[module.name])
         found += size_violations(module)
         found += statement_violations(module)
+    found += package_violations(modules)
     found += cycle_violations(modules, imports)
     return sorted(found)
+
+
+def package_violations(modules: list[Module]) -> Iterator[Violation]:
+    """Folders of modules without ``__init__.py``: linters and installers may pass them over."""
+    packages = {str(Path(m.path).parent) for m in modules if m.is_package}
+    for module in modules:
+        folder = str(Path(module.path).parent)
+        if folder not in packages:
+            yield Violation(module.path, 1, f"{folder} has no __init__.py; add one")
 
 
 # --------------------------------------------------------------------------------------------

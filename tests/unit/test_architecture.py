@@ -99,6 +99,15 @@ def test_layer_violations_are_reported_with_file_and_line(tmp_path: Path, case: 
     assert found[0].startswith(f"fgslam/{name}:{line}: ")
 
 
+def test_a_folder_of_modules_is_a_package(tmp_path: Path) -> None:
+    """A linter passes over a folder that an ignore rule swallowed; its __init__.py is missing."""
+    (tmp_path / "fgslam" / "runs").mkdir(parents=True)
+    (tmp_path / "fgslam" / "__init__.py").write_text("")
+    (tmp_path / "fgslam" / "runs" / "a.py").write_text("x = 1\n")
+    found = [str(violation) for violation in check_package(tmp_path / "fgslam")]
+    assert found == ["fgslam/runs/a.py:1: fgslam/runs has no __init__.py; add one"]
+
+
 LIBRARY_CASES = {
     "cv2 in the back-end": ("backend/a.py", "import cv2\n", "'cv2' only in datasets, frontend"),
     "gtsam in the front-end": (

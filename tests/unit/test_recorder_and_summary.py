@@ -178,6 +178,15 @@ def test_sideways_motion_and_yaw_hang_together_as_the_covariances_say() -> None:
     assert run_numbers(recorder_of(1))["correlation_x_yaw"] is None
 
 
+def test_frames_that_no_landmark_located_are_named() -> None:
+    recorder = recorder_of(3)
+    recorder.rows[2] = recorder.rows[2]._replace(status="too_few_matches", inliers=0)
+    assert frame_problems(recorder) == [
+        "frame 4: pose predicted only (too_few_matches; 11 features, 0 stereo matches, "
+        f"{recorder.rows[2].matched} landmarks matched)"
+    ]
+
+
 def test_no_frame_at_all_is_unknown_not_an_error() -> None:
     numbers = run_numbers(recorder_of(0))
     assert numbers["features"] is None
