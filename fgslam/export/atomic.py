@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -92,12 +92,6 @@ def write_bytes(path: Path, content: bytes) -> None:
 def write_text(path: Path, content: str) -> None:
     """Write a whole UTF-8 file atomically, with Unix line ends. Raises OutputError."""
     write_bytes(path, content.encode("utf-8"))
-
-
-def write_with(path: Path, writer: Callable[[Path], None]) -> None:
-    """Let ``writer`` write a file of its own accord (a library's `save`), atomically."""
-    with replacing(path) as partial:
-        writer(partial)
 
 
 def _remove_quietly(path: Path) -> None:

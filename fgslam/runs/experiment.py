@@ -89,12 +89,16 @@ def run_experiment(
         checkpoint.load(folder, pipeline, recorder)
     else:
         outputs.write_config()
-    complete = _loop(outputs, progress, stopped)
-    return _finish(outputs, complete)
+    saved = _loop(outputs, progress, stopped)
+    if saved is not None:
+        return RunResult(folder, "interrupted", saved, (), outputs)
+    return _finish(outputs)
 
 
-def _loop(outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]) -> bool:
-    """Processes the remaining frames; False when stopped before the last one."""
+def _loop(
+    outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]
+) -> EstimatorMetrics | None:
+    """Processes the remaining frames; what was saved when stopped before the last one, or None."""
     sequence, recorder = outputs.sequence, outputs.recorder
     shown = frames_to_show(len(sequence)) if outputs.config.output.pictures else frozenset()
     stream = make_stream(sequence, outputs.config.frontend)(start=len(recorder))
@@ -110,13 +114,11 @@ def _loop(outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]) 
                 draw_frame(outputs, found.i, report)
             progress("tracking", len(recorder), len(sequence))
             done = len(recorder) == len(sequence)
-            due = time.perf_counter() - saved >= interval
-            stop = stopped()  # asked once: a signal may arrive between two questions
-            if not done and (due or stop):
+            if not done and stopped():
+                return save_progress(outputs)
+            if not done and time.perf_counter() - saved >= interval:
                 interval = _save_timed(outputs)
                 saved = time.perf_counter()
-            if stop and not done:
-                return False
             waiting = time.perf_counter()
     except DatasetError:
         # The recording failed before its frame touched any state: all up to it can be kept.
@@ -125,7 +127,7 @@ def _loop(outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]) 
         raise
     finally:
         stream.close()
-    return True
+    return None
 
 
 def _save_timed(outputs: RunOutputs) -> float:
@@ -136,10 +138,11 @@ def _save_timed(outputs: RunOutputs) -> float:
     return max(wanted, _SAVING_SHARE * (time.perf_counter() - start)) if wanted else 0.0
 
 
-def save_progress(outputs: RunOutputs) -> None:
+def save_progress(outputs: RunOutputs) -> EstimatorMetrics:
     """All results so far, in valid files, and the state to resume from."""
-    outputs.write_results("interrupted")
+    metrics = outputs.write_results("interrupted")
     checkpoint.save(outputs.folder, outputs.pipeline, outputs.recorder)
+    return metrics
 
 
 def _process(outputs: RunOutputs, found: FeatureFrame) -> FrameReport:
@@ -150,11 +153,8 @@ def _process(outputs: RunOutputs, found: FeatureFrame) -> FrameReport:
     return outputs.pipeline.process(found, index, timestamp)
 
 
-def _finish(outputs: RunOutputs, complete: bool) -> RunResult:
+def _finish(outputs: RunOutputs) -> RunResult:
     pictures: tuple[Path, ...] = ()
-    if not complete:
-        metrics = outputs.write_results("interrupted")
-        return RunResult(outputs.folder, "interrupted", metrics, pictures, outputs)
     metrics = outputs.write_results("finished")
     if outputs.config.output.pictures:
         pictures = tuple(draw_run(outputs))

@@ -13,7 +13,6 @@ import yaml
 
 from fgslam import __version__
 from fgslam.config import ExperimentConfig
-from fgslam.evaluation.trajectory import to_estimate_world
 from fgslam.export.atomic import make_subfolder, write_text
 from fgslam.export.metrics import (
     EstimatorMetrics,
@@ -77,16 +76,6 @@ class RunOutputs:
         )
         self._write_timing(estimate.trajectory)
         return metrics
-
-    def position_errors(self) -> tuple[Any, Any, Any] | None:
-        """Time stamps (k,), position errors (k, 3) and rows (k,), first pose aligned, or None."""
-        truth = self.sequence.ground_truth
-        estimate = self.pipeline.estimator.estimate().trajectory
-        found = None if truth is None else to_estimate_world(estimate, truth)
-        if found is None:
-            return None
-        rows, poses = found
-        return estimate.timestamps[rows], estimate.poses[rows, :3, 3] - poses[:, :3, 3], rows
 
     def _write_estimate(self, estimate: Estimate) -> None:
         folder = make_subfolder(self.folder, self.kind)

@@ -21,7 +21,7 @@ from fgslam.export.pictures import (
 from fgslam.export.pictures.birds_eye import world_position_covariances
 from fgslam.pipeline import FrameReport
 from fgslam.runs.outputs import RunOutputs
-from fgslam.types import Increment, IntArray
+from fgslam.types import Estimate, FloatArray, Increment, IntArray
 
 FOLDER = "pictures"
 _SHOWN = (0.0, 60 / 249, 120 / 249, 180 / 249)
@@ -53,7 +53,11 @@ def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
 def draw_run(outputs: RunOutputs) -> list[Path]:
     """Map from above (Fig. 5), in perspective (Fig. 6), errors and matches over time."""
     folder = make_subfolder(outputs.folder, FOLDER)
-    drawing = _map_drawing(outputs)
+    # Once for all pictures: a smoother's estimate may be dear.
+    estimate = outputs.pipeline.estimator.estimate()
+    truth = outputs.sequence.ground_truth
+    found = None if truth is None else to_estimate_world(estimate.trajectory, truth)
+    drawing = _map_drawing(outputs, estimate, None if found is None else found[1])
     draw_birds_eye(folder / "map_from_above.png", drawing)
     draw_map_views(folder / "map_views.png", drawing)
     recorder = outputs.recorder
@@ -67,10 +71,10 @@ def draw_run(outputs: RunOutputs) -> list[Path]:
         recorder.column("landmarks")[1:],
         _title(outputs, "landmark matches"),
     )
-    found = outputs.position_errors()
     if found is not None:
-        timestamps, errors, rows = found
-        estimate = outputs.pipeline.estimator.estimate()
+        rows, true_poses = found
+        errors = estimate.trajectory.poses[rows, :3, 3] - true_poses[:, :3, 3]
+        timestamps = estimate.trajectory.timestamps[rows]
         covariances = world_position_covariances(
             estimate.trajectory.poses[rows], estimate.covariances[rows]
         )
@@ -81,20 +85,19 @@ def draw_run(outputs: RunOutputs) -> list[Path]:
     return sorted(folder.glob("*.png"))
 
 
-def _map_drawing(outputs: RunOutputs) -> MapDrawing:
+def _map_drawing(
+    outputs: RunOutputs, estimate: Estimate, true_poses: FloatArray | None
+) -> MapDrawing:
     """Valid landmarks only (6.1), as in the paper's Figure 6; all while the run is too short."""
-    estimate = outputs.pipeline.estimator.estimate()
     database = outputs.pipeline.tracker.database
     valid = database.valid[database.rows(estimate.landmarks.ids)]
     shown = valid if valid.any() else np.ones_like(valid)
-    truth = outputs.sequence.ground_truth
-    found = None if truth is None else to_estimate_world(estimate.trajectory, truth)
     return MapDrawing(
         landmarks=estimate.landmarks.positions[shown],
         poses=estimate.trajectory.poses,
         landmark_covariances=estimate.landmarks.covariances[shown],
         pose_covariances=estimate.covariances,
-        truth=None if found is None else found[1],
+        truth=true_poses,
         title=_title(outputs, "valid landmarks" if valid.any() else "landmarks"),
     )
 

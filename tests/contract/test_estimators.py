@@ -12,6 +12,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from simulated import RIG
 
 from fgslam import geometry as g
 from fgslam.backend.protocol import Estimator
@@ -25,7 +26,6 @@ from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import EgoMotionSettings
 from fgslam.types import (
     BoolArray,
-    CameraRig,
     EgoMotion,
     EgoMotionStatus,
     FloatArray,
@@ -43,17 +43,6 @@ SETTINGS: dict[str, EstimatorSettings] = {
     "landmark_kalman, running mean": LandmarkKalmanSettings(update="running_mean"),
     "landmark_kalman, half": LandmarkKalmanSettings(update="half"),
 }
-RIG = CameraRig(
-    width=320,
-    height=240,
-    fx=277.0,
-    fy=277.0,
-    cx=159.5,
-    cy=119.5,
-    baseline=0.1,
-    vertical_baseline=0.1,
-    bTc=g.BODY_FORWARD_LEFT_UP_FROM_CAMERA,
-)
 NOISE_PX = np.array([0.3, 0.3, 0.2])
 STEP = g.se3_exp(np.array([0.0, 0.03, 0.0, 0.01, 0.0, 0.08]))
 ODOMETRY_SIGMA = np.array([0.005, 0.005, 0.005, 0.01, 0.01, 0.01])

@@ -19,7 +19,6 @@ from fgslam.export.atomic import (
     replacing,
     write_bytes,
     write_text,
-    write_with,
 )
 
 
@@ -41,8 +40,8 @@ def test_failure_keeps_the_previous_version(tmp_path: Path) -> None:
         partial.write_text("half of the n")
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        write_with(target, interrupted)
+    with pytest.raises(KeyboardInterrupt), replacing(target) as beside:
+        interrupted(beside)
     assert target.read_text() == "old"
     assert not leftovers(tmp_path)
 
@@ -59,7 +58,8 @@ def test_previous_version_stands_until_the_new_one_is_complete(tmp_path: Path) -
 
 def test_library_writers_see_their_suffix(tmp_path: Path) -> None:
     target = tmp_path / "log.npz"
-    write_with(target, lambda path: np.savez(path, a=np.arange(3)))
+    with replacing(target) as path:
+        np.savez(path, a=np.arange(3))
     with np.load(target) as log:
         np.testing.assert_array_equal(log["a"], [0, 1, 2])
     assert [path.name for path in tmp_path.iterdir()] == ["log.npz"]
