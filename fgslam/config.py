@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from fgslam.errors import ConfigError
@@ -36,6 +36,20 @@ DatasetSettings: TypeAlias = Annotated[
 ]
 
 
+def _as_settings(value: Any) -> Any:
+    """A bare kind stands for that estimator with its defaults."""
+    return {"kind": value} if isinstance(value, str) else value
+
+
+def _with_default_kind(value: Any) -> Any:
+    """Keys without a kind mean the paper's estimator."""
+    if isinstance(value, dict) and "kind" not in value:
+        return {"kind": LandmarkKalmanSettings.kind, **value}
+    return value
+
+
+ComparedEstimator: TypeAlias = Annotated[EstimatorSettings, BeforeValidator(_as_settings)]
+
 _GROUPS_OF_KINDS = ("dataset", "odometry", "estimator")
 
 
@@ -51,7 +65,16 @@ class ExperimentConfig(BaseModel):
     dataset: DatasetSettings
     odometry: OdometrySettings = RecordedOdometrySettings()
     frontend: FrontendSettings = FrontendSettings()
-    estimator: EstimatorSettings = LandmarkKalmanSettings()
+    estimator: Annotated[EstimatorSettings, BeforeValidator(_with_default_kind)] = (
+        LandmarkKalmanSettings()
+    )
+    compare: Annotated[
+        tuple[ComparedEstimator, ...],
+        Field(
+            description="estimators that replay the run's own log beside the live one: kinds, or "
+            "groups of keys as under `estimator`"
+        ),
+    ] = ()
     output: OutputSettings = OutputSettings()
     provenance: Annotated[
         dict[str, Any] | None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -13,6 +14,7 @@ from fgslam.datasets.opening import open_recording
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.datasets.synthetic_odometry import SyntheticOdometry
 from fgslam.errors import ConfigError
+from fgslam.floor import DegreesOfFreedom, Floor
 from fgslam.frontend.database import LandmarkDatabase
 from fgslam.frontend.ego_motion import EgoMotionSolver
 from fgslam.frontend.map_matching import MapMatcher
@@ -22,7 +24,7 @@ from fgslam.frontend.stream import FeatureStream
 from fgslam.frontend.tracker import LandmarkTracker
 from fgslam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
 from fgslam.pipeline import SlamPipeline
-from fgslam.settings.backend import EstimatorSettings
+from fgslam.settings.backend import EstimatorSettings, FloorSettings, LandmarkKalmanSettings
 from fgslam.settings.datasets import (
     ConstantVelocitySettings,
     OdometrySettings,
@@ -89,12 +91,34 @@ def make_motion(sequence: Sequence, settings: OdometrySettings) -> MotionModel:
     return OdometryMotion(sequence, settings.kind, stand_in)
 
 
-def make_estimator(rig: CameraRig, settings: EstimatorSettings) -> Estimator:
-    """The estimator, at the origin: the world is the first camera frame, without uncertainty."""
+def make_estimator(
+    rig: CameraRig, settings: EstimatorSettings, dof: DegreesOfFreedom = 6
+) -> Estimator:
+    """The estimator, at the origin: the world is the first camera frame, without uncertainty.
+
+    ``dof`` are the degrees of freedom of the front-end's least squares, which ``floor.mode: auto``
+    takes over.
+    """
     prior = Prediction(np.eye(4), np.zeros((6, 6)))
-    match settings.kind:
-        case "landmark_kalman":
+    match settings:
+        case LandmarkKalmanSettings():
             return LandmarkKalman(rig, settings, prior)
+        case _:
+            raise ConfigError(f"estimator.kind {settings.kind} is not built yet")
+
+
+def make_floor(rig: CameraRig, settings: FloorSettings, dof: DegreesOfFreedom) -> Floor:
+    """The floor as an estimator is to use it."""
+    if settings.mode == "auto":
+        return Floor.under(rig, dof)
+    if settings.mode == "none":
+        return Floor.under(rig, 6)
+    return dataclasses.replace(
+        Floor.under(rig, 3 if dof == 6 else dof),
+        hard=settings.mode == "hard",
+        height_sigma_m=settings.height_sigma_m,
+        tilt_sigma_rad=float(np.deg2rad(settings.tilt_sigma_deg)),
+    )
 
 
 def make_pipeline(
@@ -104,7 +128,7 @@ def make_pipeline(
     estimator_settings: EstimatorSettings,
 ) -> SlamPipeline:
     """The whole system for one sequence."""
-    estimator = make_estimator(sequence.rig, estimator_settings)
+    estimator = make_estimator(sequence.rig, estimator_settings, frontend.ego_motion.dof)
     require_support(estimator, measured_odometry=odometry.kind != "constant_velocity")
     return SlamPipeline(
         stereo=StereoMatcher(sequence.rig, frontend.stereo, frontend.appearance),

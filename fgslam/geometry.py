@@ -324,6 +324,16 @@ def congruence(a: FloatArray, s: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (out + np.swapaxes(out, -1, -2)))
 
 
+def block_diagonal(first: FloatArray, rest: FloatArray) -> FloatArray:
+    """Joint covariance of one item (n, n) and k independent others (k, m, m), in that order."""
+    n, (k, m) = len(first), rest.shape[:2]
+    out = np.zeros((n + k * m, n + k * m))
+    out[:n, :n] = first
+    at = n + m * np.arange(k)[:, None] + np.arange(m)
+    out[at[:, :, None], at[:, None, :]] = rest
+    return out
+
+
 def rotate_covariances(aRb: FloatArray, covariances: FloatArray) -> FloatArray:
     """Covariances (n, 3, 3) of vectors in b, expressed in a, by one rotation ``aRb`` (3, 3).
 

@@ -5,8 +5,11 @@ The same ego-motion serves a live run and the replay of its log, against each es
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from dataclasses import dataclass
+
+import numpy as np
 
 from fgslam.backend.protocol import Estimator
 from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
@@ -73,7 +76,7 @@ class SlamPipeline:
         tracking, association = self._track(prediction, found, stereo)
         watch.lap("track")
         increment = _increment(index, timestamp, odometry if measured else None, association)
-        stats = self.estimator.update(increment, tracking)
+        stats = self.estimator.update(increment, tracking, odometry)
         self.motion.observe(timestamp, stats.wTc, _anchored(increment, tracking, stats))
         watch.lap("update")
         return FrameReport(found, stereo, increment, tracking, stats, watch.ms)
@@ -110,7 +113,7 @@ def replay_step(
         tracking = unmeasured(prediction, EgoMotionStatus.FIRST)
     else:
         tracking = _solve(estimator, ego_motion, prediction, matched)
-    stats = estimator.update(increment, tracking)
+    stats = estimator.update(increment, tracking, odometry)
     motion.observe(increment.timestamp, stats.wTc, _anchored(increment, tracking, stats))
     return stats
 
@@ -121,7 +124,16 @@ def _solve(
     prediction: Prediction,
     matched: Observations,
 ) -> EgoMotion:
-    return ego_motion.solve(prediction, PoseProblem.of(estimator.landmarks(), matched))
+    """Against the landmarks that the estimator holds; the others are no inliers."""
+    landmarks = estimator.landmarks()
+    held = np.isin(matched.ids, landmarks.ids)
+    if held.all():
+        return ego_motion.solve(prediction, PoseProblem.of(landmarks, matched))
+    solved = ego_motion.solve(prediction, PoseProblem.of(landmarks, matched.select(held)))
+    inliers = np.zeros(len(matched), np.bool_)
+    residuals = np.full(len(matched), np.inf)
+    inliers[held], residuals[held] = solved.inliers, solved.residuals
+    return dataclasses.replace(solved, inliers=inliers, residuals=residuals)
 
 
 def _anchored(increment: Increment, tracking: EgoMotion, stats: UpdateStats) -> bool:

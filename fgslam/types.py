@@ -65,6 +65,25 @@ class CameraRig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class RangeBearingSensor:
+    """Measures (azimuth, elevation, range) of landmarks: radians, metres; axes as a camera's.
+
+    ``azimuth = atan2(x, z)`` is positive to the right, ``elevation = atan2(-y, hypot(x, z))`` up.
+
+    Attributes:
+        max_range_m: farthest landmark seen.
+        bTc: (4, 4) pose of the sensor in the robot's body frame.
+    """
+
+    max_range_m: float
+    bTc: FloatArray
+
+
+Sensor: TypeAlias = CameraRig | RangeBearingSensor
+"""What measures landmarks; each by three numbers."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """The images of one instant, in the order right, left[, top]; grey, uint8, (height, width).
 
@@ -251,6 +270,8 @@ class EgoMotion:
         residuals: (k,) image residual E in pixels of every match, at ``wTc``.
         status: how it ended.
         iterations: Newton steps taken.
+        weighted_at: (4, 4) pose at which the last minimisation's weights were evaluated; None
+            where nothing was minimised.
     """
 
     wTc: FloatArray
@@ -259,6 +280,7 @@ class EgoMotion:
     residuals: FloatArray
     status: EgoMotionStatus
     iterations: int
+    weighted_at: FloatArray | None = None
 
     @property
     def correlation(self) -> FloatArray:
@@ -286,9 +308,10 @@ class Observations:
 
     Attributes:
         ids: (k,) landmark identities, unique within the frame.
-        measurement: (k, 3) (column, row, disparity), pixels.
-        covariance: (k, 3, 3), pixels squared.
-        pixels: (k, 3, 2) raw pixels in right, left, top; NaN where there is no top camera.
+        measurement: (k, 3) (column, row, disparity), pixels; of a range-bearing sensor
+            (azimuth, elevation, range), radians and metres.
+        covariance: (k, 3, 3) of the measurement.
+        pixels: (k, 3, 2) raw pixels in right, left, top; NaN where there is no such camera.
         is_new: (k,) True where this observation initiates the landmark (Type IV).
     """
 
@@ -350,6 +373,7 @@ class MeasurementType(str, Enum):
 
     ODOMETRY = "odometry"
     STEREO = "stereo"
+    RANGE_BEARING = "range_bearing"
 
 
 # --------------------------------------------------------------------------------------------
@@ -411,8 +435,16 @@ class UpdateStats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """An estimator's whole answer: trajectory, pose covariances (n, 6, 6) and the landmark map."""
+    """An estimator's whole answer.
+
+    Attributes:
+        trajectory: all poses as known now.
+        covariances: (n, 6, 6) their marginals; NaN where one cannot be had.
+        landmarks: the map, with marginal covariances.
+        remarks: what the estimator had to mend or leave out, in words.
+    """
 
     trajectory: Trajectory
     covariances: FloatArray
     landmarks: LandmarkMap
+    remarks: tuple[str, ...] = ()

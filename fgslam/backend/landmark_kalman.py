@@ -14,6 +14,7 @@ import numpy as np
 
 from fgslam.errors import EstimatorError
 from fgslam.geometry import (
+    block_diagonal,
     compose_covariance,
     congruence,
     inverse_spd3,
@@ -84,7 +85,9 @@ class LandmarkKalman:
         """Current landmarks; the arrays are read only by agreement."""
         return LandmarkMap(self._ids, self._positions, self._covariances)
 
-    def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
+    def update(
+        self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
+    ) -> UpdateStats:
         """Pose from the tracking; matched landmarks filtered, missed ones grown, new ones added."""
         if self._timestamps and not increment.timestamp > self._timestamps[-1]:
             raise EstimatorError(
@@ -114,6 +117,10 @@ class LandmarkKalman:
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
         """Covariances (k, 3, 3) of the named landmarks."""
         return self._covariances[self.landmarks().rows(ids)]
+
+    def joint_covariance(self, ids: IntArray) -> FloatArray:
+        """Pose and landmarks as the filter sees them: independent (6.4)."""
+        return block_diagonal(self._current.covariance, self.landmark_covariances(ids))
 
     def state(self) -> StateArrays:
         """Everything needed to continue; a snapshot, which later updates leave alone."""

@@ -42,16 +42,24 @@ class Estimator(Protocol):
         ...
 
     def landmarks(self) -> LandmarkMap:
-        """Current landmarks, those initiated and not yet pruned."""
+        """Current landmarks, those initiated and not yet pruned, as matching should see them.
+
+        A smoother's covariances are here those of its tracker, given the poses; marginals are in
+        :meth:`estimate` and :meth:`landmark_covariances`.
+        """
         ...
 
-    def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
+    def update(
+        self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
+    ) -> UpdateStats:
         """Take in one frame.
 
         Args:
             increment: the frame's measurements.
             tracking: least-squares pose of the frame against this estimator's own landmarks. Its
                 ``inliers`` run over the increment's matched (not new) observations, in order.
+            motion: what the pose was predicted with: the increment's odometry, or the motion
+                model's stand-in where none was measured; None for the first frame.
         """
         ...
 
@@ -61,6 +69,13 @@ class Estimator(Protocol):
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
         """Marginal covariances (k, 3, 3) of the named landmarks. KeyError for an unknown one."""
+        ...
+
+    def joint_covariance(self, ids: IntArray) -> FloatArray:
+        """Joint covariance (6 + 3k, 6 + 3k) of the last pose and the named landmarks, in order.
+
+        KeyError for an unknown landmark.
+        """
         ...
 
     def state(self) -> StateArrays:

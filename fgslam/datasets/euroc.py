@@ -32,6 +32,7 @@ MapArray: TypeAlias = npt.NDArray[np.float32]
 CAMERA_FOLDERS = ("cam0", "cam1")
 _MAX_TRUTH_GAP_S = 0.1
 # Cosine of 45 degrees: beyond, a common image plane would stretch the views out of use.
+_LEAST_BASELINE_M = 1e-3  # below it two cameras are one, up to rounding
 _LEAST_COMMON_VIEW = 0.707
 
 
@@ -113,7 +114,7 @@ def _sampling_maps(
 def _require_side_by_side(lTr: FloatArray) -> None:
     """Raises CalibrationError unless the right camera, at ``lTr``, is to the left one's right."""
     offset = lTr[:3, 3]
-    if np.abs(offset[0]) < 2.0 * np.hypot(offset[1], offset[2]):
+    if np.abs(offset[0]) < max(2.0 * np.hypot(offset[1], offset[2]), _LEAST_BASELINE_M):
         x, y, z = offset
         raise CalibrationError(
             f"cam0 and cam1 are not side by side (offset {x:.3f}, {y:.3f}, {z:.3f} m along x, y, z)"

@@ -7,10 +7,12 @@ after outliers are dropped, and capped.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.floor import Floor
 from fgslam.geometry import (
     congruence,
     inverse,
@@ -108,22 +110,12 @@ class EgoMotionSolver:
         """The world's vertical is that of the robot's body in the first camera frame."""
         self._rig = rig
         self._settings = settings
-        self._down = -rig.bTc[2, :3]
-        self._horizontal = np.linalg.svd(self._down[None, :])[2][1:].T
-
-    def constrain(self, wTc: FloatArray) -> FloatArray:
-        """The nearest pose that the chosen degrees of freedom allow."""
-        if self._settings.dof == 6:
-            return wTc
-        translation = wTc[:3, 3] - self._down * (self._down @ wTc[:3, 3])
-        rotation = wTc[:3, :3]
-        if self._settings.dof == 3:
-            rotation = self._turn_about_vertical(rotation)
-        return pose(rotation, translation)
+        self.floor = Floor.under(rig, settings.dof)
+        """Which poses are allowed."""
 
     def solve(self, prediction: Prediction, problem: PoseProblem) -> EgoMotion:
         """Pose with covariance, inliers, residuals and a status; the odometry's where it fails."""
-        prediction = Prediction(self.constrain(prediction.wTc), prediction.covariance)
+        prediction = Prediction(self.floor.constrain(prediction.wTc), prediction.covariance)
         start = prediction.wTc
         used = inliers = transform_to_camera(start, problem.points)[:, 2] > _NEAREST_DEPTH_M
         iterations = 0
@@ -131,6 +123,7 @@ class EgoMotionSolver:
         for _ in range(_REPEATS):
             if inliers.sum() < self._settings.min_matches:
                 return self._fall_back(prediction, problem, EgoMotionStatus.TOO_FEW_MATCHES)
+            weighted_at = wTc
             minimum = self._minimise(wTc, prediction, problem.select(inliers), robust)
             iterations += minimum.iterations
             if not minimum.converged:
@@ -142,18 +135,8 @@ class EgoMotionSolver:
             used, inliers, robust = inliers, kept, False
         else:
             inliers = used  # the set did not come to rest: the pose is that of the last one used
-        return self._finish(prediction, problem, minimum, inliers, iterations)
-
-    def basis(self, wTc: FloatArray) -> FloatArray:
-        """Columns (6, dof) span the tangent directions that the degrees of freedom allow."""
-        if self._settings.dof == 6:
-            return np.eye(6)
-        cRw = wTc[:3, :3].T
-        rotations = np.eye(3) if self._settings.dof == 5 else (cRw @ self._down)[:, None]
-        out = np.zeros((6, rotations.shape[1] + 2))
-        out[:3, : rotations.shape[1]] = rotations
-        out[3:, rotations.shape[1] :] = cRw @ self._horizontal
-        return out
+        found = self._finish(prediction, problem, minimum, inliers, iterations)
+        return dataclasses.replace(found, weighted_at=weighted_at)
 
     # ----------------------------------------------------------------------------------------
 
@@ -187,7 +170,7 @@ class EgoMotionSolver:
 
     def _determined(self, wTc: FloatArray, hessian: FloatArray) -> bool:
         """Whether the matches (and the prior) fix all degrees of freedom, beyond rounding."""
-        basis = self.basis(wTc)
+        basis = self.floor.basis(wTc)
         reduced = basis.T @ hessian @ basis
         size = np.sqrt(np.diagonal(reduced))
         if not (size > 0.0).all():
@@ -244,7 +227,7 @@ class EgoMotionSolver:
         self, wTc: FloatArray, hessian: FloatArray, gradient: FloatArray, damping: float
     ) -> FloatArray | None:
         """The correction (6,), to be applied on the right; None where it is undetermined."""
-        basis = self.basis(wTc)
+        basis = self.floor.basis(wTc)
         reduced = basis.T @ hessian @ basis
         reduced.flat[:: len(reduced) + 1] *= 1.0 + damping
         try:
@@ -277,11 +260,13 @@ class EgoMotionSolver:
         covariance = self._covariance(wTc, minimum.hessian)
         if allowed < 1.0:
             status = EgoMotionStatus.CAPPED
-            wTc = self.constrain(prediction.wTc @ se3_exp(allowed * correction))
+            wTc = self.floor.constrain(prediction.wTc @ se3_exp(allowed * correction))
             # The matches belong to another pose; what of it was cut off is the least we may err.
             inliers = inliers & self._inliers(wTc, problem)
             cut_off = (1.0 - allowed) * correction
-            covariance = self._allowed_part(wTc, prediction.covariance + np.outer(cut_off, cut_off))
+            covariance = self.floor.allowed_part(
+                wTc, prediction.covariance + np.outer(cut_off, cut_off)
+            )
         return EgoMotion(
             wTc=reorthonormalise(wTc),
             covariance=covariance,
@@ -304,13 +289,8 @@ class EgoMotionSolver:
         )
 
     def _covariance(self, wTc: FloatArray, hessian: FloatArray) -> FloatArray:
-        basis = self.basis(wTc)
+        basis = self.floor.basis(wTc)
         return congruence(basis, _inverse_spd(basis.T @ hessian @ basis))
-
-    def _allowed_part(self, wTc: FloatArray, covariance: FloatArray) -> FloatArray:
-        """A covariance (6, 6) without the directions that the degrees of freedom exclude."""
-        basis = self.basis(wTc)
-        return congruence(basis @ basis.T, covariance)
 
     def _fall_back(
         self, prediction: Prediction, problem: PoseProblem, status: EgoMotionStatus
@@ -318,7 +298,7 @@ class EgoMotionSolver:
         """The odometry as the frame's ego-motion (4.1); no match is used."""
         return EgoMotion(
             wTc=reorthonormalise(prediction.wTc),
-            covariance=self._allowed_part(prediction.wTc, prediction.covariance),
+            covariance=self.floor.allowed_part(prediction.wTc, prediction.covariance),
             inliers=np.zeros(len(problem), np.bool_),
             residuals=self.image_residuals(prediction.wTc, problem),
             status=status,
@@ -334,19 +314,6 @@ class EgoMotionSolver:
             project(self._rig, points)[:, :2] - problem.measurement[:, :2], axis=1
         )
         return np.where(behind, np.inf, error)
-
-    def _turn_about_vertical(self, rotation: FloatArray) -> FloatArray:
-        """The rotation about the vertical that is nearest to ``rotation``."""
-        n = self._down
-        sine = n @ np.array(
-            [
-                rotation[2, 1] - rotation[1, 2],
-                rotation[0, 2] - rotation[2, 0],
-                rotation[1, 0] - rotation[0, 1],
-            ]
-        )
-        cosine = np.trace(rotation) - n @ rotation @ n
-        return so3_exp(n * np.arctan2(sine, cosine))
 
 
 def unmeasured(prediction: Prediction, status: EgoMotionStatus) -> EgoMotion:

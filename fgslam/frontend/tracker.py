@@ -78,7 +78,7 @@ class LandmarkTracker:
         self, prediction: Prediction, landmarks: LandmarkMap, features: StereoFeatures
     ) -> Tracked:
         """Matches expected landmarks and solves for the pose; wider or closer again if asked."""
-        around = Prediction(self._ego_motion.constrain(prediction.wTc), prediction.covariance)
+        around = Prediction(self._ego_motion.floor.constrain(prediction.wTc), prediction.covariance)
         tracked = self._attempt(prediction, around, landmarks, features)
         if self._matcher.rescues and not tracked.ego_motion.status.measured:
             rescued = self._attempt(prediction, around, landmarks, features, anywhere=True)

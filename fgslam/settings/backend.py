@@ -9,9 +9,122 @@ from pydantic.dataclasses import dataclass
 
 from fgslam.settings.base import STRICT
 
+# --------------------------------------------------------------------------------------------
+# What several kinds share
+
 
 @dataclass(frozen=True, config=STRICT)
-class LandmarkKalmanSettings:
+class FloorSettings:
+    """How an estimator uses the floor under the robot."""
+
+    mode: Annotated[
+        Literal["auto", "none", "soft", "hard"],
+        Field(
+            description="`auto` the degrees of freedom of frontend.ego_motion.dof, exactly; `none` "
+            "all six; `hard` and `soft` those of dof (height, pitch and roll where it is 6), "
+            "exactly or up to the deviations below"
+        ),
+    ] = "auto"
+    height_sigma_m: Annotated[
+        float, Field(gt=0.0, description="soft: deviation of the camera's height a frame, metres")
+    ] = 0.005
+    tilt_sigma_deg: Annotated[
+        float, Field(gt=0.0, description="soft: deviation of pitch and of roll a frame, degrees")
+    ] = 0.2
+
+
+@dataclass(frozen=True, config=STRICT)
+class KernelSettings:
+    """Robust loss over a whitened residual, so that single wrong matches lose their pull."""
+
+    name: Annotated[
+        Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"],
+        Field(description="the M-estimator; `none` is least squares"),
+    ] = "huber"
+    width: Annotated[
+        float,
+        Field(gt=0.0, description="its scale, in standard deviations of the whole measurement"),
+    ] = 4.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class NamedSettings:
+    """What every estimator has."""
+
+    label: Annotated[
+        str | None,
+        Field(
+            pattern=r"^[A-Za-z0-9][\w.+-]*$",
+            description="name of its folder and of its row in tables; null: its kind",
+        ),
+    ] = None
+
+    @property
+    def title(self) -> str:
+        """The label, or the kind where there is none."""
+        return self.label or str(getattr(self, "kind", ""))
+
+
+@dataclass(frozen=True, config=STRICT)
+class GraphSettings(NamedSettings):
+    """What all smoothers share: how measurements become a graph that can be solved."""
+
+    floor: FloorSettings = FloorSettings()
+    kernel: KernelSettings = KernelSettings()
+    gate: Annotated[
+        bool,
+        Field(
+            description="leave out matches that the frame's own least squares rejected, as the "
+            "filter does; off, the kernel alone deals with them"
+        ),
+    ] = True
+    least_sightings: Annotated[
+        int,
+        Field(ge=1, description="frames in which a landmark is seen before it enters the graph"),
+    ] = 2
+    least_parallax: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="disparity over its standard deviation below which a landmark waits; of a "
+            "range sensor, range over its deviation",
+        ),
+    ] = 3.0
+    weak_parallax: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="below this a landmark in the graph gets a weak prior, so that a far point "
+            "cannot be thrown behind the camera",
+        ),
+    ] = 8.0
+    weak_prior_ranges: Annotated[
+        float,
+        Field(gt=0.0, description="standard deviation of that prior, in ranges of the landmark"),
+    ] = 2.0
+    contradicted_after: Annotated[
+        int,
+        Field(
+            ge=0,
+            description="rejected in so many frames in a row, a landmark counts as moved and "
+            "starts anew; 0: never",
+        ),
+    ] = 3
+
+
+# --------------------------------------------------------------------------------------------
+# The estimators
+
+
+@dataclass(frozen=True, config=STRICT)
+class DeadReckoningSettings(NamedSettings):
+    """Odometry alone: poses are never corrected, landmarks stay where they were first seen."""
+
+    kind: Literal["odometry"] = "odometry"
+
+
+@dataclass(frozen=True, config=STRICT)
+class LandmarkKalmanSettings(NamedSettings):
     """The paper's estimator: one 3x3 Kalman filter per landmark (Se et al. 4.1 and 6.4)."""
 
     kind: Literal["landmark_kalman"] = "landmark_kalman"
@@ -37,4 +150,131 @@ class LandmarkKalmanSettings:
     ] = 0.0001
 
 
-EstimatorSettings: TypeAlias = LandmarkKalmanSettings
+@dataclass(frozen=True, config=STRICT)
+class LandmarkKalmanGraphSettings(NamedSettings):
+    """The same estimator as factor graphs: equal to ``landmark_kalman`` up to rounding."""
+
+    kind: Literal["landmark_kalman_graph"] = "landmark_kalman_graph"
+    update: Annotated[
+        Literal["pixel", "world"],
+        Field(description="as landmark_kalman's; the averaging of 4.1 is no least-squares problem"),
+    ] = "pixel"
+    pose_covariance: Annotated[bool, Field(description="as landmark_kalman's")] = True
+    miss_growth_m: Annotated[float, Field(ge=0.0, description="as landmark_kalman's")] = 0.0001
+
+
+@dataclass(frozen=True, config=STRICT)
+class EkfSettings(NamedSettings):
+    """Full stochastic mapping: one joint covariance of pose and landmarks, no relinearisation."""
+
+    kind: Literal["ekf"] = "ekf"
+    floor: FloorSettings = FloorSettings()
+    gate_sigmas: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="a match is left out when its own innovation exceeds this many standard "
+            "deviations (Mahalanobis distance); 0: no gate",
+        ),
+    ] = 5.0
+    max_landmarks: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="refuse to hold more: the joint covariance takes 72 n^2 bytes, 1.2 GB for "
+            "4000 landmarks, and as much again while it is updated",
+        ),
+    ] = 4000
+
+
+@dataclass(frozen=True, config=STRICT)
+class FixedLagSettings(GraphSettings):
+    """Incremental fixed-lag smoother: what is older than the lag is marginalised."""
+
+    kind: Literal["fixed_lag"] = "fixed_lag"
+    lag_frames: Annotated[
+        int | None, Field(ge=1, description="lag in frames; null: the lag is given in seconds")
+    ] = 10
+    lag_s: Annotated[
+        float | None, Field(gt=0.0, description="lag in seconds; used where lag_frames is null")
+    ] = None
+
+
+@dataclass(frozen=True, config=STRICT)
+class Isam2Settings(GraphSettings):
+    """iSAM2 over all poses and landmarks."""
+
+    kind: Literal["isam2"] = "isam2"
+    update_every: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="frames between updates of the graph; a tracker (the paper's filter, "
+            "on the smoothed map) answers in between",
+        ),
+    ] = 5
+    ordering_window: Annotated[
+        int,
+        Field(
+            ge=0,
+            description="so many last poses are kept at the root of the Bayes tree; 0: GTSAM's own "
+            "choice, all variables of the update",
+        ),
+    ] = 30
+    relinearize_threshold: Annotated[
+        float, Field(gt=0.0, description="change (radians, metres) that relinearises a variable")
+    ] = 0.1
+    relinearize_skip: Annotated[
+        int, Field(ge=1, description="updates between looks for variables to relinearise")
+    ] = 1
+    keyframe_every: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="frames to a keyframe; what the frames between measured is summarised in "
+            "factors of the keyframe. 1: every frame is a variable",
+        ),
+    ] = 1
+    final_iterations: Annotated[
+        int,
+        Field(
+            ge=0,
+            description="further updates without measurements, relinearising everything that "
+            "moved, before the estimate is told",
+        ),
+    ] = 5
+
+
+@dataclass(frozen=True, config=STRICT)
+class BatchSettings(GraphSettings):
+    """Everything at once, the reference of the comparison."""
+
+    kind: Literal["batch"] = "batch"
+    method: Annotated[
+        Literal["levenberg_marquardt", "gnc"],
+        Field(
+            description="Levenberg-Marquardt with the kernel, or graduated non-convexity "
+            "(truncated least squares) without"
+        ),
+    ] = "levenberg_marquardt"
+    max_iterations: Annotated[int, Field(ge=1, description="of the solver")] = 100
+    solve_every: Annotated[
+        int,
+        Field(
+            ge=0,
+            description="live: solve anew after so many frames and track against the result; 0: "
+            "the tracker alone steers, the solution comes with the estimate",
+        ),
+    ] = 0
+
+
+EstimatorSettings: TypeAlias = Annotated[
+    DeadReckoningSettings
+    | LandmarkKalmanSettings
+    | LandmarkKalmanGraphSettings
+    | EkfSettings
+    | FixedLagSettings
+    | Isam2Settings
+    | BatchSettings,
+    Field(discriminator="kind"),
+]

@@ -11,7 +11,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-BASE = frozenset({"types", "geometry", "errors", "settings", "measurement_log", "system_check"})
+BASE = frozenset(
+    {"types", "geometry", "floor", "errors", "settings", "measurement_log", "system_check"}
+)
 STAGES = frozenset({"datasets", "simulation", "frontend", "factors", "evaluation", "export"})
 COMPOSITION = frozenset({"runs", "inspection"})
 PACKAGES = BASE | STAGES | COMPOSITION | {"config", "backend", "pipeline", "cli"}
@@ -21,6 +23,7 @@ FOUNDATION_ALLOWS: dict[str, frozenset[str]] = {
     "system_check": frozenset(),
     "types": frozenset({"errors"}),
     "geometry": frozenset({"types", "errors"}),
+    "floor": frozenset({"types", "geometry"}),
     "settings": frozenset({"types", "errors"}),
     "measurement_log": frozenset({"types", "errors", "geometry"}),
 }

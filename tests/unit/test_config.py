@@ -88,7 +88,7 @@ def test_a_misspelt_required_key_is_told_as_such(tmp_path: Path) -> None:
         ({"name": "x", "dataset": {"path": "there"}}, "dataset.kind is missing; add one of"),
         (nested(MINIMAL, "dataset.kind", "kiti"), "dataset.kind is 'kiti'; use one of"),
         (nested(MINIMAL, "odometry.kind", "wheel"), "odometry.kind is 'wheel'; use one of"),
-        (nested(MINIMAL, "estimator.kind", "magic"), "estimator.kind = 'magic' is not usable"),
+        (nested(MINIMAL, "estimator.kind", "magic"), "estimator.kind is 'magic'; use one of"),
     ],
 )
 def test_missing_keys_and_bad_kinds(values: dict[str, Any], expected: str, tmp_path: Path) -> None:

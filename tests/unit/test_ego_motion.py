@@ -285,12 +285,12 @@ def test_constraining_is_a_projection(dof: int, pitch: float) -> None:
     solver = EgoMotionSolver(rig, change(dof=dof))
     for _ in range(10):
         wTc = g.se3_exp(0.3 * rng.standard_normal(6))
-        once = solver.constrain(wTc)
-        np.testing.assert_allclose(solver.constrain(once), once, rtol=0, atol=1e-14)
+        once = solver.floor.constrain(wTc)
+        np.testing.assert_allclose(solver.floor.constrain(once), once, rtol=0, atol=1e-14)
         allowed = body_motion(dof, rig, rng)
-        np.testing.assert_allclose(solver.constrain(allowed), allowed, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(solver.floor.constrain(allowed), allowed, rtol=0, atol=1e-14)
         # Nearest: no allowed small step comes closer in rotation.
-        basis = solver.basis(once)
+        basis = solver.floor.basis(once)
         for column in (basis / np.linalg.norm(basis, axis=0)).T:
             for sign in (-1e-3, 1e-3):
                 moved = once @ g.se3_exp(sign * column)
@@ -459,7 +459,7 @@ def test_the_cap_shortens_the_correction_along_itself(dof: int) -> None:
     problem = scene(truth, rng, noise=0.0)
     free = change(dof=dof, prior=False)
     solver = EgoMotionSolver(rig, free)
-    predicted = solver.constrain(perturbed(truth, rng, 2.0))
+    predicted = solver.floor.constrain(perturbed(truth, rng, 2.0))
     full = g.se3_log(g.inverse(predicted) @ solve(problem, predicted, free, rig).wTc)
     # The cap on translation at half of what is wanted, that on rotation far away.
     half = change(free, max_correction_m=0.5 * float(np.linalg.norm(full[3:])))
@@ -475,7 +475,7 @@ def test_the_cap_shortens_the_correction_along_itself(dof: int) -> None:
     # and what was cut off is stated as uncertainty, along the allowed directions only.
     assert (found.residuals[found.inliers] <= free.outlier_px).all()
     cut_off = full - 0.5 * full
-    allowed = solver.basis(found.wTc) @ solver.basis(found.wTc).T
+    allowed = solver.floor.basis(found.wTc) @ solver.floor.basis(found.wTc).T
     stated = allowed @ (PRIOR + np.outer(cut_off, cut_off)) @ allowed.T
     np.testing.assert_allclose(found.covariance, stated, rtol=0, atol=1e-6)
     # A cap just beyond what is wanted does nothing.
