@@ -12,7 +12,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 BASE = frozenset(
-    {"types", "geometry", "floor", "errors", "settings", "measurement_log", "system_check"}
+    {
+        "types",
+        "geometry",
+        "sensors",
+        "floor",
+        "errors",
+        "settings",
+        "measurement_log",
+        "recordings",
+        "system_check",
+    }
 )
 STAGES = frozenset({"datasets", "simulation", "frontend", "factors", "evaluation", "export"})
 COMPOSITION = frozenset({"runs", "inspection"})
@@ -23,9 +33,11 @@ FOUNDATION_ALLOWS: dict[str, frozenset[str]] = {
     "system_check": frozenset(),
     "types": frozenset({"errors"}),
     "geometry": frozenset({"types", "errors"}),
+    "sensors": frozenset({"types", "geometry"}),
     "floor": frozenset({"types", "geometry"}),
     "settings": frozenset({"types", "errors"}),
     "measurement_log": frozenset({"types", "errors", "geometry"}),
+    "recordings": frozenset({"types", "errors", "geometry", "measurement_log"}),
 }
 """The order within the lowest layer, so that it has no cycle to begin with."""
 
