@@ -105,6 +105,21 @@ class LandmarkKalman:
         self._pose_covariances.append(tracking.covariance)
         return UpdateStats(tracking.wTc, tracking.covariance, len(self._ids), nis, dof)
 
+    def correct(self, current: Prediction, ids: IntArray, positions: FloatArray) -> None:
+        """Takes over a smoother's last pose and landmark positions (k, 3), between two frames.
+
+        For a filter that tracks on a smoothed map; covariances of the landmarks stay, as they
+        stand for what is known of them given the poses.
+        """
+        self._current = current
+        self._positions[self.landmarks().rows(ids)] = positions
+
+    def restart(self, observed: Observations) -> None:
+        """Starts known landmarks anew from one observation each: they have moved."""
+        if len(observed):
+            self._remove(observed.ids)
+            self._add(observed)
+
     def estimate(self) -> Estimate:
         """Trajectory as filtered, and the map."""
         count = len(self._poses)
@@ -233,13 +248,18 @@ class LandmarkKalman:
         self._positions = np.concatenate([self._positions, positions])
         self._covariances = np.concatenate([self._covariances, covariances])
         self._counts = np.concatenate([self._counts, np.ones(len(observed), np.int64)])
+        if not (np.diff(self._ids) > 0).all():
+            self._select(np.argsort(self._ids, kind="stable"))
 
     def _remove(self, ids: IntArray) -> None:
         if not len(ids):
             return
         keep = np.ones(len(self._ids), np.bool_)
         keep[self.landmarks().rows(ids)] = False
-        self._ids = self._ids[keep]
-        self._positions = self._positions[keep]
-        self._covariances = self._covariances[keep]
-        self._counts = self._counts[keep]
+        self._select(np.flatnonzero(keep))
+
+    def _select(self, rows: IntArray) -> None:
+        self._ids = self._ids[rows]
+        self._positions = self._positions[rows]
+        self._covariances = self._covariances[rows]
+        self._counts = self._counts[rows]

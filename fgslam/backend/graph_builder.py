@@ -1,0 +1,315 @@
+"""Turns a run's measurements into a factor graph, frame by frame; every smoother starts from it.
+
+A doctor stands in front of the solver: a landmark enters the graph only once it is constrained,
+starts anew when it is contradicted, and can be taken out again. Nothing is lost by waiting: a
+landmark's first observation has as many numbers as the landmark, so it says nothing about poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import gtsam
+import numpy as np
+
+from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior, weak_point_prior
+from fgslam.factors.noise import Whitening
+from fgslam.factors.range_bearing import RangeBearingFactors
+from fgslam.factors.stereo import StereoFactors
+from fgslam.floor import Floor
+from fgslam.settings.backend import GraphSettings
+from fgslam.types import (
+    CameraRig,
+    FloatArray,
+    Increment,
+    LandmarkMap,
+    Observations,
+    Odometry,
+    Prediction,
+    Sensor,
+)
+
+
+class LandmarkFactors(Protocol):
+    """Makes the factor of one landmark observation."""
+
+    def factor(
+        self, pose: int, landmark: int, measurement: FloatArray, covariance: FloatArray
+    ) -> Any:
+        """Factor between a pose and a landmark, by key."""
+        ...
+
+
+def landmark_factors(sensor: Sensor, whitening: Whitening) -> LandmarkFactors:
+    """The factors of a sensor."""
+    if isinstance(sensor, CameraRig):
+        return StereoFactors(sensor, whitening)
+    return RangeBearingFactors(whitening)
+
+
+@dataclass(slots=True, eq=False)
+class Sighting:
+    """One observation of a landmark."""
+
+    frame: int
+    measurement: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(slots=True, eq=False)
+class Track:
+    """What the graph knows of a landmark.
+
+    Attributes:
+        variable: number of its variable, -1 while it waits outside.
+        waiting: its sightings while it waits.
+        last: its latest sighting.
+        sightings: in how many frames it was seen.
+        rejections: in how many frames in a row it was matched and rejected.
+        least_parallax: below this it waits; raised when a solver failed on it.
+    """
+
+    least_parallax: float
+    last: Sighting
+    variable: int = -1
+    waiting: list[Sighting] = field(default_factory=list)
+    sightings: int = 0
+    rejections: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class NewFactors:
+    """What one frame adds.
+
+    Attributes:
+        frame: counted from 0.
+        graph: the factors.
+        values: initial values of the new variables.
+        seen: variables of all landmarks that the frame's factors touch.
+    """
+
+    frame: int
+    graph: Any
+    values: Any
+    seen: list[int]
+
+
+class GraphBuilder:
+    """Poses, landmarks and factors of a run so far.
+
+    Attributes:
+        graph: all factors; one taken out leaves an empty slot.
+        tracks: by the landmark's identity.
+        remarks: what was left out or started anew, in words.
+    """
+
+    def __init__(
+        self, sensor: Sensor, settings: GraphSettings, floor: Floor, prior: Prediction
+    ) -> None:
+        """An empty graph; ``prior`` will be that of the first pose."""
+        kernel = settings.kernel
+        self._settings = settings
+        self._floor = floor
+        self._prior = prior
+        self._factors = landmark_factors(sensor, Whitening(kernel.name, kernel.width))
+        self._rows: dict[int, list[int]] = {}
+        self._id_of: list[int] = []
+        self._first_frame = 0
+        self.graph = gtsam.NonlinearFactorGraph()
+        self.tracks: dict[int, Track] = {}
+        self.remarks: list[str] = []
+        self.frames = 0
+
+    @property
+    def variables(self) -> int:
+        """Number of landmark variables made so far."""
+        return len(self._id_of)
+
+    def id_of(self, variable: int) -> int:
+        """Identity of a landmark variable."""
+        return self._id_of[variable]
+
+    def add(
+        self,
+        increment: Increment,
+        wTc: FloatArray,
+        motion: Odometry | None,
+        accepted: Observations,
+        rejected: Observations,
+        landmarks: LandmarkMap,
+    ) -> NewFactors:
+        """Adds a frame.
+
+        Args:
+            increment: its measurements.
+            wTc: initial value of its pose.
+            motion: from the frame before; None for the first.
+            accepted: observations to use, matched and new ones.
+            rejected: matched observations that do not fit.
+            landmarks: the tracker's map after this frame: initial values, and how well each
+                landmark is known given the poses.
+        """
+        new = NewFactors(self.frames, gtsam.NonlinearFactorGraph(), gtsam.Values(), [])
+        self.frames += 1
+        self._add_pose(new, wTc, motion)
+        self._add_observations(new, accepted, wTc, landmarks)
+        self._count_rejected(rejected)
+        for identity in increment.pruned_ids.tolist():
+            self._forget(identity)
+        return new
+
+    def contradicted(self, rejected: Observations) -> Observations:
+        """Those rejected observations whose landmark must have moved: they start it anew.
+
+        To be asked before :meth:`add`, whose ``rejected`` counts this frame's rejections.
+        """
+        after = self._settings.contradicted_after
+        if after == 0:
+            return rejected.select(np.zeros(len(rejected), np.bool_))
+        moved = [
+            identity in self.tracks and self.tracks[identity].rejections + 1 >= after
+            for identity in rejected.ids.tolist()
+        ]
+        return rejected.select(np.array(moved, np.bool_))
+
+    def start_anew(self, identities: Iterable[int], why: str) -> None:
+        """Closes the variables of landmarks; their next sighting begins new ones."""
+        for identity in identities:
+            track = self.tracks.pop(identity, None)
+            if track is not None and why:
+                self.remarks.append(
+                    f"landmark {identity} (seen {track.sightings} times, last in frame "
+                    f"{track.last.frame}) {why}"
+                )
+
+    def take_out(self, variable: int) -> str:
+        """Removes a landmark from the graph; it waits until it is known twice as well.
+
+        Returns:
+            Its identity and sightings, in words.
+        """
+        identity = self._id_of[variable]
+        for row in self._rows.pop(variable, []):
+            self.graph.remove(row)
+        track = self.tracks.get(identity)
+        if track is None or track.variable != variable:
+            return f"landmark {identity} (no longer in use)"
+        track.variable = -1
+        track.waiting = []
+        track.least_parallax = 2.0 * max(track.least_parallax, 1.0)
+        return (
+            f"landmark {identity} (seen {track.sightings} times, last from frame "
+            f"{track.last.frame})"
+        )
+
+    def forget_before(self, frame: int) -> None:
+        """For a bounded lag: sightings and factors of earlier frames are no longer needed."""
+        self._first_frame = frame
+
+    def kept_factors(self) -> Any:
+        """The graph without its empty slots."""
+        kept = gtsam.NonlinearFactorGraph()
+        for row in range(self.graph.size()):
+            if self.graph.exists(row):
+                kept.add(self.graph.at(row))
+        return kept
+
+    def waiting(self) -> Iterator[tuple[int, Track]]:
+        """Landmarks that are not in the graph."""
+        return ((i, track) for i, track in self.tracks.items() if track.variable < 0)
+
+    # ----------------------------------------------------------------------------------------
+
+    def _add_pose(self, new: NewFactors, wTc: FloatArray, motion: Odometry | None) -> None:
+        key = pose_key(new.frame)
+        new.values.insert(key, gtsam.Pose3(wTc))
+        if new.frame == 0:
+            self._push(new, pose_prior(key, self._prior))
+        else:
+            if motion is None:
+                raise ValueError(f"frame {new.frame}: no motion from the frame before")
+            self._push(new, odometry_factor(pose_key(new.frame - 1), key, motion))
+        for factor in floor_factors(key, self._floor, wTc):
+            self._push(new, factor)
+
+    def _add_observations(
+        self, new: NewFactors, accepted: Observations, wTc: FloatArray, landmarks: LandmarkMap
+    ) -> None:
+        rows = landmarks.rows(accepted.ids)
+        positions = landmarks.positions[rows]
+        parallax = _parallax(positions - wTc[:3, 3], landmarks.covariances[rows])
+        for i, identity in enumerate(accepted.ids.tolist()):
+            sighting = Sighting(new.frame, accepted.measurement[i], accepted.covariance[i])
+            track = self.tracks.get(identity)
+            if track is None:
+                track = self.tracks[identity] = Track(self._settings.least_parallax, sighting)
+            track.last = sighting
+            track.sightings += 1
+            track.rejections = 0
+            if track.variable >= 0:
+                self._observe(new, track, sighting)
+            else:
+                track.waiting.append(sighting)
+                self._admit(new, identity, positions[i], wTc, float(parallax[i]))
+
+    def _admit(
+        self,
+        new: NewFactors,
+        identity: int,
+        position: FloatArray,
+        wTc: FloatArray,
+        parallax: float,
+    ) -> None:
+        """Lets a waiting landmark into the graph once it is constrained."""
+        track = self.tracks[identity]
+        track.waiting = [s for s in track.waiting if s.frame >= self._first_frame]
+        if len(track.waiting) < self._settings.least_sightings or parallax < track.least_parallax:
+            return
+        track.variable = len(self._id_of)
+        self._id_of.append(identity)
+        self._rows[track.variable] = []
+        key = landmark_key(track.variable)
+        new.values.insert(key, position)
+        if parallax < self._settings.weak_parallax:
+            distance = float(np.linalg.norm(position - wTc[:3, 3]))
+            sigma = self._settings.weak_prior_ranges * distance
+            self._rows[track.variable].append(self._push(new, weak_point_prior(key, position, sigma)))
+        for sighting in track.waiting:
+            self._observe(new, track, sighting)
+        track.waiting = []
+
+    def _observe(self, new: NewFactors, track: Track, sighting: Sighting) -> None:
+        factor = self._factors.factor(
+            pose_key(sighting.frame),
+            landmark_key(track.variable),
+            sighting.measurement,
+            sighting.covariance,
+        )
+        self._rows[track.variable].append(self._push(new, factor))
+        if not new.seen or new.seen[-1] != track.variable:
+            new.seen.append(track.variable)
+
+    def _push(self, new: NewFactors, factor: Any) -> int:
+        new.graph.add(factor)
+        self.graph.add(factor)
+        return int(self.graph.size()) - 1
+
+    def _count_rejected(self, rejected: Observations) -> None:
+        for identity in rejected.ids.tolist():
+            if identity in self.tracks:
+                self.tracks[identity].rejections += 1
+
+    def _forget(self, identity: int) -> None:
+        """The front-end dropped it: what it said stays in the graph, but it is no longer told."""
+        self.tracks.pop(identity, None)
+
+
+def _parallax(rays: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Range over its standard deviation (k,), of points at ``rays`` (k, 3) from the camera."""
+    distance = np.linalg.norm(rays, axis=1)
+    directions = rays / np.maximum(distance, 1e-12)[:, None]
+    variance = np.einsum("ki,kij,kj->k", directions, covariances, directions)
+    return np.asarray(distance / np.sqrt(np.maximum(variance, 1e-300)))

@@ -1,0 +1,68 @@
+"""Factors on poses alone: prior, odometry, floor."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from fgslam.factors.noise import STIFF_SIGMA, positive_definite
+from fgslam.floor import Floor
+from fgslam.types import FloatArray, Odometry, Prediction
+
+
+def pose_prior(pose: int, prior: Prediction) -> Any:
+    """Prior on a pose ``wTc``; directions without variance are held to ``STIFF_SIGMA``."""
+    model = gtsam.noiseModel.Gaussian.Covariance(positive_definite(prior.covariance))
+    return gtsam.PriorFactorPose3(pose, gtsam.Pose3(prior.wTc), model)
+
+
+def odometry_factor(before: int, after: int, odometry: Odometry) -> Any:
+    """Motion between two poses; its covariance is in the tangent space at the later one.
+
+    GTSAM's residual ``Log(measured^-1 between)`` lives in just that space.
+    """
+    model = gtsam.noiseModel.Gaussian.Covariance(positive_definite(odometry.covariance))
+    return gtsam.BetweenFactorPose3(before, after, gtsam.Pose3(odometry.motion), model)
+
+
+def floor_factors(pose: int, floor: Floor, wTc: FloatArray) -> list[Any]:
+    """Factors that keep a pose on the floor (Se et al. 5; S27): height, and for dof 3 its tilt.
+
+    The height is exact anywhere. The tilt is measured about the rotation nearest to ``wTc``
+    that the floor allows: it is zero for all upright poses, and its deviation keeps its meaning
+    while the heading stays near (a heading off by a radian counts tilts 4 % too much).
+
+    Args:
+        pose: key.
+        floor: which directions, hard or soft.
+        wTc: (4, 4) initial value of the pose.
+    """
+    if floor.dof == 6:
+        return []
+    height_sigma = STIFF_SIGMA if floor.hard else floor.height_sigma_m
+    origin = np.zeros(3)
+    height = gtsam.PoseTranslationPrior3D(
+        pose, origin, _one_direction(floor.down[:, None], height_sigma)
+    )
+    if floor.dof == 5:
+        return [height]
+    tilt_sigma = STIFF_SIGMA if floor.hard else floor.tilt_sigma_rad
+    upright = floor.constrain(wTc)[:3, :3]
+    tilt = gtsam.PoseRotationPrior3D(
+        pose, gtsam.Rot3(upright), _one_direction(upright.T @ floor.horizontal, tilt_sigma)
+    )
+    return [height, tilt]
+
+
+def _one_direction(directions: FloatArray, sigma: float) -> Any:
+    """Noise model that weighs only the components along orthonormal ``directions`` (3, m)."""
+    root = np.zeros((3, 3))
+    root[: directions.shape[1]] = directions.T / sigma
+    return gtsam.noiseModel.Gaussian.SqrtInformation(root)
+
+
+def weak_point_prior(landmark: int, position: FloatArray, sigma: float) -> Any:
+    """Prior on a world point (3,), the same standard deviation in all directions, metres."""
+    return gtsam.PriorFactorPoint3(landmark, position, gtsam.noiseModel.Isotropic.Sigma(3, sigma))

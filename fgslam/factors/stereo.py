@@ -1,0 +1,54 @@
+"""Stereo factors: one landmark observation (column, row, disparity) by the rig.
+
+The paper's reference is the right camera, GTSAM's stereo camera the left one (design E-S6). The
+pose variable stays the right camera's; the left one sits ``baseline`` along its -x axis and is
+told to the factor as the sensor's place on the body. GTSAM measures (u_left, u_right, v), which
+is linear in ours: ``u_left = c + d, u_right = c, v = r``; its covariance follows exactly.
+Derivation: docs/derivations/factors.md.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from fgslam.factors.noise import Whitening
+from fgslam.types import CameraRig, FloatArray
+
+FROM_MEASUREMENT: FloatArray = np.array([[1.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""(u_left, u_right, v) of (column, row, disparity)."""
+
+
+class StereoFactors:
+    """Makes C++ stereo factors of one rig.
+
+    A landmark behind the camera has a constant residual and no Jacobian, as GTSAM does it; who
+    builds graphs keeps such landmarks out.
+    """
+
+    def __init__(self, rig: CameraRig, whitening: Whitening) -> None:
+        """The rig and the noise models, robust or not."""
+        self._whitening = whitening
+        self._calibration = gtsam.Cal3_S2Stereo(
+            rig.fx, rig.fy, 0.0, rig.cx, rig.cy, rig.baseline
+        )
+        self._rTl = gtsam.Pose3(gtsam.Rot3(), np.array([-rig.baseline, 0.0, 0.0]))
+
+    def factor(
+        self, pose: int, landmark: int, measurement: FloatArray, covariance: FloatArray
+    ) -> Any:
+        """Factor between a pose ``wTc`` of the reference camera and a world point.
+
+        Args:
+            pose, landmark: keys.
+            measurement: (3,) column, row, disparity, pixels.
+            covariance: (3, 3) of it, pixels squared.
+        """
+        column, row, disparity = measurement.tolist()
+        model = self._whitening.model(covariance, FROM_MEASUREMENT)
+        measured = gtsam.StereoPoint2(column + disparity, column, row)
+        return gtsam.GenericStereoFactor3D(
+            measured, model, pose, landmark, self._calibration, False, False, self._rTl
+        )
