@@ -1,4 +1,4 @@
-"""Pure geometry: rigid motions, the stereo camera and its Jacobians, triangulation, frame changes.
+"""Pure geometry: rigid motions, the sensors and their Jacobians, triangulation, frame changes.
 
 Conventions as in :mod:`fgslam.types`: ``wTc`` poses as 4x4 matrices, tangent vectors
 [rotation, translation] on the right (``T * Exp(xi)``), which is GTSAM's ``Pose3`` convention.
@@ -11,7 +11,8 @@ import math
 
 import numpy as np
 
-from fgslam.types import CameraRig, FloatArray
+from fgslam import range_bearing
+from fgslam.types import BoolArray, CameraRig, FloatArray, Sensor
 
 # Below this rotation angle the series of sin and cos are exact to double precision.
 _SMALL_ANGLE = 1e-4
@@ -239,7 +240,7 @@ def wrap_angle(angle: FloatArray) -> FloatArray:
 
 
 # --------------------------------------------------------------------------------------------
-# The stereo camera
+# The sensors: stereo camera and range-bearing
 
 
 def transform_to_camera(wTc: FloatArray, points: FloatArray) -> FloatArray:
@@ -252,26 +253,51 @@ def transform_to_world(wTc: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(points @ wTc[:3, :3].T + wTc[:3, 3])
 
 
-def project(rig: CameraRig, points: FloatArray) -> FloatArray:
-    """(column, row, disparity) (n, 3) of points (n, 3) in the reference camera's frame, Z != 0."""
+def in_front(sensor: Sensor, points: FloatArray, nearest_m: float = 1e-3) -> BoolArray:
+    """Which points (n, 3) in the sensor's frame it can measure, by their side alone.
+
+    Those before the camera, or off the range sensor's vertical axis, by more than ``nearest_m``.
+    """
+    if isinstance(sensor, CameraRig):
+        return np.asarray(points[:, 2] > nearest_m)
+    return np.asarray(range_bearing.level_distance(points) > nearest_m)
+
+
+def project(sensor: Sensor, points: FloatArray) -> FloatArray:
+    """Measurements (n, 3) of points (n, 3) in the sensor's frame, which must be :func:`in_front`.
+
+    (column, row, disparity) of the reference camera, or (azimuth, elevation, range).
+    """
+    if not isinstance(sensor, CameraRig):
+        return range_bearing.project(points)
     inverse_depth = 1.0 / points[:, 2]
     out = np.empty_like(points)
-    out[:, 0] = rig.cx + rig.fx * points[:, 0] * inverse_depth
-    out[:, 1] = rig.cy + rig.fy * points[:, 1] * inverse_depth
-    out[:, 2] = rig.fx * rig.baseline * inverse_depth
+    out[:, 0] = sensor.cx + sensor.fx * points[:, 0] * inverse_depth
+    out[:, 1] = sensor.cy + sensor.fy * points[:, 1] * inverse_depth
+    out[:, 2] = sensor.fx * sensor.baseline * inverse_depth
     return out
 
 
-def projection_jacobian(rig: CameraRig, points: FloatArray) -> FloatArray:
-    """d(column, row, disparity)/d(point) (n, 3, 3) at points (n, 3) in the camera's frame."""
+def measurement_difference(sensor: Sensor, a: FloatArray, b: FloatArray) -> FloatArray:
+    """``a - b`` of measurements (n, 3), the azimuth of a range-bearing sensor wrapped."""
+    out = np.asarray(a - b)
+    if not isinstance(sensor, CameraRig):
+        out[:, 0] = wrap_angle(out[:, 0])
+    return out
+
+
+def projection_jacobian(sensor: Sensor, points: FloatArray) -> FloatArray:
+    """d(measurement)/d(point) (n, 3, 3) at points (n, 3) in the sensor's frame."""
+    if not isinstance(sensor, CameraRig):
+        return range_bearing.projection_jacobian(points)
     inverse_depth = 1.0 / points[:, 2]
     inverse_depth2 = inverse_depth * inverse_depth
     out = np.zeros((len(points), 3, 3))
-    out[:, 0, 0] = rig.fx * inverse_depth
-    out[:, 0, 2] = -rig.fx * points[:, 0] * inverse_depth2
-    out[:, 1, 1] = rig.fy * inverse_depth
-    out[:, 1, 2] = -rig.fy * points[:, 1] * inverse_depth2
-    out[:, 2, 2] = -rig.fx * rig.baseline * inverse_depth2
+    out[:, 0, 0] = sensor.fx * inverse_depth
+    out[:, 0, 2] = -sensor.fx * points[:, 0] * inverse_depth2
+    out[:, 1, 1] = sensor.fy * inverse_depth
+    out[:, 1, 2] = -sensor.fy * points[:, 1] * inverse_depth2
+    out[:, 2, 2] = -sensor.fx * sensor.baseline * inverse_depth2
     return out
 
 
@@ -283,38 +309,43 @@ def point_pose_jacobian(points: FloatArray) -> FloatArray:
     return out
 
 
-def triangulate(rig: CameraRig, measurement: FloatArray) -> FloatArray:
-    """Points (n, 3) in the reference camera from (column, row, disparity) (n, 3), disparity > 0.
+def triangulate(sensor: Sensor, measurement: FloatArray) -> FloatArray:
+    """Points (n, 3) in the sensor's frame from measurements (n, 3); inverse of :func:`project`.
 
-    Se et al. 2.2; the inverse of :func:`project`.
+    Of a camera rig (Se et al. 2.2) the disparity must be positive.
     """
-    depth = rig.fx * rig.baseline / measurement[:, 2]
+    if not isinstance(sensor, CameraRig):
+        return range_bearing.triangulate(measurement)
+    depth = sensor.fx * sensor.baseline / measurement[:, 2]
     out = np.empty(measurement.shape)
-    out[:, 0] = (measurement[:, 0] - rig.cx) * depth / rig.fx
-    out[:, 1] = (measurement[:, 1] - rig.cy) * depth / rig.fy
+    out[:, 0] = (measurement[:, 0] - sensor.cx) * depth / sensor.fx
+    out[:, 1] = (measurement[:, 1] - sensor.cy) * depth / sensor.fy
     out[:, 2] = depth
     return out
 
 
 def triangulation_covariance(
-    rig: CameraRig, measurement: FloatArray, covariance: FloatArray
+    sensor: Sensor, measurement: FloatArray, covariance: FloatArray
 ) -> FloatArray:
     """Full covariance (n, 3, 3) of triangulated points by first-order propagation.
 
     Keeps the off-diagonals, so that the ellipsoids lie along the rays (design B4).
 
     Args:
-        rig: the cameras.
-        measurement: (n, 3) (column, row, disparity), pixels.
-        covariance: (n, 3, 3) of the measurement, pixels squared.
+        sensor: the cameras, or the range-bearing sensor.
+        measurement: (n, 3), its units.
+        covariance: (n, 3, 3) of the measurement, its units squared.
     """
-    d = measurement[:, 2]
+    if not isinstance(sensor, CameraRig):
+        return congruence(range_bearing.triangulation_jacobian(measurement), covariance)
+    d, baseline = measurement[:, 2], sensor.baseline
+    ratio = sensor.fx / sensor.fy
     jacobian = np.zeros((len(d), 3, 3))
-    jacobian[:, 0, 0] = rig.baseline / d
-    jacobian[:, 0, 2] = -(measurement[:, 0] - rig.cx) * rig.baseline / d**2
-    jacobian[:, 1, 1] = rig.fx * rig.baseline / (rig.fy * d)
-    jacobian[:, 1, 2] = -(measurement[:, 1] - rig.cy) * rig.fx * rig.baseline / (rig.fy * d**2)
-    jacobian[:, 2, 2] = -rig.fx * rig.baseline / d**2
+    jacobian[:, 0, 0] = baseline / d
+    jacobian[:, 0, 2] = -(measurement[:, 0] - sensor.cx) * baseline / d**2
+    jacobian[:, 1, 1] = ratio * baseline / d
+    jacobian[:, 1, 2] = -(measurement[:, 1] - sensor.cy) * ratio * baseline / d**2
+    jacobian[:, 2, 2] = -sensor.fx * baseline / d**2
     return congruence(jacobian, covariance)
 
 

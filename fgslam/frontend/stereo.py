@@ -11,6 +11,7 @@ import numpy as np
 from fgslam.frontend.candidates import alike, choose, pairs_within
 from fgslam.geometry import triangulate, triangulation_covariance
 from fgslam.settings.frontend import AppearanceSettings, StereoSettings
+from fgslam.stereo_model import measurement_map, vertical_to_horizontal
 from fgslam.types import CameraRig, Features, FloatArray, IntArray, StereoFeatures
 
 
@@ -25,12 +26,7 @@ class StereoMatcher:
         self._settings = settings
         self._appearance = appearance
         self._angle = np.deg2rad(settings.orientation_deg)
-        # Vertical disparity times this is horizontal disparity (1 for the paper's rig).
-        self._vertical_to_horizontal = (
-            1.0
-            if rig.vertical_baseline is None
-            else rig.fx * rig.baseline / (rig.fy * rig.vertical_baseline)
-        )
+        self._vertical_to_horizontal = vertical_to_horizontal(rig)
         self._map = measurement_map(settings.measurement, rig.cameras, self._vertical_to_horizontal)
 
     def match(self, features: tuple[Features, ...]) -> StereoFeatures:
@@ -102,38 +98,6 @@ class StereoMatcher:
             position_covariance=triangulation_covariance(self._rig, measurement, covariance),
             pixels=pixels,
         )
-
-
-def measurement_map(kind: str, cameras: int, vertical_to_horizontal: float) -> FloatArray:
-    """Linear map (3, 2 * cameras) from pixels (c, r) per camera to (column, row, disparity).
-
-    The covariance of the measurement follows as ``sigma^2 M M^T`` for equal independent noise on
-    all coordinates. For `paper`, d is the mean of both disparities, which correlates with row and
-    column (design B4); `fused` is the least-squares solution of the rig's linear model, which
-    for three cameras has variances 5/12, 5/12 and 3/4 against the paper's 1, 1 and 1.
-    """
-    model = np.zeros((2 * cameras, 3))
-    model[0::2, 0] = 1.0  # columns of right, left, top
-    model[1::2, 1] = 1.0  # rows
-    model[2, 2] = 1.0  # the left camera's column grows by the disparity
-    if cameras == 3:
-        model[5, 2] = 1.0 / vertical_to_horizontal  # and the top camera's row
-    if kind == "fused":
-        return np.asarray(np.linalg.pinv(model), np.float64)
-    out = np.zeros((3, 2 * cameras))
-    out[0, 0] = out[1, 1] = 1.0
-    # Weights inverse to the variances; one half each where both baselines are equal.
-    weight = 1.0 if cameras == 2 else _horizontal_weight(vertical_to_horizontal)
-    out[2, 2], out[2, 0] = weight, -weight
-    if cameras == 3:
-        out[2, 5] = (1.0 - weight) * vertical_to_horizontal
-        out[2, 1] = -out[2, 5]
-    return out
-
-
-def _horizontal_weight(vertical_to_horizontal: float) -> float:
-    squared = vertical_to_horizontal**2
-    return squared / (1.0 + squared)
 
 
 def _average(
