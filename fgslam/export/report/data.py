@@ -1,0 +1,176 @@
+"""What a report page shows: plain values and arrays, whoever computed them.
+
+All poses and points of one report are in one world: that of the estimates, the reference camera's
+first frame. What cannot be known is None or NaN, never a guess; the page then says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fgslam.types import FloatArray, LandmarkMap, Trajectory
+
+
+def _no_landmarks() -> LandmarkMap:
+    return LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EstimatorReport:
+    """One estimator's result, frame by frame; arrays of (n, ...) share their rows.
+
+    Attributes:
+        title: its name in this run, unique.
+        kind: which estimator it is.
+        timestamps: (n,) seconds, increasing.
+        final_poses: (n, 4, 4) ``wTc`` as estimated at the end.
+        online_poses: (n, 4, 4) ``wTc``, each as estimated at its own time; NaN where unknown.
+        covariances: (n, 6, 6) of the final poses, tangent [rotation, translation]; NaN unknown.
+        landmarks: the final map.
+        final_error_m, online_error_m: (n,) distance from the true position; NaN where unknown.
+        nees: (n,) normalised error squared of the final pose per degree of freedom; NaN unknown.
+        nees_band: interval that holds 95 % of a consistent estimator's values, or None.
+        update_ms: (n,) milliseconds a frame; NaN where not timed.
+        ate_m: absolute trajectory error of the final path, as ``ReportData.alignment`` says.
+        nees_per_dof: mean NEES of the run per degree of freedom.
+        verdict: `consistent`, `overconfident` or `conservative`; None where not known.
+        remarks: what the estimator had to mend or leave out, in words.
+        failure: why there is no result; empty where there is one.
+    """
+
+    title: str
+    kind: str
+    timestamps: FloatArray
+    final_poses: FloatArray
+    online_poses: FloatArray
+    covariances: FloatArray
+    landmarks: LandmarkMap
+    final_error_m: FloatArray
+    online_error_m: FloatArray
+    nees: FloatArray
+    update_ms: FloatArray
+    nees_band: tuple[float, float] | None = None
+    ate_m: float | None = None
+    nees_per_dof: float | None = None
+    verdict: str | None = None
+    remarks: tuple[str, ...] = ()
+    failure: str = ""
+
+    def __post_init__(self) -> None:
+        n = len(self.timestamps)
+        shapes = {
+            "final_poses": (n, 4, 4),
+            "online_poses": (n, 4, 4),
+            "covariances": (n, 6, 6),
+            "final_error_m": (n,),
+            "online_error_m": (n,),
+            "nees": (n,),
+            "update_ms": (n,),
+        }
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(
+                    f"{self.title}: {name} has shape {getattr(self, name).shape}, not {shape}"
+                )
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    @staticmethod
+    def failed(title: str, kind: str, why: str) -> EstimatorReport:
+        """An estimator that gave no result."""
+        none, poses = np.empty(0), np.empty((0, 4, 4))
+        return EstimatorReport(
+            title=title,
+            kind=kind,
+            timestamps=none,
+            final_poses=poses,
+            online_poses=poses,
+            covariances=np.empty((0, 6, 6)),
+            landmarks=_no_landmarks(),
+            final_error_m=none,
+            online_error_m=none,
+            nees=none,
+            update_ms=none,
+            failure=why,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of the comparison table: heading with unit, and what it means."""
+
+    name: str
+    meaning: str
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """The comparison table as it is read: values as text with their units in the headings.
+
+    Attributes:
+        columns: m headings.
+        rows: title of the estimator and its m values; `-` where a value is not known.
+    """
+
+    columns: tuple[Column, ...] = ()
+    rows: tuple[tuple[str, tuple[str, ...]], ...] = ()
+
+    def __post_init__(self) -> None:
+        for title, values in self.rows:
+            if len(values) != len(self.columns):
+                raise ValueError(
+                    f"{title}: {len(values)} values in a table of {len(self.columns)} columns"
+                )
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture beside the plots: PNG or JPEG, with a caption that says what it shows."""
+
+    caption: str
+    content: bytes = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReportData:
+    """All that one page shows.
+
+    Attributes:
+        title, subtitle: headings.
+        notes: what was tolerated in the recording, warnings, in words.
+        truth: true poses in the estimates' world; None where there are none.
+        estimators: one or more, in the order of the table; their colours follow it.
+        comparison: the table.
+        pictures: of the run.
+        config_yaml: the resolved configuration, as text.
+        versions: of the program and its libraries; None where one is not installed.
+        up: (3,) the world's vertical, upwards; need not be of unit length.
+        alignment: how the errors behind ``ate_m`` were aligned, in words.
+    """
+
+    title: str
+    subtitle: str
+    estimators: tuple[EstimatorReport, ...]
+    truth: Trajectory | None = None
+    notes: tuple[str, ...] = ()
+    comparison: Comparison = field(default_factory=Comparison)
+    pictures: tuple[Picture, ...] = ()
+    config_yaml: str = ""
+    versions: Mapping[str, str | None] = field(default_factory=dict)
+    up: FloatArray = field(default_factory=lambda: np.array([0.0, -1.0, 0.0]))
+    alignment: str = "SE3 aligned"
+
+    def __post_init__(self) -> None:
+        titles = [estimator.title for estimator in self.estimators]
+        if len(set(titles)) != len(titles):
+            raise ValueError(f"titles of estimators are not unique: {titles}")
+
+    @property
+    def start(self) -> float:
+        """Seconds of the first frame: times in the plots count from it."""
+        known = [e.timestamps[0] for e in self.estimators if len(e)]
+        return float(min(known, default=0.0))

@@ -1,0 +1,114 @@
+"use strict";
+// Draws the figures of a report and keeps them in step with the page's switches and colours.
+// The switches themselves are the only state: a figure is always drawn from what they say.
+(() => {
+  const report = JSON.parse(document.getElementById("report-data").textContent);
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  const touch = matchMedia("(pointer: coarse)");
+  const narrow = matchMedia("(max-width: 600px)");
+
+  const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const switchOf = (figure, key) =>
+    document.querySelector(`input[data-figure="${figure}"][data-switch="${key}"]`);
+  const isOn = (figure, key) => switchOf(figure, key)?.checked ?? false;
+  const estimatorOn = (i) => document.querySelector(`input[data-estimator="${i}"]`)?.checked ?? true;
+  const chosenIn = (figure) => {
+    const select = document.querySelector(`select[data-figure="${figure}"]`);
+    return select === null ? null : Number(select.value);
+  };
+
+  function isVisible(figure, owner) {
+    const asked = owner.when.every((key) => isOn(figure, key));
+    if (!asked || owner.unless.some((key) => isOn(figure, key))) return false;
+    if (owner.chosen) return chosenIn(figure) === owner.estimator;
+    return owner.estimator === null || estimatorOn(owner.estimator);
+  }
+
+  function colourOf(owner) {
+    if (owner.paint === "truth") return css("--ink");
+    if (owner.paint === "grey") return css("--dots");
+    return css(`--e${owner.estimator % report.colours}`);
+  }
+
+  function dressedTrace(figure, trace) {
+    const owner = trace.meta;
+    const dressed = { ...trace, visible: isVisible(figure, owner), showlegend: false };
+    if (owner.paint === "own") return dressed;
+    if (owner.paint === "band") return { ...dressed, fillcolor: css("--band") };
+    if (trace.line) dressed.line = { ...trace.line, color: colourOf(owner) };
+    if (trace.marker) dressed.marker = { ...trace.marker, color: colourOf(owner) };
+    return dressed;
+  }
+
+  function dressedAxis(axis, isFlat) {
+    const grid = { gridcolor: css("--grid"), zerolinecolor: css("--axis"), linecolor: css("--axis") };
+    const flat = isFlat
+      ? { automargin: true, fixedrange: touch.matches }
+      : { backgroundcolor: css("--paper"), showbackground: false };
+    return { ...grid, ...flat, ...axis, title: { ...axis.title, font: { size: 13 } } };
+  }
+
+  function dressedLayout(key, layout) {
+    const dressed = {
+      ...layout,
+      uirevision: "kept", // zoom and camera outlive a redraw
+      showlegend: false,
+      autosize: true,
+      paper_bgcolor: "rgba(0,0,0,0)",
+      plot_bgcolor: "rgba(0,0,0,0)",
+      font: { family: "system-ui, sans-serif", size: 12, color: css("--ink") },
+      margin: { l: 8, r: 12, t: 8, b: 8 },
+      hoverlabel: { bgcolor: css("--paper"), bordercolor: css("--axis"), font: { color: css("--ink") } },
+      modebar: { bgcolor: "rgba(0,0,0,0)", color: css("--faint"), activecolor: css("--ink") },
+    };
+    if (layout.scene) {
+      dressed.margin = { l: 0, r: 0, t: 0, b: 0 };
+      dressed.scene = { ...layout.scene, uirevision: "kept" };
+      for (const axis of ["xaxis", "yaxis", "zaxis"])
+        dressed.scene[axis] = dressedAxis(layout.scene[axis], false);
+      return dressed;
+    }
+    dressed.xaxis = dressedAxis(layout.xaxis, true);
+    dressed.yaxis = dressedAxis(layout.yaxis, true);
+    const log = switchOf(key, "log");
+    if (log !== null) dressed.yaxis.type = log.checked ? "log" : "linear";
+    dressed.yaxis.uirevision = dressed.yaxis.type; // a linear range means nothing on the other scale
+    dressed.dragmode = touch.matches ? false : "zoom";
+    return dressed;
+  }
+
+  function draw(key) {
+    const { traces, layout } = report.figures[key];
+    const config = {
+      responsive: true,
+      displaylogo: false,
+      displayModeBar: narrow.matches ? false : "hover",
+      modeBarButtonsToRemove: ["lasso2d", "select2d"],
+    };
+    const dressed = traces.map((trace) => dressedTrace(key, trace));
+    return Plotly.react(`plot-${key}`, dressed, dressedLayout(key, layout), config);
+  }
+
+  const drawAll = () => Promise.all(Object.keys(report.figures).map(draw));
+
+  document.addEventListener("change", (event) => {
+    const { figure, estimator } = event.target.dataset;
+    if (estimator !== undefined) drawAll();
+    else if (figure !== undefined) draw(figure);
+  });
+  for (const query of [dark, touch, narrow]) query.addEventListener("change", drawAll);
+
+  const dialog = document.getElementById("closer");
+  for (const button of document.querySelectorAll("button.enlarge")) {
+    button.addEventListener("click", () => {
+      const image = button.querySelector("img");
+      dialog.querySelector("img").src = image.src;
+      dialog.querySelector("img").alt = image.alt;
+      dialog.querySelector("p").textContent = image.alt;
+      dialog.showModal();
+    });
+  }
+  dialog.querySelector("button").addEventListener("click", () => dialog.close());
+
+  drawAll().then(() => document.documentElement.setAttribute("data-drawn", "yes"));
+})();

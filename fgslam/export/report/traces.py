@@ -1,0 +1,128 @@
+"""Plotly traces as plain values: packed numbers, who they belong to, how rows are thinned.
+
+A trace names its estimator and the switches that show it; the page's script gives it its colour
+and shows or hides it. Nothing here depends on Plotly itself.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from fgslam.types import FloatArray, IntArray
+
+Trace: TypeAlias = dict[str, Any]
+
+Paint: TypeAlias = Literal["estimator", "truth", "grey", "band", "own"]
+"""What colour the page gives a trace: its estimator's, the ink's (dashed), grey, or none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Owner:
+    """Who a trace belongs to, and when it is seen.
+
+    Attributes:
+        name: told where the pointer rests.
+        estimator: its number in the report; None of what belongs to no estimator.
+        when: switches of the figure that must all be on.
+        unless: switches that must all be off.
+        chosen: seen while the figure's selector names the estimator, whether its lines are or not.
+        paint: its colour.
+    """
+
+    name: str
+    estimator: int | None = None
+    when: tuple[str, ...] = ()
+    unless: tuple[str, ...] = ()
+    chosen: bool = False
+    paint: Paint = "estimator"
+
+    def as_values(self) -> dict[str, Any]:
+        """As the page's script reads it."""
+        return {
+            "estimator": self.estimator,
+            "when": list(self.when),
+            "unless": list(self.unless),
+            "chosen": self.chosen,
+            "paint": self.paint,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Switch:
+    """A checkbox of a figure: its key in ``Owner.when``, its words, and how it starts."""
+
+    key: str
+    label: str
+    on: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A figure of the page.
+
+    Attributes:
+        key: unique in the page.
+        heading: its title.
+        description: what it shows, for those who see it and those who do not.
+        traces: what is drawn.
+        layout: Plotly's, without colours.
+        switches: checkboxes above it.
+        selects: whether one estimator at a time is chosen for part of it.
+        note: what is not drawn, in words.
+    """
+
+    key: str
+    heading: str
+    description: str
+    traces: tuple[Trace, ...]
+    layout: Mapping[str, Any]
+    switches: tuple[Switch, ...] = ()
+    selects: bool = False
+    note: str = ""
+
+
+def trace(owner: Owner, axes: Mapping[str, FloatArray], **more: Any) -> Trace:
+    """A trace; ``axes`` are its coordinates (`x`, `y`, `z`) and values told at the pointer."""
+    return {
+        "type": "scatter3d" if "z" in axes else "scatter",
+        # Plotly reads a little HTML in names; a title is never meant as such.
+        "name": html.escape(owner.name),
+        "meta": owner.as_values(),
+        **{axis: packed(values) for axis, values in axes.items()},
+        **more,
+    }
+
+
+def packed(values: FloatArray) -> dict[str, str]:
+    """Numbers as Plotly's base64 arrays of single precision: 5 bytes each, 0.01 mm in 100 m."""
+    content = np.ascontiguousarray(values, dtype="<f4").tobytes()
+    return {"dtype": "f4", "bdata": base64.b64encode(content).decode("ascii")}
+
+
+def thinned(count: int, limit: int) -> IntArray:
+    """At most ``limit`` of ``count`` rows, evenly spread, with the first and the last."""
+    if count <= limit:
+        return np.arange(count)
+    return np.unique(np.linspace(0, count - 1, limit).round().astype(np.int64))
+
+
+def peaks(values: FloatArray, limit: int) -> IntArray:
+    """Rows of values (n,) so thinned that the largest of each stretch stays; NaN only if alone."""
+    if len(values) <= limit:
+        return np.arange(len(values))
+    known = np.where(np.isnan(values), -np.inf, values)
+    parts = np.array_split(known, limit)
+    starts = np.cumsum([0, *(len(part) for part in parts[:-1])])
+    return np.asarray(starts + np.array([int(np.argmax(part)) for part in parts]), np.int64)
+
+
+def joined(polylines: FloatArray) -> FloatArray:
+    """Polylines (k, m, d) as one (k (m + 1), d) with a gap (NaN) after each."""
+    k, _, d = polylines.shape
+    return np.concatenate([polylines, np.full((k, 1, d), np.nan)], axis=1).reshape(-1, d)

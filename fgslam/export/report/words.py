@@ -1,0 +1,75 @@
+"""The headline in plain sentences: who is best and by how much, and whose claims hold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from fgslam.export.report.data import EstimatorReport, ReportData
+
+_ABOUT_EQUAL = 1.05
+_JUDGED = {
+    "consistent": "claims what it delivers: its errors are as large as its covariances say",
+    "overconfident": "is overconfident: its errors are larger than its covariances say",
+    "conservative": "is conservative: its errors are smaller than its covariances say",
+}
+
+
+def headline(data: ReportData) -> list[str]:
+    """Sentences about accuracy, consistency and failures, most important first."""
+    working = [e for e in data.estimators if not e.failure]
+    lines = [_accuracy(data, working)] if working else ["No estimator gave a result."]
+    lines += _consistency(working)
+    lines += [f"{e.title} failed: {e.failure}" for e in data.estimators if e.failure]
+    return lines
+
+
+def best(data: ReportData) -> int:
+    """Number of the most accurate estimator; of the first with landmarks where none is known."""
+    errors = [(e.ate_m, i) for i, e in enumerate(data.estimators) if e.ate_m is not None]
+    if errors:
+        return min(errors)[1]
+    return next((i for i, e in enumerate(data.estimators) if len(e.landmarks)), 0)
+
+
+def metres(value: float) -> str:
+    """A length to be read: centimetres below a metre."""
+    return f"{100.0 * value:.2f} cm" if value < 1.0 else f"{value:.3f} m"
+
+
+def _accuracy(data: ReportData, working: list[EstimatorReport]) -> str:
+    ranked = sorted((e.ate_m, e.title) for e in working if e.ate_m is not None)
+    if not ranked:
+        why = "there is no ground truth" if data.truth is None else "too few poses have a truth"
+        return f"How accurate the path is, is not known: {why}."
+    how = f"root mean square position error, {data.alignment}"
+    first, title = ranked[0]
+    if len(ranked) == 1:
+        return f"{title} is off by {metres(first)} ({how})."
+    second, other = ranked[1]
+    if second <= _ABOUT_EQUAL * first:
+        equal = [name for error, name in ranked if error <= _ABOUT_EQUAL * first]
+        return f"{_listed(equal)} are about equally accurate: {metres(first)} ({how})."
+    ratio = f"{second / first:.2g} times" if first > 0.0 else "far"
+    return (
+        f"{title} is the most accurate: off by {metres(first)} ({how}). "
+        f"The next, {other}, is off by {metres(second)}, {ratio} as much."
+    )
+
+
+def _consistency(working: list[EstimatorReport]) -> Iterator[str]:
+    for word, meaning in _JUDGED.items():
+        found = [e for e in working if e.verdict == word]
+        if found:
+            names = [f"{e.title} ({_nees(e.nees_per_dof)})" for e in found]
+            yield f"{_listed(names)}: {meaning}."
+    unknown = [e.title for e in working if e.verdict not in _JUDGED]
+    if unknown:
+        yield f"Whether the covariances of {_listed(unknown)} can be believed is not known."
+
+
+def _nees(value: float | None) -> str:
+    return "NEES not known" if value is None else f"NEES {value:.3g} per degree of freedom"
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
