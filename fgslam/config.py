@@ -28,10 +28,16 @@ from fgslam.settings.datasets import (
 )
 from fgslam.settings.frontend import FrontendSettings
 from fgslam.settings.lab import RenderedLabSettings
+from fgslam.settings.measurements import MeasurementDatasetSettings
 from fgslam.settings.output import OutputSettings
 
 DatasetSettings: TypeAlias = Annotated[
-    RenderedLabSettings | ImageFolderSettings | KittiSettings | EurocSettings | LightFieldSettings,
+    RenderedLabSettings
+    | ImageFolderSettings
+    | KittiSettings
+    | EurocSettings
+    | LightFieldSettings
+    | MeasurementDatasetSettings,
     Field(discriminator="kind"),
 ]
 

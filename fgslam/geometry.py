@@ -8,11 +8,12 @@ Functions over many items are vectorised over the leading axis.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
 from fgslam import range_bearing
-from fgslam.types import BoolArray, CameraRig, FloatArray, Sensor
+from fgslam.types import BoolArray, CameraRig, FloatArray, Odometry, Sensor
 
 # Below this rotation angle the series of sin and cos are exact to double precision.
 _SMALL_ANGLE = 1e-4
@@ -193,6 +194,21 @@ def compose_covariance(motion: FloatArray, before: FloatArray, noise: FloatArray
     """Covariance (6, 6) of ``T * motion`` given that of ``T`` and of the motion (at its end)."""
     ad = adjoint(inverse(motion))
     return np.asarray(ad @ before @ ad.T + noise)
+
+
+def compose_odometry(steps: Iterable[Odometry]) -> Odometry:
+    """Consecutive independent steps as one, with its covariance."""
+    motion, covariance = np.eye(4), np.zeros((6, 6))
+    for step in steps:
+        covariance = compose_covariance(step.motion, covariance, step.covariance)
+        motion = motion @ step.motion
+    return Odometry(motion, covariance)
+
+
+def odometry_of_camera(body: Odometry, bTc: FloatArray) -> Odometry:
+    """Odometry of the robot's body as that of its camera, by the lever arm (Se et al. 5; S30)."""
+    motion = body_to_camera_motion(body.motion, bTc)
+    return Odometry(motion, change_tangent_frame(inverse(bTc), body.covariance))
 
 
 def change_tangent_frame(aTb: FloatArray, covariance: FloatArray) -> FloatArray:

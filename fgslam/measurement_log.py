@@ -25,11 +25,15 @@ from fgslam.types import (
     IntArray,
     Observations,
     Odometry,
+    RangeBearingSensor,
+    Sensor,
     StateArrays,
 )
 
 FORMAT = "fgslam measurement log"
-VERSION = 1
+VERSION = 2
+_READABLE = (1, 2)
+"""Version 1 knew cameras only."""
 _UPPER = np.triu_indices(3)
 _UNREADABLE = (
     OSError,
@@ -59,7 +63,8 @@ _PER_OBSERVATION: dict[str, tuple[str, tuple[int, ...]]] = {
     "is_new": ("b", ()),
     "rejected": ("b", ()),
 }
-_RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline")
+_RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
+_SENSOR_KEYS = {"stereo": _RIG, "range_bearing": ("max_range_m",)}
 
 
 @dataclass(slots=True, eq=False)
@@ -67,13 +72,13 @@ class MeasurementLog:
     """Measurements of a run, frame by frame.
 
     Attributes:
-        rig: the cameras, with the lever arm.
+        rig: the cameras, or the range-bearing sensor; with the lever arm.
         motion_model: how odometry came about, and the stand-in's numbers where there was none
             (plain JSON values): replays need it to predict as the live run did.
         increments: one a frame, time increasing.
     """
 
-    rig: CameraRig
+    rig: Sensor
     motion_model: dict[str, Any]
     increments: list[Increment] = field(default_factory=list)
 
@@ -94,9 +99,10 @@ class MeasurementLog:
 
     def to_arrays(self) -> StateArrays:
         """The log as the arrays of its file."""
-        rig = {name: getattr(self.rig, name) for name in _RIG}
-        rig["vertical_baseline"] = self.rig.vertical_baseline
-        header = {"format": FORMAT, "version": VERSION, "rig": rig, "motion": self.motion_model}
+        kind = "stereo" if isinstance(self.rig, CameraRig) else "range_bearing"
+        sensor = {"kind": kind} | {name: getattr(self.rig, name) for name in _SENSOR_KEYS[kind]}
+        header = {"format": FORMAT, "version": VERSION, "sensor": sensor}
+        header["motion"] = self.motion_model
         out: StateArrays = {
             "header": np.array(json.dumps(header, sort_keys=True)),
             "rig_bTc": self.rig.bTc,
@@ -127,8 +133,7 @@ class MeasurementLog:
         """The log back from its arrays; ``where`` names the source in messages."""
         header = _read_header(arrays, where)
         _require_consistent(arrays, where)
-        rig = CameraRig(**header["rig"], bTc=arrays["rig_bTc"])
-        log = MeasurementLog(rig, header["motion"])
+        log = MeasurementLog(_sensor(header["sensor"], arrays["rig_bTc"]), header["motion"])
         observed = _split_observations(arrays)
         missed = _split(arrays, "missed")
         pruned = _split(arrays, "pruned")
@@ -176,17 +181,28 @@ def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
         header = {}
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise MeasurementLogError(f"{where}: not an fgslam measurement log; give measurements.npz")
-    if header.get("version") != VERSION:
+    if header.get("version") not in _READABLE:
         raise MeasurementLogError(
             f"{where}: measurement log of version {header.get('version')}, this fgslam reads "
-            f"version {VERSION}; repeat the run or use the matching fgslam"
+            f"versions {_READABLE[0]} to {VERSION}; repeat the run or use the matching fgslam"
         )
-    rig = header.get("rig")
-    if not isinstance(rig, dict) or set(rig) != {*_RIG, "vertical_baseline"}:
-        raise MeasurementLogError(f"{where}: the log's header names no cameras; run again")
+    if header["version"] == 1:
+        rig = header.get("rig")
+        header["sensor"] = {"kind": "stereo", **rig} if isinstance(rig, dict) else None
+    sensor = header.get("sensor")
+    keys = _SENSOR_KEYS.get(str(sensor.get("kind"))) if isinstance(sensor, dict) else None
+    if keys is None or set(sensor or ()) != {"kind", *keys}:
+        raise MeasurementLogError(f"{where}: the log's header names no sensor; run again")
     if not isinstance(header.get("motion"), dict):
         raise MeasurementLogError(f"{where}: the log's header has no motion model; run again")
     return header
+
+
+def _sensor(values: dict[str, Any], bTc: FloatArray) -> Sensor:
+    numbers = {name: value for name, value in values.items() if name != "kind"}
+    if values["kind"] == "stereo":
+        return CameraRig(**numbers, bTc=bTc)
+    return RangeBearingSensor(**numbers, bTc=bTc)
 
 
 def _require_consistent(arrays: StateArrays, where: str) -> None:

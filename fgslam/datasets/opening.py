@@ -1,4 +1,4 @@
-"""One function that opens any recording of files by its settings."""
+"""Functions that open any recording by its settings: of images, or of measurements."""
 
 from __future__ import annotations
 
@@ -9,12 +9,20 @@ from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.kitti import open_kitti
 from fgslam.datasets.light_field import open_light_field
 from fgslam.datasets.recording import Recording
+from fgslam.datasets.simulated_measurements import open_simulated_measurements
+from fgslam.errors import DatasetError
+from fgslam.recordings import MeasurementRecording
 from fgslam.settings.datasets import (
     EurocSettings,
     ImageFolderSettings,
     KittiSettings,
     LightFieldSettings,
+    OdometrySettings,
     RecordedOdometrySettings,
+)
+from fgslam.settings.measurements import (
+    MeasurementDatasetSettings,
+    SimulatedMeasurementsSettings,
 )
 
 FileRecordingSettings: TypeAlias = (
@@ -44,3 +52,26 @@ def open_recording(
             return open_euroc(settings)
         case LightFieldSettings():
             return open_light_field(settings)
+
+
+def open_measurements(
+    settings: MeasurementDatasetSettings, seed: int, odometry: OdometrySettings | None = None
+) -> MeasurementRecording:
+    """Open or simulate the measurements that the settings describe.
+
+    Args:
+        settings: one of the kinds without images.
+        seed: of what is simulated; real measurements do not depend on it.
+        odometry: what predicts the motion; None for the recording's own, with the default
+            constant velocity over its gaps.
+
+    Raises:
+        DatasetError: the recording is missing, malformed or empty.
+        ConfigError: a simulated drive cannot be driven, or synthetic odometry is asked for.
+    """
+    odometry = odometry or RecordedOdometrySettings()
+    match settings:
+        case SimulatedMeasurementsSettings():
+            return open_simulated_measurements(settings, seed, odometry)
+        case _:
+            raise DatasetError(f"dataset.kind {settings.kind} is not built yet")

@@ -14,6 +14,7 @@ from fgslam.inspection.matches import judge_matches, look_at_frames, match_facts
 from fgslam.inspection.report import Facts, render_report
 from fgslam.settings.datasets import KittiSettings
 from fgslam.settings.lab import RenderedLabSettings
+from fgslam.settings.measurements import MeasurementDatasetSettings
 
 Progress = Callable[[str, int, int], None]
 """Called with what is under way, how much is done, and of how much."""
@@ -76,7 +77,7 @@ def _configure(dataset: Path, overrides: Sequence[str]) -> ExperimentConfig:
 def _opening_facts(config: ExperimentConfig) -> Facts:
     """What to write into an experiment's configuration to use this recording."""
     dataset = config.dataset
-    if isinstance(dataset, RenderedLabSettings):
+    if isinstance(dataset, RenderedLabSettings | MeasurementDatasetSettings):
         return (("opened as", f"{dataset.kind}, seed {config.seed}"),)
     opened = f"dataset.kind {dataset.kind}, dataset.path {dataset.path}"
     if not isinstance(dataset, KittiSettings):

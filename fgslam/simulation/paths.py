@@ -250,7 +250,15 @@ def plan_drive(settings: LabDriveSettings) -> Drive:
     Raises:
         ConfigError: the path cannot be driven in so few frames, or has too few waypoints.
     """
-    path = plan_path(settings)
+    return drive_along(plan_path(settings), settings)
+
+
+def drive_along(path: PlanarPath, settings: LabDriveSettings) -> Drive:
+    """A given path, driven as the settings say; their own ``path`` is not looked at.
+
+    Raises:
+        ConfigError: the path cannot be driven in so few frames.
+    """
     law = fastest_law(
         path,
         settings.max_speed_m_s,
