@@ -33,6 +33,7 @@ from fgslam.settings.datasets import (
 )
 from fgslam.settings.frontend import FrontendSettings
 from fgslam.settings.lab import RenderedLabSettings
+from fgslam.settings.measurements import MeasurementDatasetSettings
 from fgslam.types import CameraRig, MeasurementType, Prediction, Sequence
 
 
@@ -48,6 +49,11 @@ def open_sequence(
         _require_own_noise(config.odometry)
         sequence: Sequence = RenderedLabSequence(
             dataset, config.seed, dataset.start, dataset.stop, dataset.stride, progress
+        )
+    elif isinstance(dataset, MeasurementDatasetSettings):
+        raise ConfigError(
+            f"dataset.kind {dataset.kind} holds measurements, no images; choose a recording of "
+            "images here"
         )
     else:
         noise = config.odometry if isinstance(config.odometry, RecordedOdometrySettings) else None
