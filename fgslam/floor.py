@@ -13,7 +13,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from fgslam.geometry import congruence, pose, so3_exp
-from fgslam.types import CameraRig, FloatArray
+from fgslam.types import FloatArray, Sensor
 
 DegreesOfFreedom: TypeAlias = Literal[3, 5, 6]
 
@@ -37,7 +37,7 @@ class Floor:
     tilt_sigma_rad: float = 0.0
 
     @staticmethod
-    def under(rig: CameraRig, dof: DegreesOfFreedom) -> Floor:
+    def under(rig: Sensor, dof: DegreesOfFreedom) -> Floor:
         """The exact floor that is level with the robot's body in the first camera frame."""
         return Floor(dof, -rig.bTc[2, :3])
 

@@ -18,6 +18,7 @@ from fgslam.geometry import (
     compose_covariance,
     congruence,
     inverse_spd3,
+    measurement_difference,
     point_pose_jacobian,
     project,
     projection_jacobian,
@@ -28,7 +29,6 @@ from fgslam.geometry import (
 )
 from fgslam.settings.backend import LandmarkKalmanSettings
 from fgslam.types import (
-    CameraRig,
     EgoMotion,
     Estimate,
     FloatArray,
@@ -39,6 +39,7 @@ from fgslam.types import (
     Observations,
     Odometry,
     Prediction,
+    Sensor,
     StateArrays,
     Trajectory,
     UpdateStats,
@@ -50,14 +51,14 @@ class LandmarkKalman:
 
     kind: ClassVar[str] = "landmark_kalman"
     supports: ClassVar[frozenset[MeasurementType]] = frozenset(
-        {MeasurementType.ODOMETRY, MeasurementType.STEREO}
+        {MeasurementType.ODOMETRY, MeasurementType.STEREO, MeasurementType.RANGE_BEARING}
     )
 
-    def __init__(self, rig: CameraRig, settings: LandmarkKalmanSettings, prior: Prediction) -> None:
+    def __init__(self, rig: Sensor, settings: LandmarkKalmanSettings, prior: Prediction) -> None:
         """Starts at the prior pose with an empty map.
 
         Args:
-            rig: the cameras.
+            rig: the cameras, or the range-bearing sensor.
             settings: which update, and its noise.
             prior: pose of the first frame and its covariance.
         """
@@ -180,7 +181,7 @@ class LandmarkKalman:
         return nis, 3 * len(rows)
 
     def _pixel_update(self, rows: IntArray, observed: Observations) -> float:
-        """Kalman update on (column, row, disparity), linearised at the landmark, Joseph form."""
+        """Kalman update on the measurement itself, linearised at the landmark, Joseph form."""
         wTc = self._current.wTc
         points = transform_to_camera(wTc, self._positions[rows])
         jacobian = projection_jacobian(self._rig, points)
@@ -188,7 +189,8 @@ class LandmarkKalman:
         if self._settings.pose_covariance:
             by_pose = jacobian @ point_pose_jacobian(points)
             noise = noise + congruence(by_pose, self._current.covariance)
-        innovation = observed.measurement - project(self._rig, points)
+        expected = project(self._rig, points)
+        innovation = measurement_difference(self._rig, observed.measurement, expected)
         return self._kalman(rows, jacobian @ wTc[:3, :3].T, innovation, noise)
 
     def _world_update(self, rows: IntArray, observed: Observations) -> float:

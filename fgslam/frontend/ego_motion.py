@@ -8,6 +8,7 @@ after outliers are dropped, and capped.
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +16,10 @@ import numpy as np
 from fgslam.floor import Floor
 from fgslam.geometry import (
     congruence,
+    in_front,
     inverse,
     inverse_spd3,
+    measurement_difference,
     point_pose_jacobian,
     pose,
     project,
@@ -38,9 +41,9 @@ from fgslam.types import (
     LandmarkMap,
     Observations,
     Prediction,
+    Sensor,
 )
 
-_NEAREST_DEPTH_M = 1e-3  # a point nearer than this, or behind, cannot be linearised
 _STEP_TOLERANCE = 1e-9  # radians and metres; far below anything measurable
 _ROBUST_TOLERANCE = 1e-5  # the robust minimum only chooses the inliers for the exact one
 _REPEATS = 10  # minimisations with the remaining matches; two suffice on all recordings tried
@@ -56,7 +59,7 @@ class PoseProblem:
     Attributes:
         points: (k, 3) world, metres.
         point_covariances: (k, 3, 3).
-        measurement: (k, 3) (column, row, disparity), pixels.
+        measurement: (k, 3) (column, row, disparity), pixels; or (azimuth, elevation, range).
         measurement_covariance: (k, 3, 3).
     """
 
@@ -106,18 +109,21 @@ class _Minimum:
 class EgoMotionSolver:
     """Solves for ``wTc`` from matched landmarks and a predicted pose."""
 
-    def __init__(self, rig: CameraRig, settings: EgoMotionSettings) -> None:
-        """The world's vertical is that of the robot's body in the first camera frame."""
-        self._rig = rig
+    def __init__(self, sensor: Sensor, settings: EgoMotionSettings) -> None:
+        """The world's vertical is that of the robot's body in the first camera frame.
+
+        Of a range-bearing sensor, matches are judged by ``outlier_sigmas`` alone.
+        """
+        self._sensor = sensor
         self._settings = settings
-        self.floor = Floor.under(rig, settings.dof)
+        self.floor = Floor.under(sensor, settings.dof)
         """Which poses are allowed."""
 
     def solve(self, prediction: Prediction, problem: PoseProblem) -> EgoMotion:
         """Pose with covariance, inliers, residuals and a status; the odometry's where it fails."""
         prediction = Prediction(self.floor.constrain(prediction.wTc), prediction.covariance)
         start = prediction.wTc
-        used = inliers = transform_to_camera(start, problem.points)[:, 2] > _NEAREST_DEPTH_M
+        used = inliers = in_front(self._sensor, transform_to_camera(start, problem.points))
         iterations = 0
         wTc, robust = start, self._settings.kernel != "none"
         for _ in range(_REPEATS):
@@ -186,7 +192,7 @@ class EgoMotionSolver:
             covariance = problem.measurement_covariance
         if settings.weighting == "landmark":
             points = transform_to_camera(wTc, problem.points)
-            jacobian = projection_jacobian(self._rig, points) @ wTc[:3, :3].T
+            jacobian = projection_jacobian(self._sensor, points) @ wTc[:3, :3].T
             covariance = covariance + congruence(jacobian, problem.point_covariances)
         if settings.residuals == "image_disparity":
             return inverse_spd3(covariance)
@@ -199,10 +205,10 @@ class EgoMotionSolver:
     ) -> tuple[float, FloatArray, FloatArray]:
         """Cost, Gauss-Newton Hessian (6, 6) and gradient (6,) at ``wTc``."""
         points = transform_to_camera(wTc, problem.points)
-        if points[:, 2].min() <= _NEAREST_DEPTH_M:
+        if not in_front(self._sensor, points).all():
             return np.inf, np.eye(6), np.zeros(6)
-        residual = project(self._rig, points) - problem.measurement
-        jacobian = projection_jacobian(self._rig, points) @ point_pose_jacobian(points)
+        residual = self._residual(points, problem.measurement)
+        jacobian = projection_jacobian(self._sensor, points) @ point_pose_jacobian(points)
         squared = np.einsum("ki,kij,kj->k", residual, information, residual)
         rho, weight = self._kernel(squared, robust)
         weighted = weight[:, None, None] * (information @ jacobian)
@@ -235,12 +241,21 @@ class EgoMotionSolver:
         except np.linalg.LinAlgError:
             return None
 
+    @property
+    def _farthest(self) -> float:
+        """Largest image residual of an inlier."""
+        return self._settings.outlier_px if isinstance(self._sensor, CameraRig) else math.pi
+
+    def _residual(self, points: FloatArray, measurement: FloatArray) -> FloatArray:
+        """Predicted less measured (k, 3)."""
+        return measurement_difference(self._sensor, project(self._sensor, points), measurement)
+
     def _inliers(self, wTc: FloatArray, problem: PoseProblem) -> BoolArray:
-        near = self.image_residuals(wTc, problem) <= self._settings.outlier_px  # so in front, too
+        near = self.image_residuals(wTc, problem) <= self._farthest  # so in front, too
         if self._settings.outlier_sigmas > 0.0 and self._settings.weighting != "uniform":
             candidates = problem.select(near)
             points = transform_to_camera(wTc, candidates.points)
-            residual = project(self._rig, points) - candidates.measurement
+            residual = self._residual(points, candidates.measurement)
             information = self._information(wTc, candidates)
             squared = np.einsum("ki,kij,kj->k", residual, information, residual)
             near[near] = squared <= self._settings.outlier_sigmas**2
@@ -306,13 +321,14 @@ class EgoMotionSolver:
         )
 
     def image_residuals(self, wTc: FloatArray, problem: PoseProblem) -> FloatArray:
-        """The paper's E (k,): distance in pixels of projection and measurement; inf if behind."""
+        """The paper's E (k,): distance of projection and measurement in the image; inf if behind.
+
+        Pixels; of a range-bearing sensor the angle in radians, range aside.
+        """
         points = transform_to_camera(wTc, problem.points)
-        behind = points[:, 2] <= _NEAREST_DEPTH_M
-        points[behind, 2] = 1.0
-        error = np.linalg.norm(
-            project(self._rig, points)[:, :2] - problem.measurement[:, :2], axis=1
-        )
+        behind = ~in_front(self._sensor, points)
+        points[behind] = (0.0, 0.0, 1.0)
+        error = np.linalg.norm(self._residual(points, problem.measurement)[:, :2], axis=1)
         return np.where(behind, np.inf, error)
 
 
