@@ -34,7 +34,7 @@ from fgslam.settings.datasets import (
 from fgslam.settings.frontend import FrontendSettings
 from fgslam.settings.lab import RenderedLabSettings
 from fgslam.settings.measurements import MeasurementDatasetSettings
-from fgslam.types import CameraRig, MeasurementType, Prediction, Sequence
+from fgslam.types import CameraRig, MeasurementType, Prediction, Sensor, Sequence
 
 
 def open_sequence(
@@ -98,7 +98,7 @@ def make_motion(sequence: Sequence, settings: OdometrySettings) -> MotionModel:
 
 
 def make_estimator(
-    rig: CameraRig, settings: EstimatorSettings, dof: DegreesOfFreedom = 6
+    rig: Sensor, settings: EstimatorSettings, dof: DegreesOfFreedom = 6
 ) -> Estimator:
     """The estimator, at the origin: the world is the first camera frame, without uncertainty.
 
@@ -113,7 +113,7 @@ def make_estimator(
             raise ConfigError(f"estimator.kind {settings.kind} is not built yet")
 
 
-def make_floor(rig: CameraRig, settings: FloorSettings, dof: DegreesOfFreedom) -> Floor:
+def make_floor(rig: Sensor, settings: FloorSettings, dof: DegreesOfFreedom) -> Floor:
     """The floor as an estimator is to use it."""
     if settings.mode == "auto":
         return Floor.under(rig, dof)
