@@ -93,7 +93,7 @@ def position_sigma(estimator: EstimatorReport) -> FloatArray:
     """Root of the summed variances of each final position (n,), metres; NaN where unknown."""
     variance = np.trace(estimator.covariances[:, 3:, 3:], axis1=1, axis2=2)
     # A planar covariance may round to just below zero.
-    return np.sqrt(np.maximum(variance, 0.0))
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
 def _curve(

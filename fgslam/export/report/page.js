@@ -83,7 +83,10 @@
       responsive: true,
       displaylogo: false,
       displayModeBar: narrow.matches ? false : "hover",
-      modeBarButtonsToRemove: ["lasso2d", "select2d"],
+      // By name, so that no button of a later Plotly that would send data away gets in.
+      modeBarButtons: layout.scene
+        ? [["toImage", "resetCameraDefault3d"]]
+        : [["toImage", "zoom2d", "pan2d", "zoomIn2d", "zoomOut2d", "resetScale2d"]],
     };
     const dressed = traces.map((trace) => dressedTrace(key, trace));
     return Plotly.react(`plot-${key}`, dressed, dressedLayout(key, layout), config);

@@ -1,7 +1,7 @@
 """The page itself: one HTML file that needs nothing else, neither beside it nor from the network.
 
 Everything from outside is escaped, and the page's own policy lets only the two scripts run whose
-digests it names, so that not even a mistake here would run what a configuration or a file name says.
+digests it names: not even a mistake here would run what a configuration or a file name says.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ def _gallery(pictures: list[Embedded], left_out: list[str]) -> Iterator[str]:
         yield (
             '<figure><button class="enlarge" title="enlarge">'
             f'<img src="{picture.uri}" alt="{caption}" width="{picture.width}" '
-            f'height="{picture.height}" loading="lazy"></button>'
+            f'height="{picture.height}" decoding="async"></button>'
             f"<figcaption>{caption}</figcaption></figure>"
         )
     yield "</div>"
@@ -190,7 +190,7 @@ def _remarks(data: ReportData) -> Iterator[str]:
 
 
 def _provenance(data: ReportData) -> Iterator[str]:
-    yield '<section aria-labelledby="provenance"><h2 id="provenance">What it takes to repeat it</h2>'
+    yield '<section aria-labelledby="provenance"><h2 id="provenance">Where it comes from</h2>'
     config = escape(data.config_yaml) or NOT_KNOWN
     yield f"<details><summary>Configuration</summary><pre>{config}</pre></details>"
     yield "<details><summary>Versions</summary><dl>"
@@ -258,9 +258,9 @@ def _selector(figure: str, data: ReportData) -> str:
     """Whose landmarks are shown; nothing where there are none at all."""
     chosen = best(data)
     options = "".join(
-        f'<option value="{i}"{" selected" if i == chosen else ""}>{escape(estimator.title)}</option>'
-        for i, estimator in enumerate(data.estimators)
-        if len(estimator.landmarks)
+        f'<option value="{i}"{" selected" if i == chosen else ""}>{escape(e.title)}</option>'
+        for i, e in enumerate(data.estimators)
+        if len(e.landmarks)
     )
     if not options:
         return "<span>(no landmarks)</span>"

@@ -27,8 +27,8 @@ from fgslam.export.report.traces import (
 from fgslam.geometry import congruence
 from fgslam.types import FloatArray
 
-MAX_POSES = 1500
-MAX_DOTS_ABOVE = 2_000
+MAX_POSES = 1_500
+MAX_DOTS_ABOVE = 3_000
 MAX_DOTS_MAP = 6_000
 ELLIPSES = 40
 SIGMAS = 3.0
@@ -106,7 +106,10 @@ def map_to_turn(data: ReportData) -> Figure:
     }
     scene["aspectmode"] = "manual"
     scene["aspectratio"] = dict(zip("xyz", (spans / spans.max()).tolist(), strict=True))
-    scene["camera"] = {"eye": {"x": -0.5, "y": -1.1, "z": 0.9}, "up": {"x": 0, "y": 0, "z": 1}}
+    scene["camera"] = {
+        "eye": {"x": -0.45, "y": -0.95, "z": 0.75},
+        "center": {"x": 0, "y": 0, "z": -0.1},
+    }
     scene["dragmode"] = "turntable"
     return Figure(
         "map",
@@ -213,7 +216,7 @@ def _outlines(covariances: FloatArray) -> FloatArray:
     radii = SIGMAS * np.sqrt(np.maximum(variances, 0.0))
     angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
-    return np.einsum("kij,kj,mj->kmi", directions, radii, circle)
+    return np.asarray(np.einsum("kij,kj,mj->kmi", directions, radii, circle))
 
 
 def _enlargement(data: ReportData, level: FloatArray) -> int:
@@ -246,7 +249,7 @@ def _dots_in_space(
         # Plotly would draw what lies outside the axes across the page.
         points = points[((points >= low) & (points <= high)).all(axis=1)]
         marker = {
-            "size": 2,
+            "size": 2.5,
             "color": packed(points[:, 2]),
             "colorscale": "Viridis",
             "cmin": low[2],
@@ -282,4 +285,6 @@ def _limits(data: ReportData, level: FloatArray) -> list[list[float]]:
     everything = np.concatenate(corners)
     low, high = everything.min(axis=0), everything.max(axis=0)
     centre, half = 0.5 * (low + high), 0.53 * np.maximum(high - low, 0.2)
-    return np.column_stack([centre - half, centre + half]).tolist()
+    return [
+        [float(a), float(b)] for a, b in np.column_stack([centre - half, centre + half]).tolist()
+    ]

@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from fgslam.export.report.data import EstimatorReport, ReportData
 
 _ABOUT_EQUAL = 1.05
+_ROUND_FROM = 1000.0
 _JUDGED = {
-    "consistent": "claims what it delivers: its errors are as large as its covariances say",
-    "overconfident": "is overconfident: its errors are larger than its covariances say",
-    "conservative": "is conservative: its errors are smaller than its covariances say",
+    "consistent": "errors as large as the covariances say",
+    "overconfident": "errors larger than the covariances say",
+    "conservative": "errors smaller than the covariances say",
 }
 
 
@@ -61,14 +62,16 @@ def _consistency(working: list[EstimatorReport]) -> Iterator[str]:
         found = [e for e in working if e.verdict == word]
         if found:
             names = [f"{e.title} ({_nees(e.nees_per_dof)})" for e in found]
-            yield f"{_listed(names)}: {meaning}."
+            yield f"{word.capitalize()} ({meaning}): {_listed(names)}."
     unknown = [e.title for e in working if e.verdict not in _JUDGED]
     if unknown:
         yield f"Whether the covariances of {_listed(unknown)} can be believed is not known."
 
 
 def _nees(value: float | None) -> str:
-    return "NEES not known" if value is None else f"NEES {value:.3g} per degree of freedom"
+    if value is None:
+        return "NEES not known"
+    return f"NEES {value:,.0f}" if value >= _ROUND_FROM else f"NEES {value:.3g}"
 
 
 def _listed(names: list[str]) -> str:

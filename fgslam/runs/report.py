@@ -1,0 +1,310 @@
+"""The report page of a run, built from the files of its folder alone."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from fgslam.errors import DatasetError, FgslamError
+from fgslam.evaluation.consistency import chi_square_band, judge, pose_nees
+from fgslam.evaluation.trajectory import (
+    Alignment,
+    evaluate_trajectory,
+    position_errors,
+    to_estimate_world,
+)
+from fgslam.export.atomic import RUN_MARKER
+from fgslam.export.metrics import read_metrics
+from fgslam.export.point_cloud import MapPoints, read_ply
+from fgslam.export.report import EstimatorReport, ReportData, write_report
+from fgslam.export.trajectories import read_covariances, read_tum
+from fgslam.measurement_log import MeasurementLog
+from fgslam.runs.report_parts import comparison_table, sample_pictures
+from fgslam.types import FloatArray, IntArray, LandmarkMap, Trajectory
+
+REPORT = "report.html"
+_UP = np.array([0.0, -1.0, 0.0])
+_TIMED_STAGES = ("predict", "update")
+
+
+def report_from_folder(folder: Path, run: Path | None = None) -> Path:
+    """Writes ``report.html`` into a folder of results.
+
+    Args:
+        folder: what `fgslam run` or `fgslam compare` wrote.
+        run: where configuration, truth, log and pictures are sought that ``folder`` lacks; None
+            for the folder above it, where that is a run.
+
+    Returns:
+        The page.
+
+    Raises:
+        FgslamError: there are no results, one of the files is damaged, or writing failed.
+    """
+    page = folder / REPORT
+    write_report(page, load_report(folder, run))
+    return page
+
+
+def load_report(folder: Path, run: Path | None = None) -> ReportData:
+    """All that the page of a folder shows; arguments and errors as :func:`report_from_folder`."""
+    places = _places(folder, run)
+    metrics = read_metrics(folder / "metrics.json")
+    config_text = _text(_find(places, RUN_MARKER))
+    config = _mapping(config_text)
+    truth_file = _find(places, "ground_truth.tum")
+    truth = None if truth_file is None else read_tum(truth_file)
+    live = _live_title(config)
+    timing = _live_times(_find(places, "timing.csv")) if folder == places[-1] else {}
+    estimators = tuple(
+        _estimator(folder / title, values or {}, truth, timing if title == live else {})
+        for title, values in metrics["estimators"].items()
+    )
+    pictures = next((p for p in places if (p / "pictures").is_dir()), folder) / "pictures"
+    return ReportData(
+        title=str(metrics.get("name") or config.get("name") or folder.name),
+        subtitle=_subtitle(metrics, config),
+        estimators=estimators,
+        truth=_truth_in_their_world(estimators, truth),
+        notes=_notes(metrics),
+        comparison=comparison_table(metrics["estimators"]),
+        pictures=tuple(sample_pictures(pictures)),
+        config_yaml=config_text,
+        versions=_versions(config),
+        up=_up(_find(places, "measurements.npz")),
+        alignment="after SE3 alignment",
+    )
+
+
+# --------------------------------------------------------------------------------------------
+# Files
+
+
+def _places(folder: Path, run: Path | None) -> list[Path]:
+    """Where files are sought, in order; the run's own folder last."""
+    if run is None and not (folder / RUN_MARKER).is_file():
+        above = folder.resolve().parent
+        run = above if (above / RUN_MARKER).is_file() else None
+    return [folder] if run is None or run == folder else [folder, run]
+
+
+def _find(places: list[Path], name: str) -> Path | None:
+    return next((place / name for place in places if (place / name).is_file()), None)
+
+
+def _text(path: Path | None) -> str:
+    if path is None:
+        return ""
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: cannot be read ({error}); run the experiment again") from error
+
+
+def _mapping(text: str) -> dict[str, Any]:
+    """The configuration as plain values; what cannot be read is shown as text only."""
+    try:
+        values = yaml.safe_load(text)
+    except yaml.YAMLError:
+        return {}
+    return values if isinstance(values, dict) else {}
+
+
+def _live_title(config: dict[str, Any]) -> str:
+    estimator = config.get("estimator")
+    values = estimator if isinstance(estimator, dict) else {}
+    return str(values.get("label") or values.get("kind") or "")
+
+
+def _versions(config: dict[str, Any]) -> dict[str, str | None]:
+    provenance = config.get("provenance")
+    found = provenance.get("versions") if isinstance(provenance, dict) else None
+    if not isinstance(found, dict):
+        return {}
+    return {str(name): None if value is None else str(value) for name, value in found.items()}
+
+
+def _subtitle(metrics: dict[str, Any], config: dict[str, Any]) -> str:
+    provenance = config.get("provenance")
+    dataset = provenance.get("dataset") if isinstance(provenance, dict) else None
+    parts = [
+        str(dataset["name"]) if isinstance(dataset, dict) and "name" in dataset else "",
+        f"{metrics['frames']:,} frames" if isinstance(metrics.get("frames"), int) else "",
+        f"odometry: {metrics['odometry']}" if metrics.get("odometry") else "",
+        "interrupted" if metrics.get("status") == "interrupted" else "",
+    ]
+    return ", ".join(filter(None, parts))
+
+
+def _notes(metrics: dict[str, Any]) -> tuple[str, ...]:
+    remark = [metrics["remark"]] if metrics.get("remark") else []
+    lines = [*remark, *(metrics.get("notes") or []), *(metrics.get("frame_problems") or [])]
+    shown = [str(line) for line in lines[:20]]
+    if len(lines) > len(shown):
+        shown.append(f"and {len(lines) - len(shown)} more, see metrics.json")
+    return tuple(shown)
+
+
+def _up(log: Path | None) -> FloatArray:
+    """The vertical in the first camera's frame, from the lever arm; its -y axis where unknown."""
+    if log is None:
+        return _UP
+    try:
+        return MeasurementLog.load(log).rig.bTc[2, :3]
+    except FgslamError:  # the page shows results; a log that cannot be replayed is no reason not to
+        return _UP
+
+
+# --------------------------------------------------------------------------------------------
+# One estimator
+
+
+def _estimator(
+    folder: Path, values: dict[str, Any], truth: Trajectory | None, live_ms: dict[float, float]
+) -> EstimatorReport:
+    title, kind = folder.name, str(values.get("kind") or folder.name)
+    failure = str(values.get("failure") or "")
+    if failure or not (folder / "final.tum").is_file():
+        why = failure or "it left no trajectory"
+        return EstimatorReport.failed(title, kind, why)
+    final = read_tum(folder / "final.tum")
+    covariances = _covariances(folder / "covariance.csv", final)
+    online = _online(folder / "online.tum", final)
+    errors, online_errors, nees, band = _against_truth(final, online, covariances, truth)
+    return EstimatorReport(
+        title=title,
+        kind=kind,
+        timestamps=final.timestamps,
+        final_poses=final.poses,
+        online_poses=online,
+        covariances=covariances,
+        landmarks=_landmarks(folder / "map.ply"),
+        final_error_m=errors,
+        online_error_m=online_errors,
+        nees=nees,
+        nees_band=band,
+        update_ms=_update_ms(folder / "frames.csv", final, live_ms),
+        remarks=tuple(str(line) for line in values.get("remarks") or ()),
+        **_judged(final, covariances, truth),
+    )
+
+
+def _covariances(path: Path, final: Trajectory) -> FloatArray:
+    """(n, 6, 6) by time stamp; NaN where the file has none."""
+    out = np.full((len(final), 6, 6), np.nan)
+    if path.is_file():
+        stamps, found = read_covariances(path)
+        rows, of = _same_times(final.timestamps, stamps)
+        out[rows] = found[of]
+    return out
+
+
+def _online(path: Path, final: Trajectory) -> FloatArray:
+    out = np.full((len(final), 4, 4), np.nan)
+    if path.is_file():
+        online = read_tum(path)
+        rows, of = _same_times(final.timestamps, online.timestamps)
+        out[rows] = online.poses[of]
+    return out
+
+
+def _same_times(a: FloatArray, b: FloatArray) -> tuple[IntArray, IntArray]:
+    """Rows of both that have the very same time stamp, as files of one estimator do."""
+    _, rows, of = np.intersect1d(a, b, return_indices=True)
+    return rows, of
+
+
+def _landmarks(path: Path) -> LandmarkMap:
+    """Valid landmarks only (Se et al. 6.1), as in the pictures; all while none is."""
+    if not path.is_file():
+        return LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+    points: MapPoints = read_ply(path)
+    shown = points.select(points.valid) if points.valid.any() else points
+    return LandmarkMap(shown.ids, shown.positions, shown.covariances)
+
+
+def _against_truth(
+    final: Trajectory, online: FloatArray, covariances: FloatArray, truth: Trajectory | None
+) -> tuple[FloatArray, FloatArray, FloatArray, tuple[float, float] | None]:
+    """Errors final and online (n,), NEES per degree of freedom (n,) and its band."""
+    errors, online_errors, nees = (np.full(len(final), np.nan) for _ in range(3))
+    found = None if truth is None else to_estimate_world(final, truth)
+    if found is None:
+        return errors, online_errors, nees, None
+    rows, true_poses = found
+    errors[rows] = position_errors(final.poses[rows], true_poses)
+    online_errors[rows] = position_errors(online[rows], true_poses)
+    judged = pose_nees(final.poses[rows], covariances[rows], true_poses)
+    nees[rows] = np.divide(
+        judged.values, judged.dof, out=np.full(len(rows), np.nan), where=judged.dof > 0
+    )
+    usual = np.bincount(judged.dof[judged.dof > 0])
+    band = chi_square_band(float(usual.argmax())) if len(usual) else None
+    return errors, online_errors, nees, band
+
+
+def _judged(final: Trajectory, covariances: FloatArray, truth: Trajectory | None) -> dict[str, Any]:
+    """ATE, NEES of the run and verdict, by the same functions as metrics.json's."""
+    error = evaluate_trajectory(final, truth, Alignment.SE3)
+    found = None if truth is None else to_estimate_world(final, truth)
+    if found is None:
+        return {"ate_m": None}
+    rows, true_poses = found[0][1:], found[1][1:]  # the first pose is the gauge
+    result = judge([pose_nees(final.poses[rows], covariances[rows], true_poses)])
+    if result is None:
+        return {"ate_m": error.ate_rmse_m}
+    return {
+        "ate_m": error.ate_rmse_m,
+        "nees_per_dof": result.per_dof,
+        "verdict": result.verdict,
+    }
+
+
+def _update_ms(path: Path, final: Trajectory, live_ms: dict[float, float]) -> FloatArray:
+    """Milliseconds a frame (n,) of a frames.csv, else of the live run's own clock; NaN unknown."""
+    times = live_ms
+    if path.is_file():
+        rows = csv.DictReader(io.StringIO(_text(path)))
+        times = dict(_number_pairs(path, rows, "update_ms"))
+    # Files keep 9 decimals of a second, which makes time stamps of one frame equal.
+    return np.array([times.get(round(t, 9), np.nan) for t in final.timestamps.tolist()])
+
+
+def _live_times(path: Path | None) -> dict[float, float]:
+    """What the live estimator took for each frame, by time stamp, from timing.csv."""
+    if path is None:
+        return {}
+    out: dict[float, float] = {}
+    rows = [r for r in csv.DictReader(io.StringIO(_text(path))) if r.get("stage") in _TIMED_STAGES]
+    for stamp, milliseconds in _number_pairs(path, rows, "milliseconds"):
+        out[stamp] = out.get(stamp, 0.0) + milliseconds
+    return out
+
+
+def _number_pairs(path: Path, rows: Any, name: str) -> list[tuple[float, float]]:
+    try:
+        return [(round(float(row["timestamp"]), 9), float(row[name] or "nan")) for row in rows]
+    except (KeyError, TypeError, ValueError) as error:
+        raise DatasetError(
+            f"{path}: not a table of timestamp and {name} ({error}); run the experiment again"
+        ) from error
+
+
+def _truth_in_their_world(
+    estimators: tuple[EstimatorReport, ...], truth: Trajectory | None
+) -> Trajectory | None:
+    """True poses of the frames, the first one aligned; of the estimator that has most of them."""
+    best: Trajectory | None = None
+    for estimator in estimators:
+        if truth is None or estimator.failure:
+            continue
+        final = Trajectory(estimator.timestamps, estimator.final_poses)
+        found = to_estimate_world(final, truth)
+        if found is not None and (best is None or len(found[0]) > len(best)):
+            best = Trajectory(final.timestamps[found[0]], found[1])
+    return best
