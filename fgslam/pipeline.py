@@ -41,6 +41,15 @@ class FrameReport:
     stage_ms: dict[str, float]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ReplayedFrame:
+    """What one frame of a log gave, and how long `predict`, `track` and `update` took."""
+
+    tracking: EgoMotion
+    stats: UpdateStats
+    stage_ms: dict[str, float]
+
+
 class Stopwatch:
     """Milliseconds by stage, within one frame."""
 
@@ -104,18 +113,33 @@ def replay_step(
     k: int,
 ) -> UpdateStats:
     """Gives frame ``k`` of a log to an estimator: the live loop without its matching."""
+    return replay_frame(increment, estimator, ego_motion, motion, k).stats
+
+
+def replay_frame(
+    increment: Increment,
+    estimator: Estimator,
+    ego_motion: EgoMotionSolver,
+    motion: MotionModel,
+    k: int,
+) -> ReplayedFrame:
+    """As :func:`replay_step`, with the frame's tracking and times."""
+    watch = Stopwatch()
     odometry = increment.odometry
     if odometry is None:
         odometry, _ = motion.between(k, increment.timestamp)
     prediction = estimator.predict(odometry)
+    watch.lap("predict")
     matched = increment.observations.select(~increment.observations.is_new)
     if k == 0:
         tracking = unmeasured(prediction, EgoMotionStatus.FIRST)
     else:
         tracking = _solve(estimator, ego_motion, prediction, matched)
+    watch.lap("track")
     stats = estimator.update(increment, tracking, odometry)
     motion.observe(increment.timestamp, stats.wTc, _anchored(increment, tracking, stats))
-    return stats
+    watch.lap("update")
+    return ReplayedFrame(tracking, stats, watch.ms)
 
 
 def _solve(

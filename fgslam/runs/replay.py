@@ -1,0 +1,252 @@
+"""Replays a measurement log through one estimator, as the live loop would have driven it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fgslam.backend.protocol import Estimator
+from fgslam.errors import ConfigError, FgslamError, MeasurementLogError
+from fgslam.factory import make_estimator
+from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.measurement_log import MeasurementLog
+from fgslam.motion import ConstantVelocityMotion
+from fgslam.pipeline import ReplayedFrame, replay_frame
+from fgslam.settings.backend import EstimatorSettings
+from fgslam.settings.datasets import ConstantVelocitySettings
+from fgslam.settings.frontend import EgoMotionSettings
+from fgslam.types import (
+    CameraRig,
+    Estimate,
+    FloatArray,
+    Increment,
+    LandmarkMap,
+    MeasurementType,
+    Trajectory,
+)
+
+ESTIMATOR_FAULTS = (
+    FgslamError,
+    RuntimeError,
+    ValueError,
+    ArithmeticError,
+    LookupError,
+    MemoryError,
+)
+"""What an estimator may end with: its own errors, GTSAM's (RuntimeError), NumPy's (ValueError)."""
+
+_PROC_STATUS = Path("/proc/self/status")
+
+
+class ReplayRow(NamedTuple):
+    """Numbers of one replayed frame; NaN where unknown."""
+
+    status: str
+    matched: int
+    inliers: int
+    landmarks: int
+    nis: float
+    nis_dof: int
+    update_ms: float
+    solve_ms: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Replay:
+    """What an estimator made of a log.
+
+    Attributes:
+        title: the estimator's name in tables and folders.
+        kind: which estimator it is.
+        online: each pose as it was first estimated, at its own time.
+        online_covariances: (n, 6, 6) of those.
+        estimate: trajectory, covariances and map at the end (of what was computed, on failure).
+        rows: one for each frame; ``update_ms`` is prediction and update, ``solve_ms`` the
+            least-squares pose that all estimators share.
+        final_ms: time for the final estimate after the last frame.
+        memory_before_mb: resident memory of this process before the estimator was made.
+        peak_memory_mb: its largest since the process began, the final estimate included.
+        failure: empty, or at which frame and why the estimator ended early.
+    """
+
+    title: str
+    kind: str
+    online: Trajectory
+    online_covariances: FloatArray
+    estimate: Estimate
+    rows: tuple[ReplayRow, ...]
+    final_ms: float
+    memory_before_mb: float | None
+    peak_memory_mb: float | None
+    failure: str = ""
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def column(self, name: str) -> npt.NDArray[Any]:
+        """One number of all frames."""
+        return np.array([getattr(row, name) for row in self.rows])
+
+
+def replay(
+    log: MeasurementLog,
+    settings: EstimatorSettings,
+    ego_motion: EgoMotionSettings,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Replay:
+    """Gives every frame of the log to a new estimator; its faults end the replay, not the program.
+
+    Args:
+        log: the measurements; not changed.
+        settings: of the estimator.
+        ego_motion: of the least squares that finds each frame's pose against the estimator's map.
+        progress: told frames done and of how many.
+    """
+    before_mb = memory_mb("VmRSS")
+    run = _Replaying(log, settings)
+    try:
+        estimator = make_estimator(log.rig, settings, ego_motion.dof)
+        _require_support(estimator, log)
+    except ESTIMATOR_FAULTS as error:
+        return run.result(None, before_mb, f"could not start: {reason(error)}")
+    solver = EgoMotionSolver(log.rig, ego_motion)
+    motion = replay_motion(log)
+    for k, increment in enumerate(log):
+        try:
+            frame = replay_frame(increment, estimator, solver, motion, k)
+            run.book(increment, frame)
+        except ESTIMATOR_FAULTS as error:
+            return run.result(estimator, before_mb, f"frame {increment.index}: {reason(error)}")
+        progress(k + 1, len(log))
+    return run.result(estimator, before_mb, "")
+
+
+def replay_motion(log: MeasurementLog) -> ConstantVelocityMotion:
+    """What predicted the motion in the live run where no odometry was measured.
+
+    Raises:
+        MeasurementLogError: the log's header names none.
+    """
+    values = log.motion_model.get("stand_in", log.motion_model)
+    try:
+        return ConstantVelocityMotion(ConstantVelocitySettings(**values))
+    except (TypeError, ValueError):
+        raise MeasurementLogError(
+            f"the log's motion model {log.motion_model} is not known to this fgslam; repeat the run"
+        ) from None
+
+
+def reason(error: BaseException) -> str:
+    """An error in one line; GTSAM's messages have several."""
+    text = " ".join(str(error).split())
+    if isinstance(error, FgslamError):
+        return text
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def memory_mb(name: str) -> float | None:
+    """`VmHWM` (peak) or `VmRSS` (now) of this process, mebibytes; None where /proc is missing.
+
+    Not ``ru_maxrss``: Linux hands that down to a child, which would report its parent's memory.
+    """
+    try:
+        lines = _PROC_STATUS.read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    found = [line.split() for line in lines if line.startswith(f"{name}:")]
+    return float(found[0][1]) / 1024.0 if found else None
+
+
+def _require_support(estimator: Estimator, log: MeasurementLog) -> None:
+    """Refuses an estimator that cannot use what the log holds."""
+    camera = isinstance(log.rig, CameraRig)
+    needed = {MeasurementType.STEREO if camera else MeasurementType.RANGE_BEARING}
+    if any(increment.odometry is not None for increment in log):
+        needed.add(MeasurementType.ODOMETRY)
+    lacking = sorted(kind.value for kind in needed - estimator.supports)
+    if lacking:
+        raise ConfigError(f"it cannot use {' and '.join(lacking)} measurements")
+
+
+class _Replaying:
+    """What has been computed so far."""
+
+    def __init__(self, log: MeasurementLog, settings: EstimatorSettings) -> None:
+        self._log = log
+        self._settings = settings
+        self._poses: list[FloatArray] = []
+        self._covariances: list[FloatArray] = []
+        self._rows: list[ReplayRow] = []
+
+    def book(self, increment: Increment, frame: ReplayedFrame) -> None:
+        """Keeps a frame's numbers. Raises FloatingPointError for a pose that is not finite."""
+        stats, times = frame.stats, frame.stage_ms
+        if not np.isfinite(stats.wTc).all():
+            raise FloatingPointError("the pose is not finite")
+        self._poses.append(np.array(stats.wTc))
+        self._covariances.append(np.array(stats.covariance))
+        self._rows.append(
+            ReplayRow(
+                status=frame.tracking.status.value,
+                matched=int(np.count_nonzero(~increment.observations.is_new)),
+                inliers=int(np.count_nonzero(frame.tracking.inliers)),
+                landmarks=stats.landmarks,
+                nis=float(stats.nis),
+                nis_dof=int(stats.nis_dof),
+                update_ms=times["predict"] + times["update"],
+                solve_ms=times["track"],
+            )
+        )
+
+    def result(self, estimator: Estimator | None, before_mb: float | None, failure: str) -> Replay:
+        """The answer; of an estimator that cannot give one any more, its online poses."""
+        start = time.perf_counter()
+        estimate = None
+        if estimator is not None and self._rows:
+            try:
+                estimate = self._usable(estimator.estimate())
+            except ESTIMATOR_FAULTS as error:
+                failure = failure or f"final estimate: {reason(error)}"
+        final_ms = math.nan if estimate is None else 1e3 * (time.perf_counter() - start)
+        return Replay(
+            title=self._settings.title,
+            kind=self._settings.kind,
+            online=self._online(),
+            online_covariances=np.array(self._covariances).reshape(-1, 6, 6),
+            estimate=estimate or self._online_estimate(),
+            rows=tuple(self._rows),
+            final_ms=final_ms,
+            memory_before_mb=before_mb,
+            peak_memory_mb=memory_mb("VmHWM"),
+            failure=failure,
+        )
+
+    def _online(self) -> Trajectory:
+        stamps = [increment.timestamp for increment in self._log.increments[: len(self._rows)]]
+        return Trajectory(np.array(stamps), np.array(self._poses).reshape(-1, 4, 4))
+
+    def _online_estimate(self) -> Estimate:
+        none = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+        covariances = np.array(self._covariances).reshape(-1, 6, 6)
+        remark = ("the final trajectory is the online one: no final estimate could be had",)
+        return Estimate(self._online(), covariances, none, remark if self._rows else ())
+
+    def _usable(self, estimate: Estimate) -> Estimate:
+        """The estimate, up to the last frame that went well. ValueError where it is not finite."""
+        n = len(self._rows)
+        if not np.isfinite(estimate.trajectory.poses[:n]).all():
+            raise ValueError("a pose of the final trajectory is not finite")
+        if not np.isfinite(estimate.landmarks.positions).all():
+            raise ValueError("a landmark of the final map is not finite")
+        stamps, poses = estimate.trajectory.timestamps[:n], estimate.trajectory.poses[:n]
+        covariances = estimate.covariances[:n]
+        return Estimate(
+            Trajectory(stamps, poses), covariances, estimate.landmarks, estimate.remarks
+        )
