@@ -46,10 +46,8 @@ class Browser:
     def __init__(self, driver: WebDriver) -> None:
         self.driver = driver
         self.size(*WIDE)
-        self.driver.execute_cdp_cmd("Network.enable", {})
-        self.driver.execute_cdp_cmd(
-            "Network.emulateNetworkConditions",
-            {"offline": True, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0},
+        self.driver.set_network_conditions(  # type: ignore[no-untyped-call]
+            offline=True, latency=0, throughput=0
         )
 
     def size(self, width: int, height: int, *, phone: bool = False) -> None:
@@ -69,6 +67,17 @@ class Browser:
         """Loads a report and waits until its figures are drawn."""
         self.driver.get(page.resolve().as_uri())
         self.wait("document.documentElement.dataset.drawn === 'yes'")
+
+    def reset(self) -> None:
+        """All controls of the open report as they were when it was loaded."""
+        self.driver.execute_script(
+            "for (const box of document.querySelectorAll('input'))"
+            "  box.checked = box.defaultChecked;"
+            "for (const option of document.querySelectorAll('option'))"
+            "  option.selected = option.defaultSelected;"
+            "document.querySelector('input[data-estimator]')"
+            ".dispatchEvent(new Event('change', { bubbles: true }));"
+        )
 
     def js(self, expression: str) -> Any:
         """Value of a JavaScript expression."""
