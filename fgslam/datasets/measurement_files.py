@@ -1,10 +1,16 @@
-"""What all recordings of measurements share: the motion model of their logs."""
+"""What all recordings of measurements share: landmark identities and the motion model of logs."""
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import asdict
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from fgslam.errors import ConfigError
 from fgslam.measurement_log import MeasurementLog
@@ -14,7 +20,69 @@ from fgslam.settings.datasets import (
     RecordedOdometrySettings,
     SyntheticOdometrySettings,
 )
-from fgslam.types import Increment, Sensor
+from fgslam.types import FloatArray, Increment, IntArray, Observations, Odometry, Sensor
+
+_NONE: IntArray = np.empty(0, np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredFrame:
+    """One frame of a recording whose landmarks are known by number.
+
+    Attributes:
+        index: the recording's frame number.
+        timestamp: seconds.
+        odometry: motion of the camera or sensor since the last frame of the selection, or None.
+        ids: (k,) landmark numbers, unique.
+        measurement: (k, 3).
+        covariance: (k, 3, 3).
+        pixels: (k, 3, 2) raw pixels, NaN where there are none.
+    """
+
+    index: int
+    timestamp: float
+    odometry: Odometry | None
+    ids: IntArray
+    measurement: FloatArray
+    covariance: FloatArray
+    pixels: FloatArray
+
+
+def make_increments(frames: Iterable[MeasuredFrame]) -> list[Increment]:
+    """Increments in which a landmark is new when first seen, never missed and never pruned.
+
+    Matched landmarks come first, then the new ones, each by ascending number.
+    """
+    known: set[int] = set()
+    out = []
+    for frame in frames:
+        is_new = np.array([i not in known for i in frame.ids.tolist()], np.bool_)
+        order = np.lexsort((frame.ids, is_new))
+        everything = Observations(
+            frame.ids, frame.measurement, frame.covariance, frame.pixels, is_new
+        )
+        known.update(frame.ids.tolist())
+        out.append(
+            Increment(
+                index=frame.index,
+                timestamp=frame.timestamp,
+                odometry=frame.odometry,
+                observations=everything.select(order),
+                rejected=np.zeros(len(order), np.bool_),
+                missed_ids=_NONE,
+                pruned_ids=_NONE,
+            )
+        )
+    return out
+
+
+def files_identity(files: Iterable[Path], settings: Any) -> str:
+    """SHA-256 of files by their content, and of what the settings make of them."""
+    values = {k: v for k, v in asdict(settings).items() if k not in ("path", "file")}
+    digest = hashlib.sha256(json.dumps(values, sort_keys=True).encode())
+    for path in files:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def make_log(

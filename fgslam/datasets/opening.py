@@ -10,7 +10,9 @@ from fgslam.datasets.kitti import open_kitti
 from fgslam.datasets.light_field import open_light_field
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.simulated_measurements import open_simulated_measurements
-from fgslam.errors import DatasetError
+from fgslam.datasets.stereo_tracks import open_stereo_tracks
+from fgslam.datasets.utias_range_bearing import open_lost_in_the_woods
+from fgslam.datasets.utias_stereo import open_starry_night
 from fgslam.recordings import MeasurementRecording
 from fgslam.settings.datasets import (
     EurocSettings,
@@ -23,6 +25,9 @@ from fgslam.settings.datasets import (
 from fgslam.settings.measurements import (
     MeasurementDatasetSettings,
     SimulatedMeasurementsSettings,
+    StereoTracksSettings,
+    UtiasRangeBearingSettings,
+    UtiasStereoSettings,
 )
 
 FileRecordingSettings: TypeAlias = (
@@ -73,5 +78,9 @@ def open_measurements(
     match settings:
         case SimulatedMeasurementsSettings():
             return open_simulated_measurements(settings, seed, odometry)
-        case _:
-            raise DatasetError(f"dataset.kind {settings.kind} is not built yet")
+        case StereoTracksSettings():
+            return open_stereo_tracks(settings, odometry)
+        case UtiasStereoSettings():
+            return open_starry_night(settings, odometry)
+        case UtiasRangeBearingSettings():
+            return open_lost_in_the_woods(settings, odometry)

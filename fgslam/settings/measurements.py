@@ -11,6 +11,8 @@ from fgslam.settings.base import STRICT
 from fgslam.settings.datasets import RecordingSettings
 from fgslam.settings.lab import LabRigSettings, WheelOdometrySettings
 
+Correlation: TypeAlias = Annotated[float, Field(gt=-1.0, lt=1.0)]
+
 
 @dataclass(frozen=True, config=STRICT)
 class MeasurementSelection:
@@ -44,9 +46,10 @@ class StereoTracksSettings(MeasurementSelection):
         float,
         Field(
             gt=0.0,
-            description="noise of one image coordinate, pixels; see docs/datasets/stereo_tracks.md",
+            description="noise of one image coordinate, pixels (measured: docs/datasets/"
+            "stereo_tracks.md)",
         ),
-    ] = 0.5
+    ] = 0.25
     frame_period_s: Annotated[
         float,
         Field(gt=0.0, description="time between frames, which the files lack; KITTI's is 0.1 s"),
@@ -62,6 +65,13 @@ class UtiasStereoSettings(RecordingSettings):
     pixel_sigma_scale: Annotated[
         float, Field(gt=0.0, description="factor on the file's standard deviations of the pixels")
     ] = 1.0
+    left_right_correlation: Annotated[
+        tuple[Correlation, Correlation],
+        Field(
+            description="correlation of the noise of both images, in columns and in rows (measured "
+            "against the truth); [0, 0]: independent, as the file's variances alone would have it"
+        ),
+    ] = (0.86, 0.99)
     rate_sigma_scale: Annotated[
         float, Field(gt=0.0, description="factor on the file's standard deviations of the rates")
     ] = 1.0
@@ -79,6 +89,10 @@ class UtiasRangeBearingSettings(RecordingSettings):
     rate_sigma_scale: Annotated[
         float, Field(gt=0.0, description="factor on the file's standard deviations of the rates")
     ] = 1.0
+    lateral_sigma_mps: Annotated[
+        float,
+        Field(gt=0.0, description="sideways speed, which the wheels do not measure, m/s"),
+    ] = 0.03
 
 
 # --------------------------------------------------------------------------------------------

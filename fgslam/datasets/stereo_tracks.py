@@ -1,0 +1,192 @@
+"""GTSAM's stereo feature tracks of KITTI drives (docs/datasets/stereo_tracks.md).
+
+The files lie inside the installed gtsam wheel; they are read as text, GTSAM is not loaded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.datasets.measurement_files import (
+    MeasuredFrame,
+    files_identity,
+    make_increments,
+    make_log,
+)
+from fgslam.datasets.selection import select_of
+from fgslam.datasets.tables import Table, read_table
+from fgslam.errors import CalibrationError, DatasetError
+from fgslam.geometry import (
+    BODY_FORWARD_LEFT_UP_FROM_CAMERA,
+    reorthonormalise,
+    right_from_left_camera,
+)
+from fgslam.recordings import MeasurementRecording
+from fgslam.settings.datasets import OdometrySettings
+from fgslam.settings.measurements import StereoTracksSettings
+from fgslam.stereo_model import measurement_map
+from fgslam.types import CameraRig, FloatArray, IntArray, Trajectory
+
+_INSIDE = {"00s": "00s", "00": "00", "large": "_large"}
+_PREFIX = "VO_stereo_factors"
+_COLUMNS = ("pose", "landmark", "uL", "uR", "v", "X", "Y", "Z")
+_CALIBRATION = ("fx", "fy", "skew", "cx", "cy", "baseline")
+_NOT_RIGID = 1e-3  # the files give six digits
+
+
+@dataclass(frozen=True, slots=True)
+class _Files:
+    tracks: Path
+    calibration: Path
+    poses: Path
+
+
+def open_stereo_tracks(
+    settings: StereoTracksSettings, odometry: OdometrySettings
+) -> MeasurementRecording:
+    """Opens one of the files.
+
+    Raises:
+        DatasetError: it is missing, or malformed.
+        CalibrationError: its calibration is.
+    """
+    files = _find(settings.file)
+    tracks = read_table(files.tracks, _COLUMNS)
+    rows, notes = _usable(tracks)
+    rig = _read_rig(files.calibration, tracks.values[rows])
+    numbers = np.unique(tracks.values[rows, 0]).astype(np.int64)
+    numbers = numbers[select_of(len(numbers), settings, str(files.tracks))]
+    truth = _read_poses(files.poses, rig, numbers, settings.frame_period_s)
+    if truth is not None:
+        notes += ("the reference poses are estimates from the same images, not measured truth",)
+    increments = make_increments(_frames(tracks.values[rows], numbers, settings))
+    listed = [path for path in (files.tracks, files.calibration, files.poses) if path.exists()]
+    return MeasurementRecording(
+        name=f"stereo tracks {files.tracks.stem.removeprefix(_PREFIX).removeprefix('_')}",
+        identity=files_identity(listed, settings),
+        log=make_log(rig, increments, odometry),
+        ground_truth=truth,
+        landmark_truth=None,
+        notes=notes,
+    )
+
+
+def _find(file: str) -> _Files:
+    inside = file in _INSIDE
+    tracks = _inside_gtsam() / f"{_PREFIX}{_INSIDE[file]}.txt" if inside else Path(file)
+    if not tracks.is_file():
+        raise DatasetError(
+            f"{tracks}: no such file; dataset.file is {', '.join(_INSIDE)} or the path of a file "
+            f"{_PREFIX}*.txt"
+        )
+    suffix = tracks.stem.removeprefix(_PREFIX)
+    calibration = tracks.with_name(f"VO_calibration{suffix}.txt")
+    if not calibration.is_file():
+        calibration = tracks.with_name("VO_calibration.txt")  # of the `_large` one
+    return _Files(tracks, calibration, tracks.with_name(f"VO_camera_poses{suffix}.txt"))
+
+
+def _inside_gtsam() -> Path:
+    """The wheel's folder of example data, found without loading the library."""
+    found = find_spec("gtsam")
+    if found is None or found.origin is None:
+        raise DatasetError(
+            "gtsam is not installed, and the stereo tracks lie inside it; install it or give "
+            "dataset.file a path"
+        )
+    return Path(found.origin).parent / "Data"
+
+
+def _usable(tracks: Table) -> tuple[IntArray, tuple[str, ...]]:
+    """Rows with positive disparity, by frame and landmark; and what was left out."""
+    values = tracks.values
+    bad = np.flatnonzero((values[:, :2] != np.rint(values[:, :2])).any(axis=1) | (values[:, 0] < 0))
+    if len(bad):
+        raise DatasetError(
+            f"{tracks.path}, line {tracks.lines[bad[0]]}: pose and landmark must be whole numbers "
+            f"from 0; expected columns {' '.join(_COLUMNS)}"
+        )
+    order = np.lexsort((values[:, 1], values[:, 0]))
+    twice = np.flatnonzero((np.diff(values[order, :2], axis=0) == 0.0).all(axis=1))
+    if len(twice):
+        line = tracks.lines[order[twice[0] + 1]]
+        raise DatasetError(
+            f"{tracks.path}, line {line}: the landmark is measured twice in one frame; remove one"
+        )
+    positive = values[order, 2] > values[order, 3]
+    left_out = int((~positive).sum())
+    notes = (f"{left_out} observations without disparity left out",) if left_out else ()
+    return order[positive], notes
+
+
+def _read_rig(path: Path, values: FloatArray) -> CameraRig:
+    """The calibration; the image, whose size the files lack, is what holds all measurements."""
+    table = read_table(path, _CALIBRATION, error=CalibrationError)
+    if len(table) != 1:
+        raise CalibrationError(
+            f"{path}: {len(table)} lines, expected one of {' '.join(_CALIBRATION)}; restore it"
+        )
+    fx, fy, skew, cx, cy, baseline = table.values[0].tolist()
+    if skew != 0.0 or min(fx, fy, baseline) <= 0.0:
+        raise CalibrationError(
+            f"{path}: fx, fy and baseline must be positive and skew 0; correct the line"
+        )
+    width, height = (int(np.ceil(values[:, k].max())) + 1 for k in ([2, 3], 4))
+    bTc = BODY_FORWARD_LEFT_UP_FROM_CAMERA
+    return CameraRig(width, height, fx, fy, cx, cy, baseline, None, bTc)
+
+
+def _read_poses(
+    path: Path, rig: CameraRig, numbers: IntArray, period_s: float
+) -> Trajectory | None:
+    """Reference poses of the right camera at the frames, in the left one's first; None if absent.
+
+    Lines hold the frame and the left camera's ``wTl``, row by row.
+    """
+    if not path.is_file():
+        return None
+    columns = ("pose", *(f"T{i}{j}" for i in range(4) for j in range(4)))
+    table = read_table(path, columns)
+    at = {int(number): k for k, number in enumerate(table.values[:, 0])}
+    chosen = [at[n] for n in numbers.tolist() if n in at]
+    left = table.values[chosen, 1:].reshape(-1, 4, 4)
+    for k, wTl in zip(chosen, left, strict=True):
+        off = np.abs(wTl[:3, :3] @ wTl[:3, :3].T - np.eye(3)).max()
+        if off > _NOT_RIGID or not np.array_equal(wTl[3], [0.0, 0.0, 0.0, 1.0]):
+            raise DatasetError(f"{path}, line {table.lines[k]}: not a rigid pose; correct the line")
+    rigid = np.array([reorthonormalise(wTl) for wTl in left]).reshape(-1, 4, 4)
+    stamps = table.values[chosen, 0] * period_s
+    return Trajectory(stamps, right_from_left_camera(rigid, rig.baseline))
+
+
+def _frames(
+    values: FloatArray, numbers: IntArray, settings: StereoTracksSettings
+) -> Iterator[MeasuredFrame]:
+    """The chosen frames; the left camera's (uL, v) is measured from the right one, our reference.
+
+    The files' one row stands for both images', so it is not averaged: independent noise on
+    uR, uL and v gives var(d) twice the variance of one, and cov(column, d) = -sigma^2.
+    """
+    fuse = measurement_map("paper", 2, 1.0)[:, :3]  # of columns and row: uR, v, uL
+    covariance = settings.pixel_sigma**2 * (fuse @ fuse.T)
+    start = np.searchsorted(values[:, 0], numbers)
+    end = np.searchsorted(values[:, 0], numbers, side="right")
+    for number, a, b in zip(numbers.tolist(), start, end, strict=True):
+        left, right, row = values[a:b, 2:5].T
+        pixels = np.full((b - a, 3, 2), np.nan)
+        pixels[:, 0] = np.column_stack([right, row])
+        pixels[:, 1] = np.column_stack([left, row])
+        yield MeasuredFrame(
+            index=number,
+            timestamp=number * settings.frame_period_s,
+            odometry=None,
+            ids=values[a:b, 1].astype(np.int64),
+            measurement=np.column_stack([right, row, left - right]),
+            covariance=np.tile(covariance, (b - a, 1, 1)),
+            pixels=pixels,
+        )
