@@ -2,13 +2,32 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
 
 from fgslam.errors import DatasetError
 from fgslam.types import FloatArray
+
+_UNREADABLE = (
+    OSError,
+    ValueError,
+    TypeError,
+    LookupError,
+    EOFError,
+    ArithmeticError,
+    MemoryError,
+    NotImplementedError,
+    MatReadError,
+    struct.error,
+    zlib.error,
+)
+"""What SciPy raises on truncated, damaged and foreign files."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,8 +82,6 @@ def read_matlab(path: Path) -> MatlabFile:
     Raises:
         DatasetError: it is missing, truncated, or no MATLAB file of version 5.
     """
-    from scipy.io import loadmat  # here, so that `fgslam --help` need not load it
-
     if not path.is_file():
         raise DatasetError(f"{path}: no such file; set dataset.path to the .mat file itself")
     try:
