@@ -320,12 +320,22 @@ def to_estimate_world(
         when no pose matches.
     """
     rows, true_rows = associate(estimate.timestamps, truth.timestamps, tolerance_s)
+    eTt = estimate_from_truth(estimate, truth, tolerance_s=tolerance_s)
+    return None if eTt is None else (rows, eTt @ truth.poses[true_rows])
+
+
+def estimate_from_truth(
+    estimate: Trajectory, truth: Trajectory, *, tolerance_s: float = 0.01
+) -> FloatArray | None:
+    """(4, 4) from the truth's world to the estimate's, with the first matched pose aligned.
+
+    None when no pose matches.
+    """
+    rows, true_rows = associate(estimate.timestamps, truth.timestamps, tolerance_s)
     if len(rows) == 0:
         return None
     found = align(truth.poses[true_rows], estimate.poses[rows], Alignment.FIRST_POSE)
-    if found is None:
-        return None
-    return rows, pose(found.rotation, found.translation) @ truth.poses[true_rows]
+    return None if found is None else pose(found.rotation, found.translation)
 
 
 def _rmse(values: FloatArray) -> float:
