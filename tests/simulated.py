@@ -19,6 +19,7 @@ from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
 from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import EgoMotionSettings
+from fgslam.simulation.identities import IdentityBook
 from fgslam.types import (
     BoolArray,
     CameraRig,
@@ -87,7 +88,7 @@ def simulate(drive: Drive, rng: np.random.Generator) -> Simulation:
     points = points_in_views(drive, poses, rng)
     book = _Identities(drive, points)
     increments = [book.increment(k, wTc, step, rng) for k, wTc in enumerate(poses)]
-    return Simulation(drive, np.array(poses), points[book.point_of_id], increments)
+    return Simulation(drive, np.array(poses), points[book.book.point_of_id], increments)
 
 
 def points_in_views(drive: Drive, poses: list[FloatArray], rng: np.random.Generator) -> FloatArray:
@@ -121,14 +122,12 @@ def visible(rig: CameraRig, points: FloatArray) -> BoolArray:
 
 
 class _Identities:
-    """Who is known, missed and forgotten, frame after frame."""
+    """Measures the points and keeps the book of their identities, frame after frame."""
 
     def __init__(self, drive: Drive, points: FloatArray) -> None:
         self._drive = drive
         self._points = points
-        self._id = np.full(len(points), -1)
-        self._missed = np.zeros(len(points), np.int64)
-        self.point_of_id: IntArray = np.empty(0, np.int64)
+        self.book = IdentityBook(len(points), drive.prune_after)
 
     def increment(
         self, k: int, wTc: FloatArray, step: FloatArray, rng: np.random.Generator
@@ -137,41 +136,22 @@ class _Identities:
         local = g.transform_to_camera(wTc, self._points)
         in_view = visible(drive.rig, local)
         seen = in_view & (rng.uniform(size=len(in_view)) >= drive.miss_rate)
-        known = self._id >= 0
-        matched = np.flatnonzero(seen & known)
-        matched = matched[np.argsort(self._id[matched])]
-        new = np.flatnonzero(seen & ~known)
-        missed_ids = np.sort(self._id[in_view & ~seen & known])
-        self._book(matched, new, in_view & ~seen & known)
+        sightings = self.book.take(seen, in_view)
         local[~in_view] = 1.0
         noise = drive.noise * np.array(drive.sigma_px) * rng.standard_normal(local.shape)
         measured = g.project(drive.rig, local) + noise
-        both = np.concatenate([matched, new])
-        is_new = np.arange(len(both)) >= len(matched)
+        both = np.concatenate([sightings.matched, sightings.new])
+        ids = np.concatenate([sightings.matched_ids, sightings.new_ids])
+        is_new = np.arange(len(both)) >= len(sightings.matched)
         return Increment(
             index=2 * k,
             timestamp=drive.period_s * k,
             odometry=None if k == 0 else noisy_odometry(drive, step, rng),
-            observations=observations(
-                self._id[both], measured[both], np.array(drive.sigma_px), is_new
-            ),
+            observations=observations(ids, measured[both], np.array(drive.sigma_px), is_new),
             rejected=np.zeros(len(both), np.bool_),
-            missed_ids=missed_ids,
-            pruned_ids=self._prune(),
+            missed_ids=sightings.missed_ids,
+            pruned_ids=sightings.pruned_ids,
         )
-
-    def _book(self, matched: IntArray, new: IntArray, missed: BoolArray) -> None:
-        self._missed[matched] = 0
-        self._missed[missed] += 1
-        self._id[new] = len(self.point_of_id) + np.arange(len(new))
-        self._missed[new] = 0
-        self.point_of_id = np.concatenate([self.point_of_id, new])
-
-    def _prune(self) -> IntArray:
-        gone = (self._id >= 0) & (self._missed >= self._drive.prune_after)
-        pruned = np.sort(self._id[gone])
-        self._id[gone] = -1
-        return pruned
 
 
 def noisy_odometry(drive: Drive, step: FloatArray, rng: np.random.Generator) -> Odometry:
