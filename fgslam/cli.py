@@ -84,6 +84,10 @@ def export(
         Path | None, typer.Option("--map", help="landmarks as .ply, .pcd or .off (Geomview)")
     ] = None,
     trajectory: Annotated[Path | None, typer.Option(help="camera poses as .tum or .kitti")] = None,
+    graph: Annotated[
+        Path | None,
+        typer.Option(help="measurements, poses and landmarks as .g2o, for other solvers"),
+    ] = None,
     estimator: Annotated[
         str | None, typer.Option(help="which estimator's; default the only one there is")
     ] = None,
@@ -91,10 +95,10 @@ def export(
         bool, typer.Option("--valid-only", help="landmarks seen in at least three frames")
     ] = False,
 ) -> None:
-    """Hand a run's map and trajectory to other tools."""
+    """Hand a run's map, trajectory and measurements to other tools."""
     from fgslam.runs.exporting import export_run
 
-    for line in export_run(run_folder, map_file, trajectory, estimator, valid_only):
+    for line in export_run(run_folder, map_file, trajectory, estimator, valid_only, graph):
         typer.echo(line)
 
 

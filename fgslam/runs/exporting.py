@@ -9,6 +9,7 @@ from fgslam.export.atomic import is_run_folder
 from fgslam.export.metrics import read_metrics
 from fgslam.export.point_cloud import read_ply, write_map
 from fgslam.export.trajectories import read_tum, write_trajectory
+from fgslam.runs.graph_export import export_graph
 
 
 def export_run(
@@ -17,16 +18,20 @@ def export_run(
     trajectory_file: Path | None,
     estimator: str | None,
     valid_only: bool,
+    graph_file: Path | None = None,
 ) -> list[str]:
     """Writes what was asked for; returns a line about each file.
 
     Raises:
         FgslamError: nothing asked for, no run there, or an ending that is not known.
     """
-    if map_file is None and trajectory_file is None:
-        raise ConfigError("nothing to export; give --map FILE.ply or --trajectory FILE.tum")
+    targets = (map_file, trajectory_file, graph_file)
+    if targets == (None, None, None):
+        raise ConfigError(
+            "nothing to export; give --map FILE.ply, --trajectory FILE.tum or --graph FILE.g2o"
+        )
     folder = run / _estimator_of(run, estimator)
-    _require_elsewhere(run, (map_file, trajectory_file))
+    _require_elsewhere(run, targets)
     remark = read_metrics(run / "metrics.json").get("remark") or ""
     lines = [f"note: {remark}"] if remark else []
     if map_file is not None:
@@ -39,6 +44,8 @@ def export_run(
         trajectory = read_tum(folder / "final.tum")
         write_trajectory(trajectory_file, trajectory, remark)
         lines.append(f"{trajectory_file}: {len(trajectory)} poses")
+    if graph_file is not None:
+        lines.append(export_graph(graph_file, run / "measurements.npz", folder, remark))
     return lines
 
 

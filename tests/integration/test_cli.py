@@ -224,7 +224,7 @@ def test_mistakes_of_export(
         return mistake(capfd, monkeypatch, "export", *arguments)
 
     run = finished.folder
-    assert "nothing to export; give --map FILE.ply or --trajectory FILE.tum" in told(run)
+    assert "nothing to export; give --map FILE.ply, --trajectory FILE.tum or --graph" in told(run)
     assert "use .tum or .kitti" in told(run, "--trajectory", tmp_path / "t.csv")
     line = told(run, "--map", tmp_path / "map.xyz")
     assert all(suffix in line for suffix in (".ply", ".pcd", ".off", "xyz"))
