@@ -32,6 +32,7 @@ from fgslam.types import (
     Observations,
     Odometry,
     Prediction,
+    Sensor,
     UpdateStats,
 )
 
@@ -156,8 +157,14 @@ class _Identities:
 
 def noisy_odometry(drive: Drive, step: FloatArray, rng: np.random.Generator) -> Odometry:
     """The step with noise of the stated covariance, in the tangent space at its end."""
-    sigma = np.array(drive.odometry_sigma)
-    drawn = g.se3_exp(drive.noise * sigma * rng.standard_normal(6))
+    return noisy_odometry_of(step, np.array(drive.odometry_sigma), drive.noise, rng)
+
+
+def noisy_odometry_of(
+    step: FloatArray, sigma: FloatArray, noise: float, rng: np.random.Generator
+) -> Odometry:
+    """A step with noise of standard deviations ``sigma`` (6,), drawn ``noise`` times as large."""
+    drawn = g.se3_exp(noise * sigma * rng.standard_normal(6))
     return Odometry(step @ drawn, np.diag(sigma**2))
 
 
@@ -181,7 +188,7 @@ def play(
     estimator: Estimator,
     increments: list[Increment],
     settings: EgoMotionSettings | None = None,
-    rig: CameraRig = RIG,
+    rig: Sensor = RIG,
 ) -> list[UpdateStats]:
     """Gives increments to an estimator as the replay of a log does."""
     solver = EgoMotionSolver(rig, settings or EgoMotionSettings())
