@@ -78,6 +78,65 @@ def run(
 
 
 @app.command()
+def compare(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="run folders, as fgslam run writes them")
+    ],
+    estimators: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A,B,C",
+            help="which ones: kinds, or labels of the run's configuration; default those that it "
+            "compares, else every kind",
+        ),
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="estimators.NAME.KEY=VALUE",
+            help="override one key of one estimator; may be repeated",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="folder of the results; default RUN/compare")
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="replace an earlier comparison")
+    ] = False,
+    jobs: Annotated[
+        int, typer.Option(min=1, help="estimators at a time; more than 1 disturbs the times")
+    ] = 1,
+) -> None:
+    """Replay runs' measurements through estimators and set them side by side.
+
+    Every estimator gets exactly the measurements that the run has logged. An estimator that fails
+    says where and why; the others go on.
+    """
+    from fgslam.comparison_console import show_comparisons
+    from fgslam.console import progress_bar
+    from fgslam.runs.compare import compare_runs
+
+    with _stop_flag() as stopped, progress_bar() as progress:
+        compared = compare_runs(
+            runs,
+            None if estimators is None else estimators.split(","),
+            overrides or (),
+            out,
+            "overwrite" if overwrite else "refuse",
+            jobs,
+            progress,
+            stopped,
+        )
+        interrupted = stopped()
+    show_comparisons(compared)
+    if interrupted:
+        raise typer.Exit(EXIT_INTERRUPTED)
+    if any(len(one.failures) == len(one.metrics) for one in compared):
+        raise typer.Exit(EXIT_FAULT)
+
+
+@app.command()
 def export(
     run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="a run folder")],
     map_file: Annotated[
@@ -100,6 +159,19 @@ def export(
 
     for line in export_run(run_folder, map_file, trajectory, estimator, valid_only, graph):
         typer.echo(line)
+
+
+@app.command()
+def view(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="a run folder")],
+    save: Annotated[
+        Path | None, typer.Option(help="write an .rrd file for the viewer instead of a window")
+    ] = None,
+) -> None:
+    """Open a run in the rerun viewer, where that extra is installed."""
+    from fgslam.runs.viewing import view_run
+
+    typer.echo(view_run(run_folder, save))
 
 
 @app.command()

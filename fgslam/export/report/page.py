@@ -15,15 +15,13 @@ from importlib import resources
 from pathlib import Path
 
 from fgslam.export.atomic import write_text
+from fgslam.export.report import palette
 from fgslam.export.report.curves import error_over_time, nees_over_time, time_per_frame
 from fgslam.export.report.data import Column, Comparison, EstimatorReport, ReportData
 from fgslam.export.report.paths import drive_from_above, map_to_turn
 from fgslam.export.report.pictures import Embedded, embed
 from fgslam.export.report.traces import Figure, Switch
 from fgslam.export.report.words import best, headline
-
-COLOURS = 10
-"""How many estimators have a colour of their own (``--e0`` to ``--e9`` in the style sheet)."""
 
 NOT_KNOWN = "not known"
 
@@ -80,13 +78,14 @@ def _opening(data: ReportData, scripts: list[str]) -> Iterator[str]:
     yield f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
     yield '<meta name="viewport" content="width=device-width, initial-scale=1">'
     yield '<link rel="icon" href="data:,">'
-    yield f"<title>{escape(data.title)}</title>\n<style>\n{_asset('page.css')}</style>"
+    style = palette.style_sheet() + _asset("page.css")
+    yield f"<title>{escape(data.title)}</title>\n<style>\n{style}</style>"
     yield "</head>\n<body>"
 
 
 def _closing(data: ReportData, figures: list[Figure], scripts: list[str]) -> Iterator[str]:
     values = {
-        "colours": COLOURS,
+        "colours": palette.COUNT,
         "figures": {
             figure.key: {"traces": figure.traces, "layout": figure.layout}
             for figure in figures
@@ -268,7 +267,7 @@ def _selector(figure: str, data: ReportData) -> str:
 
 
 def _swatch(i: int) -> str:
-    colour = f"background: var(--e{i % COLOURS})"
+    colour = f"background: var(--e{i % palette.COUNT})"
     return f'<span class="swatch" style="{colour}" aria-hidden="true"></span>'
 
 
