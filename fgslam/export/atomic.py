@@ -20,18 +20,26 @@ ExistingFolder: TypeAlias = Literal["refuse", "overwrite", "resume"]
 RUN_MARKER = "config.yaml"
 """The file that every run folder holds; it is written first."""
 
-_ESTIMATOR_FILES = ("online.tum", "final.tum", "covariance.csv", "map.ply")
-# What a run writes, and so all that overwriting one may delete.
-_RUN_FILES = (
+_ESTIMATOR_FILES = ("online.tum", "final.tum", "covariance.csv", "map.ply", "frames.csv")
+_RESULT_FILES = (
     RUN_MARKER,
     "measurements.npz",
     "checkpoint.npz",
     "ground_truth.tum",
+    "ground_truth_landmarks.csv",
     "metrics.json",
     "timing.csv",
+    "comparison.csv",
+    "trials.csv",
+    "trials_timing.csv",
     "report.html",
     "pictures/*.png",
     *(f"*/{name}" for name in _ESTIMATOR_FILES),
+)
+# What a run writes, and so all that overwriting one may delete; a comparison of it goes along.
+_RUN_FILES = (
+    *_RESULT_FILES,
+    *(f"compare/{name}" for name in _RESULT_FILES),
     "**/.*.partial*",
 )
 

@@ -213,7 +213,8 @@ class _Replaying:
             try:
                 estimate = self._usable(estimator.estimate())
             except ESTIMATOR_FAULTS as error:
-                failure = failure or f"final estimate: {reason(error)}"
+                why = f"no final estimate: {reason(error)}"
+                failure = f"{failure}; {why}" if failure else why
         final_ms = math.nan if estimate is None else 1e3 * (time.perf_counter() - start)
         return Replay(
             title=self._settings.title,

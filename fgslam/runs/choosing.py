@@ -1,0 +1,93 @@
+"""Which estimators a comparison is about: names and overrides to settings."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from fgslam.config import ExperimentConfig, make_config
+from fgslam.errors import ConfigError
+from fgslam.settings.backend import EstimatorSettings
+
+_PREFIX = "estimators."
+
+
+def all_kinds() -> dict[str, EstimatorSettings]:
+    """Every kind of estimator with its defaults, by kind."""
+    union = typing.get_args(EstimatorSettings)[0]
+    return {settings.kind: settings() for settings in typing.get_args(union)}
+
+
+def estimators_of(config: ExperimentConfig) -> tuple[EstimatorSettings, ...]:
+    """The live estimator, then those of `compare`; the same one twice counts once."""
+    return tuple(dict.fromkeys((config.estimator, *config.compare)))
+
+
+def compared_with(config: ExperimentConfig) -> tuple[EstimatorSettings, ...]:
+    """Those of `compare` besides the live one."""
+    return estimators_of(config)[1:]
+
+
+def choose(
+    config: ExperimentConfig, names: Sequence[str] | None, overrides: Iterable[str] = ()
+) -> tuple[EstimatorSettings, ...]:
+    """The estimators of a comparison.
+
+    Args:
+        config: of the run whose log is replayed.
+        names: titles of the configuration's estimators, or kinds; None: those of the configuration
+            where it compares any, else every kind.
+        overrides: `estimators.TITLE.key=value`.
+
+    Raises:
+        ConfigError: an unknown name, or an override that is no key of that estimator.
+    """
+    known = all_kinds() | {settings.title: settings for settings in estimators_of(config)}
+    if names is None:
+        chosen = [s.title for s in estimators_of(config)] if config.compare else list(known)
+    else:
+        chosen = list(dict.fromkeys(name.strip() for name in names if name.strip()))
+    unknown = [name for name in chosen if name not in known]
+    if unknown or not chosen:
+        what = f"no estimator {unknown[0]!r}" if unknown else "no estimator named"
+        raise ConfigError(f"{what}; give --estimators with some of {', '.join(known)}")
+    return _overridden({name: known[name] for name in chosen}, config, tuple(overrides))
+
+
+def _overridden(
+    chosen: dict[str, EstimatorSettings], config: ExperimentConfig, overrides: tuple[str, ...]
+) -> tuple[EstimatorSettings, ...]:
+    """Each estimator's settings with its own overrides, checked as those of a configuration."""
+    for override in overrides:
+        title = _addressed(override)
+        if title not in chosen:
+            raise ConfigError(
+                f"--set {override}: not of the form estimators.NAME.key=value with NAME one of "
+                f"{', '.join(chosen)}"
+            )
+    return tuple(
+        _with(settings, config, [o for o in overrides if _addressed(o) == title])
+        for title, settings in chosen.items()
+    )
+
+
+def _addressed(override: str) -> str:
+    dotted = override.partition("=")[0].strip()
+    parts = dotted.removeprefix(_PREFIX).split(".")
+    return parts[0] if dotted.startswith(_PREFIX) and len(parts) > 1 else ""
+
+
+def _with(
+    settings: EstimatorSettings, config: ExperimentConfig, overrides: list[str]
+) -> EstimatorSettings:
+    if not overrides:
+        return settings
+    title = settings.title
+    values: dict[str, Any] = config.model_copy(update={"estimator": settings}).as_values()
+    values["compare"] = []
+    moved = [f"estimator{o.strip()[len(_PREFIX) + len(title) :]}" for o in overrides]
+    found = make_config(values, moved, f"--set {overrides[0]}").estimator
+    if found.kind != settings.kind:
+        raise ConfigError(f"--set {overrides[0]}: the kind is what names it; use --estimators")
+    return found

@@ -1,0 +1,151 @@
+"""`fgslam compare`: run folders in, tables and pages out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import yaml
+
+from fgslam.config import ExperimentConfig
+from fgslam.errors import ConfigError, OutputError
+from fgslam.export.atomic import (
+    RUN_MARKER,
+    ExistingFolder,
+    create_run_folder,
+    is_run_folder,
+    write_text,
+)
+from fgslam.export.comparison_table import write_comparison_csv
+from fgslam.export.metrics import EstimatorMetrics, JsonValue, read_metrics, write_metrics
+from fgslam.runs.choosing import choose
+from fgslam.runs.comparison import Compared, Progress, ReplayTask, load_run, remark_of, replay_apart
+from fgslam.runs.outputs import versions
+from fgslam.runs.report import report_from_folder
+from fgslam.settings.backend import EstimatorSettings
+
+COMPARISON_FILE = "comparison.csv"
+DEFAULT_FOLDER = "compare"
+METRICS_FILE = "metrics.json"
+
+
+def compare_runs(
+    runs: Sequence[Path],
+    names: Sequence[str] | None = None,
+    overrides: Sequence[str] = (),
+    out: Path | None = None,
+    existing: ExistingFolder = "refuse",
+    jobs: int = 1,
+    progress: Progress = lambda what, done, total: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> list[Compared]:
+    """Replays the logs of runs through estimators.
+
+    Args:
+        runs: run folders.
+        names: which estimators, as :func:`fgslam.runs.choosing.choose`.
+        overrides: of their settings, as there.
+        out: folder of the results; of several runs each gets one below it, by its folder's name.
+            None: `compare` inside each run.
+        existing: what to do where results are already.
+        jobs: processes at a time; more than one disturbs the times.
+        progress: told of each estimator that is done.
+        stopped: True ends the replays; what was finished is kept.
+
+    Raises:
+        FgslamError: a run cannot be read, a name is unknown, or the results cannot be written.
+    """
+    folders = _folders(runs, out)
+    chosen = [choose(load_run(run)[0], names, overrides) for run in runs]
+    compared = []
+    for run, folder in zip(runs, folders, strict=True):
+        _require_apart(run, folder, existing)
+    for run, folder, estimators in zip(runs, folders, chosen, strict=True):
+        create_run_folder(folder, existing)
+        compared.append(compare_run(run, estimators, folder, jobs, progress, stopped))
+    if out is not None and len(runs) > 1:
+        write_comparison_csv(out / COMPARISON_FILE, [(c.name, c.metrics) for c in compared])
+    return compared
+
+
+def compare_run(
+    run: Path,
+    estimators: Sequence[EstimatorSettings],
+    out: Path,
+    jobs: int = 1,
+    progress: Progress = lambda what, done, total: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Compared:
+    """One run's log through the estimators, into the existing folder ``out``."""
+    config, log = load_run(run)
+    write_text(out / RUN_MARKER, _config_text(config, run, estimators))
+    ego_motion, remark = config.frontend.ego_motion, remark_of(config)
+    tasks = [ReplayTask(run, out, settings, ego_motion, remark) for settings in estimators]
+    metrics = replay_apart(tasks, jobs, progress, stopped)
+    interrupted = stopped()
+    about: dict[str, JsonValue] = {
+        "name": config.name,
+        "status": "interrupted" if interrupted else "finished",
+        "run": str(run),
+        "odometry": config.odometry.kind,
+        "remark": remark or None,
+        "notes": _notes(run),
+    }
+    write_comparison(out, config.name, len(log), metrics, about, run)
+    return Compared(config.name, run, out, len(log), metrics)
+
+
+def write_comparison(
+    out: Path,
+    name: str,
+    frames: int,
+    metrics: dict[str, EstimatorMetrics],
+    about: dict[str, JsonValue],
+    run: Path,
+) -> None:
+    """metrics.json, comparison.csv and report.html of results that are in ``out``."""
+    write_metrics(out / METRICS_FILE, frames, metrics, about)
+    write_comparison_csv(out / COMPARISON_FILE, [(name, metrics)])
+    report_from_folder(out, run)
+
+
+def _config_text(
+    config: ExperimentConfig, run: Path, estimators: Sequence[EstimatorSettings]
+) -> str:
+    """The run's configuration with the estimators compared, the present versions, and the run."""
+    values = config.model_copy(update={"compare": tuple(estimators)}).as_values()
+    dataset = (config.provenance or {}).get("dataset")
+    values["provenance"] = {"versions": versions(), "dataset": dataset, "run": str(run)}
+    return str(yaml.safe_dump(values, sort_keys=False))
+
+
+def _notes(run: Path) -> list[str]:
+    """What was tolerated in the recording, as the run wrote it down."""
+    path = run / METRICS_FILE
+    notes = read_metrics(path).get("notes") if path.is_file() else None
+    return [str(note) for note in notes or ()]
+
+
+def _require_apart(run: Path, folder: Path, existing: ExistingFolder) -> None:
+    """A comparison may replace an earlier one, never the run that it is made from."""
+    if folder.resolve() == run.resolve() or folder.resolve() in run.resolve().parents:
+        raise ConfigError(f"--out {folder}: holds the run itself; choose another folder")
+    if existing == "refuse" and is_run_folder(folder):
+        raise OutputError(
+            f"{folder} holds results already; choose another --out, or add --overwrite"
+        )
+
+
+def _folders(runs: Sequence[Path], out: Path | None) -> list[Path]:
+    """Where the results of each run go."""
+    if out is None:
+        return [run / DEFAULT_FOLDER for run in runs]
+    if len(runs) == 1:
+        return [out]
+    names = [run.resolve().name for run in runs]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ConfigError(
+            f"two runs are called {twice[0]}; compare them without --out, or one by one"
+        )
+    return [out / name for name in names]

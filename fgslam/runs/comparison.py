@@ -1,0 +1,152 @@
+"""Replays the log of a run through estimators, each in a process of its own, and compares them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.config import ExperimentConfig, load_config
+from fgslam.errors import DatasetError
+from fgslam.export.atomic import RUN_MARKER, is_run_folder
+from fgslam.export.landmark_truth import LANDMARK_TRUTH_FILE, read_landmark_truth
+from fgslam.export.metrics import EstimatorMetrics
+from fgslam.export.point_cloud import MapPoints, read_ply
+from fgslam.export.trajectories import read_tum
+from fgslam.measurement_log import MeasurementLog
+from fgslam.runs.checkpoint import LOG_FILE
+from fgslam.runs.estimator_files import write_replay
+from fgslam.runs.judging import Truth, judge_replay, seen_often
+from fgslam.runs.processes import WorkerEnded, run_apart
+from fgslam.runs.replay import replay
+from fgslam.settings.backend import EstimatorSettings
+from fgslam.settings.frontend import EgoMotionSettings
+
+GROUND_TRUTH_FILE = "ground_truth.tum"
+SYNTHETIC_REMARK = "odometry: SYNTHETIC (ground truth plus stated noise, see config.yaml)"
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayTask:
+    """What one process is to do: replay the log of ``run``, write into ``out/<title>/``."""
+
+    run: Path
+    out: Path
+    settings: EstimatorSettings
+    ego_motion: EgoMotionSettings
+    remark: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compared:
+    """The estimators of one run side by side.
+
+    Attributes:
+        name: of the run.
+        run: its folder.
+        out: where the results are.
+        frames: in the log.
+        metrics: by title, in the order asked for.
+        notes: what was tolerated in the recording.
+        pictures: drawn, if any.
+    """
+
+    name: str
+    run: Path
+    out: Path
+    frames: int
+    metrics: dict[str, EstimatorMetrics]
+    notes: tuple[str, ...] = ()
+    pictures: tuple[Path, ...] = field(default=())
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Why an estimator ended early, by title."""
+        found = {title: failure_of(metrics) for title, metrics in self.metrics.items()}
+        return {title: why for title, why in found.items() if why}
+
+
+def failure_of(metrics: EstimatorMetrics) -> str:
+    """Why the estimator ended early; empty where it did not."""
+    return str(metrics.more.get("failure") or "")
+
+
+def replay_apart(
+    tasks: Sequence[ReplayTask],
+    jobs: int,
+    progress: Progress,
+    stopped: Callable[[], bool],
+) -> dict[str, EstimatorMetrics]:
+    """Every task in its own process; metrics by title, in the order of the tasks.
+
+    With one job the times do not disturb each other.
+    """
+    found: dict[int, EstimatorMetrics] = {}
+    progress("replaying", 0, len(tasks))
+    for index, result in run_apart(perform, tasks, jobs, stopped):
+        if isinstance(result, WorkerEnded):
+            kind = tasks[index].settings.kind
+            result = EstimatorMetrics(more={"kind": kind, "failure": result.why})
+        found[index] = result
+        progress("replaying", len(found), len(tasks))
+    return {task.settings.title: found[k] for k, task in enumerate(tasks)}
+
+
+def perform(task: ReplayTask) -> EstimatorMetrics:
+    """One estimator, start to end: replay, files, judgement.
+
+    Raises:
+        FgslamError: the log or the truth cannot be read, or a file cannot be written.
+    """
+    log = MeasurementLog.load(task.run / LOG_FILE)
+    result = replay(log, task.settings, task.ego_motion)
+    write_replay(task.out, result, log, task.remark, _look(task.run))
+    return judge_replay(result, load_truth(task.run, log)).metrics
+
+
+def load_truth(run: Path, log: MeasurementLog) -> Truth:
+    """What the run folder knows to be true, the landmarks being those seen often enough.
+
+    Raises:
+        DatasetError: a file of it is damaged.
+    """
+    path, landmark_path = run / GROUND_TRUTH_FILE, run / LANDMARK_TRUTH_FILE
+    trajectory = read_tum(path) if path.is_file() else None
+    if not landmark_path.is_file():
+        return Truth(trajectory)
+    landmarks, sigma = read_landmark_truth(landmark_path)
+    judged = seen_often(log, landmarks)
+    own = sigma[np.isin(landmarks.ids, judged.ids)]
+    return Truth(trajectory, judged, float(np.median(own)) if len(own) else None)
+
+
+def load_run(run: Path) -> tuple[ExperimentConfig, MeasurementLog]:
+    """Configuration and log of a run folder.
+
+    Raises:
+        DatasetError: it is none.
+        FgslamError: one of the two cannot be read.
+    """
+    if not is_run_folder(run):
+        raise DatasetError(f"{run}: not a run folder (no {RUN_MARKER}); give what fgslam run wrote")
+    config = load_config(run / RUN_MARKER)
+    log = MeasurementLog.load(run / LOG_FILE)
+    if not len(log):
+        raise DatasetError(f"{run / LOG_FILE}: holds no frame; resume the run first")
+    return config, log
+
+
+def remark_of(config: ExperimentConfig) -> str:
+    """Marks results whose odometry was made from ground truth; empty otherwise."""
+    return SYNTHETIC_REMARK if config.odometry.kind == "synthetic" else ""
+
+
+def _look(run: Path) -> MapPoints | None:
+    """The colours that the live front-end saw; None where the run had no images."""
+    config = load_config(run / RUN_MARKER)
+    path = run / config.estimator.title / "map.ply"
+    return read_ply(path) if path.is_file() else None

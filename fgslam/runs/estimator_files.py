@@ -1,0 +1,92 @@
+"""The files of one estimator in a run folder, and what they are made from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.export.atomic import make_subfolder, write_text
+from fgslam.export.point_cloud import MapPoints, write_ply
+from fgslam.export.trajectories import write_covariances, write_tum
+from fgslam.measurement_log import MeasurementLog
+from fgslam.runs.replay import Replay, ReplayRow
+from fgslam.types import Estimate, IntArray, LandmarkMap, Trajectory
+
+FRAMES_FILE = "frames.csv"
+_GREY = 128
+_VALID_HITS = 3  # Se et al. 6.1, where no front-end's own number is known
+
+
+def write_estimate(
+    folder: Path, online: Trajectory, estimate: Estimate, points: MapPoints, remark: str
+) -> None:
+    """Trajectories, covariances and map into an estimator's folder. Raises OutputError."""
+    write_tum(folder / "online.tum", online, remark)
+    write_tum(folder / "final.tum", estimate.trajectory, remark)
+    stamps = estimate.trajectory.timestamps
+    write_covariances(folder / "covariance.csv", stamps, estimate.covariances, remark)
+    write_ply(folder / "map.ply", points, remark)
+
+
+def write_replay(
+    run: Path, replay: Replay, log: MeasurementLog, remark: str, look: MapPoints | None
+) -> None:
+    """All files of a replay into ``run/<title>/``.
+
+    Args:
+        run: the folder above the estimator's.
+        replay: what the estimator made of ``log``.
+        log: where hits and misses of the landmarks are counted.
+        remark: put into the files' comments.
+        look: landmarks with the colours that the front-end saw, e.g. the live run's map; None
+            where nothing was seen in colour.
+    """
+    folder = make_subfolder(run, replay.title)
+    points = points_from_log(replay.estimate.landmarks, log, look)
+    write_estimate(folder, replay.online, replay.estimate, points, remark)
+    write_frames(folder / FRAMES_FILE, replay)
+
+
+def write_frames(path: Path, replay: Replay) -> None:
+    """Write frames.csv: time stamp, then a column for each name of :class:`ReplayRow`."""
+    lines = [",".join(("timestamp", *ReplayRow._fields))]
+    for stamp, row in zip(replay.online.timestamps, replay.rows, strict=True):
+        cells = [_cell(value) for value in row]
+        lines.append(",".join((f"{stamp:.9f}", *cells)))
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def points_from_log(
+    landmarks: LandmarkMap, log: MeasurementLog, look: MapPoints | None
+) -> MapPoints:
+    """The map with hits and misses as the log has them, grey where no colour is known."""
+    seen = [increment.observations.ids[~increment.rejected] for increment in log]
+    hits = _counts(seen, landmarks.ids)
+    colours = np.full((len(landmarks), 3), _GREY, np.uint8)
+    if look is not None:
+        _, rows, of = np.intersect1d(landmarks.ids, look.ids, return_indices=True)
+        colours[rows] = look.colours[of]
+    return MapPoints(
+        ids=landmarks.ids,
+        positions=landmarks.positions,
+        covariances=landmarks.covariances,
+        colours=colours,
+        hits=hits,
+        misses=_counts([increment.missed_ids for increment in log], landmarks.ids),
+        valid=hits >= _VALID_HITS,
+        permanent=np.zeros(len(landmarks), np.bool_),
+    )
+
+
+def _counts(parts: list[IntArray], ids: IntArray) -> IntArray:
+    """How often each of ``ids`` (ascending) occurs in all parts together."""
+    found, counts = np.unique(np.concatenate([np.empty(0, np.int64), *parts]), return_counts=True)
+    out = np.zeros(len(ids), np.int64)
+    _, rows, of = np.intersect1d(ids, found, return_indices=True)
+    out[rows] = counts[of]
+    return out
+
+
+def _cell(value: str | float) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

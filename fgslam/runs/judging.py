@@ -1,0 +1,254 @@
+"""Judges one estimator's answer against the truth: the numbers of metrics.json."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+from fgslam.evaluation.consistency import Consistency, Nees, judge, pose_nees
+from fgslam.evaluation.landmarks import LandmarkErrors, landmark_errors
+from fgslam.evaluation.timing import time_growth
+from fgslam.evaluation.trajectory import (
+    Alignment,
+    TrajectoryError,
+    end_pose,
+    estimate_from_truth,
+    evaluate_trajectory,
+    to_estimate_world,
+)
+from fgslam.export.metrics import EstimatorMetrics, JsonValue, UpdateTime
+from fgslam.measurement_log import MeasurementLog
+from fgslam.recordings import LandmarkTruth
+from fgslam.runs.replay import Replay
+from fgslam.types import Estimate, FloatArray, IntArray, Trajectory
+
+LEAST_SIGHTINGS = 3
+"""Landmarks are judged that were seen so often: `valid` of Se et al. (6.1), for all estimators."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """What is known to be true of a run; None where nothing is.
+
+    Attributes:
+        trajectory: true poses of the reference camera or sensor.
+        landmarks: true positions, in the same world.
+        landmark_sigma_m: typical standard error of those positions; 0 where they are exact.
+    """
+
+    trajectory: Trajectory | None = None
+    landmarks: LandmarkTruth | None = None
+    landmark_sigma_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """What an estimator said, live or replayed; row k of every array is frame k.
+
+    Attributes:
+        kind: which estimator.
+        estimate: as known at the end.
+        online: each pose as first estimated; ``online_covariances`` (n, 6, 6).
+        nis, nis_dof: (n,) innovations squared and their degrees of freedom.
+        update_ms: (n,) prediction and update.
+        peak_memory_mb: of the process.
+    """
+
+    kind: str
+    estimate: Estimate
+    online: Trajectory
+    online_covariances: FloatArray
+    nis: FloatArray
+    nis_dof: IntArray
+    update_ms: FloatArray
+    peak_memory_mb: float | None = None
+
+    @staticmethod
+    def of(replay: Replay) -> Answer:
+        """The answer of a replay."""
+        return Answer(
+            kind=replay.kind,
+            estimate=replay.estimate,
+            online=replay.online,
+            online_covariances=replay.online_covariances,
+            nis=replay.column("nis").astype(np.float64),
+            nis_dof=replay.column("nis_dof").astype(np.int64),
+            update_ms=replay.column("update_ms").astype(np.float64),
+            peak_memory_mb=replay.peak_memory_mb,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judgement:
+    """The metrics, and the normalised errors that several runs are pooled from."""
+
+    metrics: EstimatorMetrics
+    nees: dict[str, Nees] = field(default_factory=dict)
+
+
+def judge_answer(answer: Answer, truth: Truth) -> Judgement:
+    """All numbers of one answer.
+
+    ``ate_rmse_m`` and the RPE are after SE3 alignment; drift, end errors, NEES and landmark errors
+    have the first pose aligned.
+    """
+    final = answer.estimate.trajectory
+    aligned = evaluate_trajectory(final, truth.trajectory, Alignment.SE3)
+    first = evaluate_trajectory(final, truth.trajectory, Alignment.FIRST_POSE)
+    errors = _landmark_errors(answer.estimate, truth)
+    nees = {
+        "pose": _pose_nees(final, answer.estimate.covariances, truth),
+        "online_pose": _pose_nees(answer.online, answer.online_covariances, truth),
+        "landmark": _no_nees() if errors is None else errors.nees,
+    }
+    judged = {name: judge([values]) for name, values in nees.items()}
+    metrics = EstimatorMetrics(
+        ate_rmse_m=aligned.ate_rmse_m,
+        rpe_trans_m=aligned.rpe_trans_m,
+        rpe_rot_deg=aligned.rpe_rot_deg,
+        drift_percent=first.drift_percent,
+        end_error_m=first.end_error_m,
+        end_error_deg=first.end_error_deg,
+        landmarks=len(answer.estimate.landmarks),
+        nees_pose_per_dof=_per_dof(judged["pose"]),
+        nees_landmark_per_dof=_per_dof(judged["landmark"]),
+        update_ms=UpdateTime.of(answer.update_ms),
+        peak_memory_mb=answer.peak_memory_mb,
+        more={
+            "kind": answer.kind,
+            "frames": len(answer.online),
+            **_alignment_notes(aligned, first),
+            "nees_pose": _as_json(judged["pose"]),
+            "nees_landmark": _as_json(judged["landmark"]),
+            "online": _online(answer.online, truth, judged["online_pose"]),
+            **_landmark_numbers(errors, truth),
+            **_innovations(answer),
+            "update_growth": _growth(answer.update_ms),
+            "last_pose_sigma": _last_pose_sigma(answer.estimate),
+            "end_against_start": _end_against_start(final),
+            "remarks": list(answer.estimate.remarks),
+        },
+    )
+    return Judgement(metrics, nees)
+
+
+def judge_replay(replay: Replay, truth: Truth) -> Judgement:
+    """As :func:`judge_answer`, with what only a replay knows."""
+    judged = judge_answer(Answer.of(replay), truth)
+    metrics = judged.metrics
+    more = dict(metrics.more) | {
+        "failure": replay.failure or None,
+        "solve_ms": asdict(UpdateTime.of(replay.column("solve_ms").astype(np.float64))),
+        "final_ms": replay.final_ms,
+        "memory_before_mb": replay.memory_before_mb,
+    }
+    values = {name: getattr(metrics, name) for name in EstimatorMetrics.__slots__} | {"more": more}
+    return Judgement(EstimatorMetrics(**values), judged.nees)
+
+
+def seen_often(log: MeasurementLog, truth: LandmarkTruth) -> LandmarkTruth:
+    """True positions of the landmarks that the log saw in at least three frames.
+
+    The same ones for every estimator: a smoother lets a landmark wait that was seen once.
+    """
+    seen = [increment.observations.ids[~increment.rejected] for increment in log]
+    ids, counts = np.unique(np.concatenate([np.empty(0, np.int64), *seen]), return_counts=True)
+    keep = np.isin(truth.ids, ids[counts >= LEAST_SIGHTINGS])
+    return LandmarkTruth(truth.ids[keep], truth.positions[keep])
+
+
+# --------------------------------------------------------------------------------------------
+
+
+def _no_nees() -> Nees:
+    return Nees(np.empty(0), np.empty(0, np.int64))
+
+
+def _per_dof(found: Consistency | None) -> float | None:
+    return None if found is None else found.per_dof
+
+
+def _as_json(found: Consistency | None) -> JsonValue:
+    return None if found is None else asdict(found)
+
+
+def _pose_nees(trajectory: Trajectory, covariances: FloatArray, truth: Truth) -> Nees:
+    """Of all poses but the first matched one: the gauge has neither error nor covariance."""
+    known = truth.trajectory
+    found = None if known is None else to_estimate_world(trajectory, known)
+    if found is None:
+        return _no_nees()
+    rows, poses = found[0][1:], found[1][1:]
+    return pose_nees(trajectory.poses[rows], covariances[rows], poses)
+
+
+def _landmark_errors(estimate: Estimate, truth: Truth) -> LandmarkErrors | None:
+    if truth.landmarks is None or truth.trajectory is None:
+        return None
+    eTt = estimate_from_truth(estimate.trajectory, truth.trajectory)
+    return None if eTt is None else landmark_errors(estimate.landmarks, truth.landmarks, eTt)
+
+
+def _alignment_notes(aligned: TrajectoryError, first: TrajectoryError) -> dict[str, JsonValue]:
+    return {
+        "alignment": aligned.alignment.value,
+        "matched_poses": aligned.matched_poses,
+        "ate_max_m": aligned.ate_max_m,
+        "ate_first_pose_m": first.ate_rmse_m,
+        "path_length_m": aligned.path_length_m,
+    }
+
+
+def _online(online: Trajectory, truth: Truth, nees: Consistency | None) -> JsonValue:
+    """The same errors of the poses as they were first estimated."""
+    aligned = evaluate_trajectory(online, truth.trajectory, Alignment.SE3)
+    first = evaluate_trajectory(online, truth.trajectory, Alignment.FIRST_POSE)
+    return {
+        "ate_rmse_m": aligned.ate_rmse_m,
+        "ate_first_pose_m": first.ate_rmse_m,
+        "rpe_trans_m": aligned.rpe_trans_m,
+        "rpe_rot_deg": aligned.rpe_rot_deg,
+        "end_error_m": first.end_error_m,
+        "end_error_deg": first.end_error_deg,
+        "nees_pose_per_dof": _per_dof(nees),
+        "nees_pose": _as_json(nees),
+    }
+
+
+def _landmark_numbers(errors: LandmarkErrors | None, truth: Truth) -> dict[str, JsonValue]:
+    return {
+        "landmark_rmse_m": None if errors is None else errors.rmse_m,
+        "landmark_median_m": None if errors is None else errors.median_m,
+        "landmarks_with_truth": None if errors is None else len(errors),
+        "landmark_truth_sigma_m": truth.landmark_sigma_m,
+    }
+
+
+def _innovations(answer: Answer) -> dict[str, JsonValue]:
+    """NIS of the matched observations, each frame an independent item."""
+    known = np.isfinite(answer.nis) & (answer.nis_dof > 0)
+    found = judge([Nees(answer.nis[known], answer.nis_dof[known])], items_independent=True)
+    return {"nis_per_dof": _per_dof(found), "nis": _as_json(found)}
+
+
+def _growth(update_ms: FloatArray) -> JsonValue:
+    found = time_growth(update_ms)
+    return None if found is None else asdict(found)
+
+
+def _last_pose_sigma(estimate: Estimate) -> JsonValue:
+    """How well the estimator thinks to know the last pose: root of the traces."""
+    if not len(estimate.covariances) or not np.isfinite(estimate.covariances[-1]).all():
+        return None
+    variances = np.maximum(np.diagonal(estimate.covariances[-1]), 0.0)
+    return {
+        "rotation_deg": float(np.degrees(np.sqrt(variances[:3].sum()))),
+        "position_m": float(np.sqrt(variances[3:].sum())),
+    }
+
+
+def _end_against_start(trajectory: Trajectory) -> JsonValue:
+    """Last pose in the frame of the first: what the paper judges its loop by."""
+    found = end_pose(trajectory)
+    return None if found is None else asdict(found)

@@ -1,0 +1,151 @@
+"""Work in processes of its own: memory is each one's own, and a crash takes nothing else along."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from typing import Generic, TypeVar
+
+from fgslam.errors import FgslamError
+
+Argument = TypeVar("Argument")
+Result = TypeVar("Result")
+
+_POLL_S = 0.2
+_THREADS = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerEnded(Generic[Argument]):
+    """A process that ended without a result.
+
+    Attributes:
+        argument: what it was given.
+        why: in words.
+    """
+
+    argument: Argument
+    why: str
+
+
+@dataclass(slots=True)
+class _Worker:
+    index: int
+    process: SpawnProcess
+    connection: Connection
+
+
+def run_apart(
+    function: Callable[[Argument], Result],
+    arguments: Sequence[Argument],
+    jobs: int = 1,
+    stopped: Callable[[], bool] = lambda: False,
+    single_threaded: bool = False,
+) -> Iterator[tuple[int, Result | WorkerEnded[Argument]]]:
+    """Calls a function on each argument, each time in a new process.
+
+    Args:
+        function: of a module's top level; result and argument are handed over by multiprocessing.
+        arguments: one a process.
+        jobs: how many at a time.
+        stopped: asked every moment; True ends the processes that run and starts no more.
+        single_threaded: linear algebra on one thread a process.
+
+    Yields:
+        Index of the argument and its result, as they come.
+
+    Raises:
+        FgslamError: what the function raised in its process.
+    """
+    waiting = list(enumerate(arguments))[::-1]
+    running: list[_Worker] = []
+    try:
+        while waiting or running:
+            if stopped():
+                break
+            while waiting and len(running) < jobs:
+                index, argument = waiting.pop()
+                with _threads_limited(single_threaded):
+                    running.append(_start(index, function, argument))
+            ready = wait([worker.connection for worker in running], _POLL_S)
+            for worker in [w for w in running if w.connection in ready]:
+                running.remove(worker)
+                yield worker.index, _collect(worker, arguments[worker.index])
+    finally:
+        for worker in running:
+            worker.process.terminate()
+            worker.process.join()
+    for worker in running:
+        yield worker.index, WorkerEnded(arguments[worker.index], "interrupted")
+    for index, argument in waiting[::-1]:
+        yield index, WorkerEnded(argument, "interrupted before it began")
+
+
+def _start(index: int, function: Callable[[Argument], Result], argument: Argument) -> _Worker:
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_work, args=(theirs, function, argument), daemon=True)
+    process.start()
+    theirs.close()  # so that the end of the process is the end of the pipe
+    return _Worker(index, process, ours)
+
+
+def _work(
+    connection: Connection, function: Callable[[Argument], Result], argument: Argument
+) -> None:
+    """In the worker: Ctrl-C is the parent's to answer."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        connection.send(function(argument))
+    except FgslamError as error:
+        connection.send(error)
+
+
+def _collect(worker: _Worker, argument: Argument) -> Result | WorkerEnded[Argument]:
+    try:
+        result: Result | FgslamError = worker.connection.recv()
+    except EOFError:
+        worker.process.join()
+        return WorkerEnded(argument, _ending(worker.process.exitcode))
+    worker.process.join()
+    if isinstance(result, FgslamError):
+        raise result
+    return result
+
+
+def _ending(code: int | None) -> str:
+    if code is None or code >= 0:
+        return f"its process ended with status {code}, see above"
+    name = signal.Signals(-code).name
+    hint = ", perhaps for lack of memory" if name == "SIGKILL" else ""
+    return f"its process was ended by {name}{hint}"
+
+
+@contextmanager
+def _threads_limited(limited: bool) -> Iterator[None]:
+    """The environment for a child's start: its libraries read it when they are loaded."""
+    if not limited:
+        yield
+        return
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
