@@ -7,6 +7,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from fgslam.backend.batch import BatchSmoother
+from fgslam.backend.dead_reckoning import DeadReckoning
+from fgslam.backend.fixed_lag import FixedLagSmoother
+from fgslam.backend.isam2 import Isam2Smoother
 from fgslam.backend.landmark_kalman import LandmarkKalman
 from fgslam.backend.protocol import Estimator
 from fgslam.config import ExperimentConfig
@@ -24,7 +28,15 @@ from fgslam.frontend.stream import FeatureStream
 from fgslam.frontend.tracker import LandmarkTracker
 from fgslam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
 from fgslam.pipeline import SlamPipeline
-from fgslam.settings.backend import EstimatorSettings, FloorSettings, LandmarkKalmanSettings
+from fgslam.settings.backend import (
+    BatchSettings,
+    DeadReckoningSettings,
+    EstimatorSettings,
+    FixedLagSettings,
+    FloorSettings,
+    Isam2Settings,
+    LandmarkKalmanSettings,
+)
 from fgslam.settings.datasets import (
     ConstantVelocitySettings,
     OdometrySettings,
@@ -107,8 +119,16 @@ def make_estimator(
     """
     prior = Prediction(np.eye(4), np.zeros((6, 6)))
     match settings:
+        case DeadReckoningSettings():
+            return DeadReckoning(rig, prior)
         case LandmarkKalmanSettings():
             return LandmarkKalman(rig, settings, prior)
+        case FixedLagSettings():
+            return FixedLagSmoother(rig, settings, make_floor(rig, settings.floor, dof), prior)
+        case Isam2Settings():
+            return Isam2Smoother(rig, settings, make_floor(rig, settings.floor, dof), prior)
+        case BatchSettings():
+            return BatchSmoother(rig, settings, make_floor(rig, settings.floor, dof), prior)
         case _:
             raise ConfigError(f"estimator.kind {settings.kind} is not built yet")
 

@@ -107,10 +107,20 @@ class GraphBuilder:
     """
 
     def __init__(
-        self, sensor: Sensor, settings: GraphSettings, floor: Floor, prior: Prediction
+        self,
+        sensor: Sensor,
+        settings: GraphSettings,
+        floor: Floor,
+        prior: Prediction,
+        remember: bool = True,
     ) -> None:
-        """An empty graph; ``prior`` will be that of the first pose."""
+        """An empty graph; ``prior`` will be that of the first pose.
+
+        With ``remember`` off, factors are handed out and not kept: for a bounded lag.
+        """
         kernel = settings.kernel
+        self._remember = remember
+        self._sensor = sensor
         self._settings = settings
         self._floor = floor
         self._prior = prior
@@ -118,6 +128,8 @@ class GraphBuilder:
         self._rows: dict[int, list[int]] = {}
         self._id_of: list[int] = []
         self._first_frame = 0
+        self._seen_frame: list[int] = []
+        self._seen_variable: list[int] = []
         self.graph = gtsam.NonlinearFactorGraph()
         self.tracks: dict[int, Track] = {}
         self.remarks: list[str] = []
@@ -193,7 +205,8 @@ class GraphBuilder:
         """
         identity = self._id_of[variable]
         for row in self._rows.pop(variable, []):
-            self.graph.remove(row)
+            if self._remember:
+                self.graph.remove(row)
         track = self.tracks.get(identity)
         if track is None or track.variable != variable:
             return f"landmark {identity} (no longer in use)"
@@ -205,9 +218,40 @@ class GraphBuilder:
             f"{track.last.frame})"
         )
 
-    def forget_before(self, frame: int) -> None:
-        """For a bounded lag: sightings and factors of earlier frames are no longer needed."""
+    def forget_before(self, frame: int) -> list[int]:
+        """For a bounded lag: earlier frames, and landmarks last seen in them, have left the graph.
+
+        Returns:
+            Identities of those landmarks; their next sighting begins a new variable.
+        """
         self._first_frame = frame
+        left = [i for i, t in self.tracks.items() if t.variable >= 0 and t.last.frame < frame]
+        for identity in left:
+            track = self.tracks[identity]
+            self._rows.pop(track.variable, None)
+            track.variable = -1
+        return left
+
+    def in_graph(self, variable: int) -> bool:
+        """Whether a landmark variable still has its factors."""
+        return variable in self._rows
+
+    def behind(self, poses: FloatArray, points: dict[int, FloatArray]) -> list[int]:
+        """Variables that lie behind a camera that saw them, where a stereo factor says nothing.
+
+        Args:
+            poses: (n, 4, 4) ``wTc`` of all frames.
+            points: positions (3,) by variable.
+        """
+        if not points or not isinstance(self._sensor, CameraRig):
+            return []
+        frames, seen = np.array(self._seen_frame), np.array(self._seen_variable)
+        position = np.full((self.variables, 3), np.nan)
+        position[list(points)] = list(points.values())
+        offset = position[seen] - poses[frames, :3, 3]
+        depth = np.einsum("ki,ki->k", offset, poses[frames, :3, 2])
+        # A variable that was taken out has no position, and NaN is not below zero.
+        return [int(variable) for variable in np.unique(seen[depth <= 0.0])]
 
     def kept_factors(self) -> Any:
         """The graph without its empty slots."""
@@ -276,7 +320,9 @@ class GraphBuilder:
         if parallax < self._settings.weak_parallax:
             distance = float(np.linalg.norm(position - wTc[:3, 3]))
             sigma = self._settings.weak_prior_ranges * distance
-            self._rows[track.variable].append(self._push(new, weak_point_prior(key, position, sigma)))
+            self._rows[track.variable].append(
+                self._push(new, weak_point_prior(key, position, sigma))
+            )
         for sighting in track.waiting:
             self._observe(new, track, sighting)
         track.waiting = []
@@ -289,12 +335,16 @@ class GraphBuilder:
             sighting.covariance,
         )
         self._rows[track.variable].append(self._push(new, factor))
+        if self._remember:
+            self._seen_frame.append(sighting.frame)
+            self._seen_variable.append(track.variable)
         if not new.seen or new.seen[-1] != track.variable:
             new.seen.append(track.variable)
 
     def _push(self, new: NewFactors, factor: Any) -> int:
         new.graph.add(factor)
-        self.graph.add(factor)
+        if self._remember:
+            self.graph.add(factor)
         return int(self.graph.size()) - 1
 
     def _count_rejected(self, rejected: Observations) -> None:

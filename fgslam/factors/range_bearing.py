@@ -28,7 +28,8 @@ class RangeBearingFactors:
         """Factor between a pose of the sensor (axes as a camera's) and a world point.
 
         Args:
-            pose, landmark: keys.
+            pose: its key.
+            landmark: its key.
             measurement: (3,) azimuth and elevation in radians, range in metres.
             covariance: (3, 3) of it.
         """

@@ -31,9 +31,7 @@ class StereoFactors:
     def __init__(self, rig: CameraRig, whitening: Whitening) -> None:
         """The rig and the noise models, robust or not."""
         self._whitening = whitening
-        self._calibration = gtsam.Cal3_S2Stereo(
-            rig.fx, rig.fy, 0.0, rig.cx, rig.cy, rig.baseline
-        )
+        self._calibration = gtsam.Cal3_S2Stereo(rig.fx, rig.fy, 0.0, rig.cx, rig.cy, rig.baseline)
         self._rTl = gtsam.Pose3(gtsam.Rot3(), np.array([-rig.baseline, 0.0, 0.0]))
 
     def factor(
@@ -42,7 +40,8 @@ class StereoFactors:
         """Factor between a pose ``wTc`` of the reference camera and a world point.
 
         Args:
-            pose, landmark: keys.
+            pose: its key.
+            landmark: its key.
             measurement: (3,) column, row, disparity, pixels.
             covariance: (3, 3) of it, pixels squared.
         """

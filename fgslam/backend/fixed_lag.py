@@ -1,0 +1,214 @@
+"""Incremental fixed-lag smoothing: poses and landmarks older than the lag are marginalised.
+
+What a marginalised variable said about the others stays, as a linear factor; the variable itself
+can no longer change. A landmark that comes back after the lag is a new variable: the smoother
+has forgotten it, which is the price of a constant effort (design, gtsam.md 1).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any, ClassVar
+
+import gtsam
+import numpy as np
+
+from fgslam.backend.graph_builder import NewFactors
+from fgslam.backend.graph_solution import (
+    Solution,
+    allowed_parts,
+    points_of,
+    poses_of_frame,
+    suspect,
+)
+from fgslam.backend.marginals import DenseMarginals
+from fgslam.backend.smoother import Smoother
+from fgslam.errors import EstimatorError
+from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
+from fgslam.factors.motion import pose_prior
+from fgslam.floor import Floor
+from fgslam.geometry import congruence, point_pose_jacobian, transform_to_camera
+from fgslam.settings.backend import FixedLagSettings
+from fgslam.types import FloatArray, Prediction, Sensor
+
+_REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
+
+
+class FixedLagSmoother(Smoother):
+    """Estimator of kind ``fixed_lag``, on :class:`fgslam.backend.protocol.Estimator`."""
+
+    kind: ClassVar[str] = "fixed_lag"
+
+    def __init__(
+        self, sensor: Sensor, settings: FixedLagSettings, floor: Floor, prior: Prediction
+    ) -> None:
+        """Starts at the prior pose with an empty map.
+
+        Raises:
+            EstimatorError: neither lag is given.
+        """
+        if settings.lag_frames is None and settings.lag_s is None:
+            raise EstimatorError("fixed_lag: no lag; set estimator.lag_frames or estimator.lag_s")
+        super().__init__(sensor, settings, floor, prior, remember=False)
+        self._in_seconds = settings.lag_frames is None
+        self._lag = float(settings.lag_frames or settings.lag_s or 0.0)
+        self._solver = self._new_solver()
+        self._values = gtsam.Values()
+        self._oldest = 0
+        self._poses: list[FloatArray] = []
+        self._covariances: list[FloatArray] = []
+        self._clock: list[float] = []
+        self._recent: deque[NewFactors] = deque()
+
+    def _absorb(self, new: NewFactors) -> None:
+        self._clock.append(float(self._inputs.increments[-1].timestamp))
+        self._poses.append(np.eye(4))
+        self._covariances.append(np.full((6, 6), np.nan))
+        self._recent.append(new)
+        self._update(new)
+        self._move_window()
+        for frame in range(self._oldest, new.frame + 1):
+            self._poses[frame] = poses_of_frame(self._values, frame)
+        marginals = self._marginals()
+        for frame in {self._oldest, new.frame}:  # the one that leaves next, and the last one
+            self._covariances[frame] = self._covariance(marginals, frame)
+        self._take_over(self._values, Prediction(self._poses[-1], self._covariances[-1]))
+
+    def _solve(self) -> Solution:
+        marginals = self._marginals()
+        for frame in range(self._oldest, len(self._poses)):
+            self._covariances[frame] = self._covariance(marginals, frame)
+        inside = [
+            track.variable
+            for track in self._builder.tracks.values()
+            if track.variable >= 0 and self._values.exists(landmark_key(track.variable))
+        ]
+        found = marginals.landmarks([landmark_key(v) for v in inside])
+        return Solution(
+            np.array(self._poses),
+            np.array(self._covariances),
+            points_of(self._values, inside),
+            dict(zip(inside, found, strict=True)),
+        )
+
+    def _joint(self, variables: list[int]) -> FloatArray:
+        last = len(self._poses) - 1
+        joint = self._marginals().joint(pose_key(last), [landmark_key(v) for v in variables])
+        project = np.eye(len(joint))
+        if self._floor.rigid_dof < 6:
+            basis = self._floor.basis(self._poses[-1])
+            project[:6, :6] = basis @ basis.T
+        return congruence(project, joint)
+
+    # ----------------------------------------------------------------------------------------
+
+    def _new_solver(self) -> Any:
+        params = gtsam.ISAM2Params()
+        params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams())
+        params.setFactorization("CHOLESKY")
+        params.setRelinearizeThreshold(0.01)
+        params.relinearizeSkip = 1
+        # Without it the list of factors, and the effort, grow with the run (gtsam.md 1).
+        params.findUnusedFactorSlots = True
+        return gtsam.IncrementalFixedLagSmoother(self._lag, params)
+
+    def _time(self, frame: int) -> float:
+        return self._clock[frame] if self._in_seconds else float(frame)
+
+    def _update(self, new: NewFactors) -> None:
+        stamp = self._time(new.frame)
+        stamps = {pose_key(new.frame): stamp} | {landmark_key(v): stamp for v in new.seen}
+        before = self._values
+        try:
+            self._solver.update(new.graph, new.values, stamps)
+            self._values = self._solver.calculateEstimate()
+        except RuntimeError as error:
+            together = gtsam.Values(before)
+            together.insert(new.values)
+            self._repair(together, error)
+
+    def _move_window(self) -> None:
+        """Notes which poses and landmarks have left; landmarks keep their last place."""
+        last = len(self._poses) - 1
+        while self._time(self._oldest) < self._time(last) - self._lag:
+            self._oldest += 1
+        while self._recent and self._recent[0].frame < self._oldest:
+            self._recent.popleft()
+        left = self._builder.forget_before(self._oldest)
+        known = self._tracker.landmarks()
+        rows = known.rows(np.array(left, np.int64))
+        for identity, row in zip(left, rows.tolist(), strict=True):
+            frame = self._builder.tracks[identity].last.frame
+            self._frozen[identity] = (
+                known.positions[row],
+                self._with_pose(frame, known.positions[row], known.covariances[row]),
+            )
+
+    def _with_pose(self, frame: int, position: FloatArray, given_poses: FloatArray) -> FloatArray:
+        """Covariance of a landmark that left: what was known given the poses, and of the pose."""
+        wTc = self._poses[frame]
+        point = transform_to_camera(wTc, position[None])
+        by_pose = congruence(point_pose_jacobian(point), self._covariances[frame])
+        return np.asarray(given_poses + congruence(wTc[:3, :3], by_pose)[0])
+
+    def _marginals(self) -> DenseMarginals:
+        """Of the window: all at once, faster than GTSAM's for one pose of a dense root clique."""
+        return DenseMarginals(_without_gaps(self._solver.getFactors()), self._values)
+
+    def _covariance(self, marginals: DenseMarginals, frame: int) -> FloatArray:
+        covariance = marginals.pose(pose_key(frame))
+        kept = allowed_parts(self._floor, self._poses[frame][None], covariance[None])
+        return np.asarray(kept[0])
+
+    def _repair(self, values: Any, error: Exception) -> None:
+        """Builds the solver anew over the window, without the landmark that failed."""
+        dropped: set[int] = set()
+        for _ in range(_REPAIRS):
+            key = suspect(error)
+            if key is None or is_pose(key) or key in dropped:
+                break
+            dropped.add(key)
+            self._remarks.append(
+                f"{self._builder.take_out(number(key))} left the system indeterminate at frame "
+                f"{self._recent[-1].frame}: taken out, solver built anew over the lag"
+            )
+            try:
+                self._rebuild(values, dropped)
+                return
+            except RuntimeError as another:
+                error = another
+        raise EstimatorError(
+            f"fixed_lag: the solver failed at frame {self._recent[-1].frame} "
+            f"({' '.join(str(error).split())}); look at that frame with fgslam inspect"
+        )
+
+    def _rebuild(self, values: Any, dropped: set[int]) -> None:
+        oldest = self._oldest
+        graph, kept = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        stamps: dict[int, float] = {}
+        covariance = self._covariances[oldest]
+        if not np.isfinite(covariance).all():
+            covariance = np.zeros((6, 6))
+        graph.add(pose_prior(pose_key(oldest), Prediction(self._poses[oldest], covariance)))
+        for new in self._recent:
+            for row in range(new.graph.size()):
+                factor = new.graph.at(row)
+                keys = list(factor.keys())
+                inside = all(not is_pose(key) or number(key) >= oldest for key in keys)
+                if inside and not dropped.intersection(keys):
+                    graph.add(factor)
+                    stamps |= dict.fromkeys(keys, self._time(new.frame))
+        for key in stamps:
+            kept.insert(key, values.atPose3(key) if is_pose(key) else values.atPoint3(key))
+        self._solver = self._new_solver()
+        self._solver.update(graph, kept, stamps)
+        self._values = self._solver.calculateEstimate()
+
+
+def _without_gaps(graph: Any) -> Any:
+    """A graph without empty slots."""
+    kept = gtsam.NonlinearFactorGraph()
+    for row in range(graph.size()):
+        if graph.exists(row):
+            kept.add(graph.at(row))
+    return kept

@@ -1,0 +1,93 @@
+"""Poses, landmarks and their marginals out of a solved graph."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fgslam.backend.marginals import GraphMarginals
+from fgslam.errors import EstimatorError
+from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.floor import Floor
+from fgslam.geometry import congruence
+from fgslam.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """The graph's answer.
+
+    Attributes:
+        poses: (n, 4, 4) of all frames.
+        pose_covariances: (n, 6, 6); NaN where they cannot be had.
+        points: positions (3,) of landmark variables.
+        point_covariances: (3, 3) of the same.
+        remark: why covariances are missing; empty where they are not.
+    """
+
+    poses: FloatArray
+    pose_covariances: FloatArray
+    points: dict[int, FloatArray]
+    point_covariances: dict[int, FloatArray]
+    remark: str = ""
+
+
+def poses_of(values: Any, frames: int) -> FloatArray:
+    """Poses (n, 4, 4) of frames 0 to n - 1 in GTSAM values."""
+    return np.array([values.atPose3(pose_key(k)).matrix() for k in range(frames)])
+
+
+def points_of(values: Any, variables: list[int]) -> dict[int, FloatArray]:
+    """Positions of landmark variables in GTSAM values."""
+    return {v: np.asarray(values.atPoint3(landmark_key(v))) for v in variables}
+
+
+def solution(graph: Any, values: Any, frames: int, variables: list[int], floor: Floor) -> Solution:
+    """Everything about frames 0 to n - 1 and landmark variables, at the given values."""
+    poses, points = poses_of(values, frames), points_of(values, variables)
+    try:
+        marginals = GraphMarginals.of(graph, values)
+        by_key = dict(zip(marginals.landmark_keys.tolist(), marginals.landmarks(), strict=True))
+        covariances = {v: by_key[landmark_key(v)] for v in variables}
+        kept = allowed_parts(floor, poses, marginals.poses())
+    except EstimatorError as error:
+        missing = {v: np.full((3, 3), np.nan) for v in variables}
+        return Solution(poses, np.full((frames, 6, 6), np.nan), points, missing, str(error))
+    return Solution(poses, kept, points, covariances)
+
+
+def allowed_parts(floor: Floor, poses: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Covariances (n, 6, 6) without what a hard floor excludes, which the graph holds stiffly."""
+    if floor.rigid_dof == 6:
+        return covariances
+    pairs = zip(poses, covariances, strict=True)
+    return np.array([floor.allowed_part(pose, covariance) for pose, covariance in pairs])
+
+
+def joint_of(graph: Any, values: Any, floor: Floor, frame: int, variables: list[int]) -> FloatArray:
+    """Joint covariance (6 + 3k, 6 + 3k) of a frame's pose and landmark variables."""
+    marginals = GraphMarginals.of(graph, values)
+    pose = int(np.searchsorted(marginals.pose_keys, pose_key(frame)))
+    keys = np.array([landmark_key(v) for v in variables], np.int64)
+    rows: IntArray = np.searchsorted(marginals.landmark_keys, keys).astype(np.int64)
+    joint = marginals.joint(pose, rows)
+    if floor.rigid_dof == 6:
+        return joint
+    basis = floor.basis(poses_of_frame(values, frame))
+    project = np.eye(len(joint))
+    project[:6, :6] = basis @ basis.T
+    return congruence(project, joint)
+
+
+def poses_of_frame(values: Any, frame: int) -> FloatArray:
+    """The pose (4, 4) of one frame."""
+    return np.asarray(values.atPose3(pose_key(frame)).matrix())
+
+
+def suspect(error: Exception) -> int | None:
+    """Key of the variable near which GTSAM says that the system was indeterminate, if it does."""
+    words = str(error).split("variable", 1)
+    digits = "".join(c for c in words[-1].strip().split(" ")[0] if c.isdigit())
+    return int(digits) if len(words) == 2 and digits else None

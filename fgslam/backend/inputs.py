@@ -1,0 +1,91 @@
+"""What an estimator was given, frame by frame: the state of those that cannot show their inside."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fgslam.measurement_log import MeasurementLog
+from fgslam.types import (
+    EgoMotion,
+    EgoMotionStatus,
+    FloatArray,
+    Increment,
+    Odometry,
+    Sensor,
+    StateArrays,
+)
+
+
+@dataclass(slots=True, eq=False)
+class RecordedInputs:
+    """Arguments of all updates so far."""
+
+    increments: list[Increment] = field(default_factory=list)
+    trackings: list[EgoMotion] = field(default_factory=list)
+    motions: list[Odometry | None] = field(default_factory=list)
+
+    def append(self, increment: Increment, tracking: EgoMotion, motion: Odometry | None) -> None:
+        """Keeps one update's arguments."""
+        self.increments.append(increment)
+        self.trackings.append(tracking)
+        self.motions.append(motion)
+
+    def __iter__(self) -> Iterator[tuple[Increment, EgoMotion, Odometry | None]]:
+        return zip(self.increments, self.trackings, self.motions, strict=True)
+
+    def timestamps(self) -> FloatArray:
+        """(n,) seconds."""
+        return np.array([increment.timestamp for increment in self.increments])
+
+    def to_arrays(self, sensor: Sensor) -> StateArrays:
+        """All of it as plain arrays."""
+        log = MeasurementLog(sensor, {}, list(self.increments))
+        n = len(self.trackings)
+        known = np.array([motion is not None for motion in self.motions], np.bool_)
+        given = [motion for motion in self.motions if motion is not None]
+        return {f"log/{name}": array for name, array in log.to_arrays().items()} | {
+            "wTc": np.array([t.wTc for t in self.trackings]).reshape(n, 4, 4),
+            "covariance": np.array([t.covariance for t in self.trackings]).reshape(n, 6, 6),
+            "matches": np.array([len(t.inliers) for t in self.trackings], np.int64),
+            "inliers": np.concatenate(
+                [np.empty(0, np.bool_), *(t.inliers for t in self.trackings)]
+            ),
+            "residuals": np.concatenate([np.empty(0), *(t.residuals for t in self.trackings)]),
+            "status": np.array([t.status.value for t in self.trackings], "U32"),
+            "iterations": np.array([t.iterations for t in self.trackings], np.int64),
+            "motion_known": known,
+            "motion": np.array([m.motion for m in given]).reshape(-1, 4, 4),
+            "motion_covariance": np.array([m.covariance for m in given]).reshape(-1, 6, 6),
+        }
+
+    @staticmethod
+    def from_arrays(state: StateArrays) -> RecordedInputs:
+        """Back from :meth:`to_arrays`."""
+        logged = {
+            name.removeprefix("log/"): array
+            for name, array in state.items()
+            if name.startswith("log/")
+        }
+        log = MeasurementLog.from_arrays(logged, "the smoother's saved state")
+        ends = np.cumsum(state["matches"])[:-1]
+        inliers = np.split(state["inliers"], ends)
+        residuals = np.split(state["residuals"], ends)
+        row = np.cumsum(state["motion_known"]) - 1
+        out = RecordedInputs()
+        for k, increment in enumerate(log):
+            tracking = EgoMotion(
+                state["wTc"][k],
+                state["covariance"][k],
+                inliers[k],
+                residuals[k],
+                EgoMotionStatus(str(state["status"][k])),
+                int(state["iterations"][k]),
+            )
+            motion = None
+            if state["motion_known"][k]:
+                motion = Odometry(state["motion"][row[k]], state["motion_covariance"][row[k]])
+            out.append(increment, tracking, motion)
+        return out

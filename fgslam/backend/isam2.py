@@ -1,0 +1,169 @@
+"""iSAM2 (Kaess et al. 2012) over all poses and landmarks."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gtsam
+import numpy as np
+
+from fgslam.backend.graph_builder import NewFactors
+from fgslam.backend.graph_solution import (
+    Solution,
+    allowed_parts,
+    joint_of,
+    points_of,
+    poses_of,
+    poses_of_frame,
+    solution,
+    suspect,
+)
+from fgslam.backend.smoother import Smoother
+from fgslam.errors import EstimatorError
+from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
+from fgslam.floor import Floor
+from fgslam.settings.backend import Isam2Settings
+from fgslam.types import FloatArray, Prediction, Sensor
+
+_REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
+
+
+class Isam2Smoother(Smoother):
+    """Estimator of kind ``isam2``, on :class:`fgslam.backend.protocol.Estimator`.
+
+    Updates come every few frames; in between the tracker answers. The last poses are kept at the
+    root of the Bayes tree, which is three times faster than GTSAM's own choice (all landmarks of
+    the update), with the same estimate.
+    """
+
+    kind: ClassVar[str] = "isam2"
+
+    def __init__(
+        self, sensor: Sensor, settings: Isam2Settings, floor: Floor, prior: Prediction
+    ) -> None:
+        """Starts at the prior pose with an empty map."""
+        super().__init__(sensor, settings, floor, prior)
+        self._settings = settings
+        self._isam = self._new_solver()
+        self._graph = gtsam.NonlinearFactorGraph()
+        self._new_values = gtsam.Values()
+        self._values = gtsam.Values()
+
+    def _absorb(self, new: NewFactors) -> None:
+        self._graph.push_back(new.graph)
+        self._new_values.insert(new.values)
+        if (new.frame + 1) % self._settings.update_every == 0 or new.frame == 0:
+            self._flush()
+            last = Prediction(poses_of_frame(self._values, new.frame), self._covariance(new.frame))
+            self._take_over(self._values, last)
+
+    def _solve(self) -> Solution:
+        self._flush()
+        for _ in range(self._settings.final_iterations):
+            moved = self._isam.update(
+                gtsam.NonlinearFactorGraph(), gtsam.Values(), [], self._groups(), None, None, True
+            ).getVariablesRelinearized()
+            self._values = self._isam.calculateEstimate()
+            if moved == 0:
+                break
+        self._take_out_behind()
+        graph = self._builder.kept_factors()
+        return solution(graph, self._values, self._builder.frames, self._variables(), self._floor)
+
+    def _joint(self, variables: list[int]) -> FloatArray:
+        self._flush()
+        graph = self._builder.kept_factors()
+        return joint_of(graph, self._values, self._floor, self._builder.frames - 1, variables)
+
+    # ----------------------------------------------------------------------------------------
+
+    def _new_solver(self) -> Any:
+        params = gtsam.ISAM2Params()
+        params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams())
+        params.setFactorization("CHOLESKY")
+        params.setRelinearizeThreshold(self._settings.relinearize_threshold)
+        params.relinearizeSkip = self._settings.relinearize_skip
+        return gtsam.ISAM2(params)
+
+    def _variables(self) -> list[int]:
+        return [v for v in range(self._builder.variables) if self._builder.in_graph(v)]
+
+    def _flush(self) -> None:
+        """Brings the frames since the last update in."""
+        if self._graph.size() == 0:
+            return
+        graph, values = self._graph, self._new_values
+        self._graph, self._new_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._update(graph, values)
+
+    def _update(self, graph: Any, values: Any) -> None:
+        try:
+            self._isam.update(graph, values, [], self._groups())
+            self._values = self._isam.calculateEstimate()
+        except RuntimeError as error:
+            together = gtsam.Values(self._values)
+            together.insert(values)
+            self._repair(together, error)
+
+    def _groups(self) -> Any:
+        """Constrained ordering: the last poses in the last group; None for GTSAM's own."""
+        window = self._settings.ordering_window
+        if window == 0:
+            return None
+        groups = gtsam.KeyGroupMap()
+        frames = self._builder.frames
+        for frame in range(max(0, frames - window), frames):
+            groups.insert2(pose_key(frame), 1)
+        return groups
+
+    def _repair(self, values: Any, error: Exception) -> None:
+        """Builds the solver anew from the last good values, without the landmark that failed.
+
+        After an exception iSAM2's inside is unusable; our own graph is not.
+        """
+        for _ in range(_REPAIRS):
+            key = suspect(error)
+            if key is None or is_pose(key) or not self._builder.in_graph(number(key)):
+                break
+            self._take_out(number(key), values, "left the system indeterminate")
+            try:
+                self._rebuild(values)
+                return
+            except RuntimeError as another:
+                error = another
+        raise self._failed(error)
+
+    def _take_out_behind(self) -> None:
+        """A landmark behind a camera that saw it is wrong, and says nothing to the solver."""
+        poses = poses_of(self._values, self._builder.frames)
+        behind = self._builder.behind(poses, points_of(self._values, self._variables()))
+        values = gtsam.Values(self._values)
+        for variable in behind:
+            self._take_out(variable, values, "came out behind a camera")
+        if behind:
+            self._rebuild(values)
+
+    def _take_out(self, variable: int, values: Any, why: str) -> None:
+        what = self._builder.take_out(variable)
+        values.erase(landmark_key(variable))
+        self._remarks.append(
+            f"{what} {why} at frame {self._builder.frames - 1}: taken out of the graph, iSAM2 "
+            "built anew from the last estimate"
+        )
+
+    def _rebuild(self, values: Any) -> None:
+        self._isam = self._new_solver()
+        self._isam.update(self._builder.kept_factors(), values, [], self._groups())
+        self._values = self._isam.calculateEstimate()
+
+    def _failed(self, error: Exception) -> EstimatorError:
+        return EstimatorError(
+            f"isam2: the solver failed at frame {self._builder.frames - 1} "
+            f"({' '.join(str(error).split())}); look at that frame with fgslam inspect"
+        )
+
+    def _covariance(self, frame: int) -> FloatArray:
+        """Marginal of a pose."""
+        covariance = np.asarray(self._isam.marginalCovariance(pose_key(frame)))
+        pose = poses_of_frame(self._values, frame)
+        return np.asarray(allowed_parts(self._floor, pose[None], covariance[None])[0])

@@ -1,0 +1,228 @@
+"""What all smoothers share: a tracker in front, the graph behind, and one answer from both.
+
+Between two solutions of the graph the paper's filter tracks on the smoothed map: it predicts, gives
+the landmarks to match against, and the initial values of what is new. After each solution it
+takes over the smoothed pose and positions. So the graph may be solved every frame, every tenth,
+or once, and the front-end never waits for it.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+import numpy as np
+
+from fgslam.backend.graph_builder import GraphBuilder, NewFactors, Sighting
+from fgslam.backend.graph_solution import Solution
+from fgslam.backend.inputs import RecordedInputs
+from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.errors import EstimatorError
+from fgslam.factors.keys import landmark_key
+from fgslam.floor import Floor
+from fgslam.geometry import (
+    adjoint,
+    congruence,
+    inverse,
+    point_pose_jacobian,
+    transform_to_world,
+    triangulate,
+    triangulation_covariance,
+)
+from fgslam.settings.backend import GraphSettings, LandmarkKalmanSettings
+from fgslam.types import (
+    EgoMotion,
+    Estimate,
+    FloatArray,
+    Increment,
+    IntArray,
+    LandmarkMap,
+    MeasurementType,
+    Odometry,
+    Prediction,
+    Sensor,
+    StateArrays,
+    Trajectory,
+    UpdateStats,
+)
+
+
+class Smoother(ABC):
+    """Base of the smoothers; they say when the graph is solved, and how."""
+
+    kind: ClassVar[str]
+    supports: ClassVar[frozenset[MeasurementType]] = frozenset(MeasurementType)
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        settings: GraphSettings,
+        floor: Floor,
+        prior: Prediction,
+        remember: bool = True,
+    ) -> None:
+        """Starts at the prior pose with an empty map; ``remember`` as GraphBuilder's."""
+        self._sensor = sensor
+        self._floor = floor
+        self._gate = settings.gate
+        self._start = prior
+        self._tracker = LandmarkKalman(sensor, LandmarkKalmanSettings(), prior)
+        self._builder = GraphBuilder(sensor, settings, floor, prior, remember)
+        self._inputs = RecordedInputs()
+        self._smoothed = prior
+        self._remarks: list[str] = []
+        self._answer: Solution | None = None
+        self._frozen: dict[int, tuple[FloatArray, FloatArray]] = {}
+
+    # -- the protocol ------------------------------------------------------------------------
+
+    def predict(self, odometry: Odometry | None) -> Prediction:
+        """Pose after the camera moved by ``odometry``."""
+        return self._tracker.predict(odometry)
+
+    def landmarks(self) -> LandmarkMap:
+        """Smoothed landmarks with what is known of them given the poses."""
+        return self._tracker.landmarks()
+
+    def update(
+        self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
+    ) -> UpdateStats:
+        """Tracks the frame, adds it to the graph, solves the graph if it is time to."""
+        motion = increment.odometry if increment.odometry is not None else motion
+        stats = self._tracker.update(increment, tracking)
+        self._inputs.append(increment, tracking, motion)
+        self._answer = None
+        self._absorb(self._add(increment, tracking, motion))
+        current = self._current(tracking)
+        return UpdateStats(
+            current.wTc, current.covariance, stats.landmarks, stats.nis, stats.nis_dof
+        )
+
+    def estimate(self) -> Estimate:
+        """All poses and landmarks as the graph has them now, with their marginals."""
+        answer = self._solved()
+        return Estimate(
+            Trajectory(self._inputs.timestamps(), answer.poses),
+            answer.pose_covariances,
+            self._map(answer),
+            (*self._remarks, *self._builder.remarks),
+        )
+
+    def landmark_covariances(self, ids: IntArray) -> FloatArray:
+        """Marginal covariances (k, 3, 3) of the named landmarks."""
+        found = self._map(self._solved())
+        return found.covariances[found.rows(ids)]
+
+    def joint_covariance(self, ids: IntArray) -> FloatArray:
+        """Joint covariance of the last pose and the named landmarks."""
+        self._tracker.landmarks().rows(ids)
+        variables = [self._builder.tracks[i].variable for i in ids.tolist()]
+        outside = [i for i, v in zip(ids.tolist(), variables, strict=True) if v < 0]
+        if outside:
+            raise EstimatorError(
+                f"landmark {outside[0]} waits outside the graph until it is constrained; ask for "
+                "its marginal instead"
+            )
+        return self._joint(variables)
+
+    def state(self) -> StateArrays:
+        """Everything that was put in: a solver's inside has no arrays, but repeats to the bit."""
+        return self._inputs.to_arrays(self._sensor)
+
+    def restore(self, state: StateArrays) -> None:
+        """Repeats all updates of :meth:`state`."""
+        if self._builder.frames:
+            raise EstimatorError("only a new estimator can be restored")
+        for increment, tracking, motion in RecordedInputs.from_arrays(state):
+            self.update(increment, tracking, motion)
+
+    # -- what a smoother adds ----------------------------------------------------------------
+
+    @abstractmethod
+    def _absorb(self, new: NewFactors) -> None:
+        """Takes a frame's factors in; solves when it is time to."""
+
+    @abstractmethod
+    def _solve(self) -> Solution:
+        """All poses and landmarks, with covariances."""
+
+    @abstractmethod
+    def _joint(self, variables: list[int]) -> FloatArray:
+        """Joint covariance of the last pose and landmark variables."""
+
+    # -- common steps ------------------------------------------------------------------------
+
+    def _add(
+        self, increment: Increment, tracking: EgoMotion, motion: Odometry | None
+    ) -> NewFactors:
+        observed = increment.observations
+        matched = observed.select(~observed.is_new)
+        used = tracking.inliers if self._gate else np.ones(len(matched), np.bool_)
+        rejected = matched.select(~used)
+        moved = self._builder.contradicted(rejected)
+        self._builder.start_anew(moved.ids.tolist(), "was contradicted again and again: moved")
+        self._tracker.restart(moved)
+        for identity in moved.ids.tolist():
+            self._frozen.pop(identity, None)
+        accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
+        held = np.isin(accepted.ids, self._tracker.landmarks().ids)
+        return self._builder.add(
+            increment, tracking.wTc, motion, accepted.select(held), rejected, self.landmarks()
+        )
+
+    def _take_over(self, values: Any, current: Prediction) -> None:
+        """Lets the tracker go on from smoothed values."""
+        ids, positions = self._positions(values)
+        self._smoothed = current
+        self._tracker.correct(current, ids, positions)
+
+    def _positions(self, values: Any) -> tuple[IntArray, FloatArray]:
+        """Identities and positions of the tracker's landmarks that ``values`` hold."""
+        tracks, ids, positions = self._builder.tracks, [], []
+        for identity in self._tracker.landmarks().ids.tolist():
+            track = tracks.get(identity)
+            if track is not None and track.variable >= 0:
+                key = landmark_key(track.variable)
+                if values.exists(key):
+                    ids.append(identity)
+                    positions.append(values.atPoint3(key))
+        return np.array(ids, np.int64), np.array(positions, np.float64).reshape(-1, 3)
+
+    def _current(self, tracking: EgoMotion) -> Prediction:
+        """The last pose: the tracker's, whose map is as uncertain as the pose last smoothed."""
+        now = self._tracker.predict(None)
+        if now.wTc is self._smoothed.wTc:
+            return self._smoothed
+        moved = adjoint(inverse(now.wTc) @ self._smoothed.wTc)
+        drift = congruence(moved, self._smoothed.covariance)
+        return Prediction(now.wTc, self._floor.allowed_part(now.wTc, drift + tracking.covariance))
+
+    def _solved(self) -> Solution:
+        if self._answer is None:
+            self._answer = self._solve()
+        return self._answer
+
+    def _map(self, answer: Solution) -> LandmarkMap:
+        """The tracker's landmarks where the graph has them; those that wait, from their pose."""
+        ids = self._tracker.landmarks().ids
+        positions, covariances = np.empty((len(ids), 3)), np.empty((len(ids), 3, 3))
+        for row, identity in enumerate(ids.tolist()):
+            track = self._builder.tracks[identity]
+            if track.variable in answer.points:
+                positions[row] = answer.points[track.variable]
+                covariances[row] = answer.point_covariances[track.variable]
+            elif identity in self._frozen:
+                positions[row], covariances[row] = self._frozen[identity]
+            else:
+                positions[row], covariances[row] = self._seen_from(answer, track.last)
+        return LandmarkMap(ids, positions, covariances)
+
+    def _seen_from(self, answer: Solution, sighting: Sighting) -> tuple[FloatArray, FloatArray]:
+        """Position and covariance of a landmark from a single sighting."""
+        wTc = answer.poses[sighting.frame]
+        measurement = sighting.measurement[None]
+        point = triangulate(self._sensor, measurement)
+        local = triangulation_covariance(self._sensor, measurement, sighting.covariance[None])
+        by_pose = congruence(point_pose_jacobian(point), answer.pose_covariances[sighting.frame])
+        world = congruence(wTc[:3, :3], local + by_pose)
+        return transform_to_world(wTc, point)[0], world[0]
