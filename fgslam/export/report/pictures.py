@@ -12,7 +12,7 @@ from PIL import Image, UnidentifiedImageError
 from fgslam.export.report.data import Picture
 
 MAX_WIDTH = 1400
-BUDGET_BYTES = 3_600_000
+BUDGET_BYTES = 2_800_000
 _KEPT_AS_IT_IS = 120_000
 _QUALITY = 80
 
@@ -50,6 +50,7 @@ def embed(pictures: Sequence[Picture]) -> tuple[list[Embedded], list[str]]:
 def _embed(picture: Picture) -> Embedded | None:
     try:
         with Image.open(io.BytesIO(picture.content)) as opened:
+            opened.load()  # a torn file shows only now
             width, height = opened.size
             if len(picture.content) <= _KEPT_AS_IT_IS and opened.format in ("PNG", "JPEG", "WEBP"):
                 mime, content = f"image/{opened.format.lower()}", picture.content

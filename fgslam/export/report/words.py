@@ -50,10 +50,10 @@ def _accuracy(data: ReportData, working: list[EstimatorReport]) -> str:
     if second <= _ABOUT_EQUAL * first:
         equal = [name for error, name in ranked if error <= _ABOUT_EQUAL * first]
         return f"{_listed(equal)} are about equally accurate: {metres(first)} ({how})."
-    ratio = f"{second / first:.2g} times" if first > 0.0 else "far"
+    ratio = f", {second / first:.2g} times as much" if first > 0.0 else ""
     return (
         f"{title} is the most accurate: off by {metres(first)} ({how}). "
-        f"The next, {other}, is off by {metres(second)}, {ratio} as much."
+        f"The next, {other}, is off by {metres(second)}{ratio}."
     )
 
 
