@@ -1,0 +1,161 @@
+"""Dead reckoning: the odometry as it is, the floor of every comparison.
+
+No measurement of a landmark ever moves a pose. Landmarks stand where they were first seen from,
+with the uncertainty of that pose and of that one observation.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from fgslam.backend.filtered import FilteredTrajectory, FirstSights
+from fgslam.geometry import (
+    adjoint,
+    compose_covariance,
+    congruence,
+    inverse,
+    point_pose_jacobian,
+    reorthonormalise,
+    transform_to_camera,
+    transform_to_world,
+)
+from fgslam.types import (
+    EgoMotion,
+    Estimate,
+    FloatArray,
+    Increment,
+    IntArray,
+    LandmarkMap,
+    MeasurementType,
+    Observations,
+    Odometry,
+    Prediction,
+    Sensor,
+    StateArrays,
+    UpdateStats,
+)
+
+
+class DeadReckoning:
+    """Estimator of kind ``odometry``, on :class:`fgslam.backend.protocol.Estimator`."""
+
+    kind: ClassVar[str] = "odometry"
+    supports: ClassVar[frozenset[MeasurementType]] = frozenset(MeasurementType)
+
+    def __init__(self, sensor: Sensor, prior: Prediction) -> None:
+        """Starts at the prior: pose of the first frame and its covariance."""
+        self._sensor = sensor
+        self._current = prior
+        self._past = FilteredTrajectory()
+        self._map = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+        self._first_frame: IntArray = np.empty(0, np.int64)
+
+    def predict(self, odometry: Odometry | None) -> Prediction:
+        """Pose after the camera moved by ``odometry``."""
+        if odometry is None:
+            return self._current
+        return Prediction(
+            self._current.wTc @ odometry.motion,
+            compose_covariance(odometry.motion, self._current.covariance, odometry.covariance),
+        )
+
+    def landmarks(self) -> LandmarkMap:
+        """Landmarks as first seen; the arrays are read only by agreement."""
+        return self._map
+
+    def update(
+        self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
+    ) -> UpdateStats:
+        """Moves on by the odometry, or the stand-in; ``tracking`` and matches have no say."""
+        predicted = self.predict(self._past.motion_to(increment, motion))
+        self._current = Prediction(reorthonormalise(predicted.wTc), predicted.covariance)
+        self._add(increment.observations.select(increment.observations.is_new))
+        self._remove(increment.pruned_ids)
+        self._past.append(increment.timestamp, self._current)
+        wTc, covariance = self._current.wTc, self._current.covariance
+        return UpdateStats(wTc, covariance, len(self._map), float("nan"), 0)
+
+    def estimate(self) -> Estimate:
+        """Trajectory as predicted, and the map."""
+        return Estimate(self._past.trajectory(), self._past.pose_covariances(), self._map)
+
+    def landmark_covariances(self, ids: IntArray) -> FloatArray:
+        """Covariances (k, 3, 3) of the named landmarks."""
+        return self._map.covariances[self._map.rows(ids)]
+
+    def joint_covariance(self, ids: IntArray) -> FloatArray:
+        """Exact to first order: an early pose's error lives on in all that came after it."""
+        rows = self._map.rows(ids)
+        frames = [*self._first_frame[rows].tolist(), len(self._past) - 1]
+        jacobians = [*self._by_pose(rows), np.eye(6)]
+        start = np.cumsum([6, *[3] * len(rows)])
+        at = [slice(s, s + 3) for s in start[:-1]] + [slice(0, 6)]
+        out = np.zeros((start[-1], start[-1]))
+        for i, a in enumerate(at):
+            for j, b in enumerate(at):
+                early, late = sorted((i, j), key=lambda k: frames[k])
+                cross = self._between_poses(frames[early], frames[late])
+                block = jacobians[early] @ cross @ jacobians[late].T
+                out[a, b] = block if i == early else block.T
+        for a, row in zip(at, rows.tolist(), strict=False):
+            out[a, a] = self._map.covariances[row]
+        return np.asarray(0.5 * (out + out.T))
+
+    def state(self) -> StateArrays:
+        """Everything needed to continue; nothing in it is ever written to again."""
+        return self._past.state() | {
+            "current_pose": self._current.wTc,
+            "current_covariance": self._current.covariance,
+            "ids": self._map.ids,
+            "positions": self._map.positions,
+            "covariances": self._map.covariances,
+            "first_frame": self._first_frame,
+        }
+
+    def restore(self, state: StateArrays) -> None:
+        """Continues from :meth:`state`."""
+        self._past = FilteredTrajectory.restored(state)
+        self._current = Prediction(state["current_pose"], state["current_covariance"])
+        self._map = LandmarkMap(state["ids"], state["positions"], state["covariances"])
+        self._first_frame = state["first_frame"]
+
+    # ----------------------------------------------------------------------------------------
+
+    def _add(self, observed: Observations) -> None:
+        """Type IV landmarks: their own noise and the pose's, at the pose of this frame."""
+        first = FirstSights.of(self._sensor, observed)
+        wTc = self._current.wTc
+        by_pose = point_pose_jacobian(first.points)
+        local = first.covariances + congruence(by_pose, self._current.covariance)
+        ids = np.concatenate([self._map.ids, first.observed.ids])
+        positions = np.concatenate([self._map.positions, transform_to_world(wTc, first.points)])
+        covariances = np.concatenate([self._map.covariances, congruence(wTc[:3, :3], local)])
+        frames = np.concatenate([self._first_frame, np.full(len(first.points), len(self._past))])
+        order = np.argsort(ids, kind="stable")
+        self._map = LandmarkMap(ids[order], positions[order], covariances[order])
+        self._first_frame = frames[order]
+
+    def _remove(self, ids: IntArray) -> None:
+        keep = ~np.isin(self._map.ids, ids)
+        self._map = LandmarkMap(
+            self._map.ids[keep], self._map.positions[keep], self._map.covariances[keep]
+        )
+        self._first_frame = self._first_frame[keep]
+
+    def _by_pose(self, rows: IntArray) -> list[FloatArray]:
+        """d(landmark)/d(tangent of the pose that it was first seen from), each (3, 6)."""
+        out = []
+        for row in rows.tolist():
+            wTc = self._past.poses[self._first_frame[row]]
+            local = transform_to_camera(wTc, self._map.positions[[row]])
+            out.append(-wTc[:3, :3] @ point_pose_jacobian(local)[0])
+        return out
+
+    def _between_poses(self, early: int, late: int) -> FloatArray:
+        """Cross-covariance (6, 6) of two poses of the trajectory: what the first hands on."""
+        if late < 0:
+            return self._current.covariance
+        onward = adjoint(inverse(self._past.poses[late]) @ self._past.poses[early])
+        return np.asarray(self._past.covariances[early] @ onward.T)

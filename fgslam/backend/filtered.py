@@ -1,0 +1,119 @@
+"""What filters share: a trajectory that is never revised, and landmarks placed at first sight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fgslam.errors import EstimatorError
+from fgslam.geometry import in_front, triangulate, triangulation_covariance
+from fgslam.types import (
+    BoolArray,
+    CameraRig,
+    FloatArray,
+    Increment,
+    Observations,
+    Odometry,
+    Prediction,
+    Sensor,
+    StateArrays,
+    Trajectory,
+)
+
+
+@dataclass(slots=True, eq=False)
+class FilteredTrajectory:
+    """Poses ``wTc`` and their covariances, one a frame, as they were when their frame came."""
+
+    timestamps: list[float] = field(default_factory=list)
+    poses: list[FloatArray] = field(default_factory=list)
+    covariances: list[FloatArray] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def append(self, timestamp: float, current: Prediction) -> None:
+        """Adds the frame just processed."""
+        self.timestamps.append(timestamp)
+        self.poses.append(current.wTc)
+        self.covariances.append(current.covariance)
+
+    def motion_to(self, increment: Increment, motion: Odometry | None) -> Odometry | None:
+        """The increment's odometry, or else the stand-in; None for the first frame alone.
+
+        Raises EstimatorError where time does not increase, or a later frame has no motion at all.
+        """
+        if self.timestamps and not increment.timestamp > self.timestamps[-1]:
+            raise EstimatorError(
+                f"frame {increment.index}: time stamp {increment.timestamp:.9f} s does not come "
+                f"after {self.timestamps[-1]:.9f} s; sort the measurements by time"
+            )
+        known = increment.odometry if increment.odometry is not None else motion
+        if known is None and self.timestamps:
+            raise EstimatorError(
+                f"frame {increment.index}: neither odometry nor a stand-in says how the camera "
+                "moved; hand the motion model's step to the update"
+            )
+        return known
+
+    def trajectory(self) -> Trajectory:
+        """All poses."""
+        poses = np.array(self.poses).reshape(-1, 4, 4)
+        return Trajectory(np.array(self.timestamps, np.float64), poses)
+
+    def pose_covariances(self) -> FloatArray:
+        """(n, 6, 6) of all poses."""
+        return np.array(self.covariances).reshape(-1, 6, 6)
+
+    def state(self) -> StateArrays:
+        """All of it as plain arrays."""
+        trajectory = self.trajectory()
+        return {
+            "timestamps": trajectory.timestamps,
+            "poses": trajectory.poses,
+            "pose_covariances": self.pose_covariances(),
+        }
+
+    @staticmethod
+    def restored(state: StateArrays) -> FilteredTrajectory:
+        """Back from :meth:`state`."""
+        return FilteredTrajectory(
+            [float(t) for t in state["timestamps"]],
+            list(state["poses"]),
+            list(state["pose_covariances"]),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FirstSights:
+    """Landmarks placed by a single observation each.
+
+    Attributes:
+        observed: those of the given observations that fix a point before the sensor.
+        points: (k, 3) in the sensor's frame, metres.
+        covariances: (k, 3, 3) of the points, the sensor's pose taken as exact.
+    """
+
+    observed: Observations
+    points: FloatArray
+    covariances: FloatArray
+
+    @staticmethod
+    def of(sensor: Sensor, observed: Observations) -> FirstSights:
+        """Triangulates; what lies at infinity or behind the sensor is left out."""
+        observed = observed.select(_placeable(sensor, observed.measurement))
+        points = triangulate(sensor, observed.measurement)
+        kept = in_front(sensor, points)
+        observed, points = observed.select(kept), points[kept]
+        covariances = triangulation_covariance(sensor, observed.measurement, observed.covariance)
+        return FirstSights(observed, points, covariances)
+
+
+def _placeable(sensor: Sensor, measurement: FloatArray) -> BoolArray:
+    """Positive disparity, or range: otherwise the triangulation has nothing to divide by."""
+    finite = np.isfinite(measurement).all(axis=1)
+    last = np.where(finite, measurement[:, 2], 0.0)
+    # Far below any disparity that a camera can tell from zero, far above one that overflows.
+    least = 1e-6 if isinstance(sensor, CameraRig) else 0.0
+    return np.asarray(last > least)
