@@ -58,9 +58,9 @@ def open_stereo_tracks(
     files = _find(settings.file)
     tracks = read_table(files.tracks, _COLUMNS)
     rows, notes = _usable(tracks)
-    rig = _read_rig(files.calibration, tracks.values[rows])
     numbers = np.unique(tracks.values[rows, 0]).astype(np.int64)
     numbers = numbers[select_of(len(numbers), settings, str(files.tracks))]
+    rig = _read_rig(files.calibration, tracks.values[rows])
     truth = _read_poses(files.poses, rig, numbers, settings.frame_period_s)
     if truth is not None:
         notes += ("the reference poses are estimates from the same images, not measured truth",)

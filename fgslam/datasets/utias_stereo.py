@@ -85,6 +85,8 @@ def _read(file: MatlabFile) -> _Recorded:
             "restore the file"
         )
     positive = ~unseen & (y[:, :, 0] > y[:, :, 2])
+    if not positive.any():
+        raise DatasetError(f"{file.path}: y_k_j never sees a landmark; restore the file")
     body = np.tile(np.eye(4), (n, 1, 1))
     body[:, :3, :3] = [g.so3_exp(theta) for theta in file.array("theta_vk_i", (3, n)).T]
     body[:, :3, 3] = file.array("r_i_vk_i", (3, n)).T

@@ -1,0 +1,264 @@
+"""GTSAM's stereo tracks: the right camera becomes the reference, bad files are told in one line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from simulated import assert_same_bits
+
+from fgslam import geometry as g
+from fgslam.datasets.opening import open_measurements
+from fgslam.errors import CalibrationError, DatasetError
+from fgslam.evaluation.trajectory import evaluate_trajectory
+from fgslam.factory import make_estimator
+from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.motion import ConstantVelocityMotion
+from fgslam.pipeline import replay_step
+from fgslam.recordings import MeasurementRecording
+from fgslam.settings.backend import LandmarkKalmanSettings
+from fgslam.settings.datasets import ConstantVelocitySettings
+from fgslam.settings.frontend import EgoMotionSettings
+from fgslam.settings.measurements import StereoTracksSettings
+from fgslam.types import CameraRig, FloatArray
+
+FX, FY, CX, CY, B = 700.0, 710.0, 600.0, 180.0, 0.5
+POINTS = np.array([[1.0, 0.5, 10.0], [-2.0, -1.0, 8.0], [0.3, 0.2, 25.0], [3.0, -0.4, 14.0]])
+IDS = (7, 15, 3, 40)
+FRAMES = (0, 1, 4)  # keyframes: the files skip some
+SEEN = {0: (7, 15, 3), 1: (7, 3), 4: (15, 3, 40)}
+
+
+def left_poses() -> FloatArray:
+    """``wTl`` (3, 4, 4): forward, and a turn."""
+    return np.array([g.se3_exp(n * np.array([0, 0.02, 0, 0, 0, 0.8])) for n in (0.0, 1.0, 4.0)])
+
+
+@pytest.fixture
+def tracks(tmp_path: Path) -> Path:
+    """Three frames of four landmarks, sorted by landmark as GTSAM's files are."""
+    rows = []
+    for number, pose in zip(FRAMES, left_poses(), strict=True):
+        for which, point in zip(IDS, g.transform_to_camera(pose, POINTS), strict=True):
+            if which in SEEN[number]:
+                x, y, z = point
+                left, right = FX * x / z + CX, FX * (x - B) / z + CX
+                rows.append([number, which, left, right, FY * y / z + CY, x, y, z])
+    rows.sort(key=lambda row: (row[1], row[0]))
+    path = tmp_path / "VO_stereo_factors_try.txt"
+    path.write_text("\n".join(" ".join(f"{v:.12g}" for v in row) for row in rows), "utf-8")
+    (tmp_path / "VO_calibration_try.txt").write_text(f"{FX} {FY} 0.0 {CX} {CY} {B}", "utf-8")
+    lines = [
+        " ".join([str(number), *(f"{v:.9g}" for v in pose.ravel())])
+        for number, pose in zip(FRAMES, left_poses(), strict=True)
+    ]
+    (tmp_path / "VO_camera_poses_try.txt").write_text("\n".join(lines), "utf-8")
+    return path
+
+
+def opened(path: Path, **values: object) -> MeasurementRecording:
+    return open_measurements(StereoTracksSettings(file=str(path), **values), 0)  # type: ignore[arg-type]
+
+
+def test_measurements_are_the_right_camera_s(tracks: Path) -> None:
+    recording = opened(tracks)
+    rig, truth = recording.log.rig, recording.ground_truth
+    assert isinstance(rig, CameraRig)
+    assert (rig.fx, rig.fy, rig.cx, rig.cy, rig.baseline) == (FX, FY, CX, CY, B)
+    assert rig.vertical_baseline is None
+    assert truth is not None
+    np.testing.assert_allclose(truth.poses[0, :3, 3], [B, 0.0, 0.0], atol=1e-9)
+    for increment, wTr in zip(recording.log, truth.poses, strict=True):
+        seen = increment.observations
+        points = POINTS[[IDS.index(i) for i in seen.ids.tolist()]]
+        expected = g.project(rig, g.transform_to_camera(wTr, points))
+        np.testing.assert_allclose(seen.measurement, expected, atol=1e-5)
+        np.testing.assert_allclose(seen.pixels[:, 0], seen.measurement[:, :2])
+        np.testing.assert_allclose(
+            seen.pixels[:, 1, 0] - seen.pixels[:, 0, 0], seen.measurement[:, 2]
+        )
+        assert np.isnan(seen.pixels[:, 2]).all()
+
+
+def test_frames_identities_and_times(tracks: Path) -> None:
+    log = opened(tracks, frame_period_s=0.2).log
+    assert [increment.index for increment in log] == [0, 1, 4]
+    assert [increment.timestamp for increment in log] == pytest.approx([0.0, 0.2, 0.8])
+    assert [i.observations.ids.tolist() for i in log] == [[3, 7, 15], [3, 7], [3, 15, 40]]
+    assert [i.observations.is_new.tolist() for i in log] == [
+        [True] * 3,
+        [False] * 2,
+        [False, False, True],
+    ]
+    assert all(len(i.missed_ids) == len(i.pruned_ids) == 0 for i in log)
+    assert all(i.odometry is None for i in log)
+    assert log.motion_model["kind"] == "constant_velocity"
+
+
+def test_the_covariance_is_that_of_independent_pixels(tracks: Path) -> None:
+    covariance = opened(tracks, pixel_sigma=0.5).log.increments[0].observations.covariance[0]
+    np.testing.assert_allclose(covariance, 0.25 * np.array([[1, 0, -1], [0, 1, 0], [-1, 0, 2]]))
+
+
+def test_selected_frames_start_their_landmarks_anew(tracks: Path) -> None:
+    recording = opened(tracks, start=1)
+    assert [increment.index for increment in recording.log] == [1, 4]
+    assert recording.log.increments[0].observations.is_new.all()
+    assert recording.ground_truth is not None
+    assert recording.ground_truth.timestamps == pytest.approx([0.1, 0.4])
+    assert [i.index for i in opened(tracks, stride=2).log] == [0, 4]
+    with pytest.raises(DatasetError, match="choose a smaller start"):
+        opened(tracks, start=3)
+
+
+def test_the_identity_is_of_the_content(tracks: Path) -> None:
+    first = opened(tracks).identity
+    assert opened(tracks).identity == first
+    assert opened(tracks, pixel_sigma=0.3).identity != first
+    text = tracks.read_text("utf-8")
+    tracks.write_text(text.replace("7 ", "8 ", 1), "utf-8")
+    assert opened(tracks).identity != first
+
+
+def test_reference_poses_are_called_estimates_and_may_be_absent(tracks: Path) -> None:
+    assert any("estimates" in note for note in opened(tracks).notes)
+    tracks.with_name("VO_camera_poses_try.txt").unlink()
+    recording = opened(tracks)
+    assert recording.ground_truth is None
+    assert recording.notes == ()
+
+
+def test_observations_without_disparity_are_left_out_and_told(tracks: Path) -> None:
+    lines = tracks.read_text("utf-8").splitlines()
+    words = lines[0].split()
+    words[3] = words[2]
+    tracks.write_text("\n".join([" ".join(words), *lines[1:]]), "utf-8")
+    recording = opened(tracks)
+    assert recording.notes[0] == "1 observations without disparity left out"
+    assert sum(len(i.observations) for i in recording.log) == 7
+
+
+# --------------------------------------------------------------------------------------------
+# Bad files
+
+
+def broken_line(change: Callable[[list[str]], list[str]]) -> Callable[[Path], None]:
+    """Changes the words of the third line of the tracks."""
+
+    def apply(tracks: Path) -> None:
+        lines = tracks.read_text("utf-8").splitlines()
+        lines[2] = " ".join(change(lines[2].split()))
+        tracks.write_text("\n".join(lines), "utf-8")
+
+    return apply
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda words: words[:5], "line 3: 5 columns, expected 8"),
+        (lambda words: [*words[:3], "x", *words[4:]], "line 3: uR is 'x', not a number"),
+        (lambda words: [*words[:3], "nan", *words[4:]], "line 3: uR is nan, not finite"),
+        (lambda words: ["0.5", *words[1:]], "line 3: pose and landmark must be whole numbers"),
+        (lambda words: ["-1", *words[1:]], "line 3: pose and landmark must be whole numbers"),
+        (lambda words: ["0", *words[1:]], "line 3: the landmark is measured twice in one frame"),
+    ],
+)
+def test_a_wrong_line_is_named(
+    tracks: Path, change: Callable[[list[str]], list[str]], message: str
+) -> None:
+    broken_line(change)(tracks)
+    with pytest.raises(DatasetError, match=message) as caught:
+        opened(tracks)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("VO_calibration_try.txt", "700 700 0.0 600", "4 columns, expected 6"),
+        ("VO_calibration_try.txt", "700 700 0.3 600 180 0.5", "skew 0"),
+        ("VO_calibration_try.txt", "700 700 0.0 600 180 -0.5", "baseline must be positive"),
+        ("VO_calibration_try.txt", "", "0 lines, expected one"),
+        ("VO_camera_poses_try.txt", "0 " + 16 * "1 ", "line 1: not a rigid pose"),
+        ("VO_camera_poses_try.txt", "0 1 2", "3 columns, expected 17"),
+    ],
+)
+def test_wrong_calibration_and_poses_are_named(
+    tracks: Path, name: str, text: str, message: str
+) -> None:
+    tracks.with_name(name).write_text(text, "utf-8")
+    with pytest.raises(DatasetError, match=message) as caught:
+        opened(tracks)
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_files_are_named(tracks: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"no such file; dataset\.file is 00s, 00, large or"):
+        opened(tmp_path / "VO_stereo_factors_none.txt")
+    tracks.with_name("VO_calibration_try.txt").unlink()
+    with pytest.raises(CalibrationError, match=r"VO_calibration\.txt"):
+        opened(tracks)
+    tracks.write_text("", "utf-8")
+    tracks.with_name("VO_calibration.txt").write_text(f"{FX} {FY} 0 {CX} {CY} {B}", "utf-8")
+    with pytest.raises(DatasetError, match="has no frame at all"):
+        opened(tracks)
+
+
+# --------------------------------------------------------------------------------------------
+# The files inside the gtsam package
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "observations", "landmarks"),
+    [("large", 26, 8189, 2634), ("00s", 77, 52544, 15638), ("00", 135, 88781, 26136)],
+)
+def test_gtsam_s_own_files(name: str, frames: int, observations: int, landmarks: int) -> None:
+    recording = open_measurements(StereoTracksSettings(file=name), 0)
+    assert len(recording.log) == frames
+    assert sum(len(i.observations) for i in recording.log) == observations
+    assert sum(int(i.observations.is_new.sum()) for i in recording.log) == landmarks
+    assert recording.ground_truth is not None
+    assert len(recording.ground_truth) == frames
+
+
+def test_gtsam_is_found_and_not_loaded() -> None:
+    script = (
+        "import sys\n"
+        "from fgslam.datasets.opening import open_measurements\n"
+        "from fgslam.settings.measurements import StereoTracksSettings\n"
+        "open_measurements(StereoTracksSettings(file='large'), 0)\n"
+        "print('gtsam' in sys.modules)"
+    )
+    done = subprocess.run(  # noqa: S603 - our own interpreter and our own script
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "False"
+
+
+def test_the_filter_follows_the_reference(rng: np.random.Generator) -> None:
+    """23 m from constant velocity alone; the reference is as good as its own estimate."""
+    recording = open_measurements(StereoTracksSettings(file="large"), 0)
+    log = recording.log
+    estimator = make_estimator(log.rig, LandmarkKalmanSettings())
+    limits = EgoMotionSettings(max_correction_m=3.0, max_correction_deg=10.0)
+    solver = EgoMotionSolver(log.rig, limits)
+    motion = ConstantVelocityMotion(ConstantVelocitySettings())
+    stats = [replay_step(step, estimator, solver, motion, k) for k, step in enumerate(log)]
+    error = evaluate_trajectory(estimator.estimate().trajectory, recording.ground_truth)
+    assert error.ate_rmse_m is not None
+    assert error.ate_rmse_m < 0.03
+    nis = sum(s.nis for s in stats if s.nis_dof) / sum(s.nis_dof for s in stats)
+    assert 0.7 < nis < 1.3  # the default pixel_sigma is what it claims to be
+
+
+@pytest.mark.data
+def test_the_same_files_elsewhere(shared_data: Path) -> None:
+    inside = open_measurements(StereoTracksSettings(file="00s"), 0)
+    beside = opened(shared_data / "landmarks" / "VO_stereo_factors00s.txt")
+    assert_same_bits(inside.log.to_arrays(), beside.log.to_arrays())
