@@ -1,0 +1,394 @@
+"""UTIAS recordings: a small world written as their files, then the files themselves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from fgslam import geometry as g
+from fgslam.datasets.opening import open_measurements
+from fgslam.errors import DatasetError
+from fgslam.evaluation.trajectory import evaluate_trajectory
+from fgslam.factory import make_estimator
+from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.motion import ConstantVelocityMotion
+from fgslam.pipeline import replay_step
+from fgslam.recordings import MeasurementRecording
+from fgslam.settings.backend import LandmarkKalmanSettings
+from fgslam.settings.datasets import ConstantVelocitySettings
+from fgslam.settings.frontend import EgoMotionSettings
+from fgslam.settings.measurements import UtiasRangeBearingSettings, UtiasStereoSettings
+from fgslam.types import CameraRig, FloatArray, RangeBearingSensor, Trajectory
+
+N = 12
+STEREO_FILE = "utias_starry_night_dataset3.mat"
+WOODS_FILE = "utias_lost_in_the_woods_dataset2.mat"
+
+
+def starry(rng: np.random.Generator) -> dict[str, Any]:
+    """An exact world in the file's own variables, written from Barfoot's equations."""
+    t = np.cumsum(rng.uniform(0.05, 0.15, N))
+    w, v = rng.normal(0.0, 0.4, (3, N)), rng.normal(0.0, 0.5, (3, N))
+    rotation, position = g.so3_exp(np.array([0.3, -2.8, 0.4])), np.array([1.0, 2.0, 0.3])
+    theta, r = np.empty((3, N)), np.empty((3, N))
+    c_c_v, rho = g.so3_exp(np.array([0.1, 1.4, -0.3])), np.array([0.05, 0.1, -0.02])
+    landmarks = rng.uniform(-2.0, 2.0, (3, 6)) + position[:, None]
+    y = -np.ones((4, N, 6))
+    fu, fv, cu, cv, b = 480.0, 470.0, 320.0, 240.0, 0.24
+    for k in range(N):
+        theta[:, k], r[:, k] = g.so3_log(rotation), position
+        local = c_c_v @ (rotation.T @ (landmarks - position[:, None]) - rho[:, None])
+        for j in np.flatnonzero(local[2] > 0.3):
+            x, down, z = local[:, j]
+            row = fv * down / z + cv
+            pixels = [fu * x / z + cu, row, fu * (x - b) / z + cu, row]
+            if min(pixels) >= 0.0:
+                y[:, k, j] = pixels
+        if k < N - 1:
+            dt = t[k + 1] - t[k]
+            position = position + rotation @ (dt * v[:, k])
+            rotation = rotation @ g.so3_exp(dt * w[:, k])
+    column = np.ones((3, 1))
+    numbers = {"fu": fu, "fv": fv, "cu": cu, "cv": cv, "b": b}
+    return {
+        "t": t[None],
+        "theta_vk_i": theta,
+        "r_i_vk_i": r,
+        "w_vk_vk_i": w,
+        "v_vk_vk_i": v,
+        "rho_i_pj_i": landmarks,
+        "y_k_j": y,
+        "C_c_v": c_c_v,
+        "rho_v_c_v": rho[:, None],
+        "w_var": 0.01 * column,
+        "v_var": np.array([[0.001], [0.002], [0.003]]),
+        "y_var": np.array([[4.0], [9.0], [16.0], [25.0]]),
+        **{name: np.array([[value]]) for name, value in numbers.items()},
+    }
+
+
+def woods(rng: np.random.Generator) -> dict[str, Any]:
+    """The same for the plane."""
+    t = 0.1 * np.arange(N)
+    v, om = rng.uniform(0.1, 0.5, N), rng.normal(0.0, 0.8, N)
+    pose = g.pose(g.so3_exp(np.array([0.0, 0.0, 3.0])), np.array([1.0, -2.0, 0.0]))
+    landmarks = rng.uniform(-4.0, 4.0, (5, 2))
+    true, ranges, bearings = np.empty((N, 3)), np.zeros((N, 5)), np.zeros((N, 5))
+    ahead = 0.22
+    for k in range(N):
+        heading = np.arctan2(pose[1, 0], pose[0, 0])
+        true[k] = pose[0, 3], pose[1, 3], heading
+        laser = pose[:2, 3] + ahead * np.array([np.cos(heading), np.sin(heading)])
+        away = landmarks - laser
+        ranges[k] = np.hypot(*away.T)
+        bearings[k] = g.wrap_angle(np.arctan2(away[:, 1], away[:, 0]) - heading)
+        pose = pose @ g.se3_exp(0.1 * np.array([0, 0, om[k], v[k], 0, 0]))
+    ranges[3, 2] = bearings[3, 2] = 0.0
+    valid = np.ones((N, 1), np.uint8)
+    valid[5] = 0
+    numbers = {"d": ahead, "r_var": 0.0009, "b_var": 0.0004, "v_var": 0.004, "om_var": 0.01}
+    return {
+        "t": t[:, None],
+        "v": v[:, None],
+        "om": om[:, None],
+        "r": ranges,
+        "b": bearings,
+        "l": landmarks,
+        "x_true": true[:, :1],
+        "y_true": true[:, 1:2],
+        "th_true": true[:, 2:],
+        "true_valid": valid,
+        **{name: np.array([[value]]) for name, value in numbers.items()},
+    }
+
+
+def opened(tmp_path: Path, values: dict[str, Any], **settings: Any) -> MeasurementRecording:
+    """The values written as a file and opened by the reader that fits."""
+    path = tmp_path / "values.mat"
+    savemat(path, values)
+    kind = UtiasStereoSettings if "y_k_j" in values else UtiasRangeBearingSettings
+    return open_measurements(kind(path=str(path), **settings), 0)
+
+
+def require_exact(recording: MeasurementRecording) -> int:
+    """Every measurement is that of the true landmark from the true pose; how many there were."""
+    truth, landmarks = recording.ground_truth, recording.landmark_truth
+    assert truth is not None
+    assert landmarks is not None
+    at = dict(zip(truth.timestamps.tolist(), truth.poses, strict=True))
+    count = 0
+    for increment in recording.log:
+        if increment.timestamp in at:
+            seen = increment.observations
+            points = landmarks.positions[np.searchsorted(landmarks.ids, seen.ids)]
+            local = g.transform_to_camera(at[increment.timestamp], points)
+            expected = g.project(recording.log.rig, local)
+            error = g.measurement_difference(recording.log.rig, seen.measurement, expected)
+            np.testing.assert_allclose(error, 0.0, atol=1e-8)
+            count += len(seen)
+    return count
+
+
+def require_exact_motion(recording: MeasurementRecording) -> None:
+    truth = recording.ground_truth
+    assert truth is not None
+    poses = dict(zip(truth.timestamps.tolist(), truth.poses, strict=True))
+    compared = 0
+    for before, after in zip(recording.log.increments, recording.log.increments[1:], strict=False):
+        if before.timestamp in poses and after.timestamp in poses:
+            assert after.odometry is not None
+            moved = g.inverse(poses[before.timestamp]) @ poses[after.timestamp]
+            np.testing.assert_allclose(after.odometry.motion, moved, atol=1e-9)
+            compared += 1
+    assert compared > 2
+
+
+# --------------------------------------------------------------------------------------------
+# Exact worlds
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_starry_night_is_read_as_its_equations_say(
+    tmp_path: Path, rng: np.random.Generator, stride: int
+) -> None:
+    recording = opened(tmp_path, starry(rng), stride=stride)
+    assert require_exact(recording) >= 4
+    require_exact_motion(recording)
+    assert isinstance(recording.log.rig, CameraRig)
+    assert [i.index for i in recording.log] == list(range(0, N, stride))
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_lost_in_the_woods_is_read_as_its_equations_say(
+    tmp_path: Path, rng: np.random.Generator, stride: int
+) -> None:
+    recording = opened(tmp_path, woods(rng), stride=stride, max_range_m=100.0)
+    assert require_exact(recording) >= 10
+    require_exact_motion(recording)
+    sensor = recording.log.rig
+    assert isinstance(sensor, RangeBearingSensor)
+    np.testing.assert_allclose(sensor.bTc[:3, 3], [0.22, 0.0, 0.0])
+
+
+def test_pixels_left_and_right_keep_their_places(tmp_path: Path, rng: np.random.Generator) -> None:
+    values = starry(rng)
+    for increment in opened(tmp_path, values).log:
+        seen = increment.observations
+        written = values["y_k_j"][:, increment.index, seen.ids].T
+        np.testing.assert_array_equal(seen.pixels[:, 1], written[:, :2])
+        np.testing.assert_array_equal(seen.pixels[:, 0], written[:, 2:])
+        unseen = np.setdiff1d(np.arange(6), seen.ids)
+        assert (values["y_k_j"][:, increment.index, unseen] == -1.0).all()
+
+
+def test_pixel_covariance_follows_from_the_file_s_variances(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    def first(**settings: Any) -> FloatArray:
+        log = opened(tmp_path, starry(rng), **settings).log
+        return next(i.observations.covariance[0] for i in log if len(i.observations))
+
+    independent = first(left_right_correlation=(0.0, 0.0))
+    np.testing.assert_allclose(independent, [[16, 0, -16], [0, 8.5, 0], [-16, 0, 20]])
+    tied = first(left_right_correlation=(0.5, 0.9), pixel_sigma_scale=2.0)
+    np.testing.assert_allclose(
+        tied, 4.0 * np.array([[16, 0, 4 - 16], [0, 8.5 + 0.5 * 0.9 * 15, 0], [4 - 16, 0, 20 - 8]])
+    )
+
+
+def test_odometry_covariance_is_that_of_noisy_rates(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """Monte Carlo over the rates of one step of Starry Night, in the reference camera."""
+    values = starry(rng)
+    stated = opened(tmp_path, values).log.increments[1].odometry
+    assert stated is not None
+    rig = opened(tmp_path, values).log.rig
+    dt = values["t"][0, 1] - values["t"][0, 0]
+    w, v = values["w_vk_vk_i"][:, 0], values["v_vk_vk_i"][:, 0]
+    drawn = []
+    for _ in range(4000):
+        turn = dt * (w + np.sqrt(values["w_var"][:, 0]) * rng.standard_normal(3))
+        way = dt * (v + np.sqrt(values["v_var"][:, 0]) * rng.standard_normal(3))
+        body = g.pose(g.so3_exp(turn), way)
+        camera = g.body_to_camera_motion(body, rig.bTc)
+        drawn.append(g.se3_log(g.inverse(stated.motion) @ camera))
+    sample = np.cov(np.array(drawn).T)
+    size = np.sqrt(np.diagonal(stated.covariance))
+    np.testing.assert_allclose(
+        sample / np.outer(size, size), stated.covariance / np.outer(size, size), atol=0.08
+    )
+
+
+def test_wheels_tell_way_and_turn_and_little_of_the_side(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """The covariance back in the body: forward x, left y, up z."""
+    recording = opened(tmp_path, woods(rng), lateral_sigma_mps=0.05, rate_sigma_scale=2.0)
+    odometry = recording.log.increments[1].odometry
+    assert odometry is not None
+    body = g.change_tangent_frame(recording.log.rig.bTc, odometry.covariance)
+    sigma = np.sqrt(np.diagonal(body)) / 0.1
+    assert sigma[2] == pytest.approx(2.0 * np.sqrt(0.01))
+    assert sigma[3] == pytest.approx(2.0 * np.sqrt(0.004))
+    assert sigma[4] == pytest.approx(0.05)
+
+
+def test_far_readings_and_frames_without_truth_are_told(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    values = woods(rng)
+    near = opened(tmp_path, values, max_range_m=3.0)
+    ranges = np.concatenate([i.observations.measurement[:, 2] for i in near.log])
+    wanted = values["r"][(values["r"] > 0.0) & (values["r"] <= 3.0)]
+    np.testing.assert_array_equal(np.sort(ranges), np.sort(wanted))
+    far = int((values["r"] > 3.0).sum())
+    assert f"{far} readings beyond 3 m left out" in near.notes
+    assert f"1 of {N} frames have no ground truth" in near.notes
+    assert near.ground_truth is not None
+    assert len(near.ground_truth) == N - 1
+    assert len(near.log) == N
+
+
+# --------------------------------------------------------------------------------------------
+# Bad files
+
+
+def wrong(values: dict[str, Any], name: str, value: object) -> dict[str, Any]:
+    changed = {k: v for k, v in values.items() if k != name}
+    return changed if value is None else changed | {name: value}
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "value", "message"),
+    [
+        (starry, "t", None, "no variable t of numbers"),
+        (starry, "y_var", np.full((4, 1), "x"), "no variable y_var of numbers"),
+        (starry, "C_c_v", np.eye(2), "variable C_c_v is 2 x 2, expected 3 x 3"),
+        (starry, "C_c_v", 2.0 * np.eye(3), "C_c_v is not a rotation"),
+        (starry, "w_var", np.zeros((3, 1)), "variable w_var must be positive"),
+        (starry, "fu", np.array([[np.nan]]), "variable fu is not finite"),
+        (starry, "t", np.zeros((1, N)), "times t do not increase"),
+        (starry, "y_k_j", -np.ones((4, N, 6)), "y_k_j never sees a landmark"),
+        (starry, "y_k_j", np.ones((4, N, 5)), f"is 4 x {N} x 5, expected 4 x {N} x 6"),
+        (woods, "d", None, "no variable d of numbers"),
+        (woods, "r", np.ones((N, 4)), f"variable r is {N} x 4, expected {N} x 5"),
+        (woods, "om_var", np.array([[-1.0]]), "variable om_var must be positive"),
+        (woods, "b", np.full((N, 5), np.inf), "variable b is not finite"),
+    ],
+)
+def test_a_wrong_variable_is_named(
+    tmp_path: Path, rng: np.random.Generator, make: Any, name: str, value: object, message: str
+) -> None:
+    values = make(rng)
+    path = tmp_path / "values.mat"
+    savemat(path, wrong(values, name, value))
+    kind = UtiasStereoSettings if make is starry else UtiasRangeBearingSettings
+    with pytest.raises(DatasetError, match=message) as caught:
+        open_measurements(kind(path=str(path)), 0)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_negative_pixel_is_no_measurement(tmp_path: Path, rng: np.random.Generator) -> None:
+    values = starry(rng)
+    values["y_k_j"][1, 0, 0] = -3.0
+    with pytest.raises(DatasetError, match="a negative pixel that is not marked unseen"):
+        opened(tmp_path, values)
+
+
+def test_missing_and_damaged_files_are_told_in_one_line(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    path = tmp_path / "a.mat"
+    with pytest.raises(DatasetError, match=r"no such file; set dataset\.path"):
+        open_measurements(UtiasStereoSettings(path=str(path)), 0)
+    savemat(path, starry(rng), do_compression=True)
+    whole = path.read_bytes()
+    for damaged in (b"", b"not MATLAB", whole[:60], whole[: len(whole) // 2], whole[:-3]):
+        path.write_bytes(damaged)
+        with pytest.raises(DatasetError, match="it may be truncated, restore it") as caught:
+            open_measurements(UtiasStereoSettings(path=str(path)), 0)
+        assert "\n" not in str(caught.value)
+    path.write_bytes(whole)
+    with pytest.raises(DatasetError, match="choose a smaller start"):
+        open_measurements(UtiasStereoSettings(path=str(path), start=N), 0)
+    with pytest.raises(DatasetError, match="variable t is 1 x 12, expected n x 1"):
+        open_measurements(UtiasRangeBearingSettings(path=str(path)), 0)
+
+
+# --------------------------------------------------------------------------------------------
+# The files themselves
+
+
+def filtered(recording: MeasurementRecording, settings: EgoMotionSettings) -> Trajectory:
+    log = recording.log
+    estimator = make_estimator(log.rig, LandmarkKalmanSettings(), settings.dof)
+    solver = EgoMotionSolver(log.rig, settings)
+    motion = ConstantVelocityMotion(ConstantVelocitySettings())
+    for k, increment in enumerate(log):
+        replay_step(increment, estimator, solver, motion, k)
+    return estimator.estimate().trajectory
+
+
+def dead_reckoning(recording: MeasurementRecording) -> Trajectory:
+    poses = [np.eye(4)]
+    for increment in recording.log.increments[1:]:
+        assert increment.odometry is not None
+        poses.append(poses[-1] @ increment.odometry.motion)
+    return Trajectory(np.array([i.timestamp for i in recording.log]), np.array(poses))
+
+
+def ate(trajectory: Trajectory, recording: MeasurementRecording) -> float:
+    error = evaluate_trajectory(trajectory, recording.ground_truth).ate_rmse_m
+    assert error is not None
+    return error
+
+
+@pytest.mark.data
+def test_starry_night(shared_data: Path) -> None:
+    path = shared_data / "landmarks" / STEREO_FILE
+    recording = open_measurements(UtiasStereoSettings(path=str(path), stop=1000), 0)
+    assert len(recording.log) == 1000
+    loose = EgoMotionSettings(min_matches=1, outlier_px=60.0, max_correction_deg=30.0)
+    found, alone = (
+        ate(filtered(recording, loose), recording),
+        ate(dead_reckoning(recording), recording),
+    )
+    assert found < 0.1
+    assert found < 0.3 * alone
+
+
+@pytest.mark.data
+def test_the_residuals_of_starry_night_are_those_stated(shared_data: Path) -> None:
+    """True landmarks from true poses: the file's variances, and the correlation of the images."""
+    path = shared_data / "landmarks" / STEREO_FILE
+    recording = open_measurements(UtiasStereoSettings(path=str(path)), 0)
+    truth, landmarks = recording.ground_truth, recording.landmark_truth
+    assert truth is not None
+    assert landmarks is not None
+    errors = []
+    for increment, wTc in zip(recording.log, truth.poses, strict=True):
+        seen = increment.observations
+        local = g.transform_to_camera(wTc, landmarks.positions[seen.ids])
+        errors.append(seen.measurement - g.project(recording.log.rig, local))
+    sample = np.cov(np.concatenate(errors).T)
+    first = next(i.observations for i in recording.log if len(i.observations))
+    stated = first.covariance[0]
+    assert np.diagonal(sample) == pytest.approx(np.diagonal(stated), rel=0.06)
+    assert sample[0, 2] == pytest.approx(stated[0, 2], abs=1.5)
+
+
+@pytest.mark.data
+def test_lost_in_the_woods(shared_data: Path) -> None:
+    path = shared_data / "landmarks" / WOODS_FILE
+    settings = UtiasRangeBearingSettings(path=str(path), stop=3000, stride=5)
+    recording = open_measurements(settings, 0)
+    assert len(recording.log) == 600
+    planar = EgoMotionSettings(dof=3, min_matches=1)
+    assert ate(dead_reckoning(recording), recording) > 0.3
+    assert ate(filtered(recording, planar), recording) < 0.06
