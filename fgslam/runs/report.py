@@ -28,6 +28,7 @@ from fgslam.runs.report_parts import comparison_table, sample_pictures
 from fgslam.types import FloatArray, IntArray, LandmarkMap, Trajectory
 
 REPORT = "report.html"
+LOG = "measurements.npz"
 _UP = np.array([0.0, -1.0, 0.0])
 _TIMED_STAGES = ("predict", "update")
 
@@ -76,7 +77,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
         pictures=tuple(sample_pictures(pictures)),
         config_yaml=config_text,
         versions=_versions(config),
-        up=_up(_find(places, "measurements.npz")),
+        up=_up(_find(places, LOG)),
         alignment="after SE3 alignment",
     )
 
@@ -87,7 +88,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
 
 def _places(folder: Path, run: Path | None) -> list[Path]:
     """Where files are sought, in order; the run's own folder last."""
-    if run is None and not (folder / RUN_MARKER).is_file():
+    if run is None and not (folder / LOG).is_file():
         above = folder.resolve().parent
         run = above if (above / RUN_MARKER).is_file() else None
     return [folder] if run is None or run == folder else [folder, run]
@@ -169,9 +170,8 @@ def _estimator(
 ) -> EstimatorReport:
     title, kind = folder.name, str(values.get("kind") or folder.name)
     failure = str(values.get("failure") or "")
-    if failure or not (folder / "final.tum").is_file():
-        why = failure or "it left no trajectory"
-        return EstimatorReport.failed(title, kind, why)
+    if not (folder / "final.tum").is_file():
+        return EstimatorReport.failed(title, kind, failure or "it left no trajectory")
     final = read_tum(folder / "final.tum")
     covariances = _covariances(folder / "covariance.csv", final)
     online = _online(folder / "online.tum", final)
@@ -190,6 +190,7 @@ def _estimator(
         nees_band=band,
         update_ms=_update_ms(folder / "frames.csv", final, live_ms),
         remarks=tuple(str(line) for line in values.get("remarks") or ()),
+        failure=failure,
         **_judged(final, covariances, truth),
     )
 
@@ -301,8 +302,8 @@ def _truth_in_their_world(
     """True poses of the frames, the first one aligned; of the estimator that has most of them."""
     best: Trajectory | None = None
     for estimator in estimators:
-        if truth is None or estimator.failure:
-            continue
+        if truth is None:
+            break
         final = Trajectory(estimator.timestamps, estimator.final_poses)
         found = to_estimate_world(final, truth)
         if found is not None and (best is None or len(found[0]) > len(best)):

@@ -96,6 +96,13 @@ _METRICS = (
         str,
     ),
     _Metric(
+        "online.nees_pose_per_dof",
+        "NEES online",
+        "NEES of each pose as first estimated, by its covariance of that time",
+        _ratio,
+        optional=True,
+    ),
+    _Metric(
         "nees_landmark_per_dof",
         "NEES landmarks",
         "normalised error squared of the landmarks per degree of freedom",
@@ -109,10 +116,24 @@ _METRICS = (
         optional=True,
     ),
     _Metric(
+        "last_pose_sigma.position_m",
+        "last sigma (cm)",
+        "standard deviation of the last pose's position, as claimed",
+        _CM,
+        optional=True,
+    ),
+    _Metric(
         "update_ms.median", "median (ms)", "time for a frame, median over the run", _number(".2f")
     ),
     _Metric("update_ms.p95", "p95 (ms)", "time for a frame that 95 % stay below", _number(".2f")),
     _Metric("update_ms.max", "worst (ms)", "longest time for a frame", _number(".1f")),
+    _Metric(
+        "update_growth.ratio",
+        "growth",
+        "median time of the last fifth of the frames over that of the second fifth: 1 is flat",
+        _number(".2f"),
+        optional=True,
+    ),
     _Metric("peak_memory_mb", "memory (MiB)", "largest resident memory of the process", _INTEGER),
 )
 

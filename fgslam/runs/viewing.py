@@ -96,7 +96,7 @@ def _log(rerun: Any, stream: Any, data: ReportData) -> None:
         line = rerun.LineStrips3D([positions], colors=[_WHITE], labels=["truth"], show_labels=False)
         stream.log("world/first_camera/truth", line, static=True)
     for i, estimator in enumerate(data.estimators):
-        if not estimator.failure:
+        if len(estimator):
             colour = _rgb(ON_DARK[i % COUNT])
             _log_scene(rerun, stream, estimator, colour)
             _log_numbers(rerun, stream, estimator, colour, data.start)

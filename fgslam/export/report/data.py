@@ -38,7 +38,7 @@ class EstimatorReport:
         nees_per_dof: mean NEES of the run per degree of freedom.
         verdict: `consistent`, `overconfident` or `conservative`; None where not known.
         remarks: what the estimator had to mend or leave out, in words.
-        failure: why there is no result; empty where there is one.
+        failure: why it ended early, with what it had until then, or gave nothing; else empty.
     """
 
     title: str

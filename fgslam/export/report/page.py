@@ -157,9 +157,11 @@ def _headings(columns: Iterable[Column]) -> str:
 def _rows(table: Comparison, estimators: tuple[EstimatorReport, ...]) -> Iterator[str]:
     numbers = {estimator.title: i for i, estimator in enumerate(estimators)}
     for title, values in table.rows:
-        swatch = _swatch(numbers[title]) if title in numbers else ""
+        row = numbers.get(title)
+        swatch = "" if row is None else _swatch(row)
+        failed = " (failed)" if row is not None and estimators[row].failure else ""
         cells = "".join(f"<td>{escape(value)}</td>" for value in values)
-        yield f'<tr><th scope="row">{swatch}{escape(title)}</th>{cells}</tr>'
+        yield f'<tr><th scope="row">{swatch}{escape(title + failed)}</th>{cells}</tr>'
 
 
 def _gallery(pictures: list[Embedded], left_out: list[str]) -> Iterator[str]:
@@ -213,7 +215,7 @@ def _toolbar(data: ReportData) -> str:
         f'<label><input type="checkbox" data-estimator="{i}" checked>{_swatch(i)}'
         f"{escape(estimator.title)}</label>"
         for i, estimator in enumerate(data.estimators)
-        if not estimator.failure
+        if len(estimator)
     )
     truth = '<span><span class="swatch truth"></span>truth</span>' if data.truth else ""
     return (

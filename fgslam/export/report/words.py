@@ -25,8 +25,15 @@ def headline(data: ReportData) -> list[str]:
 
 
 def best(data: ReportData) -> int:
-    """Number of the most accurate estimator; of the first with landmarks where none is known."""
-    errors = [(e.ate_m, i) for i, e in enumerate(data.estimators) if e.ate_m is not None]
+    """Number of the most accurate estimator with a map; of the first one where that is not known.
+
+    One that ended early has its error over part of the way only, and is no match for the others.
+    """
+    errors = [
+        (e.ate_m, i)
+        for i, e in enumerate(data.estimators)
+        if e.ate_m is not None and len(e.landmarks) and not e.failure
+    ]
     if errors:
         return min(errors)[1]
     return next((i for i, e in enumerate(data.estimators) if len(e.landmarks)), 0)
