@@ -1,0 +1,283 @@
+"""Full stochastic mapping: one Kalman filter over the pose and all landmarks.
+
+The costly alternative that Se, Lowe and Little (2001, 6) name and set aside; Smith, Self and
+Cheeseman (1990). In the graph's terms a smoother that marginalises every past pose and never
+linearises a measurement anew. Derivation: docs/derivations/ekf.md.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from fgslam.backend.ekf_update import (
+    Correction,
+    DivergedError,
+    FloorMeasurement,
+    Matches,
+    correct,
+)
+from fgslam.backend.filtered import FilteredTrajectory, FirstSights
+from fgslam.backend.growing_covariance import BLOCK, FRONT, GrowingCovariance, rows_of
+from fgslam.errors import EstimatorError
+from fgslam.floor import Floor
+from fgslam.geometry import (
+    adjoint,
+    congruence,
+    inverse,
+    point_pose_jacobian,
+    pose,
+    reorthonormalise,
+    se3_exp,
+    so3_exp,
+    transform_to_world,
+)
+from fgslam.settings.backend import EkfSettings
+from fgslam.types import (
+    EgoMotion,
+    Estimate,
+    FloatArray,
+    Increment,
+    IntArray,
+    LandmarkMap,
+    MeasurementType,
+    Odometry,
+    Prediction,
+    Sensor,
+    StateArrays,
+    UpdateStats,
+)
+
+
+class FullEkf:
+    """Estimator of kind ``ekf``, on :class:`fgslam.backend.protocol.Estimator`.
+
+    The state is the current pose and the landmarks in world coordinates; the pose's error lives in
+    the tangent space at the estimate, [rotation, translation].
+    """
+
+    kind: ClassVar[str] = "ekf"
+    supports: ClassVar[frozenset[MeasurementType]] = frozenset(MeasurementType)
+
+    def __init__(
+        self, sensor: Sensor, settings: EkfSettings, floor: Floor, prior: Prediction
+    ) -> None:
+        """Starts at the prior pose, brought onto a hard floor, with an empty map."""
+        self._sensor = sensor
+        self._settings = settings
+        self._floor = floor
+        self._wTc = floor.constrain(prior.wTc) if floor.rigid_dof < 6 else prior.wTc
+        self._covariance = GrowingCovariance(floor.allowed_part(self._wTc, prior.covariance))
+        self._ids: IntArray = np.empty(0, np.int64)
+        self._positions: FloatArray = np.empty((0, 3))
+        self._past = FilteredTrajectory()
+        self._matched = self._gated = self._skipped = 0
+        self._map: LandmarkMap | None = None
+
+    def predict(self, odometry: Odometry | None) -> Prediction:
+        """Pose after the camera moved by ``odometry``, on the floor if that is hard."""
+        wTc, front = self._moved(odometry)
+        return Prediction(wTc, front[:FRONT])
+
+    def landmarks(self) -> LandmarkMap:
+        """Landmarks with their marginal covariances."""
+        if self._map is None:
+            order = np.argsort(self._ids, kind="stable")
+            covariances = self._covariance.diagonal_blocks(order)
+            self._map = LandmarkMap(self._ids[order], self._positions[order], covariances)
+        return self._map
+
+    def update(
+        self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
+    ) -> UpdateStats:
+        """Predicts, corrects by all matches at once, drops the pruned, adds the new.
+
+        ``tracking`` is not used. Raises EstimatorError where time does not increase, the map
+        outgrows `max_landmarks`, a number is not finite, or the covariance loses its
+        definiteness; the state is then as before.
+        """
+        motion = self._past.motion_to(increment, motion)
+        first = self._first_sights(increment)
+        self._require_room(increment, len(first.points))
+        self._require_finite(increment, motion)
+        wTc, front = self._moved(motion)
+        found = self._correction(increment, wTc, front)
+        # Nothing below can fail.
+        self._take_over(found, wTc, front)
+        used = found.matched + len(first.points)
+        self._skipped += len(increment.observations) - used
+        self._drop(increment)
+        self._add(first)
+        current = Prediction(self._wTc, self._covariance.front()[:FRONT])
+        self._past.append(increment.timestamp, current)
+        return UpdateStats(
+            current.wTc, current.covariance, len(self._ids), found.nis, found.nis_dof
+        )
+
+    def estimate(self) -> Estimate:
+        """Trajectory as filtered, and the map."""
+        remarks = []
+        if self._gated:
+            remarks.append(
+                f"{self._gated} of {self._matched} matches left out: innovation beyond "
+                f"{self._settings.gate_sigmas:g} standard deviations"
+            )
+        if self._skipped:
+            remarks.append(
+                f"{self._skipped} observations left out: landmark unknown, at infinity or behind"
+            )
+        return Estimate(
+            self._past.trajectory(),
+            self._past.pose_covariances(),
+            self.landmarks(),
+            tuple(remarks),
+        )
+
+    def landmark_covariances(self, ids: IntArray) -> FloatArray:
+        """Marginal covariances (k, 3, 3) of the named landmarks."""
+        return self._covariance.diagonal_blocks(self._blocks(ids))
+
+    def joint_covariance(self, ids: IntArray) -> FloatArray:
+        """Joint covariance of the last pose and the named landmarks, as the filter holds it."""
+        rows = rows_of(self._blocks(ids)).ravel()
+        return self._covariance.square(np.concatenate([np.arange(FRONT), rows]))
+
+    def state(self) -> StateArrays:
+        """Everything needed to continue; the covariance as its lower triangle."""
+        return self._past.state() | {
+            "pose": self._wTc,
+            "covariance": self._covariance.packed(),
+            "ids": self._ids,
+            "positions": self._positions,
+            "counts": np.array([self._matched, self._gated, self._skipped]),
+        }
+
+    def restore(self, state: StateArrays) -> None:
+        """Continues from :meth:`state`."""
+        self._past = FilteredTrajectory.restored(state)
+        self._wTc = state["pose"]
+        self._covariance = GrowingCovariance.unpacked(state["covariance"])
+        self._ids, self._positions = state["ids"], state["positions"]
+        self._matched, self._gated, self._skipped = state["counts"].tolist()
+        self._map = None
+
+    # -- what may fail, before anything is changed ---------------------------------------------
+
+    def _first_sights(self, increment: Increment) -> FirstSights:
+        new = increment.observations.is_new & ~np.isin(increment.observations.ids, self._ids)
+        return FirstSights.of(self._sensor, increment.observations.select(new))
+
+    def _require_room(self, increment: Increment, new: int) -> None:
+        leaving = int(np.isin(self._ids, increment.pruned_ids).sum())
+        count = len(self._ids) - leaving + new
+        if count > self._settings.max_landmarks:
+            size = (FRONT + BLOCK * count) ** 2 * 8 / 1e9
+            raise EstimatorError(
+                f"frame {increment.index}: {count} landmarks exceed max_landmarks "
+                f"{self._settings.max_landmarks} of the ekf (their joint covariance takes "
+                f"{size:.2g} GB and each update time in proportion); raise it, prune earlier, or "
+                "use isam2"
+            )
+        try:
+            self._covariance.reserve(count)
+        except MemoryError:
+            raise EstimatorError(
+                f"frame {increment.index}: no memory for the joint covariance of {count} "
+                "landmarks; lower max_landmarks, prune earlier, or use isam2"
+            ) from None
+
+    def _require_finite(self, increment: Increment, motion: Odometry | None) -> None:
+        seen = increment.observations
+        given = [seen.measurement, seen.covariance]
+        if motion is not None:
+            given += [motion.motion, motion.covariance]
+        if not all(np.isfinite(array).all() for array in given):
+            raise EstimatorError(
+                f"frame {increment.index}: a measurement or the odometry is not finite; "
+                "leave it out of the log"
+            )
+
+    def _moved(self, motion: Odometry | None) -> tuple[FloatArray, FloatArray]:
+        """Predicted pose and the joint covariance's columns (n, 6) of it."""
+        front = self._covariance.front()
+        if motion is None:
+            return self._wTc, front
+        wTc, noise = self._wTc @ motion.motion, motion.covariance
+        transition = adjoint(inverse(motion.motion))
+        if self._floor.rigid_dof < 6:
+            wTc = self._floor.constrain(wTc)
+            noise = self._floor.allowed_part(wTc, noise)
+            basis = self._floor.basis(wTc)
+            transition = basis @ (basis.T @ transition)
+        front[FRONT:] = front[FRONT:] @ transition.T
+        front[:FRONT] = congruence(transition, front[:FRONT]) + 0.5 * (noise + noise.T)
+        return wTc, front
+
+    def _correction(self, increment: Increment, wTc: FloatArray, front: FloatArray) -> Correction:
+        seen = increment.observations
+        seen = seen.select(np.isin(seen.ids, self._ids))
+        blocks = self._blocks(seen.ids)
+        matches = Matches.of(self._sensor, wTc, blocks, self._positions[blocks], seen)
+        floor = FloorMeasurement.of(self._floor, wTc)
+        try:
+            return correct(self._covariance, front, matches, floor, self._settings.gate_sigmas)
+        except DivergedError as cause:
+            raise EstimatorError(
+                f"frame {increment.index}: the ekf has diverged: {cause}; use isam2, which "
+                "linearises anew, or state the odometry's and the measurements' noise larger"
+            ) from None
+
+    # -- the change itself ---------------------------------------------------------------------
+
+    def _take_over(self, found: Correction, wTc: FloatArray, front: FloatArray) -> None:
+        self._covariance.set_front(front)
+        if found.gain.shape[1]:
+            self._covariance.subtract(found.gain, found.half)
+            self._positions = self._positions + found.step[FRONT:].reshape(-1, 3)
+            wTc = self._retract(wTc, found.step[:FRONT])
+        self._wTc = reorthonormalise(wTc)
+        self._map = None
+        self._matched += found.matched
+        self._gated += found.matched - found.nis_dof // BLOCK
+
+    def _retract(self, wTc: FloatArray, step: FloatArray) -> FloatArray:
+        """The corrected pose; on a hard floor the errors' horizontal and vertical stay such."""
+        if self._floor.rigid_dof == 6:
+            return wTc @ se3_exp(step)
+        moved = pose(wTc[:3, :3] @ so3_exp(step[:3]), wTc[:3, 3] + wTc[:3, :3] @ step[3:])
+        moved = self._floor.constrain(moved)
+        carry = self._floor.basis(moved) @ self._floor.basis(wTc).T
+        front = self._covariance.front()
+        front[FRONT:] = front[FRONT:] @ carry.T
+        front[:FRONT] = congruence(carry, front[:FRONT])
+        self._covariance.set_front(front)
+        return moved
+
+    def _drop(self, increment: Increment) -> None:
+        gone = np.flatnonzero(np.isin(self._ids, increment.pruned_ids))
+        if len(gone):
+            remaining = self._covariance.drop(gone)
+            self._ids, self._positions = self._ids[remaining], self._positions[remaining]
+
+    def _add(self, first: FirstSights) -> None:
+        """New landmarks, correlated with all there is through the pose they were seen from."""
+        if not len(first.points):
+            return
+        by_pose = -self._wTc[:3, :3] @ point_pose_jacobian(first.points)
+        flat = by_pose.reshape(-1, FRONT)
+        front = self._covariance.front()
+        square = congruence(flat, front[:FRONT])
+        own = congruence(self._wTc[:3, :3], first.covariances)
+        at = BLOCK * np.arange(len(own))[:, None] + np.arange(BLOCK)
+        square[at[:, :, None], at[:, None, :]] += own
+        self._covariance.append(front @ flat.T, square)
+        self._ids = np.concatenate([self._ids, first.observed.ids])
+        positions = transform_to_world(self._wTc, first.points)
+        self._positions = np.concatenate([self._positions, positions])
+
+    def _blocks(self, ids: IntArray) -> IntArray:
+        """Block of each landmark. KeyError for an unknown one."""
+        order = np.argsort(self._ids, kind="stable")
+        known = LandmarkMap(self._ids[order], self._positions, np.empty(0))
+        return order[known.rows(ids)]
