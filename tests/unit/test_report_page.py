@@ -28,7 +28,7 @@ from fgslam.export.report import (
     write_report,
 )
 from fgslam.export.report import paths as drawn
-from fgslam.export.report.curves import nees_over_time, position_sigma
+from fgslam.export.report.curves import error_over_time, nees_over_time, position_sigma
 from fgslam.export.report.page import render
 from fgslam.export.report.paths import drive_from_above, level_axes, map_to_turn
 from fgslam.export.report.pictures import BUDGET_BYTES, MAX_WIDTH, embed
@@ -163,6 +163,23 @@ def test_ellipses_hold_three_sigma_of_the_covariance_turned_into_the_world() -> 
     y = numbers(named(drive_from_above(data), "isam2, 3 sigma")["y"])
     assert np.nanmax(x) == pytest.approx(3 * 0.5, rel=0.01)
     assert np.nanmax(y) == pytest.approx(3 * 0.01, rel=0.01)
+
+
+def switches(figure: Figure) -> dict[str, bool]:
+    return {switch.key: switch.on for switch in figure.switches}
+
+
+def test_scales_start_so_that_the_best_can_be_seen() -> None:
+    """Beside dead reckoning, errors are logarithmic and ellipses of true size at first."""
+    rng, truth = np.random.default_rng(2), loop(60)
+    good = estimator_report("good", truth, rng, sigma_m=0.005)
+    similar = ReportData("", "", (good, estimator_report("b", truth, rng, sigma_m=0.008)), truth)
+    assert not switches(error_over_time(similar))["log"]
+    assert switches(drive_from_above(similar))["enlarged"]
+    drifting = estimator_report("odometry", truth, rng, sigma_m=0.15)
+    unlike = ReportData("", "", (good, drifting), truth)
+    assert switches(error_over_time(unlike))["log"]
+    assert not switches(drive_from_above(unlike)).get("enlarged", False)
 
 
 def test_covariances_that_are_not_known_have_no_ellipse() -> None:

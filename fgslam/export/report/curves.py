@@ -16,6 +16,7 @@ SIGMAS = 3.0
 _FINAL = {"dash": "solid", "width": 2}
 _ONLINE = {"dash": "dot", "width": 2}
 _CLAIMED = {"dash": "dash", "width": 1.2}
+_WIDELY = 8.0
 _SECONDS = {"title": {"text": "time since the start (s)"}}
 
 
@@ -44,10 +45,20 @@ def error_over_time(data: ReportData) -> Figure:
             Switch("final", "final path"),
             Switch("online", "path as first estimated", on=False),
             Switch("claimed", "claimed (3 sigma)"),
-            Switch("log", "logarithmic", on=False),
+            Switch("log", "logarithmic", on=_differ_widely(data)),
         ),
         note="" if known else "Errors are not known: only what the estimators claim is drawn.",
     )
+
+
+def _differ_widely(data: ReportData) -> bool:
+    """Whether a linear scale would press the better estimators onto its axis."""
+    largest = [
+        float(np.nanmax(e.final_error_m))
+        for e in data.estimators
+        if np.isfinite(e.final_error_m).any()
+    ]
+    return bool(largest) and max(largest) > _WIDELY * min(largest)
 
 
 def nees_over_time(data: ReportData) -> Figure:

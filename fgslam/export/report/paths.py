@@ -33,6 +33,8 @@ MAX_DOTS_MAP = 6_000
 ELLIPSES = 40
 SIGMAS = 3.0
 _CORNERS = 33
+# Dead reckoning beside smoothers: enlarged as these need it, its ellipses would cover everything.
+_FLOOD = 0.25
 _BULK = (1.5, 98.5)
 _TOLD = (
     "<b>%{fullData.name}</b><br>%{x:.3f} m right, %{y:.3f} m ahead"
@@ -79,7 +81,8 @@ def drive_from_above(data: ReportData) -> Figure:
         Switch("ellipses", "uncertainty (3 sigma)"),
     ]
     if factor > 1:
-        switches.append(Switch("enlarged", f"enlarged {factor} times"))
+        readable = _widest(data, level) * factor < _FLOOD * _span(data, level)
+        switches.append(Switch("enlarged", f"enlarged {factor} times", on=readable))
     return Figure(
         "above",
         "The drive from above",
@@ -224,8 +227,22 @@ def _enlargement(data: ReportData, level: FloatArray) -> int:
     claimed = np.concatenate(
         [np.empty((0, 2, 2)), *(_claimed(e, level[:2])[1] for e in data.estimators)]
     )
-    span = max(high - low for low, high in _limits(data, level)[:2])
-    return exaggeration(claimed, span) if len(claimed) else 1
+    return exaggeration(claimed, _span(data, level)) if len(claimed) else 1
+
+
+def _widest(data: ReportData, level: FloatArray) -> float:
+    """Typical width in metres of the widest estimator's ellipses, at true size."""
+    widths = [
+        2.0 * SIGMAS * np.sqrt(np.median(np.linalg.eigvalsh(covariances)[:, -1]))
+        for covariances in (_claimed(e, level[:2])[1] for e in data.estimators)
+        if len(covariances)
+    ]
+    return float(max(widths, default=0.0))
+
+
+def _span(data: ReportData, level: FloatArray) -> float:
+    """Larger side of the view from above, metres."""
+    return max(high - low for low, high in _limits(data, level)[:2])
 
 
 # --------------------------------------------------------------------------------------------
