@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 
 import gtsam
 
-from fgslam.backend.graduated import graduated, observed_variables
 from fgslam.backend.graph_builder import NewFactors
 from fgslam.backend.graph_solution import (
     Solution,
@@ -16,6 +15,7 @@ from fgslam.backend.graph_solution import (
     poses_of,
     solution,
 )
+from fgslam.backend.outliers import graduated, observed_variables, solver_parameters, trimmed
 from fgslam.backend.smoother import Smoother
 from fgslam.errors import EstimatorError
 from fgslam.factors.keys import landmark_key
@@ -86,20 +86,17 @@ class BatchSmoother(Smoother):
         return graph
 
     def _unseen(self, graph: Any) -> list[int]:
-        """Variables of which graduated non-convexity kept no observation."""
-        if self._settings.method != "gnc":
-            return []
+        """Variables of which no observation fits the others."""
         return sorted(set(self._variables()) - observed_variables(graph))
 
     def _minimise(self, graph: Any) -> tuple[Any, Any]:
         """Values at the minimum, and the factors that have a say in it."""
-        params = gtsam.LevenbergMarquardtParams()
-        params.setMaxIterations(self._settings.max_iterations)
-        params.setRelativeErrorTol(_RELATIVE_TOLERANCE)
-        params.setAbsoluteErrorTol(0.0)
+        params = solver_parameters(self._settings.max_iterations, _RELATIVE_TOLERANCE)
         try:
             if self._settings.method == "gnc":
                 return graduated(graph, self._values, params)
+            if self._settings.trim:
+                return trimmed(graph, self._values, params)
             optimizer = gtsam.LevenbergMarquardtOptimizer(graph, self._values, params)
             return optimizer.optimize(), graph
         except RuntimeError as error:

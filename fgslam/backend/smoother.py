@@ -160,7 +160,9 @@ class Smoother(ABC):
         used = tracking.inliers if self._gate else np.ones(len(matched), np.bool_)
         rejected = matched.select(~used)
         moved = self._builder.contradicted(rejected)
-        self._builder.start_anew(moved.ids.tolist(), "was contradicted again and again: moved")
+        self._builder.start_anew(
+            moved.ids.tolist(), "was rejected in frame after frame: moved, or matched wrongly"
+        )
         self._tracker.restart(moved)
         for identity in moved.ids.tolist():
             self._frozen.pop(identity, None)

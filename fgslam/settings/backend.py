@@ -250,6 +250,22 @@ class BatchSettings(GraphSettings):
     """Everything at once, the reference of the comparison."""
 
     kind: Literal["batch"] = "batch"
+    kernel: KernelSettings = KernelSettings("cauchy", 3.0)
+    gate: Annotated[
+        bool,
+        Field(
+            description="leave out matches that the frame's own least squares rejected; off, the "
+            "whole problem decides"
+        ),
+    ] = False
+    trim: Annotated[
+        bool,
+        Field(
+            description="after the minimum with the kernel, leave out observations beyond the "
+            "99.9 % quantile of chi-square and solve the rest without it: its covariances are "
+            "those of least squares"
+        ),
+    ] = True
     method: Annotated[
         Literal["levenberg_marquardt", "gnc"],
         Field(

@@ -1,0 +1,115 @@
+"""Solving with wrong matches: a kernel and then a trim, or graduated non-convexity.
+
+Either way the last solution is plain least squares over the observations that fit, so that its
+covariances mean what they say.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gtsam
+from scipy.stats import chi2
+
+from fgslam.factors.keys import is_pose, number
+
+_CONFIDENCE = 0.999  # of a right match's residual
+_GATE = float(chi2.ppf(_CONFIDENCE, 3))  # 16.3, of a landmark observation's three numbers
+_KEPT = 0.5  # weights end at 0 or 1
+_ROUNDS = 10  # trims until the observations that fit do not change any more
+_ROUGH = 1e-4  # of the cost: the minimum with the kernel only chooses what fits
+
+
+def solver_parameters(max_iterations: int, relative_tolerance: float) -> Any:
+    """Parameters of Levenberg-Marquardt that stop by the relative change of the cost alone."""
+    params = gtsam.LevenbergMarquardtParams()
+    params.setMaxIterations(max_iterations)
+    params.setRelativeErrorTol(relative_tolerance)
+    params.setAbsoluteErrorTol(0.0)
+    return params
+
+
+def graduated(graph: Any, values: Any, inner: Any) -> tuple[Any, Any]:
+    """Graduated non-convexity (Yang et al. 2020) with truncated least squares, by GTSAM.
+
+    Landmark observations are the possible outliers.
+
+    Args:
+        graph: factors without kernels.
+        values: initial values.
+        inner: parameters of the Levenberg-Marquardt steps.
+
+    Returns:
+        Values at the minimum, and the graph without the observations that were rejected.
+    """
+    factors = [graph.at(row) for row in range(graph.size())]
+    observed = [_landmark(factor) is not None for factor in factors]
+    params = gtsam.GncLMParams(inner)
+    params.setLossType(gtsam.GncLossType.TLS)
+    params.setKnownInliers([row for row, is_one in enumerate(observed) if not is_one])
+    optimizer = gtsam.GncLMOptimizer(graph, values, params)
+    optimizer.setInlierCostThresholdsAtProbability(_CONFIDENCE)
+    found = optimizer.optimize()
+    weights = optimizer.getWeights()
+    kept = gtsam.NonlinearFactorGraph()
+    for factor, weight, is_one in zip(factors, weights, observed, strict=True):
+        if weight > _KEPT or not is_one:
+            kept.add(factor)
+    return found, kept
+
+
+def trimmed(graph: Any, values: Any, params: Any) -> tuple[Any, Any]:
+    """Minimises with the factors' own kernels, then without them over what fits.
+
+    Args:
+        graph: factors, landmark observations with a kernel.
+        values: initial values.
+        params: of Levenberg-Marquardt.
+
+    Returns:
+        Values at the minimum, and the plain factors that were kept.
+    """
+    rough = solver_parameters(params.getMaxIterations(), _ROUGH)
+    values = gtsam.LevenbergMarquardtOptimizer(graph, values, rough).optimize()
+    factors = [graph.at(row) for row in range(graph.size())]
+    fits: list[bool] = []
+    for _ in range(_ROUNDS):
+        before, fits = fits, [_fits(factor, values) for factor in factors]
+        if fits == before:
+            break
+        kept = gtsam.NonlinearFactorGraph()
+        for factor, fit in zip(factors, fits, strict=True):
+            if fit:
+                kept.add(_plain(factor))
+        values = gtsam.LevenbergMarquardtOptimizer(kept, values, params).optimize()
+    return values, kept
+
+
+def _fits(factor: Any, values: Any) -> bool:
+    """Whether a factor is no landmark observation, or one within the gate."""
+    if _landmark(factor) is None:
+        return True
+    residual = factor.whitenedError(values)
+    return bool(residual @ residual <= _GATE)
+
+
+def _plain(factor: Any) -> Any:
+    """The factor without its kernel."""
+    model = factor.noiseModel()
+    if isinstance(model, gtsam.noiseModel.Robust):
+        return factor.cloneWithNewNoiseModel(model.noise())
+    return factor
+
+
+def observed_variables(graph: Any) -> set[int]:
+    """Landmark variables that some pose observes."""
+    found = {_landmark(graph.at(row)) for row in range(graph.size())}
+    return {variable for variable in found if variable is not None}
+
+
+def _landmark(factor: Any) -> int | None:
+    """The landmark variable of an observation; None for other factors."""
+    keys = list(factor.keys())
+    if len(keys) != 2 or not is_pose(keys[0]) or is_pose(keys[1]):
+        return None
+    return number(keys[1])
