@@ -33,6 +33,7 @@ MAX_DOTS_MAP = 6_000
 ELLIPSES = 40
 SIGMAS = 3.0
 _CORNERS = 33
+_DENSE = 3_000  # dots; finer ones keep the paths in sight
 # Dead reckoning beside smoothers: enlarged as these need it, its ellipses would cover everything.
 _FLOOD = 0.25
 _BULK = (1.5, 98.5)
@@ -266,7 +267,7 @@ def _dots_in_space(
         # Plotly would draw what lies outside the axes across the page.
         points = points[((points >= low) & (points <= high)).all(axis=1)]
         marker = {
-            "size": 2.5,
+            "size": 2.5 if len(points) < _DENSE else 1.6,
             "color": packed(points[:, 2]),
             "colorscale": "Viridis",
             "cmin": low[2],
