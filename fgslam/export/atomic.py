@@ -33,6 +33,7 @@ _RESULT_FILES = (
     "trials.csv",
     "trials_timing.csv",
     "report.html",
+    "view.rrd",
     "pictures/*.png",
     *(f"*/{name}" for name in _ESTIMATOR_FILES),
 )
