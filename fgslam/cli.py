@@ -15,6 +15,9 @@ import typer
 from fgslam.errors import FgslamError
 
 if TYPE_CHECKING:
+    from fgslam.config import ExperimentConfig
+    from fgslam.export.atomic import ExistingFolder
+    from fgslam.runs.comparison import Compared
     from fgslam.runs.experiment import Progress
 
 EXIT_USER = 2
@@ -51,30 +54,55 @@ def run(
         bool, typer.Option("--resume", help="continue an interrupted run to the same bytes")
     ] = False,
 ) -> None:
-    """Run an experiment: images in, run folder out.
+    """Run an experiment: images in, run folder out; measurements without images, too.
 
     Ctrl-C ends it early with all files valid; --resume goes on from there.
     """
     from fgslam.config import load_config
-    from fgslam.console import progress_bar, show_result
     from fgslam.errors import ConfigError
-    from fgslam.runs.experiment import resume_command, run_experiment
+    from fgslam.runs.measured import holds_measurements
 
     if overwrite and resume:
         raise ConfigError("--overwrite and --resume exclude each other; give one of them")
     settings = load_config(config, overrides or ())
     folder = out or Path("runs") / settings.name
+    existing: ExistingFolder = "resume" if resume else "overwrite" if overwrite else "refuse"
+    run_it = _run_measurements if holds_measurements(settings) else _run_images
+    run_it(settings, folder, existing)
+
+
+def _run_images(settings: ExperimentConfig, folder: Path, existing: ExistingFolder) -> None:
+    from fgslam.comparison_console import show_comparisons
+    from fgslam.console import progress_bar, show_result
+    from fgslam.runs.experiment import resume_command, run_experiment
+
     with _stop_flag() as stopped, progress_bar() as progress:
-        result = run_experiment(
-            settings,
-            folder,
-            "resume" if resume else "overwrite" if overwrite else "refuse",
-            _stoppable(progress, stopped),
-            stopped,
-        )
+        result = run_experiment(settings, folder, existing, _stoppable(progress, stopped), stopped)
     show_result(result, resume_command(folder))
+    if result.compared is not None:
+        show_comparisons([result.compared])
     if result.status == "interrupted":
         raise typer.Exit(EXIT_INTERRUPTED)
+
+
+def _run_measurements(settings: ExperimentConfig, folder: Path, existing: ExistingFolder) -> None:
+    from fgslam.comparison_console import show_comparisons
+    from fgslam.console import progress_bar
+    from fgslam.runs.measured import run_measured
+
+    with _stop_flag() as stopped, progress_bar() as progress:
+        compared = run_measured(settings, folder, existing, progress, stopped)
+        interrupted = stopped()
+    show_comparisons([compared])
+    _exit_after([compared], interrupted)
+
+
+def _exit_after(compared: list[Compared], interrupted: bool) -> None:
+    """The exit status of a comparison: a failed estimator is told, all of them are a fault."""
+    if interrupted:
+        raise typer.Exit(EXIT_INTERRUPTED)
+    if any(len(one.failures) == len(one.metrics) for one in compared):
+        raise typer.Exit(EXIT_FAULT)
 
 
 @app.command()
@@ -130,10 +158,7 @@ def compare(
         )
         interrupted = stopped()
     show_comparisons(compared)
-    if interrupted:
-        raise typer.Exit(EXIT_INTERRUPTED)
-    if any(len(one.failures) == len(one.metrics) for one in compared):
-        raise typer.Exit(EXIT_FAULT)
+    _exit_after(compared, interrupted)
 
 
 @app.command()

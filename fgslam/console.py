@@ -60,10 +60,10 @@ def show_result(result: RunResult, resume: str) -> None:
     for line in _remarks(result):
         console.out(line)
     folder = result.folder
-    kind = result.outputs.kind
+    title = result.outputs.title
     # Paths are printed plain, so that they can be copied whatever the terminal's width.
-    console.out(f"trajectory  {folder / kind / 'final.tum'}")
-    console.out(f"map         {folder / kind / 'map.ply'}")
+    console.out(f"trajectory  {folder / title / 'final.tum'}")
+    console.out(f"map         {folder / title / 'map.ply'}")
     if result.pictures:
         console.out(f"pictures    {result.pictures[0].parent}{'/'}")
     console.out(f"metrics     {folder / 'metrics.json'}")
@@ -75,7 +75,7 @@ def _table(result: RunResult) -> Table:
     outputs, metrics = result.outputs, result.metrics
     numbers = run_numbers(outputs.recorder)
     remark = f"\n{outputs.remark}" if outputs.remark else ""
-    table = Table(title=f"{outputs.config.name}: {outputs.kind}{remark}", show_header=False)
+    table = Table(title=f"{outputs.config.name}: {outputs.title}{remark}", show_header=False)
     matches = numbers["landmark_matches"]
     rows: list[tuple[str, object]] = [
         ("frames", f"{len(outputs.recorder)} of {len(outputs.sequence)}"),

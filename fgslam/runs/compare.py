@@ -5,26 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import yaml
-
-from fgslam.config import ExperimentConfig
 from fgslam.errors import ConfigError, OutputError
 from fgslam.export.atomic import (
-    RUN_MARKER,
     ExistingFolder,
     create_run_folder,
     is_run_folder,
-    write_text,
 )
 from fgslam.export.comparison_table import write_comparison_csv
 from fgslam.export.metrics import EstimatorMetrics, JsonValue, read_metrics, write_metrics
 from fgslam.runs.choosing import choose
-from fgslam.runs.comparison import Compared, Progress, ReplayTask, load_run, remark_of, replay_apart
-from fgslam.runs.outputs import versions
+from fgslam.runs.comparison import (
+    COMPARISON_FILE,
+    Compared,
+    Progress,
+    load_run,
+    remark_of,
+    replay_apart,
+    tasks_of,
+)
+from fgslam.runs.outputs import write_config
 from fgslam.runs.report import report_from_folder
 from fgslam.settings.backend import EstimatorSettings
 
-COMPARISON_FILE = "comparison.csv"
 DEFAULT_FOLDER = "compare"
 METRICS_FILE = "metrics.json"
 
@@ -78,17 +80,17 @@ def compare_run(
 ) -> Compared:
     """One run's log through the estimators, into the existing folder ``out``."""
     config, log = load_run(run)
-    write_text(out / RUN_MARKER, _config_text(config, run, estimators))
-    ego_motion, remark = config.frontend.ego_motion, remark_of(config)
-    tasks = [ReplayTask(run, out, settings, ego_motion, remark) for settings in estimators]
-    metrics = replay_apart(tasks, jobs, progress, stopped)
+    dataset = (config.provenance or {}).get("dataset")
+    now_compared = config.model_copy(update={"compare": tuple(estimators)})
+    write_config(out, now_compared, {"dataset": dataset, "run": str(run)})
+    metrics = replay_apart(tasks_of(config, run, out, estimators), jobs, progress, stopped)
     interrupted = stopped()
     about: dict[str, JsonValue] = {
         "name": config.name,
         "status": "interrupted" if interrupted else "finished",
         "run": str(run),
         "odometry": config.odometry.kind,
-        "remark": remark or None,
+        "remark": remark_of(config) or None,
         "notes": _notes(run),
     }
     write_comparison(out, config.name, len(log), metrics, about, run)
@@ -107,16 +109,6 @@ def write_comparison(
     write_metrics(out / METRICS_FILE, frames, metrics, about)
     write_comparison_csv(out / COMPARISON_FILE, [(name, metrics)])
     report_from_folder(out, run)
-
-
-def _config_text(
-    config: ExperimentConfig, run: Path, estimators: Sequence[EstimatorSettings]
-) -> str:
-    """The run's configuration with the estimators compared, the present versions, and the run."""
-    values = config.model_copy(update={"compare": tuple(estimators)}).as_values()
-    dataset = (config.provenance or {}).get("dataset")
-    values["provenance"] = {"versions": versions(), "dataset": dataset, "run": str(run)}
-    return str(yaml.safe_dump(values, sort_keys=False))
 
 
 def _notes(run: Path) -> list[str]:

@@ -24,6 +24,7 @@ from fgslam.runs.replay import replay
 from fgslam.settings.backend import EstimatorSettings
 from fgslam.settings.frontend import EgoMotionSettings
 
+COMPARISON_FILE = "comparison.csv"
 GROUND_TRUTH_FILE = "ground_truth.tum"
 SYNTHETIC_REMARK = "odometry: SYNTHETIC (ground truth plus stated noise, see config.yaml)"
 
@@ -73,6 +74,14 @@ class Compared:
 def failure_of(metrics: EstimatorMetrics) -> str:
     """Why the estimator ended early; empty where it did not."""
     return str(metrics.more.get("failure") or "")
+
+
+def tasks_of(
+    config: ExperimentConfig, run: Path, out: Path, estimators: Sequence[EstimatorSettings]
+) -> list[ReplayTask]:
+    """A task for each estimator."""
+    ego_motion, remark = config.frontend.ego_motion, remark_of(config)
+    return [ReplayTask(run, out, settings, ego_motion, remark) for settings in estimators]
 
 
 def replay_apart(

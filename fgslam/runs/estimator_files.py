@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import typing
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from fgslam.errors import DatasetError
 from fgslam.export.atomic import make_subfolder, write_text
 from fgslam.export.point_cloud import MapPoints, write_ply
 from fgslam.export.trajectories import write_covariances, write_tum
@@ -14,6 +20,9 @@ from fgslam.runs.replay import Replay, ReplayRow
 from fgslam.types import Estimate, IntArray, LandmarkMap, Trajectory
 
 FRAMES_FILE = "frames.csv"
+_VALUE: dict[str, Callable[[str], Any]] = typing.get_type_hints(ReplayRow)
+"""What makes a cell's text a value again."""
+
 _GREY = 128
 _VALID_HITS = 3  # Se et al. 6.1, where no front-end's own number is known
 
@@ -55,6 +64,17 @@ def write_frames(path: Path, replay: Replay) -> None:
         cells = [_cell(value) for value in row]
         lines.append(",".join((f"{stamp:.9f}", *cells)))
     write_text(path, "\n".join(lines) + "\n")
+
+
+def read_frames(path: Path) -> list[ReplayRow]:
+    """The rows of a frames.csv. Raises DatasetError where it is none."""
+    try:
+        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
+        return [ReplayRow(**{name: _VALUE[name](row[name]) for name in _VALUE}) for row in rows]
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise DatasetError(
+            f"{path}: not a frames.csv ({error}); run the experiment again"
+        ) from error
 
 
 def points_from_log(

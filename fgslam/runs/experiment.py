@@ -8,23 +8,28 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal
 
 import numpy as np
 
 from fgslam.config import ExperimentConfig, load_config
 from fgslam.errors import ConfigError, DatasetError
 from fgslam.export.atomic import RUN_MARKER, ExistingFolder, create_run_folder
+from fgslam.export.comparison_table import write_comparison_csv
 from fgslam.export.metrics import EstimatorMetrics
 from fgslam.factory import make_pipeline, make_stream, open_sequence
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.measurement_log import MeasurementLog
 from fgslam.pipeline import FrameReport
 from fgslam.runs import checkpoint
+from fgslam.runs.choosing import compared_with
+from fgslam.runs.comparison import COMPARISON_FILE, Compared, replay_apart, tasks_of
 from fgslam.runs.outputs import RunOutputs, versions
-from fgslam.runs.pictures import draw_frame, draw_run, frames_to_show
+from fgslam.runs.pictures import draw_frame, draw_run, figures_of, frames_to_show
 from fgslam.runs.recorder import RunRecorder
-from fgslam.types import FloatArray, Sequence, StereoFeatures
+from fgslam.runs.rendered_truth import TrueDepth
+from fgslam.runs.report import report_from_folder
+from fgslam.types import Sequence, StereoFeatures
 
 Progress = Callable[[str, int, int], None]
 """Called with what is under way, how much is done, and of how much."""
@@ -32,15 +37,6 @@ Progress = Callable[[str, int, int], None]
 _SAVING_SHARE = 10.0  # the loop runs at least this many times as long as it saves
 _PRECISION_EVERY = 10  # frames between checks of stereo matches against rendered depth
 _PRECISION_PX = 1.5  # disparity error of a correct match; a SIFT match's noise is a tenth of it
-
-
-@runtime_checkable
-class TrueDepth(Protocol):
-    """A recording whose exact depth is known."""
-
-    def depth(self, i: int) -> FloatArray:
-        """Depth (height, width) of the reference image of frame ``i``, metres."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +48,7 @@ class RunResult:
     metrics: EstimatorMetrics
     pictures: tuple[Path, ...]
     outputs: RunOutputs
+    compared: Compared | None = None
 
 
 def run_experiment(
@@ -92,7 +89,7 @@ def run_experiment(
     saved = _loop(outputs, progress, stopped)
     if saved is not None:
         return RunResult(folder, "interrupted", saved, (), outputs)
-    return _finish(outputs)
+    return _finish(outputs, progress, stopped)
 
 
 def _loop(
@@ -153,13 +150,33 @@ def _process(outputs: RunOutputs, found: FeatureFrame) -> FrameReport:
     return outputs.pipeline.process(found, index, timestamp)
 
 
-def _finish(outputs: RunOutputs) -> RunResult:
+def _finish(outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]) -> RunResult:
     pictures: tuple[Path, ...] = ()
     metrics = outputs.write_results("finished")
     if outputs.config.output.pictures:
-        pictures = tuple(draw_run(outputs))
+        pictures = tuple(draw_run(outputs.folder, figures_of(outputs)))
     checkpoint.remove(outputs.folder)
-    return RunResult(outputs.folder, "finished", metrics, pictures, outputs)
+    compared = _compare(outputs, metrics, progress, stopped)
+    report_from_folder(outputs.folder)
+    return RunResult(outputs.folder, "finished", metrics, pictures, outputs, compared)
+
+
+def _compare(
+    outputs: RunOutputs,
+    live: EstimatorMetrics,
+    progress: Progress,
+    stopped: Callable[[], bool],
+) -> Compared | None:
+    """Replays the run's log through the other estimators that the configuration names."""
+    config, folder = outputs.config, outputs.folder
+    others = compared_with(config)
+    if not others:
+        return None
+    metrics = {outputs.title: live}
+    metrics |= replay_apart(tasks_of(config, folder, folder, others), 1, progress, stopped)
+    outputs.write_metrics(metrics, "finished")
+    write_comparison_csv(folder / COMPARISON_FILE, [(config.name, metrics)])
+    return Compared(config.name, folder, folder, len(outputs.recorder), metrics)
 
 
 def _stereo_precision(sequence: Sequence, i: int, stereo: StereoFeatures) -> float:

@@ -47,7 +47,6 @@ class Answer:
     """What an estimator said, live or replayed; row k of every array is frame k.
 
     Attributes:
-        kind: which estimator.
         estimate: as known at the end.
         online: each pose as first estimated; ``online_covariances`` (n, 6, 6).
         nis, nis_dof: (n,) innovations squared and their degrees of freedom.
@@ -55,7 +54,6 @@ class Answer:
         peak_memory_mb: of the process.
     """
 
-    kind: str
     estimate: Estimate
     online: Trajectory
     online_covariances: FloatArray
@@ -68,7 +66,6 @@ class Answer:
     def of(replay: Replay) -> Answer:
         """The answer of a replay."""
         return Answer(
-            kind=replay.kind,
             estimate=replay.estimate,
             online=replay.online,
             online_covariances=replay.online_covariances,
@@ -116,7 +113,6 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
         update_ms=UpdateTime.of(answer.update_ms),
         peak_memory_mb=answer.peak_memory_mb,
         more={
-            "kind": answer.kind,
             "frames": len(answer.online),
             **_alignment_notes(aligned, first),
             "nees_pose": _as_json(judged["pose"]),
@@ -137,12 +133,16 @@ def judge_replay(replay: Replay, truth: Truth) -> Judgement:
     """As :func:`judge_answer`, with what only a replay knows."""
     judged = judge_answer(Answer.of(replay), truth)
     metrics = judged.metrics
-    more = dict(metrics.more) | {
-        "failure": replay.failure or None,
-        "solve_ms": asdict(UpdateTime.of(replay.column("solve_ms").astype(np.float64))),
-        "final_ms": replay.final_ms,
-        "memory_before_mb": replay.memory_before_mb,
-    }
+    more = (
+        {"kind": replay.kind}
+        | dict(metrics.more)
+        | {
+            "failure": replay.failure or None,
+            "solve_ms": asdict(UpdateTime.of(replay.column("solve_ms").astype(np.float64))),
+            "final_ms": replay.final_ms,
+            "memory_before_mb": replay.memory_before_mb,
+        }
+    )
     values = {name: getattr(metrics, name) for name in EstimatorMetrics.__slots__} | {"more": more}
     return Judgement(EstimatorMetrics(**values), judged.nees)
 

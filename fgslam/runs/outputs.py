@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import platform
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -13,7 +15,8 @@ import yaml
 
 from fgslam import __version__
 from fgslam.config import ExperimentConfig
-from fgslam.export.atomic import make_subfolder, write_text
+from fgslam.export.atomic import RUN_MARKER, make_subfolder, write_text
+from fgslam.export.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
 from fgslam.export.metrics import (
     EstimatorMetrics,
     JsonValue,
@@ -21,12 +24,16 @@ from fgslam.export.metrics import (
     write_metrics,
     write_timing,
 )
-from fgslam.export.point_cloud import MapPoints, write_ply
-from fgslam.export.trajectories import write_covariances, write_tum
+from fgslam.export.point_cloud import MapPoints
+from fgslam.export.trajectories import write_tum
 from fgslam.frontend.database import LandmarkDatabase
 from fgslam.pipeline import SlamPipeline
 from fgslam.runs.checkpoint import save_log
+from fgslam.runs.comparison import GROUND_TRUTH_FILE, load_truth, remark_of
+from fgslam.runs.estimator_files import write_estimate
+from fgslam.runs.judging import Truth
 from fgslam.runs.recorder import STAGES, RunRecorder
+from fgslam.runs.rendered_truth import rendered_landmark_truth
 from fgslam.runs.summary import estimator_metrics, run_numbers
 from fgslam.types import Estimate, LandmarkMap, Sequence, Trajectory
 
@@ -44,54 +51,60 @@ class RunOutputs:
     recorder: RunRecorder
 
     @property
-    def kind(self) -> str:
-        """The live estimator's kind, which names its folder."""
-        return self.pipeline.estimator.kind
+    def title(self) -> str:
+        """The live estimator's label or kind, which names its folder."""
+        return self.config.estimator.title
 
     @property
     def remark(self) -> str:
         """Marks results whose odometry was made from ground truth; empty otherwise."""
-        if self.config.odometry.kind != "synthetic":
-            return ""
-        return "odometry: SYNTHETIC (ground truth plus stated noise, see config.yaml)"
+        return remark_of(self.config)
 
     def write_config(self) -> None:
         """The resolved configuration with what it takes to repeat the run."""
-        values = self.config.as_values() | {"provenance": self._provenance()}
-        write_text(self.folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
+        recording = {"name": self.sequence.name, "identity": self.sequence.identity}
+        write_config(self.folder, self.config, {"dataset": recording})
 
     def write_results(self, status: str) -> EstimatorMetrics:
         """Log, trajectories, covariances, map, metrics and timing of the frames so far."""
         estimate = self.pipeline.estimator.estimate()
         save_log(self.folder, self.recorder.log)
-        if self.sequence.ground_truth is not None:
-            write_tum(self.folder / "ground_truth.tum", self.sequence.ground_truth)
+        truth = self._write_truth(with_landmarks=status == "finished")
         self._write_estimate(estimate)
-        metrics = estimator_metrics(estimate, self.sequence.ground_truth, self.recorder)
-        write_metrics(
-            self.folder / "metrics.json",
-            len(self.recorder),
-            {self.kind: metrics},
-            self._about(status) | run_numbers(self.recorder),
-        )
+        metrics = self._with_kind(estimator_metrics(estimate, truth, self.recorder))
+        self.write_metrics({self.title: metrics}, status)
         self._write_timing(estimate.trajectory)
         return metrics
 
+    def write_metrics(self, estimators: Mapping[str, EstimatorMetrics], status: str) -> None:
+        """metrics.json of the live estimator and of those that replayed its log."""
+        about = self._about(status) | run_numbers(self.recorder)
+        write_metrics(self.folder / "metrics.json", len(self.recorder), estimators, about)
+
+    def _with_kind(self, metrics: EstimatorMetrics) -> EstimatorMetrics:
+        more = {"kind": self.pipeline.estimator.kind} | dict(metrics.more)
+        return dataclasses.replace(metrics, more=more)
+
+    def _write_truth(self, with_landmarks: bool) -> Truth:
+        """True path, and true landmarks where the recording is rendered and ``with_landmarks``."""
+        path = self.sequence.ground_truth
+        if path is not None:
+            write_tum(self.folder / GROUND_TRUTH_FILE, path)
+        found = (
+            rendered_landmark_truth(self.sequence, self.recorder.log) if with_landmarks else None
+        )
+        if found is None:
+            return Truth(path)
+        write_landmark_truth(self.folder / LANDMARK_TRUTH_FILE, *found)
+        return load_truth(self.folder, self.recorder.log)
+
     def _write_estimate(self, estimate: Estimate) -> None:
-        folder = make_subfolder(self.folder, self.kind)
+        folder = make_subfolder(self.folder, self.title)
         online = Trajectory(
             estimate.trajectory.timestamps, np.array(self.recorder.online_poses).reshape(-1, 4, 4)
         )
-        write_tum(folder / "online.tum", online, self.remark)
-        write_tum(folder / "final.tum", estimate.trajectory, self.remark)
-        write_covariances(
-            folder / "covariance.csv",
-            estimate.trajectory.timestamps,
-            estimate.covariances,
-            self.remark,
-        )
         points = map_points(estimate.landmarks, self.pipeline.tracker.database)
-        write_ply(folder / "map.ply", points, self.remark)
+        write_estimate(folder, online, estimate, points, self.remark)
 
     def _write_timing(self, trajectory: Trajectory) -> None:
         indices = [increment.index for increment in self.recorder.log]
@@ -119,11 +132,11 @@ class RunOutputs:
             "notes": list(self.sequence.notes),
         }
 
-    def _provenance(self) -> dict[str, Any]:
-        return {
-            "versions": versions(),
-            "dataset": {"name": self.sequence.name, "identity": self.sequence.identity},
-        }
+
+def write_config(folder: Path, config: ExperimentConfig, provenance: dict[str, Any]) -> None:
+    """config.yaml: every default filled in, with the versions and where the data came from."""
+    values = config.as_values() | {"provenance": {"versions": versions()} | provenance}
+    write_text(folder / RUN_MARKER, yaml.safe_dump(values, sort_keys=False))
 
 
 def versions() -> dict[str, str | None]:

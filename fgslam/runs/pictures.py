@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +22,10 @@ from fgslam.export.pictures import (
 from fgslam.export.pictures.birds_eye import world_position_covariances
 from fgslam.pipeline import FrameReport
 from fgslam.runs.outputs import RunOutputs
-from fgslam.types import Estimate, FloatArray, Increment, IntArray
+from fgslam.types import BoolArray, Estimate, FloatArray, Increment, IntArray, Trajectory
 
 FOLDER = "pictures"
+_SYNTHETIC = ", synthetic odometry"
 _SHOWN = (0.0, 60 / 249, 120 / 249, 180 / 249)
 """Frames shown, as parts of the run: those of the paper's Figure 4."""
 
@@ -50,47 +52,92 @@ def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
         draw_flow(folder / f"flow_{i:06d}.png", images[0], before, after, title)
 
 
-def draw_run(outputs: RunOutputs) -> list[Path]:
-    """Map from above (Fig. 5), in perspective (Fig. 6), errors and matches over time."""
-    folder = make_subfolder(outputs.folder, FOLDER)
+@dataclass(frozen=True, slots=True, eq=False)
+class RunFigures:
+    """What the pictures of a whole run are drawn from.
+
+    Attributes:
+        name: of the run, for titles.
+        synthetic: whether its odometry was made from ground truth, which every title says.
+        estimate: of the estimator drawn.
+        truth: true poses, or None.
+        valid: (n,) which landmarks of the estimate were seen often enough (Se et al. 6.1).
+        frames: (m,) the recording's numbers of the frames.
+        matched, inliers, landmarks: (m,) counts of each frame.
+    """
+
+    name: str
+    synthetic: bool
+    estimate: Estimate
+    truth: Trajectory | None
+    valid: BoolArray
+    frames: IntArray
+    matched: IntArray
+    inliers: IntArray
+    landmarks: IntArray
+
+    def title(self, what: str) -> str:
+        """Title of one picture."""
+        return f"{self.name}: {what}{_SYNTHETIC if self.synthetic else ''}"
+
+
+def figures_of(outputs: RunOutputs) -> RunFigures:
+    """A live run's figures."""
     # Once for all pictures: a smoother's estimate may be dear.
     estimate = outputs.pipeline.estimator.estimate()
-    truth = outputs.sequence.ground_truth
+    database, recorder = outputs.pipeline.tracker.database, outputs.recorder
+    return RunFigures(
+        name=outputs.config.name,
+        synthetic=bool(outputs.remark),
+        estimate=estimate,
+        truth=outputs.sequence.ground_truth,
+        valid=database.valid[database.rows(estimate.landmarks.ids)],
+        frames=np.array([increment.index for increment in recorder.log], np.int64),
+        matched=recorder.column("matched"),
+        inliers=recorder.column("inliers"),
+        landmarks=recorder.column("landmarks"),
+    )
+
+
+def draw_run(run: Path, figures: RunFigures) -> list[Path]:
+    """Map from above (Fig. 5), in perspective (Fig. 6), errors and matches over time."""
+    folder = make_subfolder(run, FOLDER)
+    estimate, truth = figures.estimate, figures.truth
     found = None if truth is None else to_estimate_world(estimate.trajectory, truth)
-    drawing = _map_drawing(outputs, estimate, None if found is None else found[1])
+    drawing = _map_drawing(figures, None if found is None else found[1])
     draw_birds_eye(folder / "map_from_above.png", drawing)
     draw_map_views(folder / "map_views.png", drawing)
-    recorder = outputs.recorder
     # The first frame has no landmarks to match.
-    frames = np.array([increment.index for increment in recorder.log][1:], np.int64)
     draw_matches(
         folder / "matches.png",
-        frames,
-        recorder.column("matched")[1:],
-        recorder.column("inliers")[1:],
-        recorder.column("landmarks")[1:],
-        _title(outputs, "landmark matches"),
+        figures.frames[1:],
+        figures.matched[1:],
+        figures.inliers[1:],
+        figures.landmarks[1:],
+        figures.title("landmark matches"),
     )
     if found is not None:
-        rows, true_poses = found
-        errors = estimate.trajectory.poses[rows, :3, 3] - true_poses[:, :3, 3]
-        timestamps = estimate.trajectory.timestamps[rows]
-        covariances = world_position_covariances(
-            estimate.trajectory.poses[rows], estimate.covariances[rows]
-        )
-        # A planar covariance, rotated, may round to just below zero.
-        sigmas = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
-        title = _title(outputs, "position error, first pose aligned")
-        draw_errors(folder / "position_error.png", timestamps, errors, sigmas, title)
+        _draw_position_errors(folder / "position_error.png", figures, *found)
     return sorted(folder.glob("*.png"))
 
 
-def _map_drawing(
-    outputs: RunOutputs, estimate: Estimate, true_poses: FloatArray | None
-) -> MapDrawing:
+def _draw_position_errors(
+    path: Path, figures: RunFigures, rows: IntArray, true_poses: FloatArray
+) -> None:
+    trajectory = figures.estimate.trajectory
+    errors = trajectory.poses[rows, :3, 3] - true_poses[:, :3, 3]
+    covariances = world_position_covariances(
+        trajectory.poses[rows], figures.estimate.covariances[rows]
+    )
+    # A planar covariance, rotated, may round to just below zero.
+    sigmas = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
+    title = figures.title("position error, first pose aligned")
+    draw_errors(path, trajectory.timestamps[rows], errors, sigmas, title)
+
+
+def _map_drawing(figures: RunFigures, true_poses: FloatArray | None) -> MapDrawing:
     """Valid landmarks only (6.1), as in the paper's Figure 6; all while the run is too short."""
-    database = outputs.pipeline.tracker.database
-    valid = database.valid[database.rows(estimate.landmarks.ids)]
+    valid, estimate = figures.valid, figures.estimate
     shown = valid if valid.any() else np.ones_like(valid)
     return MapDrawing(
         landmarks=estimate.landmarks.positions[shown],
@@ -98,7 +145,7 @@ def _map_drawing(
         landmark_covariances=estimate.landmarks.covariances[shown],
         pose_covariances=estimate.covariances,
         truth=true_poses,
-        title=_title(outputs, "valid landmarks" if valid.any() else "landmarks"),
+        title=figures.title("valid landmarks" if valid.any() else "landmarks"),
     )
 
 
@@ -113,5 +160,4 @@ def _common(earlier: Increment, now: Increment) -> tuple[IntArray, IntArray]:
 
 
 def _title(outputs: RunOutputs, what: str) -> str:
-    synthetic = ", synthetic odometry" if outputs.remark else ""
-    return f"{outputs.config.name}: {what}{synthetic}"
+    return f"{outputs.config.name}: {what}{_SYNTHETIC if outputs.remark else ''}"

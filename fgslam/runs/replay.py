@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import resource
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -84,7 +86,7 @@ class Replay:
     rows: tuple[ReplayRow, ...]
     final_ms: float
     memory_before_mb: float | None
-    peak_memory_mb: float | None
+    peak_memory_mb: float
     failure: str = ""
 
     def __len__(self) -> int:
@@ -164,6 +166,15 @@ def memory_mb(name: str) -> float | None:
     return float(found[0][1]) / 1024.0 if found else None
 
 
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process so far, mebibytes."""
+    found = memory_mb("VmHWM")
+    if found is None:  # no /proc: kibibytes everywhere but on macOS, where they are bytes
+        unit = 1024.0**2 if sys.platform == "darwin" else 1024.0
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    return found
+
+
 def _require_support(estimator: Estimator, log: MeasurementLog) -> None:
     """Refuses an estimator that cannot use what the log holds."""
     camera = isinstance(log.rig, CameraRig)
@@ -225,7 +236,7 @@ class _Replaying:
             rows=tuple(self._rows),
             final_ms=final_ms,
             memory_before_mb=before_mb,
-            peak_memory_mb=memory_mb("VmHWM"),
+            peak_memory_mb=peak_memory_mb(),
             failure=failure,
         )
 

@@ -52,7 +52,7 @@ class Run:
     @property
     def estimator(self) -> dict[str, Any]:
         """Metrics of the live estimator."""
-        found: dict[str, Any] = self.metrics["estimators"][self.result.outputs.kind]
+        found: dict[str, Any] = self.metrics["estimators"][self.result.outputs.title]
         return found
 
     @property

@@ -13,6 +13,7 @@ from fgslam.geometry import se3_exp
 from fgslam.measurement_log import MeasurementLog, load_arrays
 from fgslam.pipeline import FrameReport
 from fgslam.runs.checkpoint import write_arrays
+from fgslam.runs.judging import Truth
 from fgslam.runs.recorder import STAGES, FrameRow, RunRecorder
 from fgslam.runs.summary import estimator_metrics, frame_problems, run_numbers
 from fgslam.types import (
@@ -199,7 +200,7 @@ def test_a_perfect_path_has_no_error_in_any_world() -> None:
     estimate, recorder = estimate_of(8), recorder_of(8)
     world = se3_exp(np.array([0.3, -1.2, 0.7, 5.0, -3.0, 2.0]))
     truth = Trajectory(estimate.trajectory.timestamps, world @ estimate.trajectory.poses)
-    metrics = estimator_metrics(estimate, truth, recorder)
+    metrics = estimator_metrics(estimate, Truth(truth), recorder)
     assert metrics.ate_rmse_m == pytest.approx(0.0, abs=1e-12)
     assert metrics.end_error_m == pytest.approx(0.0, abs=1e-12)
     assert metrics.rpe_rot_deg == pytest.approx(0.0, abs=1e-5)
@@ -216,7 +217,7 @@ def test_a_known_error_at_the_end() -> None:
     poses[-1] = poses[-1] @ se3_exp(np.array([0.0, np.radians(2.0), 0.0, 0.0, 0.0, 0.0]))
     poses[-1, :3, 3] += [0.03, 0.0, 0.04]
     truth = Trajectory(estimate.trajectory.timestamps, poses)
-    metrics = estimator_metrics(estimate, truth, recorder)
+    metrics = estimator_metrics(estimate, Truth(truth), recorder)
     assert metrics.end_error_m == pytest.approx(0.05, abs=1e-9)
     assert metrics.end_error_deg == pytest.approx(2.0, abs=1e-6)
     length = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()
@@ -227,8 +228,8 @@ def test_a_known_error_at_the_end() -> None:
 @pytest.mark.parametrize("count", [1, 2])
 def test_without_truth_or_with_too_little_of_it(count: int) -> None:
     estimate, recorder = estimate_of(count), recorder_of(count)
-    metrics = estimator_metrics(estimate, None, recorder)
+    metrics = estimator_metrics(estimate, Truth(), recorder)
     assert metrics.ate_rmse_m is None
     assert metrics.nees_pose_per_dof is None
     assert metrics.landmarks == 7
-    assert estimator_metrics(estimate, estimate.trajectory, recorder).ate_rmse_m is None
+    assert estimator_metrics(estimate, Truth(estimate.trajectory), recorder).ate_rmse_m is None
