@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 
 import gtsam
 
-from fgslam.backend.graph_builder import NewFactors
 from fgslam.backend.graph_solution import (
     Solution,
     joint_of,
@@ -16,6 +15,7 @@ from fgslam.backend.graph_solution import (
     solution,
 )
 from fgslam.backend.outliers import graduated, observed_variables, solver_parameters, trimmed
+from fgslam.backend.segments import TrackedFrame
 from fgslam.backend.smoother import Smoother
 from fgslam.errors import EstimatorError
 from fgslam.factors.keys import landmark_key
@@ -46,7 +46,8 @@ class BatchSmoother(Smoother):
         self._values = gtsam.Values()
         self._optimised: Any = None
 
-    def _absorb(self, new: NewFactors) -> None:
+    def _absorb(self, tracked: TrackedFrame) -> None:
+        new = self._enter(tracked)
         self._values.insert(new.values)
         self._optimised = None
         every = self._settings.solve_every
@@ -57,12 +58,11 @@ class BatchSmoother(Smoother):
 
     def _solve(self) -> Solution:
         graph = self._optimise()
-        frames = self._builder.frames
-        return solution(graph, self._values, frames, self._variables(), self._floor)
+        return solution(graph, self._values, self._builder.frames, self._variables(), self._floor)
 
     def _joint(self, variables: list[int]) -> FloatArray:
         graph = self._optimise()
-        return joint_of(graph, self._values, self._floor, self._builder.frames - 1, variables)
+        return joint_of(graph, self._values, self._floor, self._builder.frames[-1], variables)
 
     def _variables(self) -> list[int]:
         return [v for v in range(self._builder.variables) if self._builder.in_graph(v)]
@@ -101,6 +101,6 @@ class BatchSmoother(Smoother):
             return optimizer.optimize(), graph
         except RuntimeError as error:
             raise EstimatorError(
-                f"batch: the solver failed after frame {self._builder.frames - 1} "
+                f"batch: the solver failed after frame {self._builder.frames[-1]} "
                 f"({' '.join(str(error).split())}); look at that frame with fgslam inspect"
             ) from None

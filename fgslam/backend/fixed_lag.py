@@ -22,6 +22,7 @@ from fgslam.backend.graph_solution import (
     suspect,
 )
 from fgslam.backend.marginals import DenseMarginals
+from fgslam.backend.segments import TrackedFrame
 from fgslam.backend.smoother import Smoother
 from fgslam.errors import EstimatorError
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
@@ -60,7 +61,8 @@ class FixedLagSmoother(Smoother):
         self._clock: list[float] = []
         self._recent: deque[NewFactors] = deque()
 
-    def _absorb(self, new: NewFactors) -> None:
+    def _absorb(self, tracked: TrackedFrame) -> None:
+        new = self._enter(tracked)
         self._clock.append(float(self._inputs.increments[-1].timestamp))
         self._poses.append(np.eye(4))
         self._covariances.append(np.full((6, 6), np.nan))

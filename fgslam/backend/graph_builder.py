@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
+from fgslam.backend.segments import TrackedFrame
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior, weak_point_prior
 from fgslam.factors.noise import Whitening
@@ -24,10 +25,9 @@ from fgslam.settings.backend import GraphSettings
 from fgslam.types import (
     CameraRig,
     FloatArray,
-    Increment,
+    IntArray,
     LandmarkMap,
     Observations,
-    Odometry,
     Prediction,
     Sensor,
 )
@@ -103,6 +103,7 @@ class GraphBuilder:
     Attributes:
         graph: all factors; one taken out leaves an empty slot.
         tracks: by the landmark's identity.
+        frames: those whose poses are in the graph, in time order.
         remarks: what was left out or started anew, in words.
     """
 
@@ -133,7 +134,7 @@ class GraphBuilder:
         self.graph = gtsam.NonlinearFactorGraph()
         self.tracks: dict[int, Track] = {}
         self.remarks: list[str] = []
-        self.frames = 0
+        self.frames: list[int] = []
 
     @property
     def variables(self) -> int:
@@ -144,39 +145,35 @@ class GraphBuilder:
         """Identity of a landmark variable."""
         return self._id_of[variable]
 
-    def add(
-        self,
-        increment: Increment,
-        wTc: FloatArray,
-        motion: Odometry | None,
-        accepted: Observations,
-        rejected: Observations,
-        landmarks: LandmarkMap,
-    ) -> NewFactors:
-        """Adds a frame.
+    def add(self, tracked: TrackedFrame, landmarks: LandmarkMap) -> NewFactors:
+        """Adds a frame's pose and observations.
 
         Args:
-            increment: its measurements.
-            wTc: initial value of its pose.
-            motion: from the frame before; None for the first.
-            accepted: observations to use, matched and new ones.
-            rejected: matched observations that do not fit.
+            tracked: initial value of the pose, motion from the graph's last frame, observations.
             landmarks: the tracker's map after this frame: initial values, and how well each
                 landmark is known given the poses.
         """
-        new = NewFactors(self.frames, gtsam.NonlinearFactorGraph(), gtsam.Values(), [])
-        self.frames += 1
-        self._add_pose(new, wTc, motion)
-        self._add_observations(new, accepted, wTc, landmarks)
-        self._count_rejected(rejected)
-        for identity in increment.pruned_ids.tolist():
-            self._forget(identity)
+        new = NewFactors(tracked.frame, gtsam.NonlinearFactorGraph(), gtsam.Values(), [])
+        self._add_pose(new, tracked)
+        self.frames.append(tracked.frame)
+        self._add_observations(new, tracked, landmarks)
         return new
+
+    def note(self, rejected: Observations, pruned: IntArray) -> None:
+        """Books matched observations that did not fit, and landmarks that the front-end dropped.
+
+        What a dropped landmark said stays in the graph, but it is no longer told.
+        """
+        for identity in rejected.ids.tolist():
+            if identity in self.tracks:
+                self.tracks[identity].rejections += 1
+        for identity in pruned.tolist():
+            self.tracks.pop(identity, None)
 
     def contradicted(self, rejected: Observations) -> Observations:
         """Those rejected observations whose landmark must have moved: they start it anew.
 
-        To be asked before :meth:`add`, whose ``rejected`` counts this frame's rejections.
+        To be asked before :meth:`note` counts this frame's rejections.
         """
         after = self._settings.contradicted_after
         if after == 0:
@@ -240,7 +237,7 @@ class GraphBuilder:
         """Variables that lie behind a camera that saw them, where a stereo factor says nothing.
 
         Args:
-            poses: (n, 4, 4) ``wTc`` of all frames.
+            poses: (n, 4, 4) ``wTc`` by frame, those of the graph at least.
             points: positions (3,) by variable.
         """
         if not points or not isinstance(self._sensor, CameraRig):
@@ -267,21 +264,22 @@ class GraphBuilder:
 
     # ----------------------------------------------------------------------------------------
 
-    def _add_pose(self, new: NewFactors, wTc: FloatArray, motion: Odometry | None) -> None:
+    def _add_pose(self, new: NewFactors, tracked: TrackedFrame) -> None:
         key = pose_key(new.frame)
-        new.values.insert(key, gtsam.Pose3(wTc))
-        if new.frame == 0:
+        new.values.insert(key, gtsam.Pose3(tracked.wTc))
+        if not self.frames:
             self._push(new, pose_prior(key, self._prior))
+        elif tracked.motion is None:
+            raise ValueError(f"frame {new.frame}: no motion from the frame before")
         else:
-            if motion is None:
-                raise ValueError(f"frame {new.frame}: no motion from the frame before")
-            self._push(new, odometry_factor(pose_key(new.frame - 1), key, motion))
-        for factor in floor_factors(key, self._floor, wTc):
+            self._push(new, odometry_factor(pose_key(self.frames[-1]), key, tracked.motion))
+        for factor in floor_factors(key, self._floor, tracked.wTc):
             self._push(new, factor)
 
     def _add_observations(
-        self, new: NewFactors, accepted: Observations, wTc: FloatArray, landmarks: LandmarkMap
+        self, new: NewFactors, tracked: TrackedFrame, landmarks: LandmarkMap
     ) -> None:
+        accepted, wTc = tracked.accepted, tracked.wTc
         rows = landmarks.rows(accepted.ids)
         positions = landmarks.positions[rows]
         parallax = _parallax(positions - wTc[:3, 3], landmarks.covariances[rows])
@@ -346,15 +344,6 @@ class GraphBuilder:
         if self._remember:
             self.graph.add(factor)
         return int(self.graph.size()) - 1
-
-    def _count_rejected(self, rejected: Observations) -> None:
-        for identity in rejected.ids.tolist():
-            if identity in self.tracks:
-                self.tracks[identity].rejections += 1
-
-    def _forget(self, identity: int) -> None:
-        """The front-end dropped it: what it said stays in the graph, but it is no longer told."""
-        self.tracks.pop(identity, None)
 
 
 def _parallax(rays: FloatArray, covariances: FloatArray) -> FloatArray:

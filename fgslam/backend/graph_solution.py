@@ -20,7 +20,7 @@ class Solution:
     """The graph's answer.
 
     Attributes:
-        poses: (n, 4, 4) of all frames.
+        poses: (n, 4, 4) by frame; NaN for those between keyframes.
         pose_covariances: (n, 6, 6); NaN where they cannot be had.
         points: positions (3,) of landmark variables.
         point_covariances: (3, 3) of the same.
@@ -34,9 +34,12 @@ class Solution:
     remark: str = ""
 
 
-def poses_of(values: Any, frames: int) -> FloatArray:
-    """Poses (n, 4, 4) of frames 0 to n - 1 in GTSAM values."""
-    return np.array([values.atPose3(pose_key(k)).matrix() for k in range(frames)])
+def poses_of(values: Any, frames: list[int]) -> FloatArray:
+    """Poses (n, 4, 4) by frame, up to the last of ``frames``; NaN for those not among them."""
+    out = np.full((frames[-1] + 1, 4, 4), np.nan)
+    for frame in frames:
+        out[frame] = values.atPose3(pose_key(frame)).matrix()
+    return out
 
 
 def points_of(values: Any, variables: list[int]) -> dict[int, FloatArray]:
@@ -44,17 +47,20 @@ def points_of(values: Any, variables: list[int]) -> dict[int, FloatArray]:
     return {v: np.asarray(values.atPoint3(landmark_key(v))) for v in variables}
 
 
-def solution(graph: Any, values: Any, frames: int, variables: list[int], floor: Floor) -> Solution:
-    """Everything about frames 0 to n - 1 and landmark variables, at the given values."""
+def solution(
+    graph: Any, values: Any, frames: list[int], variables: list[int], floor: Floor
+) -> Solution:
+    """Everything about frames of the graph and landmark variables, at the given values."""
     poses, points = poses_of(values, frames), points_of(values, variables)
+    kept = np.full((len(poses), 6, 6), np.nan)
     try:
         marginals = GraphMarginals.of(graph, values)
         by_key = dict(zip(marginals.landmark_keys.tolist(), marginals.landmarks(), strict=True))
         covariances = {v: by_key[landmark_key(v)] for v in variables}
-        kept = allowed_parts(floor, poses, marginals.poses())
+        kept[frames] = allowed_parts(floor, poses[frames], marginals.poses())
     except EstimatorError as error:
         missing = {v: np.full((3, 3), np.nan) for v in variables}
-        return Solution(poses, np.full((frames, 6, 6), np.nan), points, missing, str(error))
+        return Solution(poses, kept, points, missing, str(error))
     return Solution(poses, kept, points, covariances)
 
 

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import gtsam
 import numpy as np
 
-from fgslam.backend.graph_builder import NewFactors
+from fgslam.backend.between import fill_between
 from fgslam.backend.graph_solution import (
     Solution,
     allowed_parts,
@@ -18,12 +18,14 @@ from fgslam.backend.graph_solution import (
     solution,
     suspect,
 )
+from fgslam.backend.segments import Segments, TrackedFrame
 from fgslam.backend.smoother import Smoother
 from fgslam.errors import EstimatorError
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 from fgslam.floor import Floor
+from fgslam.geometry import adjoint, congruence, inverse, reorthonormalise
 from fgslam.settings.backend import Isam2Settings
-from fgslam.types import FloatArray, Prediction, Sensor
+from fgslam.types import FloatArray, Observations, Prediction, Sensor
 
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
 
@@ -48,14 +50,27 @@ class Isam2Smoother(Smoother):
         self._graph = gtsam.NonlinearFactorGraph()
         self._new_values = gtsam.Values()
         self._values = gtsam.Values()
+        self._segments = Segments(sensor, settings.keyframe_every)
+        self._updated = 0
 
-    def _absorb(self, new: NewFactors) -> None:
+    def _absorb(self, tracked: TrackedFrame) -> None:
+        entering = self._segments.take(tracked, self._tracker.landmarks())
+        if entering is None:
+            return
+        new = self._enter(entering)
         self._graph.push_back(new.graph)
         self._new_values.insert(new.values)
-        if (new.frame + 1) % self._settings.update_every == 0 or new.frame == 0:
+        if tracked.frame == 0 or tracked.frame - self._updated >= self._settings.update_every:
+            self._updated = tracked.frame
             self._flush()
-            last = Prediction(poses_of_frame(self._values, new.frame), self._covariance(new.frame))
-            self._take_over(self._values, last)
+            self._take_over(self._values, self._moved_on(entering, tracked))
+
+    def _moved_on(self, entered: TrackedFrame, tracked: TrackedFrame) -> Prediction:
+        """The last frame's pose, as far from the one that entered last as it was tracked."""
+        motion = inverse(entered.wTc) @ tracked.wTc
+        covariance = congruence(adjoint(inverse(motion)), self._covariance(entered.frame))
+        pose = poses_of_frame(self._values, entered.frame) @ motion
+        return Prediction(reorthonormalise(pose), covariance)
 
     def _solve(self) -> Solution:
         self._flush()
@@ -68,12 +83,16 @@ class Isam2Smoother(Smoother):
                 break
         self._take_out_behind()
         graph = self._builder.kept_factors()
-        return solution(graph, self._values, self._builder.frames, self._variables(), self._floor)
+        frames = self._builder.frames
+        solved = solution(graph, self._values, frames, self._variables(), self._floor)
+        variable_of = {i: track.variable for i, track in self._builder.tracks.items()}
+        between, motions = self._segments.between, self._inputs.motions
+        return fill_between(self._sensor, self._floor, solved, between, motions, variable_of)
 
     def _joint(self, variables: list[int]) -> FloatArray:
         self._flush()
         graph = self._builder.kept_factors()
-        return joint_of(graph, self._values, self._floor, self._builder.frames - 1, variables)
+        return joint_of(graph, self._values, self._floor, self._builder.frames[-1], variables)
 
     # ----------------------------------------------------------------------------------------
 
@@ -111,8 +130,7 @@ class Isam2Smoother(Smoother):
         if window == 0:
             return None
         groups = gtsam.KeyGroupMap()
-        frames = self._builder.frames
-        for frame in range(max(0, frames - window), frames):
+        for frame in self._builder.frames[-window:]:
             groups.insert2(pose_key(frame), 1)
         return groups
 
@@ -147,7 +165,7 @@ class Isam2Smoother(Smoother):
         what = self._builder.take_out(variable)
         values.erase(landmark_key(variable))
         self._remarks.append(
-            f"{what} {why} at frame {self._builder.frames - 1}: taken out of the graph, iSAM2 "
+            f"{what} {why} at frame {self._builder.frames[-1]}: taken out of the graph, iSAM2 "
             "built anew from the last estimate"
         )
 
@@ -156,9 +174,13 @@ class Isam2Smoother(Smoother):
         self._isam.update(self._builder.kept_factors(), values, [], self._groups())
         self._values = self._isam.calculateEstimate()
 
+    def _restart(self, moved: Observations) -> None:
+        super()._restart(moved)
+        self._segments.forget(moved.ids.tolist())
+
     def _failed(self, error: Exception) -> EstimatorError:
         return EstimatorError(
-            f"isam2: the solver failed at frame {self._builder.frames - 1} "
+            f"isam2: the solver failed at frame {self._builder.frames[-1]} "
             f"({' '.join(str(error).split())}); look at that frame with fgslam inspect"
         )
 

@@ -17,6 +17,7 @@ from fgslam.backend.graph_builder import GraphBuilder, NewFactors, Sighting
 from fgslam.backend.graph_solution import Solution
 from fgslam.backend.inputs import RecordedInputs
 from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.backend.segments import TrackedFrame
 from fgslam.errors import EstimatorError
 from fgslam.factors.keys import landmark_key
 from fgslam.floor import Floor
@@ -38,6 +39,7 @@ from fgslam.types import (
     IntArray,
     LandmarkMap,
     MeasurementType,
+    Observations,
     Odometry,
     Prediction,
     Sensor,
@@ -92,7 +94,7 @@ class Smoother(ABC):
         stats = self._tracker.update(increment, tracking)
         self._inputs.append(increment, tracking, motion)
         self._answer = None
-        self._absorb(self._add(increment, tracking, motion))
+        self._absorb(self._sorted_out(increment, tracking, motion))
         current = self._current(tracking)
         return UpdateStats(
             current.wTc, current.covariance, stats.landmarks, stats.nis, stats.nis_dof
@@ -131,7 +133,7 @@ class Smoother(ABC):
 
     def restore(self, state: StateArrays) -> None:
         """Repeats all updates of :meth:`state`."""
-        if self._builder.frames:
+        if self._inputs.increments:
             raise EstimatorError("only a new estimator can be restored")
         for increment, tracking, motion in RecordedInputs.from_arrays(state):
             self.update(increment, tracking, motion)
@@ -139,8 +141,8 @@ class Smoother(ABC):
     # -- what a smoother adds ----------------------------------------------------------------
 
     @abstractmethod
-    def _absorb(self, new: NewFactors) -> None:
-        """Takes a frame's factors in; solves when it is time to."""
+    def _absorb(self, tracked: TrackedFrame) -> None:
+        """Takes a frame in; solves when it is time to."""
 
     @abstractmethod
     def _solve(self) -> Solution:
@@ -152,25 +154,33 @@ class Smoother(ABC):
 
     # -- common steps ------------------------------------------------------------------------
 
-    def _add(
+    def _sorted_out(
         self, increment: Increment, tracking: EgoMotion, motion: Odometry | None
-    ) -> NewFactors:
+    ) -> TrackedFrame:
+        """The frame with those observations that fit; landmarks that moved have started anew."""
         observed = increment.observations
         matched = observed.select(~observed.is_new)
         used = tracking.inliers if self._gate else np.ones(len(matched), np.bool_)
         rejected = matched.select(~used)
         moved = self._builder.contradicted(rejected)
-        self._builder.start_anew(
-            moved.ids.tolist(), "was rejected in frame after frame: moved, or matched wrongly"
-        )
+        self._restart(moved)
+        self._builder.note(rejected, increment.pruned_ids)
+        accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
+        held = np.isin(accepted.ids, self._tracker.landmarks().ids)
+        frame = len(self._inputs.increments) - 1
+        return TrackedFrame(frame, tracking.wTc, motion, accepted.select(held))
+
+    def _restart(self, moved: Observations) -> None:
+        """Landmarks that were contradicted too often begin anew where they are seen now."""
+        why = "was rejected in frame after frame (moved, or matched wrongly): started anew"
+        self._builder.start_anew(moved.ids.tolist(), why)
         self._tracker.restart(moved)
         for identity in moved.ids.tolist():
             self._frozen.pop(identity, None)
-        accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
-        held = np.isin(accepted.ids, self._tracker.landmarks().ids)
-        return self._builder.add(
-            increment, tracking.wTc, motion, accepted.select(held), rejected, self.landmarks()
-        )
+
+    def _enter(self, tracked: TrackedFrame) -> NewFactors:
+        """Enters a frame into the graph."""
+        return self._builder.add(tracked, self._tracker.landmarks())
 
     def _take_over(self, values: Any, current: Prediction) -> None:
         """Lets the tracker go on from smoothed values."""
@@ -208,9 +218,12 @@ class Smoother(ABC):
         """The tracker's landmarks where the graph has them; those that wait, from their pose."""
         ids = self._tracker.landmarks().ids
         positions, covariances = np.empty((len(ids), 3)), np.empty((len(ids), 3, 3))
+        known = self._tracker.landmarks()
         for row, identity in enumerate(ids.tolist()):
-            track = self._builder.tracks[identity]
-            if track.variable in answer.points:
+            track = self._builder.tracks.get(identity)
+            if track is None:  # seen since the last keyframe only
+                positions[row], covariances[row] = known.positions[row], known.covariances[row]
+            elif track.variable in answer.points:
                 positions[row] = answer.points[track.variable]
                 covariances[row] = answer.point_covariances[track.variable]
             elif identity in self._frozen:
