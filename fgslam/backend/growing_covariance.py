@@ -15,7 +15,7 @@ FRONT = 6
 BLOCK = 3
 """Rows and columns of a landmark."""
 _SLAB = 192  # rows updated at once: large enough for the product's speed, small enough for cache
-_GROWTH = 1.5
+_GROWTH = 1.2
 
 
 class GrowingCovariance:
