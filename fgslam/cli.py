@@ -17,6 +17,8 @@ from fgslam.errors import FgslamError
 if TYPE_CHECKING:
     from fgslam.config import ExperimentConfig
     from fgslam.export.atomic import ExistingFolder
+    from fgslam.runs.baseline import Results
+    from fgslam.runs.choosing import Choice
     from fgslam.runs.comparison import Compared
     from fgslam.runs.experiment import Progress
 
@@ -94,71 +96,155 @@ def _run_measurements(settings: ExperimentConfig, folder: Path, existing: Existi
         compared = run_measured(settings, folder, existing, progress, stopped)
         interrupted = stopped()
     show_comparisons([compared])
-    _exit_after([compared], interrupted)
+    if status := _status_of([compared], interrupted):
+        raise typer.Exit(status)
 
 
-def _exit_after(compared: list[Compared], interrupted: bool) -> None:
-    """The exit status of a comparison: a failed estimator is told, all of them are a fault."""
+def _status_of(compared: list[Compared], interrupted: bool) -> int:
+    """Exit status of a comparison: a failed estimator is told, all of them are a fault."""
     if interrupted:
-        raise typer.Exit(EXIT_INTERRUPTED)
-    if any(len(one.failures) == len(one.metrics) for one in compared):
-        raise typer.Exit(EXIT_FAULT)
+        return EXIT_INTERRUPTED
+    return EXIT_FAULT if any(len(c.failures) == len(c.metrics) for c in compared) else 0
+
+
+# The options of `compare`, here so that the command itself fits on a page.
+_Runs = Annotated[
+    list[Path],
+    typer.Argument(metavar="RUN...", help="run folders; with --trials one run or experiment.yaml"),
+]
+_Estimators = Annotated[
+    str | None,
+    typer.Option(
+        metavar="A,B,C",
+        help="which ones: kinds, or labels of the run's configuration; default those that it "
+        "compares, else every kind",
+    ),
+]
+_EstimatorOverrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="estimators.NAME.KEY=VALUE",
+        help="override one key of one estimator; may be repeated",
+    ),
+]
+_Out = Annotated[
+    Path | None, typer.Option(help="folder of the results; default RUN/compare or RUN/trials")
+]
+_OverwriteResults = Annotated[
+    bool, typer.Option("--overwrite", help="replace an earlier comparison")
+]
+_Jobs = Annotated[
+    int, typer.Option(min=1, help="processes at a time; more than 1 disturbs the times")
+]
+_TrialCount = Annotated[
+    int | None, typer.Option("--trials", min=1, help="repeat over so many worlds of noise")
+]
+_FirstSeed = Annotated[
+    int | None, typer.Option(min=0, help="of the first trial; default the configuration's")
+]
+_WriteBaseline = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="write the results as a baseline")
+]
+_CheckBaseline = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="compare with a baseline; exit with 1 where one got worse"),
+]
 
 
 @app.command()
-def compare(
-    runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN...", help="run folders, as fgslam run writes them")
-    ],
-    estimators: Annotated[
-        str | None,
-        typer.Option(
-            metavar="A,B,C",
-            help="which ones: kinds, or labels of the run's configuration; default those that it "
-            "compares, else every kind",
-        ),
-    ] = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="estimators.NAME.KEY=VALUE",
-            help="override one key of one estimator; may be repeated",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="folder of the results; default RUN/compare")
-    ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="replace an earlier comparison")
-    ] = False,
-    jobs: Annotated[
-        int, typer.Option(min=1, help="estimators at a time; more than 1 disturbs the times")
-    ] = 1,
+def compare(  # noqa: PLR0913 - each option is a parameter
+    runs: _Runs,
+    estimators: _Estimators = None,
+    overrides: _EstimatorOverrides = None,
+    out: _Out = None,
+    overwrite: _OverwriteResults = False,
+    jobs: _Jobs = 1,
+    trials: _TrialCount = None,
+    seed: _FirstSeed = None,
+    write_baseline: _WriteBaseline = None,
+    check_baseline: _CheckBaseline = None,
 ) -> None:
     """Replay runs' measurements through estimators and set them side by side.
 
     Every estimator gets exactly the measurements that the run has logged. An estimator that fails
-    says where and why; the others go on.
+    says where and why; the others go on. With --trials the experiment is repeated with new noise,
+    and paired tests say whether the smoothers beat the filters.
     """
+    from fgslam.errors import ConfigError
+    from fgslam.runs.choosing import Choice
+
+    names = None if estimators is None else tuple(estimators.split(","))
+    choice, existing = Choice(names, tuple(overrides or ())), _existing(overwrite)
+    if trials is None and seed is not None:
+        raise ConfigError("--seed means nothing without --trials; give both or none")
+    if trials is None:
+        results, status = _compare_runs(runs, choice, out, existing, jobs)
+    elif len(runs) == 1:
+        results, status = _compare_trials(runs[0], (trials, seed), choice, out, existing, jobs)
+    else:
+        raise ConfigError("--trials takes one run or experiment at a time; give one")
+    regression = _baselines(results, write_baseline, check_baseline)
+    if status or regression:
+        raise typer.Exit(status or EXIT_FAULT)
+
+
+def _existing(overwrite: bool) -> ExistingFolder:
+    return "overwrite" if overwrite else "refuse"
+
+
+def _compare_runs(
+    runs: list[Path], choice: Choice, out: Path | None, existing: ExistingFolder, jobs: int
+) -> tuple[Results, int]:
+    """Metrics by run and estimator, and the exit status."""
     from fgslam.comparison_console import show_comparisons
     from fgslam.console import progress_bar
     from fgslam.runs.compare import compare_runs
 
     with _stop_flag() as stopped, progress_bar() as progress:
-        compared = compare_runs(
-            runs,
-            None if estimators is None else estimators.split(","),
-            overrides or (),
-            out,
-            "overwrite" if overwrite else "refuse",
-            jobs,
-            progress,
-            stopped,
-        )
+        compared = compare_runs(runs, choice, out, existing, jobs, progress, stopped)
         interrupted = stopped()
     show_comparisons(compared)
-    _exit_after(compared, interrupted)
+    return {one.name: one.metrics for one in compared}, _status_of(compared, interrupted)
+
+
+def _compare_trials(
+    source: Path,
+    seeds: tuple[int, int | None],
+    choice: Choice,
+    out: Path | None,
+    existing: ExistingFolder,
+    jobs: int,
+) -> tuple[Results, int]:
+    """Means over the trials by run and estimator, and the exit status."""
+    from fgslam.comparison_console import show_trials
+    from fgslam.console import progress_bar
+    from fgslam.runs.trial_results import together
+    from fgslam.runs.trials import Seeds, run_trials
+
+    with _stop_flag() as stopped, progress_bar() as progress:
+        trials = run_trials(source, Seeds(*seeds), choice, out, existing, jobs, progress, stopped)
+        interrupted = stopped()
+    show_trials(trials)
+    means = {title: together(trials.summary, title) for title in trials.summary.means}
+    status = EXIT_INTERRUPTED if interrupted else EXIT_FAULT if trials.failures else 0
+    return {trials.name: means}, status
+
+
+def _baselines(results: Results, write: Path | None, check: Path | None) -> bool:
+    """Writes and checks baselines; whether something became worse."""
+    import shlex
+
+    from fgslam.comparison_console import show_deviations
+    from fgslam.runs.baseline import check_baseline, write_baseline
+
+    if write is not None:
+        write_baseline(write, results, shlex.join(["fgslam", *sys.argv[1:]]))
+    if check is None:
+        return False
+    deviations = check_baseline(check, results)
+    show_deviations(check, deviations)
+    return any(deviation.regression for deviation in deviations)
 
 
 @app.command()

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
 
 from fgslam.export.comparison_table import value_at
+from fgslam.runs.baseline import Deviation
 from fgslam.runs.comparison import Compared
+from fgslam.runs.trial_results import failures_of, together
+from fgslam.runs.trials import Trials
 
 UNKNOWN = "-"
 _REMARKS_SHOWN = 3
@@ -25,13 +29,41 @@ class _Column(NamedTuple):
 
 def show_comparisons(compared: Sequence[Compared]) -> None:
     """Tables of each run, then of all together where there are several."""
-    console = Console()
-    if not console.is_terminal:  # a file or a pipe has no width to keep to
-        console = Console(width=_WIDTH_OF_FILES)
+    console = _console()
     for one in compared:
         _show(console, one)
     if len(compared) > 1:
         console.print(_summary(compared))
+
+
+def show_trials(trials: Trials) -> None:
+    """Means over the trials, the verdict on each estimator, and who beats whom."""
+    console = _console()
+    summary = trials.summary
+    values = {title: together(summary, title).as_json() for title in summary.means}
+    count = len(summary.rows)
+    heading = f"{trials.name}: {count} trials, mean [95 % interval]; NEES pooled, 1 is right"
+    console.print(_table(heading, _TRIAL_COLUMNS, values))
+    for pair in summary.pairs:
+        console.out(pair.sentence)
+    for line in (*trials.failures, *failures_of(summary)):
+        console.out(f"failed      {line}")
+    console.out(f"results     {trials.out}")
+
+
+def show_deviations(baseline: Path, deviations: Sequence[Deviation]) -> None:
+    """What differs from the baseline, each in a line, or that nothing does."""
+    console = _console()
+    for deviation in deviations:
+        console.out(f"{'REGRESSION' if deviation.regression else 'deviation':<12}{deviation.text}")
+    if not deviations:
+        console.out(f"baseline    {baseline}: all values within their tolerances")
+
+
+def _console() -> Console:
+    console = Console()
+    # A file or a pipe has no width to keep to.
+    return console if console.is_terminal else Console(width=_WIDTH_OF_FILES)
 
 
 def _show(console: Console, one: Compared) -> None:
@@ -160,6 +192,20 @@ def _signed(value: float) -> str:
     return f"{value:+.2f}"
 
 
+def _interval(scale: float, digits: int) -> Callable[..., str]:
+    def text(found: Mapping[str, Any]) -> str:
+        mean, lower, upper = found["mean"], found["lower"], found["upper"]
+        ends = "" if lower is None else f" [{scale * lower:.{digits}f}, {scale * upper:.{digits}f}]"
+        return f"{scale * mean:.{digits}f}{ends}"
+
+    return text
+
+
+def _pooled(found: Mapping[str, Any]) -> str:
+    band = f"{found['lower']:.2f}-{found['upper']:.2f}"
+    return f"{_ratio(found['per_dof'])} {found['verdict']} ({band})"
+
+
 _NO_TRUTH = "no ground truth, or fewer than three poses matched"
 _NO_LANDMARKS = "true landmark positions are not known, or none of them is in the map"
 _ACCURACY = (
@@ -212,4 +258,11 @@ _COST = (
     _Column("final\nestimate s", ("final_ms",), _seconds, "not timed apart in a live run"),
     _Column("peak memory\nMiB", ("peak_memory_mb",), _whole, "this system does not tell"),
     _Column("landmarks\nin the map", ("landmarks",), _whole, "no frame was processed"),
+)
+_TRIAL_COLUMNS = (
+    _Column("ATE final cm", ("intervals.ate_rmse_m",), _interval(100.0, 3), _NO_TRUTH),
+    _Column("ATE online cm", ("intervals_online.ate_rmse_m",), _interval(100.0, 3), _NO_TRUTH),
+    _Column("landmarks rms cm", ("intervals.landmark_rmse_m",), _interval(100.0, 2), _NO_LANDMARKS),
+    _Column("NEES pose", ("nees_pose",), _pooled, _NO_TRUTH),
+    _Column("NEES landmarks", ("nees_landmark",), _pooled, _NO_LANDMARKS),
 )

@@ -12,7 +12,7 @@ from typing import Any
 from fgslam.export.atomic import write_text
 from fgslam.export.metrics import EstimatorMetrics
 
-COLUMNS: tuple[tuple[str, str], ...] = (
+RESULT_COLUMNS: tuple[tuple[str, str], ...] = (
     ("kind", "kind"),
     ("frames", "frames"),
     ("alignment", "alignment"),
@@ -46,6 +46,11 @@ COLUMNS: tuple[tuple[str, str], ...] = (
     ("nis_per_dof", "nis_per_dof"),
     ("last_pose_sigma_m", "last_pose_sigma.position_m"),
     ("last_pose_sigma_deg", "last_pose_sigma.rotation_deg"),
+    ("failure", "failure"),
+)
+"""What the same measurements give to the byte: column, and where its value is in the metrics."""
+
+TIME_COLUMNS: tuple[tuple[str, str], ...] = (
     ("update_median_ms", "update_ms.median"),
     ("update_p95_ms", "update_ms.p95"),
     ("update_max_ms", "update_ms.max"),
@@ -55,30 +60,34 @@ COLUMNS: tuple[tuple[str, str], ...] = (
     ("update_slope_ms_per_1000_frames", "update_growth.slope_ms_per_1000"),
     ("peak_memory_mib", "peak_memory_mb"),
     ("memory_before_mib", "memory_before_mb"),
-    ("failure", "failure"),
 )
-"""Name of each column and where its value is in an estimator's part of metrics.json."""
+"""What differs from one execution to the next."""
 
 
 def write_comparison_csv(
-    path: Path, runs: Sequence[tuple[str, Mapping[str, EstimatorMetrics]]]
+    path: Path,
+    runs: Sequence[tuple[str, Mapping[str, EstimatorMetrics]]],
+    columns: Sequence[tuple[str, str]] = RESULT_COLUMNS + TIME_COLUMNS,
+    key: str = "run",
 ) -> None:
     """Write the table atomically; a value that is not known is an empty cell.
 
     Args:
         path: the file.
         runs: name of each run and its estimators' metrics by title.
+        columns: which, see above.
+        key: heading of the runs' names.
 
     Raises:
         OutputError: the file cannot be written.
     """
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(["run", "estimator", *(name for name, _ in COLUMNS)])
+    writer.writerow([key, "estimator", *(name for name, _ in columns)])
     for run, estimators in runs:
         for title, metrics in estimators.items():
             values = metrics.as_json()
-            cells = [_cell(value_at(values, where)) for _, where in COLUMNS]
+            cells = [_cell(value_at(values, where)) for _, where in columns]
             writer.writerow([run, title, *cells])
     write_text(path, buffer.getvalue())
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from fgslam.config import ExperimentConfig, make_config
@@ -11,6 +11,23 @@ from fgslam.errors import ConfigError
 from fgslam.settings.backend import EstimatorSettings
 
 _PREFIX = "estimators."
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What the user asked for.
+
+    Attributes:
+        names: titles of the configuration's estimators, or kinds; None: those of the configuration
+            where it compares any, else every kind.
+        overrides: `estimators.TITLE.key=value`.
+    """
+
+    names: tuple[str, ...] | None = None
+    overrides: tuple[str, ...] = ()
+
+
+EVERY = Choice()
 
 
 def all_kinds() -> dict[str, EstimatorSettings]:
@@ -29,21 +46,18 @@ def compared_with(config: ExperimentConfig) -> tuple[EstimatorSettings, ...]:
     return estimators_of(config)[1:]
 
 
-def choose(
-    config: ExperimentConfig, names: Sequence[str] | None, overrides: Iterable[str] = ()
-) -> tuple[EstimatorSettings, ...]:
+def choose(config: ExperimentConfig, choice: Choice) -> tuple[EstimatorSettings, ...]:
     """The estimators of a comparison.
 
     Args:
         config: of the run whose log is replayed.
-        names: titles of the configuration's estimators, or kinds; None: those of the configuration
-            where it compares any, else every kind.
-        overrides: `estimators.TITLE.key=value`.
+        choice: what the user asked for.
 
     Raises:
         ConfigError: an unknown name, or an override that is no key of that estimator.
     """
     known = all_kinds() | {settings.title: settings for settings in estimators_of(config)}
+    names = choice.names
     if names is None:
         chosen = [s.title for s in estimators_of(config)] if config.compare else list(known)
     else:
@@ -52,7 +66,7 @@ def choose(
     if unknown or not chosen:
         what = f"no estimator {unknown[0]!r}" if unknown else "no estimator named"
         raise ConfigError(f"{what}; give --estimators with some of {', '.join(known)}")
-    return _overridden({name: known[name] for name in chosen}, config, tuple(overrides))
+    return _overridden({name: known[name] for name in chosen}, config, choice.overrides)
 
 
 def _overridden(
@@ -60,22 +74,19 @@ def _overridden(
 ) -> tuple[EstimatorSettings, ...]:
     """Each estimator's settings with its own overrides, checked as those of a configuration."""
     for override in overrides:
-        title = _addressed(override)
-        if title not in chosen:
+        if not any(_addresses(override, title) for title in chosen):
             raise ConfigError(
                 f"--set {override}: not of the form estimators.NAME.key=value with NAME one of "
                 f"{', '.join(chosen)}"
             )
     return tuple(
-        _with(settings, config, [o for o in overrides if _addressed(o) == title])
+        _with(settings, config, [o for o in overrides if _addresses(o, title)])
         for title, settings in chosen.items()
     )
 
 
-def _addressed(override: str) -> str:
-    dotted = override.partition("=")[0].strip()
-    parts = dotted.removeprefix(_PREFIX).split(".")
-    return parts[0] if dotted.startswith(_PREFIX) and len(parts) > 1 else ""
+def _addresses(override: str, title: str) -> bool:
+    return override.strip().startswith(f"{_PREFIX}{title}.")
 
 
 def _with(

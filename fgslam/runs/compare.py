@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from fgslam.config import ExperimentConfig
 from fgslam.errors import ConfigError, OutputError
 from fgslam.export.atomic import (
     ExistingFolder,
@@ -13,7 +14,7 @@ from fgslam.export.atomic import (
 )
 from fgslam.export.comparison_table import write_comparison_csv
 from fgslam.export.metrics import EstimatorMetrics, JsonValue, read_metrics, write_metrics
-from fgslam.runs.choosing import choose
+from fgslam.runs.choosing import EVERY, Choice, choose
 from fgslam.runs.comparison import (
     COMPARISON_FILE,
     Compared,
@@ -33,8 +34,7 @@ METRICS_FILE = "metrics.json"
 
 def compare_runs(
     runs: Sequence[Path],
-    names: Sequence[str] | None = None,
-    overrides: Sequence[str] = (),
+    choice: Choice = EVERY,
     out: Path | None = None,
     existing: ExistingFolder = "refuse",
     jobs: int = 1,
@@ -45,8 +45,7 @@ def compare_runs(
 
     Args:
         runs: run folders.
-        names: which estimators, as :func:`fgslam.runs.choosing.choose`.
-        overrides: of their settings, as there.
+        choice: which estimators.
         out: folder of the results; of several runs each gets one below it, by its folder's name.
             None: `compare` inside each run.
         existing: what to do where results are already.
@@ -58,7 +57,7 @@ def compare_runs(
         FgslamError: a run cannot be read, a name is unknown, or the results cannot be written.
     """
     folders = _folders(runs, out)
-    chosen = [choose(load_run(run)[0], names, overrides) for run in runs]
+    chosen = [choose(load_run(run)[0], choice) for run in runs]
     compared = []
     for run, folder in zip(runs, folders, strict=True):
         _require_apart(run, folder, existing)
@@ -93,13 +92,13 @@ def compare_run(
         "remark": remark_of(config) or None,
         "notes": _notes(run),
     }
-    write_comparison(out, config.name, len(log), metrics, about, run)
+    write_comparison(out, config, len(log), metrics, about, run)
     return Compared(config.name, run, out, len(log), metrics)
 
 
 def write_comparison(
     out: Path,
-    name: str,
+    config: ExperimentConfig,
     frames: int,
     metrics: dict[str, EstimatorMetrics],
     about: dict[str, JsonValue],
@@ -107,8 +106,9 @@ def write_comparison(
 ) -> None:
     """metrics.json, comparison.csv and report.html of results that are in ``out``."""
     write_metrics(out / METRICS_FILE, frames, metrics, about)
-    write_comparison_csv(out / COMPARISON_FILE, [(name, metrics)])
-    report_from_folder(out, run)
+    write_comparison_csv(out / COMPARISON_FILE, [(config.name, metrics)])
+    if config.output.report:
+        report_from_folder(out, run)
 
 
 def _notes(run: Path) -> list[str]:

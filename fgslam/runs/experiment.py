@@ -157,7 +157,8 @@ def _finish(outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]
         pictures = tuple(draw_run(outputs.folder, figures_of(outputs)))
     checkpoint.remove(outputs.folder)
     compared = _compare(outputs, metrics, progress, stopped)
-    report_from_folder(outputs.folder)
+    if outputs.config.output.report:
+        report_from_folder(outputs.folder)
     return RunResult(outputs.folder, "finished", metrics, pictures, outputs, compared)
 
 

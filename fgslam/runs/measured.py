@@ -91,7 +91,7 @@ def run_measured(
     pictures: tuple[Path, ...] = ()
     if config.output.pictures and rows:
         pictures = tuple(draw_run(folder, _figures(folder, config, recording, rows)))
-    write_comparison(folder, config.name, len(recording.log), metrics, about, folder)
+    write_comparison(folder, config, len(recording.log), metrics, about, folder)
     notes = recording.notes
     return Compared(config.name, folder, folder, len(recording.log), metrics, notes, pictures)
 

@@ -12,9 +12,10 @@ from fgslam.settings.base import STRICT
 
 @dataclass(frozen=True, config=STRICT)
 class OutputSettings:
-    """Pictures and checkpoints."""
+    """Pictures, the page and checkpoints."""
 
     pictures: Annotated[bool, Field(description="draw the pictures of the run folder")] = True
+    report: Annotated[bool, Field(description="write report.html")] = True
     checkpoint_seconds: Annotated[
         float,
         Field(
