@@ -177,9 +177,25 @@ def test_scales_start_so_that_the_best_can_be_seen() -> None:
     assert not switches(error_over_time(similar))["log"]
     assert switches(drive_from_above(similar))["enlarged"]
     drifting = estimator_report("odometry", truth, rng, sigma_m=0.15)
-    unlike = ReportData("", "", (good, drifting), truth)
-    assert switches(error_over_time(unlike))["log"]
-    assert not switches(drive_from_above(unlike)).get("enlarged", False)
+    unlike = drive_from_above(ReportData("", "", (good, drifting), truth))
+    assert switches(error_over_time(ReportData("", "", (good, drifting), truth)))["log"]
+    assert not switches(unlike).get("enlarged", False)
+    assert "wide" not in switches(unlike)
+
+
+def test_ellipses_that_would_hide_the_view_wait_until_asked_for() -> None:
+    rng, truth = np.random.default_rng(2), loop(60)
+    good = estimator_report("good", truth, rng, sigma_m=0.005)
+    lost = estimator_report("lost", truth, rng)
+    covariances = lost.covariances.copy()
+    covariances[:, 3:, 3:] = 4.0 * np.eye(3)
+    lost = dataclasses.replace(lost, covariances=covariances)
+    figure = drive_from_above(ReportData("", "", (good, lost), truth))
+    assert switches(figure)["wide"] is False
+    assert switches(figure)["enlarged"] is True  # as the good one alone needs it
+    for trace in figure.traces:
+        if trace["name"].endswith("3 sigma"):
+            assert ("wide" in trace["meta"]["when"]) is trace["name"].startswith("lost")
 
 
 def test_covariances_that_are_not_known_have_no_ellipse() -> None:
@@ -209,7 +225,7 @@ def test_far_landmarks_do_not_shrink_the_map() -> None:
     assert high - low < 15.0
     solid = map_to_turn(far)
     assert numbers(named(solid, "landmark of isam2")["x"]).max() < 15.0
-    assert re.search(r"Up to \d+ far landmarks lie outside", solid.note)
+    assert re.search(r"Far landmarks outside the box, not drawn: up to \d+\.", solid.note)
 
 
 def test_thinning_keeps_ends_and_peaks() -> None:

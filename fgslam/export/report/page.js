@@ -72,6 +72,7 @@
     dressed.yaxis = dressedAxis(layout.yaxis, true);
     const log = switchOf(key, "log");
     if (log !== null) dressed.yaxis.type = log.checked ? "log" : "linear";
+    dressed.yaxis.exponentformat = "power"; // not 100µ, beside a unit of its own
     dressed.yaxis.uirevision = dressed.yaxis.type; // a linear range means nothing on the other scale
     dressed.dragmode = touch.matches ? false : "zoom";
     return dressed;

@@ -61,38 +61,28 @@ def level_axes(up: FloatArray) -> FloatArray:
 def drive_from_above(data: ReportData) -> Figure:
     """Truth, every estimator's final and online path, ellipses and landmarks, equal axes."""
     level = level_axes(data.up)
-    factor = _enlargement(data, level)
-    traces = [
-        *_dots_above(data, level),
-        *_paths(data, level[:2]),
-        *_ellipses(data, level[:2], 1, "enlarged" if factor > 1 else ""),
-    ]
-    if factor > 1:
-        traces += _ellipses(data, level[:2], factor, "")
     x, y = _limits(data, level)[:2]
+    ellipses, of_ellipses = _uncertainty(data, level)
     layout = {
         "xaxis": {"title": {"text": "right (m)"}, "range": x, "constrain": "domain"},
         "yaxis": {"title": {"text": "ahead (m)"}, "range": y, "scaleanchor": "x"},
         "hovermode": "closest",
     }
-    switches = [
-        Switch("truth", "truth"),
-        Switch("final", "final path"),
-        Switch("online", "path as first estimated", on=False),
-        Switch("ellipses", "uncertainty (3 sigma)"),
-    ]
-    if factor > 1:
-        readable = _widest(data, level) * factor < _FLOOD * _span(data, level)
-        switches.append(Switch("enlarged", f"enlarged {factor} times", on=readable))
     return Figure(
         "above",
         "The drive from above",
         "Solid: the path as known at the end. Dotted: each pose as first estimated. Dashed: the "
         f"truth. An ellipse reaches {SIGMAS:.0f} standard deviations of the position as the "
         "estimator claims it. Grey dots: landmarks of the estimator chosen.",
-        tuple(traces),
+        (*_dots_above(data, level), *_paths(data, level[:2]), *ellipses),
         layout,
-        (*switches, Switch("landmarks", "landmarks")),
+        (
+            Switch("truth", "truth"),
+            Switch("final", "final path"),
+            Switch("online", "path as first estimated", on=False),
+            *of_ellipses,
+            Switch("landmarks", "landmarks"),
+        ),
         selects=True,
         note=_thinning_note(data, MAX_DOTS_ABOVE),
     )
@@ -111,7 +101,7 @@ def map_to_turn(data: ReportData) -> Figure:
     scene["aspectmode"] = "manual"
     scene["aspectratio"] = dict(zip("xyz", (spans / spans.max()).tolist(), strict=True))
     scene["camera"] = {
-        "eye": {"x": -0.45, "y": -0.95, "z": 0.75},
+        "eye": {"x": -0.5, "y": -1.05, "z": 0.85},
         "center": {"x": 0, "y": 0, "z": -0.1},
     }
     scene["dragmode"] = "turntable"
@@ -157,7 +147,7 @@ def _outside(data: ReportData, level: FloatArray, limits: list[list[float]]) -> 
         points = estimator.landmarks.positions @ level.T
         counts.append(int((~((points >= low) & (points <= high)).all(axis=1)).sum()))
     worst = max(counts, default=0)
-    return f"Up to {worst:,} far landmarks lie outside the box and are not drawn." if worst else ""
+    return f"Far landmarks outside the box, not drawn: up to {worst:,}." if worst else ""
 
 
 # --------------------------------------------------------------------------------------------
@@ -192,15 +182,45 @@ def _path(
     return trace(owner, axes, mode="lines", line=style, hovertemplate=told)
 
 
-def _ellipses(data: ReportData, plane: FloatArray, factor: int, unless: str) -> Iterator[Trace]:
-    when = ("ellipses",) if factor == 1 else ("ellipses", "enlarged")
+def _uncertainty(data: ReportData, level: FloatArray) -> tuple[list[Trace], list[Switch]]:
+    """Ellipses of all estimators with their switches.
+
+    One factor enlarges all, so that they stay comparable. Estimators whose ellipses would hide the
+    view even at true size have no say in it, and are shown when asked for.
+    """
+    span = _span(data, level)
+    wide = [_is_wide(estimator, level, span) for estimator in data.estimators]
+    claimed = [_claimed(estimator, level[:2]) for estimator in data.estimators]
+    narrow = [found[1] for found, hidden in zip(claimed, wide, strict=True) if not hidden]
+    judged = np.concatenate([np.empty((0, 2, 2)), *narrow])
+    factor = exaggeration(judged, span) if len(judged) else 1
+    switches = [Switch("ellipses", "uncertainty (3 sigma)")]
+    if any(wide):
+        switches.append(Switch("wide", "very large ones, too", on=False))
+    if factor > 1:
+        widths = [
+            _width(e, level) for e, hidden in zip(data.estimators, wide, strict=True) if not hidden
+        ]
+        readable = max(widths) * factor < _FLOOD * span
+        switches.append(Switch("enlarged", f"enlarged {factor} times", on=readable))
+    traces = []
     for i, estimator in enumerate(data.estimators):
-        centres, covariances = _claimed(estimator, plane)
-        outline = centres[:, None] + factor * _outlines(covariances)
-        x, y = joined(outline).T
-        owner = Owner(f"{estimator.title}, 3 sigma", i, when, (unless,) if unless else ())
-        style = {"width": 1.2}
-        yield trace(owner, {"x": x, "y": y}, mode="lines", line=style, hoverinfo="skip")
+        when = ("ellipses", "wide") if wide[i] else ("ellipses",)
+        for scale in sorted({1, factor}):
+            key = ("enlarged",)
+            owner = Owner(
+                f"{estimator.title}, 3 sigma",
+                i,
+                when if scale == 1 else when + key,
+                key if scale == 1 and factor > 1 else (),
+            )
+            traces.append(_ellipses(owner, *claimed[i], scale))
+    return traces, switches
+
+
+def _ellipses(owner: Owner, centres: FloatArray, covariances: FloatArray, scale: int) -> Trace:
+    x, y = joined(centres[:, None] + scale * _outlines(covariances)).T
+    return trace(owner, {"x": x, "y": y}, mode="lines", line={"width": 1.2}, hoverinfo="skip")
 
 
 def _claimed(estimator: EstimatorReport, plane: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -223,22 +243,17 @@ def _outlines(covariances: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("kij,kj,mj->kmi", directions, radii, circle))
 
 
-def _enlargement(data: ReportData, level: FloatArray) -> int:
-    """One factor for all estimators, so that their ellipses stay comparable."""
-    claimed = np.concatenate(
-        [np.empty((0, 2, 2)), *(_claimed(e, level[:2])[1] for e in data.estimators)]
-    )
-    return exaggeration(claimed, _span(data, level)) if len(claimed) else 1
+def _is_wide(estimator: EstimatorReport, level: FloatArray, span: float) -> bool:
+    """Whether the typical ellipse would hide the view: dead reckoning beside smoothers."""
+    return _width(estimator, level) > _FLOOD * span
 
 
-def _widest(data: ReportData, level: FloatArray) -> float:
-    """Typical width in metres of the widest estimator's ellipses, at true size."""
-    widths = [
-        2.0 * SIGMAS * np.sqrt(np.median(np.linalg.eigvalsh(covariances)[:, -1]))
-        for covariances in (_claimed(e, level[:2])[1] for e in data.estimators)
-        if len(covariances)
-    ]
-    return float(max(widths, default=0.0))
+def _width(estimator: EstimatorReport, level: FloatArray) -> float:
+    """Typical width of an estimator's ellipses at true size, metres; 0 where none is known."""
+    covariances = _claimed(estimator, level[:2])[1]
+    if not len(covariances):
+        return 0.0
+    return float(2.0 * SIGMAS * np.sqrt(np.median(np.linalg.eigvalsh(covariances)[:, -1])))
 
 
 def _span(data: ReportData, level: FloatArray) -> float:
