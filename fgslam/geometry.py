@@ -354,14 +354,13 @@ def triangulation_covariance(
     """
     if not isinstance(sensor, CameraRig):
         return congruence(range_bearing.triangulation_jacobian(measurement), covariance)
-    d, baseline = measurement[:, 2], sensor.baseline
-    ratio = sensor.fx / sensor.fy
+    d, fx, fy, baseline = measurement[:, 2], sensor.fx, sensor.fy, sensor.baseline
     jacobian = np.zeros((len(d), 3, 3))
     jacobian[:, 0, 0] = baseline / d
     jacobian[:, 0, 2] = -(measurement[:, 0] - sensor.cx) * baseline / d**2
-    jacobian[:, 1, 1] = ratio * baseline / d
-    jacobian[:, 1, 2] = -(measurement[:, 1] - sensor.cy) * ratio * baseline / d**2
-    jacobian[:, 2, 2] = -sensor.fx * baseline / d**2
+    jacobian[:, 1, 1] = fx * baseline / (fy * d)
+    jacobian[:, 1, 2] = -(measurement[:, 1] - sensor.cy) * fx * baseline / (fy * d**2)
+    jacobian[:, 2, 2] = -fx * baseline / d**2
     return congruence(jacobian, covariance)
 
 

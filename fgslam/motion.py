@@ -8,9 +8,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from fgslam.geometry import (
-    body_to_camera_motion,
-    change_tangent_frame,
     inverse,
+    odometry_of_camera,
     se3_exp,
     se3_log,
 )
@@ -52,7 +51,6 @@ class OdometryMotion:
         """``kind`` is `recorded` or `synthetic`, for the log."""
         self._sequence = sequence
         self._bTc = sequence.rig.bTc
-        self._cTb = inverse(self._bTc)
         self._kind = kind
         self._stand_in = stand_in
 
@@ -63,8 +61,7 @@ class OdometryMotion:
         body = self._sequence.odometry(i)
         if body is None:
             return self._stand_in.between(i, timestamp)
-        motion = body_to_camera_motion(body.motion, self._bTc)
-        return Odometry(motion, change_tangent_frame(self._cTb, body.covariance)), True
+        return odometry_of_camera(body, self._bTc), True
 
     def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
         """Keeps the stand-in's velocity fresh."""

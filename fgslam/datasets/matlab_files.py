@@ -86,7 +86,7 @@ def read_matlab(path: Path) -> MatlabFile:
         raise DatasetError(f"{path}: no such file; set dataset.path to the .mat file itself")
     try:
         return MatlabFile(path, loadmat(str(path)))
-    except Exception as error:
+    except _UNREADABLE as error:
         cause = " ".join(str(error).split()) or type(error).__name__
         raise DatasetError(
             f"{path}: not a readable MATLAB file ({cause}); it may be truncated, restore it"

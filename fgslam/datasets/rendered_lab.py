@@ -141,11 +141,7 @@ class RenderedLabSequence:
         last = self._index(i)
         if i == 0:
             return None
-        motion, covariance = np.eye(4), np.zeros((6, 6))
-        for step in self._odometry[self._index(i - 1) : last]:
-            covariance = geometry.compose_covariance(step.motion, covariance, step.covariance)
-            motion = motion @ step.motion
-        return Odometry(motion, covariance)
+        return geometry.compose_odometry(self._odometry[self._index(i - 1) : last])
 
     @property
     def ground_truth(self) -> Trajectory:

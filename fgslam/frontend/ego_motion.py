@@ -243,8 +243,8 @@ class EgoMotionSolver:
 
     @property
     def _farthest(self) -> float:
-        """Largest image residual of an inlier."""
-        return self._settings.outlier_px if isinstance(self._sensor, CameraRig) else math.pi
+        """Largest image residual of an inlier; of a range sensor, more than any angle."""
+        return self._settings.outlier_px if isinstance(self._sensor, CameraRig) else 2.0 * math.pi
 
     def _residual(self, points: FloatArray, measurement: FloatArray) -> FloatArray:
         """Predicted less measured (k, 3)."""

@@ -67,10 +67,11 @@ def simulate_measurements(
     """Drives, measures, and keeps the books; the selected frames only.
 
     Raises:
-        ConfigError: the drive does not exist in the place, or not in so few frames, or the
-            selection leaves none of them.
+        ConfigError: the drive does not exist in the place, or not in so few frames, the selection
+            leaves none of them, or an imperfection would begin after the last.
     """
     drive = plan_measured_drive(settings.drive, settings.world.place)
+    _require_effect(settings, len(drive.timestamps))
     rig = make_rig(settings.rig)
     world = build_world(settings.world, drive.corners)
     chosen = _selection(len(drive.timestamps), settings)
@@ -103,6 +104,29 @@ def _selection(count: int, settings: SimulatedMeasurementsSettings) -> IntArray:
             f"{count} frames; lower dataset.start or raise dataset.stop"
         )
     return chosen
+
+
+def _require_effect(settings: SimulatedMeasurementsSettings, frames: int) -> None:
+    """Refuses keys that would do nothing."""
+    starts: dict[str, int] = {}
+    if settings.odometry_fault is not None:
+        starts["odometry_fault.start"] = settings.odometry_fault.start
+    if settings.blackout is not None:
+        starts["blackout.start"] = settings.blackout.start
+    if settings.moved is not None:
+        starts["moved.frame"] = settings.moved.frame
+    for key, start in starts.items():
+        if start >= frames:
+            raise ConfigError(
+                f"dataset.{key} is {start}, but the drive has the frames 0 to {frames - 1}; "
+                "choose an earlier one"
+            )
+    detection = settings.detection
+    if detection.min_range_m >= detection.max_range_m:
+        raise ConfigError(
+            f"dataset.detection.min_range_m is {detection.min_range_m:g} and max_range_m "
+            f"{detection.max_range_m:g}, which leaves no landmark; raise the latter"
+        )
 
 
 class _Camera:

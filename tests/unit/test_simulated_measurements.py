@@ -360,6 +360,10 @@ def test_the_motion_model_is_what_the_settings_ask_for() -> None:
         ({"world": {"place": "corridor"}}, "lab_loop does not exist in a corridor"),
         ({"drive": {"frames": 50}}, "raise frames or leave it null"),
         ({"start": 249}, "leave none of the drive's 249 frames"),
+        ({"blackout": {"start": 249}}, "blackout.start is 249, but the drive has the frames"),
+        ({"moved": {"frame": 300}}, "moved.frame is 300"),
+        ({"odometry_fault": {"start": 999}}, "odometry_fault.start is 999"),
+        ({"detection": {"min_range_m": 8.0}}, "leaves no landmark; raise the latter"),
         ({"start": 5, "stop": 5}, "leave none of the drive's 249 frames"),
     ],
 )
