@@ -9,6 +9,7 @@ from fgslam.export.atomic import is_run_folder
 from fgslam.export.metrics import read_metrics
 from fgslam.export.point_cloud import read_ply, write_map
 from fgslam.export.trajectories import read_tum, write_trajectory
+from fgslam.runs.checkpoint import LOG_FILE
 from fgslam.runs.graph_export import export_graph
 
 
@@ -45,8 +46,14 @@ def export_run(
         write_trajectory(trajectory_file, trajectory, remark)
         lines.append(f"{trajectory_file}: {len(trajectory)} poses")
     if graph_file is not None:
-        lines.append(export_graph(graph_file, run / "measurements.npz", folder, remark))
+        lines.append(export_graph(graph_file, _log_of(run), folder, remark))
     return lines
+
+
+def _log_of(run: Path) -> Path:
+    """The measurements: of a comparison, which has none of its own, those of the run above it."""
+    own, above = run / LOG_FILE, run.resolve().parent / LOG_FILE
+    return above if above.is_file() and not own.is_file() else own
 
 
 def _require_elsewhere(run: Path, targets: tuple[Path | None, ...]) -> None:

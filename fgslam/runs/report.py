@@ -24,11 +24,11 @@ from fgslam.export.point_cloud import MapPoints, read_ply
 from fgslam.export.report import EstimatorReport, ReportData, write_report
 from fgslam.export.trajectories import read_covariances, read_tum
 from fgslam.measurement_log import MeasurementLog
+from fgslam.runs.checkpoint import LOG_FILE
 from fgslam.runs.report_parts import comparison_table, sample_pictures
 from fgslam.types import FloatArray, IntArray, LandmarkMap, Trajectory
 
 REPORT = "report.html"
-LOG = "measurements.npz"
 _UP = np.array([0.0, -1.0, 0.0])
 _TIMED_STAGES = ("predict", "update")
 
@@ -77,7 +77,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
         pictures=tuple(sample_pictures(pictures)),
         config_yaml=config_text,
         versions=_versions(config),
-        up=_up(_find(places, LOG)),
+        up=_up(_find(places, LOG_FILE)),
         alignment="after SE3 alignment",
     )
 
@@ -88,7 +88,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
 
 def _places(folder: Path, run: Path | None) -> list[Path]:
     """Where files are sought, in order; the run's own folder last."""
-    if run is None and not (folder / LOG).is_file():
+    if run is None and not (folder / LOG_FILE).is_file():
         above = folder.resolve().parent
         run = above if (above / RUN_MARKER).is_file() else None
     return [folder] if run is None or run == folder else [folder, run]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -45,7 +46,7 @@ def test_help_of_the_whole(monkeypatch: Patch, capfd: Capture) -> None:
     for arguments in ((), ("--help",)):
         assert main(monkeypatch, *arguments) == 0
         out = capfd.readouterr().out
-        for verb in ("run", "export", "inspect"):
+        for verb in ("run", "export", "inspect", "view"):
             assert verb in out
 
 
@@ -54,6 +55,8 @@ def test_help_of_the_whole(monkeypatch: Patch, capfd: Capture) -> None:
     [
         ("run", ("experiments/lab_loop.yaml", "--out", "--set", "--overwrite", "--resume")),
         ("export", ("--map", ".ply", ".pcd", ".off", "--trajectory", ".tum", ".kitti")),
+        ("export", ("--graph", ".g2o", "--estimator")),
+        ("view", ("rerun viewer", "--save", ".rrd")),
         ("inspect", ("recording's folder", "--frames")),
     ],
 )
@@ -199,6 +202,21 @@ def test_export_of_the_trajectory(finished: Finished, tmp_path: Path, monkeypatc
     np.testing.assert_allclose(read_kitti(kitti), truth.poses, atol=1e-11)
 
 
+def test_export_of_the_graph(
+    finished: Finished, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    """Of a run, and of a comparison's folder inside it, which has no log of its own."""
+    graph, again = tmp_path / "a.g2o", tmp_path / "b.g2o"
+    assert main(monkeypatch, "export", finished.folder, "--graph", graph) == 0
+    assert "a.g2o: 12 poses" in capfd.readouterr().out
+    run = Path(shutil.copytree(finished.folder, tmp_path / "run"))
+    shutil.copytree(run / KIND, run / "compare" / KIND)
+    for name in ("config.yaml", "metrics.json"):
+        shutil.copy(run / name, run / "compare")
+    assert main(monkeypatch, "export", run / "compare", "--graph", again) == 0
+    assert graph.read_bytes() == again.read_bytes()
+
+
 def test_an_export_never_replaces_the_run_itself(
     finished: Finished, monkeypatch: Patch, capfd: Capture
 ) -> None:
@@ -226,6 +244,7 @@ def test_mistakes_of_export(
     run = finished.folder
     assert "nothing to export; give --map FILE.ply, --trajectory FILE.tum or --graph" in told(run)
     assert "use .tum or .kitti" in told(run, "--trajectory", tmp_path / "t.csv")
+    assert "use .g2o" in told(run, "--graph", tmp_path / "t.graph")
     line = told(run, "--map", tmp_path / "map.xyz")
     assert all(suffix in line for suffix in (".ply", ".pcd", ".off", "xyz"))
     absent = tmp_path / "absent"
