@@ -12,10 +12,10 @@ import pytest
 from simulated import assert_same_bits
 
 from fgslam import geometry as g
+from fgslam.backend.landmark_kalman import LandmarkKalman
 from fgslam.datasets.opening import open_measurements
 from fgslam.errors import CalibrationError, DatasetError
 from fgslam.evaluation.trajectory import evaluate_trajectory
-from fgslam.factory import make_estimator
 from fgslam.frontend.ego_motion import EgoMotionSolver
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
@@ -24,7 +24,7 @@ from fgslam.settings.backend import LandmarkKalmanSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import EgoMotionSettings
 from fgslam.settings.measurements import StereoTracksSettings
-from fgslam.types import CameraRig, FloatArray
+from fgslam.types import CameraRig, FloatArray, Prediction
 
 FX, FY, CX, CY, B = 700.0, 710.0, 600.0, 180.0, 0.5
 POINTS = np.array([[1.0, 0.5, 10.0], [-2.0, -1.0, 8.0], [0.3, 0.2, 25.0], [3.0, -0.4, 14.0]])
@@ -245,7 +245,9 @@ def test_the_filter_follows_the_reference(rng: np.random.Generator) -> None:
     """23 m from constant velocity alone; the reference is as good as its own estimate."""
     recording = open_measurements(StereoTracksSettings(file="large"), 0)
     log = recording.log
-    estimator = make_estimator(log.rig, LandmarkKalmanSettings())
+    estimator = LandmarkKalman(
+        log.rig, LandmarkKalmanSettings(), Prediction(np.eye(4), np.zeros((6, 6)))
+    )
     limits = EgoMotionSettings(max_correction_m=3.0, max_correction_deg=10.0)
     solver = EgoMotionSolver(log.rig, limits)
     motion = ConstantVelocityMotion(ConstantVelocitySettings())

@@ -10,10 +10,10 @@ import pytest
 from scipy.io import savemat
 
 from fgslam import geometry as g
+from fgslam.backend.landmark_kalman import LandmarkKalman
 from fgslam.datasets.opening import open_measurements
 from fgslam.errors import DatasetError
 from fgslam.evaluation.trajectory import evaluate_trajectory
-from fgslam.factory import make_estimator
 from fgslam.frontend.ego_motion import EgoMotionSolver
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
@@ -22,7 +22,7 @@ from fgslam.settings.backend import LandmarkKalmanSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import EgoMotionSettings
 from fgslam.settings.measurements import UtiasRangeBearingSettings, UtiasStereoSettings
-from fgslam.types import CameraRig, FloatArray, RangeBearingSensor, Trajectory
+from fgslam.types import CameraRig, FloatArray, Prediction, RangeBearingSensor, Trajectory
 
 N = 12
 STEREO_FILE = "utias_starry_night_dataset3.mat"
@@ -327,7 +327,9 @@ def test_missing_and_damaged_files_are_told_in_one_line(
 
 def filtered(recording: MeasurementRecording, settings: EgoMotionSettings) -> Trajectory:
     log = recording.log
-    estimator = make_estimator(log.rig, LandmarkKalmanSettings(), settings.dof)
+    estimator = LandmarkKalman(
+        log.rig, LandmarkKalmanSettings(), Prediction(np.eye(4), np.zeros((6, 6)))
+    )
     solver = EgoMotionSolver(log.rig, settings)
     motion = ConstantVelocityMotion(ConstantVelocitySettings())
     for k, increment in enumerate(log):
