@@ -56,6 +56,7 @@ def _with_default_kind(value: Any) -> Any:
 
 ComparedEstimator: TypeAlias = Annotated[EstimatorSettings, BeforeValidator(_as_settings)]
 
+_TAKEN_FOLDERS = ("pictures", "compare", "trials")
 _GROUPS_OF_KINDS = ("dataset", "odometry", "estimator")
 
 
@@ -117,9 +118,27 @@ def make_config(values: dict[str, Any], overrides: Iterable[str], where: str) ->
 def parse_config(values: Mapping[str, Any], where: str) -> ExperimentConfig:
     """Checks plain values against the schema; ``where`` names their source in messages."""
     try:
-        return ExperimentConfig.model_validate(values)
+        config = ExperimentConfig.model_validate(values)
     except ValidationError as error:
         raise ConfigError(_describe(error.errors(), where)) from None
+    _require_own_folders(config, where)
+    return config
+
+
+def _require_own_folders(config: ExperimentConfig, where: str) -> None:
+    """Each estimator needs a name of its own: that of its folder. The same one twice is one."""
+    different = dict.fromkeys((config.estimator, *config.compare))
+    titles = [settings.title for settings in different]
+    for title in titles:
+        if title in _TAKEN_FOLDERS:
+            raise ConfigError(
+                f"{where}: an estimator cannot be called {title}, a folder of the run; choose "
+                "another label"
+            )
+        if titles.count(title) > 1:
+            raise ConfigError(
+                f"{where}: two different estimators are called {title}; give one of them a label"
+            )
 
 
 def _kind(values: Mapping[str, Any], group: str) -> Any:
@@ -205,6 +224,25 @@ def _apply(values: dict[str, Any], override: str) -> None:
 # Messages
 
 
+_PLAIN_WORDS = {
+    "tuple_type": "give a list, e.g. [a, b]",
+    "list_type": "give a list, e.g. [a, b]",
+    "dict_type": "give a group of keys",
+    "dataclass_type": "give a group of keys",
+    "model_attributes_type": "give a group of keys, or the name of a kind where one will do",
+    "int_type": "give a whole number",
+    "int_parsing": "give a whole number",
+    "int_from_float": "give a whole number",
+    "float_type": "give a number",
+    "float_parsing": "give a number",
+    "bool_type": "give true or false",
+    "bool_parsing": "give true or false",
+    "string_type": "give text, in quotes where it looks like a number",
+    "finite_number": "give a finite number",
+}
+"""What a value must be, by pydantic's type of error; others speak for themselves."""
+
+
 def _describe(errors: list[ErrorDetails], where: str) -> str:
     unknown = ("extra_forbidden", "unexpected_keyword_argument")
     # A misspelt key also leaves the right one missing; the misspelling is the cause.
@@ -222,7 +260,8 @@ def _describe(errors: list[ErrorDetails], where: str) -> str:
     if first["type"] == "union_tag_invalid":
         kinds, tag = _kinds(schema, names), first["ctx"]["tag"]
         return f"{where}: {key}.kind is {tag!r}; use one of {kinds}{more}"
-    return f"{where}: {key} = {first['input']!r} is not usable: {first['msg']}{more}"
+    words = _PLAIN_WORDS.get(first["type"], first["msg"])
+    return f"{where}: {key} = {first['input']!r} is not usable: {words}{more}"
 
 
 def _kinds(schema: dict[str, Any], names: list[str]) -> str:
@@ -235,15 +274,24 @@ def _nodes(schema: dict[str, Any], node: dict[str, Any]) -> list[dict[str, Any]]
     if "$ref" in node:
         return _nodes(schema, schema["$defs"][node["$ref"].rsplit("/", 1)[-1]])
     inner = [*node.get("oneOf", []), *node.get("anyOf", []), *node.get("allOf", [])]
+    if isinstance(node.get("items"), dict):
+        inner.append(node["items"])
     if inner:
         return [found for part in inner for found in _nodes(schema, part)]
     return [node]
 
 
 def _descend(schema: dict[str, Any], names: list[str]) -> tuple[list[str], list[dict[str, Any]]]:
-    """Follows a location through the schema, dropping the tags of unions on the way."""
-    nodes, kept = [schema], []
+    """Follows a location through the schema, dropping the tags of unions on the way.
+
+    Items of lists are written `key[3]`.
+    """
+    nodes: list[dict[str, Any]] = [schema]
+    kept: list[str] = []
     for name in names:
+        if name.isdigit() and kept:  # an item of a list; `_nodes` has looked inside already
+            kept[-1] += f"[{name}]"
+            continue
         found = [n["properties"][name] for n in nodes if name in n.get("properties", {})]
         if not found:
             tagged = [n for n in nodes if _has_tag(n, name)]
@@ -263,6 +311,8 @@ def _has_tag(node: dict[str, Any], tag: str) -> bool:
 
 def _without_tags(schema: dict[str, Any], names: list[str]) -> list[str]:
     kept, nodes = _descend(schema, names[:-1])
+    if names and names[-1].isdigit():
+        return _descend(schema, names)[0]
     return kept if any(_has_tag(n, names[-1]) for n in nodes) else [*kept, names[-1]]
 
 

@@ -135,9 +135,9 @@ def test_a_wrong_value_is_named_with_its_key(key: str, value: object, tmp_path: 
 
 def test_a_wrong_item_of_a_vector_is_named_by_its_place(tmp_path: Path) -> None:
     values = nested(MINIMAL, "dataset.lever_arm_m", [1.0, 2.0, float("inf")])
-    assert "dataset.lever_arm_m.2 = inf is not usable" in message_of(values, tmp_path)
+    assert "dataset.lever_arm_m[2] = inf is not usable" in message_of(values, tmp_path)
     values = nested(MINIMAL, "dataset.lever_arm_m", [1.0, 2.0])
-    assert "dataset.lever_arm_m.2 is missing" in message_of(values, tmp_path)
+    assert "dataset.lever_arm_m[2] is missing" in message_of(values, tmp_path)
 
 
 # --------------------------------------------------------------------------------------------
@@ -302,3 +302,51 @@ def descriptions(node: dict[str, Any], schema: dict[str, Any], at: str) -> list[
 def test_every_key_says_what_it_means() -> None:
     schema = ExperimentConfig.model_json_schema()
     assert descriptions(schema, schema, "") == []
+
+
+# --------------------------------------------------------------------------------------------
+# Estimators to compare
+
+
+@pytest.mark.parametrize(
+    ("compare", "words"),
+    [
+        (["isam3"], "compare[0].kind is 'isam3'; use one of odometry, landmark_kalman"),
+        (["batch", {"update_every": 3}], "compare[1].kind is missing; add one of odometry"),
+        ([{"kind": "isam2", "updat_every": 3}], "compare[0].updat_every; did you mean update_ev"),
+        ([{"kind": "isam2", "kernel": {"nam": "x"}}], "compare[0].kernel.nam; did you mean name?"),
+        (["batch", {"kind": "isam2", "update_every": 0}], "compare[1].update_every = 0 is not"),
+        ([3], "compare[0] = 3 is not usable: give a group of keys, or the name of a kind"),
+        ("isam2", "compare = 'isam2' is not usable: give a list, e.g. [a, b]"),
+    ],
+)
+def test_items_of_compare_are_named_by_their_place(
+    compare: object, words: str, tmp_path: Path
+) -> None:
+    assert words in message_of(LAB | {"compare": compare}, tmp_path)
+
+
+def test_every_estimator_has_a_folder_of_its_own(tmp_path: Path) -> None:
+    other = {"kind": "landmark_kalman", "update": "world"}
+    message = message_of(LAB | {"compare": [other]}, tmp_path)
+    assert "two different estimators are called landmark_kalman; give one of them a" in message
+    assert len(parse_config(LAB | {"compare": [other | {"label": "w"}]}, "x").compare) == 1
+    assert len(parse_config(LAB | {"compare": ["landmark_kalman"]}, "x").compare) == 1
+    taken = LAB | {"estimator": {"label": "pictures"}}
+    assert "cannot be called pictures, a folder of the run" in message_of(taken, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("dataset.stride", "two", "give a whole number"),
+        ("dataset.stride", 1.5, "give a whole number"),
+        ("output.pictures", "perhaps", "give true or false"),
+        ("estimator.miss_growth_m", "much", "give a number"),
+    ],
+)
+def test_wrong_types_are_told_in_plain_words(
+    key: str, value: object, words: str, tmp_path: Path
+) -> None:
+    message = message_of(nested(MINIMAL, key, value), tmp_path)
+    assert f"{key} = {value!r} is not usable: {words}" in message

@@ -1,0 +1,333 @@
+"""Choosing estimators, tables, files and baselines of a comparison."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from simulated import RIG, Drive, simulate
+
+from fgslam.config import ExperimentConfig, parse_config
+from fgslam.errors import ConfigError, DatasetError
+from fgslam.evaluation.consistency import Nees
+from fgslam.export.comparison_table import (
+    RESULT_COLUMNS,
+    TIME_COLUMNS,
+    value_at,
+    write_comparison_csv,
+)
+from fgslam.export.landmark_truth import read_landmark_truth, write_landmark_truth
+from fgslam.export.metrics import EstimatorMetrics, UpdateTime
+from fgslam.export.point_cloud import MapPoints
+from fgslam.measurement_log import MeasurementLog
+from fgslam.recordings import LandmarkTruth
+from fgslam.runs.baseline import check_baseline, write_baseline
+from fgslam.runs.choosing import Choice, all_kinds, choose, estimators_of
+from fgslam.runs.estimator_files import points_from_log
+from fgslam.runs.judging import seen_often
+from fgslam.runs.rendered_truth import points_under
+from fgslam.runs.trial_results import summarise, together
+from fgslam.settings.backend import Isam2Settings, LandmarkKalmanSettings
+from fgslam.types import LandmarkMap
+
+LAB: dict[str, Any] = {"name": "x", "dataset": {"kind": "rendered_lab"}}
+
+
+def config(**more: Any) -> ExperimentConfig:
+    return parse_config(LAB | more, "test")
+
+
+# --------------------------------------------------------------------------------------------
+# Which estimators
+
+
+def test_the_configurations_estimators_are_the_default() -> None:
+    named = {"kind": "isam2", "label": "often", "update_every": 1}
+    chosen = choose(config(compare=["landmark_kalman", "batch", named]), Choice())
+    assert [s.title for s in chosen] == ["landmark_kalman", "batch", "often"]
+
+
+def test_without_any_every_kind_is_compared_the_live_one_as_it_was_set() -> None:
+    chosen = choose(config(estimator={"update": "world"}), Choice())
+    assert [s.kind for s in chosen] == list(all_kinds())
+    assert LandmarkKalmanSettings(update="world") in chosen
+
+
+def test_names_are_labels_or_kinds() -> None:
+    run = config(compare=[{"kind": "isam2", "label": "often", "update_every": 1}])
+    chosen = choose(run, Choice(("often", " isam2", "often")))
+    assert chosen == (Isam2Settings(label="often", update_every=1), Isam2Settings())
+    with pytest.raises(ConfigError, match=r"no estimator 'isam3'; give --estimators with some of"):
+        choose(run, Choice(("isam3",)))
+    with pytest.raises(ConfigError, match="no estimator named"):
+        choose(run, Choice(("",)))
+
+
+def test_overrides_reach_one_estimator() -> None:
+    run = config(compare=["isam2", {"kind": "isam2", "label": "a.b"}])
+    wanted = ("estimators.isam2.update_every=7", "estimators.a.b.kernel.width=2.5")
+    live, isam2, dotted = choose(run, Choice(None, wanted))
+    assert live == LandmarkKalmanSettings()
+    assert isam2 == Isam2Settings(update_every=7)
+    assert isinstance(dotted, Isam2Settings)
+    assert (dotted.title, dotted.kernel.width, dotted.update_every) == ("a.b", 2.5, 5)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("estimators.batch.method=gnc", "NAME one of landmark_kalman, isam2"),
+        ("isam2.update_every=3", "not of the form estimators.NAME.key=value"),
+        ("estimators.isam2.updat_every=3", "did you mean update_every"),
+        ("estimators.isam2.update_every=0", "is not usable"),
+        ("estimators.isam2.kind=batch", "the kind is what names it"),
+    ],
+)
+def test_overrides_that_are_none(override: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        choose(config(compare=["isam2"]), Choice(None, (override,)))
+
+
+def test_the_same_estimator_twice_is_one() -> None:
+    run = config(compare=["odometry", "landmark_kalman", "odometry"])
+    assert [s.title for s in estimators_of(run)] == ["landmark_kalman", "odometry"]
+
+
+# --------------------------------------------------------------------------------------------
+# Files
+
+
+METRICS = EstimatorMetrics(
+    ate_rmse_m=0.0123,
+    update_ms=UpdateTime(1.0, 2.0, 3.0),
+    nees_pose_per_dof=2.0,
+    more={
+        "kind": "isam2",
+        "landmark_rmse_m": float("nan"),
+        "online": {"ate_rmse_m": 0.02},
+        "failure": "frame 3, twice: no",
+    },
+)
+
+
+def test_the_table_has_a_row_for_every_estimator_and_run(tmp_path: Path) -> None:
+    path = tmp_path / "comparison.csv"
+    write_comparison_csv(path, [("a", {"x": METRICS, "y": EstimatorMetrics()}), ("b", {})])
+    rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+    assert [(row["run"], row["estimator"]) for row in rows] == [("a", "x"), ("a", "y")]
+    first = rows[0]
+    assert list(first) == ["run", "estimator", *(n for n, _ in (*RESULT_COLUMNS, *TIME_COLUMNS))]
+    assert (first["ate_final_m"], first["ate_online_m"]) == ("0.0123", "0.02")
+    assert (first["update_p95_ms"], first["landmark_rmse_m"]) == ("2", "")
+    assert first["failure"] == "frame 3, twice: no"
+    assert set(rows[1].values()) == {"a", "y", ""}
+    assert value_at(METRICS.as_json(), "online.ate_rmse_m.more") is None
+
+
+def test_landmark_truth_reads_back(tmp_path: Path, rng: np.random.Generator) -> None:
+    path = tmp_path / "truth.csv"
+    truth = LandmarkTruth(np.array([2, 5, 9]), rng.normal(size=(3, 3)))
+    write_landmark_truth(path, truth, np.array([0.0, 0.001, 0.5]))
+    found, sigma = read_landmark_truth(path)
+    np.testing.assert_array_equal(found.ids, truth.ids)
+    np.testing.assert_allclose(found.positions, truth.positions, atol=1e-9)
+    np.testing.assert_array_equal(sigma, [0.0, 0.001, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("x,y\n", "line 1: not 'id,x,y,z,sigma_m'"),
+        ("id,x,y,z,sigma_m\n1,0,0,0,0\n2,0,zero,0,0\n", "line 3: could not convert"),
+        ("id,x,y,z,sigma_m\n1,0,0,0\n", "line 2: "),
+        ("id,x,y,z,sigma_m\n2,0,0,0,0\n1,0,0,0,0\n", "ids do not increase"),
+        ("id,x,y,z,sigma_m\n2,0,nan,0,0\n", "not finite"),
+    ],
+)
+def test_damaged_landmark_truth_is_refused(content: str, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "truth.csv"
+    path.write_text(content, encoding="utf-8")
+    with pytest.raises(DatasetError, match=words):
+        read_landmark_truth(path)
+
+
+def a_log() -> MeasurementLog:
+    simulation = simulate(Drive(frames=10), np.random.default_rng(4))
+    return MeasurementLog(RIG, {}, simulation.increments)
+
+
+def test_hits_and_misses_are_counted_from_the_log() -> None:
+    log = a_log()
+    log.increments[3].rejected[:2] = True
+    ids = np.arange(40)
+    landmarks = LandmarkMap(ids, np.zeros((40, 3)), np.zeros((40, 3, 3)))
+    look = MapPoints(
+        ids=np.array([3]),
+        positions=np.zeros((1, 3)),
+        covariances=np.zeros((1, 3, 3)),
+        colours=np.array([[1, 2, 3]], np.uint8),
+        hits=np.zeros(1, np.int64),
+        misses=np.zeros(1, np.int64),
+        valid=np.ones(1, np.bool_),
+        permanent=np.ones(1, np.bool_),
+    )
+    points = points_from_log(landmarks, log, look)
+    for k in ids:
+        seen = sum(int((i.observations.ids[~i.rejected] == k).sum()) for i in log)
+        assert points.hits[k] == seen
+        assert points.misses[k] == sum(int((i.missed_ids == k).sum()) for i in log)
+        assert points.valid[k] == (seen >= 3)
+    assert points.misses.sum() > 0
+    assert points.colours[3].tolist() == [1, 2, 3]
+    assert set(points.colours[[0, 39]].ravel().tolist()) == {128}
+
+
+def test_landmarks_seen_twice_are_not_judged() -> None:
+    log = a_log()
+    count = 1 + max(int(i.observations.ids.max()) for i in log)
+    truth = LandmarkTruth(np.arange(count), np.zeros((count, 3)))
+    judged = seen_often(log, truth)
+    seen = np.concatenate([i.observations.ids[~i.rejected] for i in log])
+    expected = [k for k in range(count) if (seen == k).sum() >= 3]
+    assert judged.ids.tolist() == expected
+    assert 0 < len(expected) < count
+
+
+# --------------------------------------------------------------------------------------------
+# Depth under a pixel
+
+
+def test_the_point_under_a_pixel_of_a_plane_is_exact(rng: np.random.Generator) -> None:
+    # Plane n . p = 2, slanted by some twenty degrees.
+    normal = np.array([0.3, -0.2, 1.0])
+    rows, columns = np.mgrid[0 : RIG.height, 0 : RIG.width]
+    rays = np.dstack([(columns - RIG.cx) / RIG.fx, (rows - RIG.cy) / RIG.fy, np.ones(rows.shape)])
+    depth = 2.0 / (rays @ normal)
+    pixels = rng.uniform([5.0, 5.0], [RIG.width - 6.0, RIG.height - 6.0], (50, 2))
+    points, known = points_under(RIG, depth, pixels)
+    assert known.all()
+    np.testing.assert_allclose(points @ normal, 2.0, atol=1e-9)
+    seen = RIG.fx * points[:, 0] / points[:, 2] + RIG.cx
+    np.testing.assert_allclose(seen, pixels[:, 0], atol=1e-9)
+
+
+def test_at_an_edge_or_without_depth_the_point_is_not_known() -> None:
+    depth = np.full((RIG.height, RIG.width), 2.0)
+    depth[:, 100:] = 3.0
+    depth[50, 50] = np.nan
+    pixels = np.array([[99.5, 20.0], [98.5, 20.0], [49.5, 49.5], [-0.5, 3.0], [319.0, 3.0]])
+    points, known = points_under(RIG, depth, pixels)
+    assert known.tolist() == [False, True, False, False, False]
+    assert np.isnan(points[~known]).all()
+    assert points[1, 2] == pytest.approx(2.0)
+
+
+# --------------------------------------------------------------------------------------------
+# Trials
+
+
+def trial(seed: int, filter_ate: float, smoother_ate: float, failure: str = "") -> Any:
+    more: dict[str, Any] = {"kind": "x", "failure": failure or None}
+    metrics = {
+        "kalman": EstimatorMetrics(ate_rmse_m=filter_ate, more={"kind": "landmark_kalman"}),
+        "worse": EstimatorMetrics(ate_rmse_m=filter_ate + 1.0, more={"kind": "ekf"}),
+        "smooth": EstimatorMetrics(ate_rmse_m=smoother_ate, more=more),
+    }
+    nees = Nees(np.array([6.0, 12.0]), np.array([3, 3]))
+    return (
+        seed,
+        metrics,
+        {t: dict.fromkeys(("pose", "online_pose", "landmark"), nees) for t in metrics},
+    )
+
+
+KINDS = {"kalman": "landmark_kalman", "worse": "ekf", "smooth": "isam2"}
+
+
+def test_trials_say_who_beats_whom() -> None:
+    rows = [trial(k, 0.02 + 0.001 * k, 0.01 + 0.0005 * k) for k in range(8)]
+    summary = summarise(rows, KINDS)
+    first, second = summary.pairs
+    assert (first.smoother, first.filter, first.best_filter) == ("smooth", "kalman", True)
+    assert not second.best_filter
+    assert first.sentence.startswith("smooth beats kalman (the best filter) in 8 of 8 trials; ")
+    assert "final ATE is lower by 1.175 cm, 95 % [1.0" in first.sentence
+    assert "0.50 times; p = 0.0078" in first.sentence
+    pooled = summary.pooled["kalman"]["pose"]
+    assert pooled is not None
+    assert (pooled.per_dof, pooled.independent) == (3.0, 8)
+    assert together(summary, "kalman").ate_rmse_m == pytest.approx(0.0235)
+
+
+def test_the_filter_may_win_and_few_trials_show_nothing() -> None:
+    won = summarise([trial(k, 0.01 + 0.001 * k, 0.03) for k in range(8)], KINDS).pairs[0]
+    assert won.sentence.startswith("kalman (the best filter) beats smooth in 8 of 8 trials; ")
+    assert "higher by" in won.sentence
+    few = summarise([trial(k, 0.02, 0.01 + 0.001 * k) for k in range(3)], KINDS).pairs[0]
+    assert few.sentence.startswith("no difference shown between smooth and kalman")
+    assert "better in 3, worse in 0 of 3 trials" in few.sentence
+    one = summarise([trial(0, 0.02, 0.01)], KINDS).pairs[0]
+    assert "one trial has no interval" in one.sentence
+
+
+def test_a_failed_trial_does_not_count() -> None:
+    rows = [trial(0, 0.02, 0.01), trial(1, 0.02, 0.01), trial(2, 0.02, 0.0001, "frame 2: no")]
+    summary = summarise(rows, KINDS)
+    assert summary.pairs[0].test.difference.count == 2
+    assert together(summary, "smooth").ate_rmse_m == pytest.approx(0.01)
+    pooled = summary.pooled["smooth"]["pose"]
+    assert pooled is not None
+    assert pooled.independent == 2
+
+
+# --------------------------------------------------------------------------------------------
+# Baselines
+
+
+SOUND = EstimatorMetrics(ate_rmse_m=0.01, nees_pose_per_dof=1.5, more={"kind": "isam2"})
+
+
+def checked(path: Path, **changes: Any) -> list[tuple[bool, str]]:
+    results = {"run": {"isam2": dataclasses.replace(SOUND, **changes)}}
+    return [(d.regression, d.text) for d in check_baseline(path, results)]
+
+
+def test_a_baseline_tells_worse_from_better(tmp_path: Path) -> None:
+    path = tmp_path / "baseline.json"
+    write_baseline(path, {"run": {"isam2": SOUND}}, "fgslam compare")
+    assert checked(path) == []
+    assert checked(path, ate_rmse_m=0.0104, nees_pose_per_dof=1.6) == []
+    ((worse, text),) = checked(path, ate_rmse_m=0.011)
+    assert worse
+    assert text == (
+        "run, isam2: ate_final_m: 0.01 in the baseline, 0.011 now (+10.0 %), tolerance 5 %: worse"
+    )
+    assert [w for w, _ in checked(path, ate_rmse_m=0.005)] == [False]
+    assert [w for w, _ in checked(path, nees_pose_per_dof=1.0)] == [False]
+    assert [w for w, _ in checked(path, nees_pose_per_dof=0.5)] == [True]
+    assert checked(path, ate_rmse_m=None)[0][0]
+    missing = check_baseline(path, {"run": {}})
+    assert [(d.regression, d.text) for d in missing] == [
+        (True, "run, isam2: not among the results")
+    ]
+
+
+@pytest.mark.parametrize("spoil", ["format", "version", "relative_tolerances", "runs"])
+def test_what_is_no_baseline_is_refused(spoil: str, tmp_path: Path) -> None:
+    path = tmp_path / "baseline.json"
+    write_baseline(path, {"run": {"isam2": SOUND}}, "fgslam compare")
+    document = json.loads(path.read_text(encoding="utf-8"))
+    document[spoil] = {}
+    path.write_text(json.dumps(document), encoding="utf-8")
+    with pytest.raises(ConfigError, match="--write-baseline"):
+        checked(path)
+    path.write_text("{", encoding="utf-8")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        checked(path)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        checked(tmp_path / "absent.json")

@@ -1,0 +1,71 @@
+"""Work in processes of its own: results, errors, crashes and stops."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import pytest
+
+from fgslam.errors import ConfigError
+from fgslam.runs.processes import WorkerEnded, run_apart
+
+
+def work(what: str) -> str:
+    """What the tests ask of a process."""
+    match what:
+        case "error":
+            raise ConfigError("a user's mistake")
+        case "killed":
+            os.kill(os.getpid(), signal.SIGKILL)
+        case "exit":
+            os._exit(3)
+        case "sleep":
+            time.sleep(60.0)
+    return f"{what} {os.environ.get('OMP_NUM_THREADS', 'unset')}"
+
+
+def test_results_come_with_the_index_of_their_argument() -> None:
+    found = dict(run_apart(work, ["a", "b"], jobs=2, single_threaded=True))
+    assert found == {0: "a 1", 1: "b 1"}
+
+
+def test_the_environment_is_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    assert dict(run_apart(work, ["a"], single_threaded=True)) == {0: "a 1"}
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+    assert "MKL_NUM_THREADS" not in os.environ
+
+
+def test_a_crash_takes_nothing_else_along() -> None:
+    found = dict(run_apart(work, ["killed", "exit", "fine"], jobs=1))
+    first, second = found[0], found[1]
+    assert isinstance(first, WorkerEnded)
+    assert first.argument == "killed"
+    assert first.why == "its process was ended by SIGKILL, perhaps for lack of memory"
+    assert isinstance(second, WorkerEnded)
+    assert "status 3" in second.why
+    assert str(found[2]).startswith("fine")
+
+
+def test_a_users_mistake_is_raised_here() -> None:
+    with pytest.raises(ConfigError, match="a user's mistake"):
+        list(run_apart(work, ["error"]))
+
+
+def test_stopping_ends_what_runs_and_starts_no_more() -> None:
+    asked = 0
+
+    def stopped() -> bool:
+        nonlocal asked
+        asked += 1
+        return asked > 2
+
+    found = dict(run_apart(work, ["sleep", "never"], jobs=1, stopped=stopped))
+    running, waiting = found[0], found[1]
+    assert isinstance(running, WorkerEnded)
+    assert running.why == "interrupted"
+    assert isinstance(waiting, WorkerEnded)
+    assert waiting.why == "interrupted before it began"

@@ -1,0 +1,175 @@
+"""Replays: the same numbers as the loop gives, and faults that end one estimator only."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from simulated import RIG, Drive, assert_same_bits, play, simulate
+
+from fgslam import factory
+from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.errors import EstimatorError, MeasurementLogError
+from fgslam.measurement_log import MeasurementLog
+from fgslam.runs import replay as module
+from fgslam.runs.judging import Truth, judge_replay
+from fgslam.runs.replay import Replay, memory_mb, peak_memory_mb, replay, replay_motion
+from fgslam.settings.backend import LandmarkKalmanSettings
+from fgslam.settings.datasets import ConstantVelocitySettings
+from fgslam.settings.frontend import EgoMotionSettings
+from fgslam.types import Estimate, Trajectory, UpdateStats
+
+SETTINGS = LandmarkKalmanSettings(label="named")
+CONSTANT_VELOCITY: dict[str, Any] = factory.ConstantVelocityMotion(
+    ConstantVelocitySettings()
+).description()
+
+
+def a_log(frames: int = 8) -> MeasurementLog:
+    simulation = simulate(Drive(frames=frames), np.random.default_rng(4))
+    motion = {"kind": "recorded", "stand_in": CONSTANT_VELOCITY}
+    return MeasurementLog(RIG, motion, simulation.increments)
+
+
+def faulty(monkeypatch: pytest.MonkeyPatch, **methods: Any) -> None:
+    """Estimators of the kind, with some of their methods replaced."""
+    kind = type("Faulty", (LandmarkKalman,), methods)
+
+    def make(rig: Any, settings: Any, dof: Any) -> Any:
+        prior = factory.Prediction(np.eye(4), np.zeros((6, 6)))
+        return kind(rig, settings, prior)
+
+    monkeypatch.setattr(module, "make_estimator", make)
+
+
+def run(log: MeasurementLog) -> Replay:
+    return replay(log, SETTINGS, EgoMotionSettings())
+
+
+def test_a_replay_gives_what_the_loop_gives() -> None:
+    log = a_log()
+    estimator = factory.make_estimator(RIG, SETTINGS)
+    stats = play(estimator, log.increments)
+    told: list[tuple[int, int]] = []
+    replayed = replay(log, SETTINGS, EgoMotionSettings(), lambda done, of: told.append((done, of)))
+    assert_same_bits(replayed.estimate, estimator.estimate())
+    np.testing.assert_array_equal(replayed.online.poses, [s.wTc for s in stats])
+    np.testing.assert_array_equal(replayed.online_covariances, [s.covariance for s in stats])
+    np.testing.assert_array_equal(replayed.online.timestamps, [i.timestamp for i in log])
+    np.testing.assert_array_equal(replayed.column("nis"), [s.nis for s in stats])
+    assert replayed.column("status").tolist() == ["first"] + 7 * ["ok"]
+    assert replayed.column("landmarks").tolist() == [s.landmarks for s in stats]
+    assert (replayed.column("inliers") <= replayed.column("matched")).all()
+    assert (replayed.column("update_ms") > 0.0).all()
+    assert replayed.column("solve_ms")[1:].min() > 0.0
+    assert (replayed.title, replayed.kind, replayed.failure) == ("named", "landmark_kalman", "")
+    assert told == [(k + 1, 8) for k in range(8)]
+
+
+def test_memory_is_that_of_this_process() -> None:
+    before = memory_mb("VmRSS")
+    if before is None:
+        pytest.skip("no /proc here: memory comes from getrusage")
+    block = np.ones(8_000_000)  # 61 MiB
+    assert memory_mb("VmRSS") > before + 50.0  # type: ignore[operator]
+    assert peak_memory_mb() >= before + 50.0
+    assert block.sum() == 8e6
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (RuntimeError("Indeterminant\n linear system"), "RuntimeError: Indeterminant linear"),
+        (EstimatorError("no such thing"), "no such thing"),
+        (np.linalg.LinAlgError("Singular matrix"), "LinAlgError: Singular matrix"),
+        (KeyError(17), "KeyError: 17"),
+    ],
+)
+def test_a_fault_ends_the_replay_with_frame_and_reason(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, words: str
+) -> None:
+    def update(self: Any, increment: Any, tracking: Any, motion: Any = None) -> UpdateStats:
+        if increment.index == 10:  # the sixth: the simulation counts by two
+            raise error
+        return LandmarkKalman.update(self, increment, tracking, motion)
+
+    faulty(monkeypatch, update=update)
+    log = a_log()
+    replayed = run(log)
+    assert replayed.failure.startswith("frame 10: ")
+    assert words in replayed.failure
+    assert "\n" not in replayed.failure
+    sound = replay_of(log, 5)
+    assert_same_bits(replayed.estimate, sound.estimate)
+    assert_same_bits(replayed.online, sound.online)
+    metrics = judge_replay(replayed, Truth()).metrics
+    assert metrics.more["failure"] == replayed.failure
+    assert metrics.more["frames"] == 5
+
+
+def replay_of(log: MeasurementLog, frames: int) -> Replay:
+    """The first frames of the log through the sound estimator."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "make_estimator", factory.make_estimator)
+        return run(MeasurementLog(log.rig, log.motion_model, log.increments[:frames]))
+
+
+def test_a_pose_that_is_not_finite_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    def update(self: Any, increment: Any, tracking: Any, motion: Any = None) -> UpdateStats:
+        stats = LandmarkKalman.update(self, increment, tracking, motion)
+        bad = np.full((4, 4), np.nan) if increment.index == 6 else stats.wTc
+        return UpdateStats(bad, stats.covariance, stats.landmarks, stats.nis, stats.nis_dof)
+
+    faulty(monkeypatch, update=update)
+    replayed = run(a_log())
+    assert replayed.failure == "frame 6: FloatingPointError: the pose is not finite"
+    assert len(replayed) == len(replayed.online) == len(replayed.estimate.trajectory) == 3
+    assert np.isfinite(replayed.estimate.trajectory.poses).all()
+
+
+def test_without_a_final_estimate_the_online_poses_remain(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def estimate(self: Any) -> Estimate:
+        raise RuntimeError("no solution")
+
+    faulty(monkeypatch, estimate=estimate)
+    replayed = run(a_log())
+    assert replayed.failure == "no final estimate: RuntimeError: no solution"
+    assert_same_bits(replayed.estimate.trajectory, replayed.online)
+    assert len(replayed.estimate.landmarks) == 0
+    assert "online" in replayed.estimate.remarks[0]
+    assert np.isnan(replayed.final_ms)
+
+
+def test_a_final_estimate_that_is_not_finite_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    def estimate(self: Any) -> Estimate:
+        found = LandmarkKalman.estimate(self)
+        poses = found.trajectory.poses.copy()
+        poses[2, 0, 3] = np.inf
+        trajectory = Trajectory(found.trajectory.timestamps, poses)
+        return Estimate(trajectory, found.covariances, found.landmarks)
+
+    faulty(monkeypatch, estimate=estimate)
+    replayed = run(a_log())
+    assert "not finite" in replayed.failure
+    assert np.isfinite(replayed.estimate.trajectory.poses).all()
+
+
+def test_an_estimator_that_cannot_use_the_log_does_not_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    faulty(monkeypatch, supports=frozenset())
+    replayed = run(a_log())
+    assert replayed.failure == "could not start: it cannot use odometry and stereo measurements"
+    assert len(replayed) == 0
+
+
+def test_the_header_tells_the_motion() -> None:
+    direct = MeasurementLog(RIG, CONSTANT_VELOCITY)
+    nested = MeasurementLog(RIG, {"kind": "recorded", "stand_in": CONSTANT_VELOCITY})
+    assert replay_motion(direct).description() == CONSTANT_VELOCITY
+    assert replay_motion(nested).description() == CONSTANT_VELOCITY
+    with pytest.raises(MeasurementLogError, match="not known to this fgslam; repeat the run"):
+        replay_motion(MeasurementLog(RIG, {"kind": "warp"}))
