@@ -274,7 +274,17 @@ def test_no_such_folder(tmp_path: Path, refusal: Refusal) -> None:
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
 
-@pytest.mark.parametrize("name", ["euroc_v101", "kitti_raw_0926", "kitti06", "chess_trinocular"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "euroc_v101",
+        "kitti_raw_0926",
+        "kitti06",
+        "chess_trinocular",
+        "starry_night",
+        "lost_in_the_woods",
+    ],
+)
 def test_experiments_say_clearly_that_their_data_is_absent(
     name: str,
     tmp_path: Path,

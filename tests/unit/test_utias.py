@@ -305,7 +305,7 @@ def test_missing_and_damaged_files_are_told_in_one_line(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     path = tmp_path / "a.mat"
-    with pytest.raises(DatasetError, match=r"no such file; set dataset\.path"):
+    with pytest.raises(DatasetError, match=r"does not exist; check dataset\.path"):
         open_measurements(UtiasStereoSettings(path=str(path)), 0)
     savemat(path, starry(rng), do_compression=True)
     whole = path.read_bytes()
