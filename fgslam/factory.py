@@ -9,9 +9,11 @@ import numpy as np
 
 from fgslam.backend.batch import BatchSmoother
 from fgslam.backend.dead_reckoning import DeadReckoning
+from fgslam.backend.ekf import FullEkf
 from fgslam.backend.fixed_lag import FixedLagSmoother
 from fgslam.backend.isam2 import Isam2Smoother
 from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.backend.landmark_kalman_graph import LandmarkKalmanGraph
 from fgslam.backend.protocol import Estimator
 from fgslam.config import ExperimentConfig
 from fgslam.datasets.opening import open_recording
@@ -31,10 +33,12 @@ from fgslam.pipeline import SlamPipeline
 from fgslam.settings.backend import (
     BatchSettings,
     DeadReckoningSettings,
+    EkfSettings,
     EstimatorSettings,
     FixedLagSettings,
     FloorSettings,
     Isam2Settings,
+    LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
 )
 from fgslam.settings.datasets import (
@@ -43,7 +47,7 @@ from fgslam.settings.datasets import (
     RecordedOdometrySettings,
     SyntheticOdometrySettings,
 )
-from fgslam.settings.frontend import FrontendSettings
+from fgslam.settings.frontend import EgoMotionSettings, FrontendSettings
 from fgslam.settings.lab import RenderedLabSettings
 from fgslam.settings.measurements import MeasurementDatasetSettings
 from fgslam.types import CameraRig, MeasurementType, Prediction, Sensor, Sequence
@@ -110,27 +114,46 @@ def make_motion(sequence: Sequence, settings: OdometrySettings) -> MotionModel:
 
 
 def make_estimator(
-    rig: Sensor, settings: EstimatorSettings, dof: DegreesOfFreedom = 6
+    rig: Sensor,
+    settings: EstimatorSettings,
+    ego_motion: EgoMotionSettings | None = None,
+    prior: Prediction | None = None,
 ) -> Estimator:
-    """The estimator, at the origin: the world is the first camera frame, without uncertainty.
+    """The estimator, at the prior pose; without one the world is the first camera frame, exactly.
 
-    ``dof`` are the degrees of freedom of the front-end's least squares, which ``floor.mode: auto``
-    takes over.
+    ``ego_motion`` are the front-end's settings: ``floor.mode: auto`` takes their degrees of freedom
+    over, ``landmark_kalman_graph`` their whole cost.
     """
-    prior = Prediction(np.eye(4), np.zeros((6, 6)))
+    prior = prior or Prediction(np.eye(4), np.zeros((6, 6)))
+    ego_motion = ego_motion or EgoMotionSettings()
     match settings:
         case DeadReckoningSettings():
             return DeadReckoning(rig, prior)
         case LandmarkKalmanSettings():
             return LandmarkKalman(rig, settings, prior)
-        case FixedLagSettings():
-            return FixedLagSmoother(rig, settings, make_floor(rig, settings.floor, dof), prior)
-        case Isam2Settings():
-            return Isam2Smoother(rig, settings, make_floor(rig, settings.floor, dof), prior)
-        case BatchSettings():
-            return BatchSmoother(rig, settings, make_floor(rig, settings.floor, dof), prior)
+        case LandmarkKalmanGraphSettings():
+            return LandmarkKalmanGraph(rig, settings, prior, ego_motion)
+        case EkfSettings():
+            floor = make_floor(rig, settings.floor, ego_motion.dof)
+            return FullEkf(rig, settings, floor, prior)
         case _:
-            raise ConfigError(f"estimator.kind {settings.kind} is not built yet")
+            floor = make_floor(rig, settings.floor, ego_motion.dof)
+            return _make_smoother(rig, settings, floor, prior)
+
+
+def _make_smoother(
+    rig: Sensor,
+    settings: FixedLagSettings | Isam2Settings | BatchSettings,
+    floor: Floor,
+    prior: Prediction,
+) -> Estimator:
+    match settings:
+        case FixedLagSettings():
+            return FixedLagSmoother(rig, settings, floor, prior)
+        case Isam2Settings():
+            return Isam2Smoother(rig, settings, floor, prior)
+        case BatchSettings():
+            return BatchSmoother(rig, settings, floor, prior)
 
 
 def make_floor(rig: Sensor, settings: FloorSettings, dof: DegreesOfFreedom) -> Floor:
@@ -154,7 +177,7 @@ def make_pipeline(
     estimator_settings: EstimatorSettings,
 ) -> SlamPipeline:
     """The whole system for one sequence."""
-    estimator = make_estimator(sequence.rig, estimator_settings, frontend.ego_motion.dof)
+    estimator = make_estimator(sequence.rig, estimator_settings, frontend.ego_motion)
     require_support(estimator, measured_odometry=odometry.kind != "constant_velocity")
     return SlamPipeline(
         stereo=StereoMatcher(sequence.rig, frontend.stereo, frontend.appearance),

@@ -114,7 +114,7 @@ def replay(
     before_mb = memory_mb("VmRSS")
     run = _Replaying(log, settings)
     try:
-        estimator = make_estimator(log.rig, settings, ego_motion.dof)
+        estimator = make_estimator(log.rig, settings, ego_motion)
         _require_support(estimator, log)
     except ESTIMATOR_FAULTS as error:
         return run.result(None, before_mb, f"could not start: {reason(error)}")

@@ -1,0 +1,160 @@
+"""The paper's estimator expressed as factor graphs, GTSAM doing the algebra.
+
+Equal to :class:`fgslam.backend.landmark_kalman.LandmarkKalman` up to rounding: the pose is that of
+a graph on fixed landmarks (Se et al. 3.3), each landmark that of a graph of its own (6.4).
+Which edges of the full graph are missing, and what that costs, is derived in
+docs/derivations/landmark_filter_as_graph.md.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+import gtsam
+import numpy as np
+
+from fgslam.backend.fixed_map_pose import FixedMapPose
+from fgslam.backend.landmark_elimination import Eliminated, LandmarkElimination, fused
+from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.errors import EstimatorError
+from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.factors.noise import Whitening
+from fgslam.factors.stereo import StereoFactors
+from fgslam.geometry import transform_to_world, triangulate
+from fgslam.settings.backend import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
+from fgslam.settings.frontend import EgoMotionSettings
+from fgslam.types import (
+    BoolArray,
+    CameraRig,
+    EgoMotion,
+    EgoMotionStatus,
+    FloatArray,
+    Increment,
+    IntArray,
+    MeasurementType,
+    Observations,
+    Odometry,
+    Prediction,
+    Sensor,
+    UpdateStats,
+)
+
+
+class LandmarkKalmanGraph(LandmarkKalman):
+    """Estimator of kind ``landmark_kalman_graph``; books and state are the closed form's."""
+
+    kind: ClassVar[str] = "landmark_kalman_graph"
+    supports: ClassVar[frozenset[MeasurementType]] = frozenset(
+        {MeasurementType.ODOMETRY, MeasurementType.STEREO}
+    )
+
+    def __init__(
+        self,
+        rig: Sensor,
+        settings: LandmarkKalmanGraphSettings,
+        prior: Prediction,
+        ego_motion: EgoMotionSettings,
+    ) -> None:
+        """Starts at the prior pose with an empty map.
+
+        Args:
+            rig: the cameras. Raises EstimatorError for another sensor.
+            settings: which update, and its noise.
+            prior: pose of the first frame and its covariance.
+            ego_motion: the front-end's, whose cost the pose's graph repeats.
+        """
+        if not isinstance(rig, CameraRig):
+            raise EstimatorError(
+                "landmark_kalman_graph is built on stereo factors; for a range-bearing sensor use "
+                "landmark_kalman"
+            )
+        closed_form = LandmarkKalmanSettings(
+            update=settings.update,
+            pose_covariance=settings.pose_covariance,
+            miss_growth_m=settings.miss_growth_m,
+        )
+        super().__init__(rig, closed_form, prior)
+        self._pose_graph = FixedMapPose(rig, ego_motion)
+        self._cameras = rig
+
+    def update(
+        self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
+    ) -> UpdateStats:
+        """As the closed form, with the frame's pose from its graph.
+
+        Where the tracking found no minimum (first frame, too few matches, capped, no image), the
+        pose is the tracking's.
+        """
+        _require_depth(increment, tracking.inliers, self._settings.update == "world")
+        if tracking.status is EgoMotionStatus.OK and tracking.weighted_at is not None:
+            known = increment.odometry if increment.odometry is not None else motion
+            matched = increment.observations.select(~increment.observations.is_new)
+            found = self._pose_graph.solve(
+                self.predict(known),
+                tracking.weighted_at,
+                self.landmarks(),
+                matched.select(tracking.inliers),
+            )
+            tracking = dataclasses.replace(tracking, wTc=found.wTc, covariance=found.covariance)
+        return super().update(increment, tracking, motion)
+
+    # -- the landmarks' algebra, by elimination ------------------------------------------------
+
+    def _pixel_update(self, rows: IntArray, observed: Observations) -> float:
+        """Stereo factor and prior of each landmark, linearised at the landmark."""
+        found = self._eliminated(self._positions[rows], self._covariances[rows], observed)
+        return self._apply(rows, found)
+
+    def _world_update(self, rows: IntArray, observed: Observations) -> float:
+        """Two priors on each landmark: what was known, and the position observed."""
+        positions, noise = self._observed_positions(observed)
+        given = zip(self._covariances[rows], positions - self._positions[rows], noise, strict=True)
+        return self._apply(rows, [fused(*of_one) for of_one in given])
+
+    def _observed_positions(self, observed: Observations) -> tuple[FloatArray, FloatArray]:
+        """A stereo factor alone, eliminated where it is met exactly."""
+        points = triangulate(self._cameras, observed.measurement)
+        positions = transform_to_world(self._current.wTc, points)
+        found = self._eliminated(positions, [None] * len(observed), observed)
+        covariances = np.array([one.covariance for one in found]).reshape(-1, 3, 3)
+        return positions, covariances
+
+    def _eliminated(
+        self, positions: FloatArray, priors: Any, observed: Observations
+    ) -> list[Eliminated]:
+        by_pose = self._current.covariance if self._settings.pose_covariance else None
+        elimination = LandmarkElimination(by_pose)
+        factors = StereoFactors(self._cameras, Whitening())
+        values = gtsam.Values()
+        values.insert(pose_key(0), gtsam.Pose3(self._current.wTc))
+        values.insert(landmark_key(0), np.zeros(3))
+        out = []
+        given = zip(positions, priors, observed.measurement, observed.covariance, strict=True)
+        for position, prior, measured, noise in given:
+            values.update(landmark_key(0), position)
+            factor = factors.factor(pose_key(0), landmark_key(0), measured, noise)
+            out.append(elimination.observed(factor, values, prior))
+        return out
+
+    def _apply(self, rows: IntArray, found: list[Eliminated]) -> float:
+        self._positions[rows] += np.array([one.step for one in found])
+        self._covariances[rows] = np.array([one.covariance for one in found])
+        return sum(one.misfit for one in found)
+
+
+def _require_depth(increment: Increment, inliers: BoolArray, world: bool) -> None:
+    """A factor of a point at infinity or behind constrains nothing: there is nothing to invert.
+
+    Where observed positions are fused (``world``), this goes for matches, too.
+    """
+    seen = increment.observations
+    placed = seen.is_new.copy()
+    if world:
+        placed[~seen.is_new] = inliers
+    without = seen.ids[placed & (seen.measurement[:, 2] <= 0.0)]
+    if len(without):
+        raise EstimatorError(
+            f"frame {increment.index}: landmark {without[0]} has no positive disparity; leave "
+            "such observations out of the log"
+        )
