@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from simulated import assert_same_bits
 
 from fgslam import geometry as g
 from fgslam.backend.landmark_kalman import LandmarkKalman
-from fgslam.config import make_config
+from fgslam.config import load_config, make_config
 from fgslam.datasets.opening import open_measurements
 from fgslam.errors import ConfigError
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
@@ -418,3 +419,35 @@ def test_the_paper_s_drive_is_as_good_as_rendered() -> None:
     assert len(recording.log) == 249
     _, spoilt = filtered(recorded(stop=None, outlier_fraction=0.2))
     assert spoilt < 0.03
+
+
+SIMULATED = {
+    path.stem: config
+    for path in sorted((Path(__file__).parents[2] / "experiments").glob("*.yaml"))
+    for config in (load_config(path),)
+    if isinstance(config.dataset, SimulatedMeasurementsSettings)
+}
+
+
+def test_there_are_simulated_experiments() -> None:
+    assert SIMULATED.keys() >= {
+        "lab_trials",
+        "sharp_turns",
+        "outliers",
+        "long_drive",
+        "sparse_features",
+        "poor_odometry",
+    }
+
+
+@pytest.mark.parametrize("name", SIMULATED)
+def test_every_simulated_experiment_opens(name: str) -> None:
+    """Of the length asked for, rarely without a landmark, and always with odometry."""
+    config = SIMULATED[name]
+    dataset = config.dataset
+    assert isinstance(dataset, SimulatedMeasurementsSettings)
+    recording = open_measurements(dataset, config.seed, config.odometry)
+    assert len(recording.log) == dataset.drive.frames
+    matched = [int((~i.observations.is_new).sum()) for i in recording.log.increments[1:]]
+    assert np.mean(np.array(matched) >= 3) > 0.97
+    assert all(i.odometry is not None for i in recording.log.increments[1:])
