@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -172,8 +172,10 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     and paired tests say whether the smoothers beat the filters.
     """
     from fgslam.errors import ConfigError
+    from fgslam.runs.baseline import read_baseline
     from fgslam.runs.choosing import Choice
 
+    expected = None if check_baseline is None else read_baseline(check_baseline)
     names = None if estimators is None else tuple(estimators.split(","))
     choice, existing = Choice(names, tuple(overrides or ())), _existing(overwrite)
     if trials is None and seed is not None:
@@ -184,7 +186,9 @@ def compare(  # noqa: PLR0913 - each option is a parameter
         results, status = _compare_trials(runs[0], (trials, seed), choice, out, existing, jobs)
     else:
         raise ConfigError("--trials takes one run or experiment at a time; give one")
-    regression = _baselines(results, write_baseline, check_baseline)
+    if write_baseline is not None:
+        _write_baseline(write_baseline, results)
+    regression = expected is not None and _check_baseline(expected, results)
     if status or regression:
         raise typer.Exit(status or EXIT_FAULT)
 
@@ -231,19 +235,22 @@ def _compare_trials(
     return {trials.name: means}, status
 
 
-def _baselines(results: Results, write: Path | None, check: Path | None) -> bool:
-    """Writes and checks baselines; whether something became worse."""
+def _write_baseline(path: Path, results: Results) -> None:
     import shlex
 
-    from fgslam.comparison_console import show_deviations
-    from fgslam.runs.baseline import check_baseline, write_baseline
+    from fgslam.runs.baseline import write_baseline
 
-    if write is not None:
-        write_baseline(write, results, shlex.join(["fgslam", *sys.argv[1:]]))
-    if check is None:
-        return False
-    deviations = check_baseline(check, results)
-    show_deviations(check, deviations)
+    write_baseline(path, results, shlex.join(["fgslam", *sys.argv[1:]]))
+    typer.echo(f"baseline    {path}")
+
+
+def _check_baseline(expected: dict[str, Any], results: Results) -> bool:
+    """Shows what differs; whether something became worse."""
+    from fgslam.comparison_console import show_deviations
+    from fgslam.runs.baseline import check_baseline
+
+    deviations = check_baseline(expected, results)
+    show_deviations(deviations)
     return any(deviation.regression for deviation in deviations)
 
 

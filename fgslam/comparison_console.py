@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.console import Console
@@ -51,13 +50,13 @@ def show_trials(trials: Trials) -> None:
     console.out(f"results     {trials.out}")
 
 
-def show_deviations(baseline: Path, deviations: Sequence[Deviation]) -> None:
+def show_deviations(deviations: Sequence[Deviation]) -> None:
     """What differs from the baseline, each in a line, or that nothing does."""
     console = _console()
     for deviation in deviations:
         console.out(f"{'REGRESSION' if deviation.regression else 'deviation':<12}{deviation.text}")
     if not deviations:
-        console.out(f"baseline    {baseline}: all values within their tolerances")
+        console.out("baseline    all values are within their tolerances")
 
 
 def _console() -> Console:

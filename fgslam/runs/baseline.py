@@ -73,13 +73,23 @@ def write_baseline(path: Path, results: Results, command: str) -> None:
     write_text(path, json.dumps(document, indent=2, allow_nan=False) + "\n")
 
 
-def check_baseline(path: Path, results: Results) -> list[Deviation]:
-    """Compares results with a baseline; runs and estimators that it does not know are ignored.
+def read_baseline(path: Path) -> dict[str, Any]:
+    """A baseline's document. Raises ConfigError where the file is missing or is none."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, ValueError, RecursionError) as error:
+        raise ConfigError(
+            f"{path}: cannot be read as a baseline ({error}); write one with --write-baseline"
+        ) from None
+    if not _is_baseline(document):
+        raise ConfigError(
+            f"{path}: is no {FORMAT} of version {VERSION}; write one with --write-baseline"
+        )
+    return dict(document)
 
-    Raises:
-        ConfigError: the file is missing or is no baseline.
-    """
-    document = _read(path)
+
+def check_baseline(document: Mapping[str, Any], results: Results) -> list[Deviation]:
+    """Compares results with a baseline; runs and estimators that it does not know are ignored."""
     tolerances: dict[str, float] = document["relative_tolerances"]
     out: list[Deviation] = []
     for run, estimators in document["runs"].items():
@@ -127,20 +137,6 @@ def _deviation(
 def _off(ratio: float) -> float:
     """How far a ratio is from 1, either way."""
     return abs(math.log(ratio)) if ratio > 0.0 else math.inf
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise ConfigError(
-            f"{path}: cannot be read as a baseline ({error}); write one with --write-baseline"
-        ) from None
-    if not _is_baseline(document):
-        raise ConfigError(
-            f"{path}: is no {FORMAT} of version {VERSION}; write one with --write-baseline"
-        )
-    return dict(document)
 
 
 def _is_baseline(document: Any) -> bool:

@@ -86,16 +86,17 @@ class RunOutputs:
         return dataclasses.replace(metrics, more=more)
 
     def _write_truth(self, with_landmarks: bool) -> Truth:
-        """True path, and true landmarks where the recording is rendered and ``with_landmarks``."""
-        path = self.sequence.ground_truth
-        if path is not None:
-            write_tum(self.folder / GROUND_TRUTH_FILE, path)
+        """True path, and true landmarks where the recording is rendered and ``with_landmarks``.
+
+        What is returned is read back: replays of the log are judged by the same digits.
+        """
+        if self.sequence.ground_truth is not None:
+            write_tum(self.folder / GROUND_TRUTH_FILE, self.sequence.ground_truth)
         found = (
             rendered_landmark_truth(self.sequence, self.recorder.log) if with_landmarks else None
         )
-        if found is None:
-            return Truth(path)
-        write_landmark_truth(self.folder / LANDMARK_TRUTH_FILE, *found)
+        if found is not None:
+            write_landmark_truth(self.folder / LANDMARK_TRUTH_FILE, *found)
         return load_truth(self.folder, self.recorder.log)
 
     def _write_estimate(self, estimate: Estimate) -> None:

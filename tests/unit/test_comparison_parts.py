@@ -26,7 +26,7 @@ from fgslam.export.metrics import EstimatorMetrics, UpdateTime
 from fgslam.export.point_cloud import MapPoints
 from fgslam.measurement_log import MeasurementLog
 from fgslam.recordings import LandmarkTruth
-from fgslam.runs.baseline import check_baseline, write_baseline
+from fgslam.runs.baseline import check_baseline, read_baseline, write_baseline
 from fgslam.runs.choosing import Choice, all_kinds, choose, estimators_of
 from fgslam.runs.estimator_files import points_from_log
 from fgslam.runs.judging import seen_often
@@ -294,7 +294,7 @@ SOUND = EstimatorMetrics(ate_rmse_m=0.01, nees_pose_per_dof=1.5, more={"kind": "
 
 def checked(path: Path, **changes: Any) -> list[tuple[bool, str]]:
     results = {"run": {"isam2": dataclasses.replace(SOUND, **changes)}}
-    return [(d.regression, d.text) for d in check_baseline(path, results)]
+    return [(d.regression, d.text) for d in check_baseline(read_baseline(path), results)]
 
 
 def test_a_baseline_tells_worse_from_better(tmp_path: Path) -> None:
@@ -311,7 +311,7 @@ def test_a_baseline_tells_worse_from_better(tmp_path: Path) -> None:
     assert [w for w, _ in checked(path, nees_pose_per_dof=1.0)] == [False]
     assert [w for w, _ in checked(path, nees_pose_per_dof=0.5)] == [True]
     assert checked(path, ate_rmse_m=None)[0][0]
-    missing = check_baseline(path, {"run": {}})
+    missing = check_baseline(read_baseline(path), {"run": {}})
     assert [(d.regression, d.text) for d in missing] == [
         (True, "run, isam2: not among the results")
     ]

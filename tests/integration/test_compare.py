@@ -1,0 +1,268 @@
+"""`fgslam run` with comparisons and on measurements, `fgslam compare`, trials and baselines."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from recordings import experiment
+from running import KIND, main, metrics_of, run_values, write_config
+
+from fgslam.config import parse_config
+from fgslam.export.metrics import EstimatorMetrics
+from fgslam.export.point_cloud import read_ply
+from fgslam.export.trajectories import read_covariances, read_tum
+from fgslam.measurement_log import MeasurementLog
+from fgslam.runs.measured import run_measured
+
+CONTRACT = set(EstimatorMetrics().as_json())
+FRAMES = 30
+ESTIMATOR_FILES = {"online.tum", "final.tum", "covariance.csv", "map.ply", "frames.csv"}
+DRIVE: dict[str, Any] = {
+    "name": "short_drive",
+    "dataset": {"kind": "simulated_measurements", "stop": FRAMES, "detection": {"features": 40}},
+    "frontend": {"ego_motion": {"dof": 3}},
+    "compare": [{"kind": "landmark_kalman", "label": "world", "update": "world"}],
+}
+SAME = ("final.tum", "online.tum", "covariance.csv", "map.ply")
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on simulated measurements, two estimators; read only."""
+    folder = tmp_path_factory.mktemp("measured") / "run"
+    run_measured(parse_config(DRIVE, "test"), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def plain(measured: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same run, whose comparisons write no page, which takes a while."""
+    folder = Path(shutil.copytree(measured, tmp_path_factory.mktemp("plain") / "run"))
+    values = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+    values["output"]["report"] = False
+    write_config(folder / "config.yaml", values)
+    return folder
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+
+
+# --------------------------------------------------------------------------------------------
+# fgslam run
+
+
+def test_a_run_on_measurements_fills_its_folder(measured: Path) -> None:
+    log = MeasurementLog.load(measured / "measurements.npz")
+    assert len(log) == FRAMES
+    for title in (KIND, "world"):
+        folder = measured / title
+        assert {file.name for file in folder.iterdir()} == ESTIMATOR_FILES
+        assert len(read_tum(folder / "final.tum")) == FRAMES
+        assert len(read_covariances(folder / "covariance.csv")[0]) == FRAMES
+        points = read_ply(folder / "map.ply")
+        assert (points.colours == 128).all()
+        assert points.hits.sum() > 500
+        assert [row["status"] for row in rows_of(folder / "frames.csv")][:2] == ["first", "ok"]
+    names = {path.name for path in (measured / "pictures").iterdir()}
+    assert names == {
+        "map_from_above.png",
+        "map_views.png",
+        "matches.png",
+        "position_error.png",
+    }
+    assert "<html" in (measured / "report.html").read_text(encoding="utf-8")[:1000]
+    assert len(rows_of(measured / "timing.csv")) == 2 * FRAMES
+
+
+def test_metrics_hold_the_names_of_the_contract_and_true_landmarks(measured: Path) -> None:
+    document = metrics_of(measured)
+    assert (document["frames"], document["status"]) == (FRAMES, "finished")
+    assert list(document["estimators"]) == [KIND, "world"]
+    for metrics in document["estimators"].values():
+        assert set(metrics) >= CONTRACT
+        assert metrics["matched_poses"] == FRAMES
+        assert 0.0 < metrics["ate_rmse_m"] < 0.05
+        assert 0.0 < metrics["landmark_rmse_m"] < 1.0
+        assert metrics["nees_landmark"]["items"] == metrics["landmarks_with_truth"] > 50
+        assert metrics["landmark_truth_sigma_m"] == 0.0
+        assert metrics["update_growth"]["ratio"] > 0.0
+        assert metrics["peak_memory_mb"] >= metrics["memory_before_mb"] > 20.0
+        # A filter's final trajectory is its online one.
+        assert metrics["online"]["ate_rmse_m"] == pytest.approx(metrics["ate_rmse_m"])
+    rows = rows_of(measured / "comparison.csv")
+    assert [(row["run"], row["estimator"]) for row in rows] == [
+        ("short_drive", KIND),
+        ("short_drive", "world"),
+    ]
+
+
+def test_a_run_on_measurements_starts_anew(
+    measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    config = write_config(tmp_path / "c.yaml", DRIVE)
+    assert main(monkeypatch, "run", config, "--out", measured, "--resume") == 2
+    assert "cannot be resumed" in capsys.readouterr().err
+    assert main(monkeypatch, "run", config, "--out", measured) == 2
+    assert "holds a run already" in capsys.readouterr().err
+
+
+def test_a_run_replays_its_own_log_to_the_bit(recording: Path, tmp_path: Path) -> None:
+    values = experiment(recording) | {
+        "estimator": {"kind": KIND, "label": "live"},
+        "compare": [{"kind": KIND, "label": "again"}],
+    }
+    run = run_values(values, tmp_path / "run")
+    assert run.result.compared is not None
+    assert list(run.result.compared.metrics) == ["live", "again"]
+    for name in SAME[:3]:
+        live, again = (run.folder / title / name for title in ("live", "again"))
+        assert live.read_bytes() == again.read_bytes()
+    live_map, again_map = (read_ply(run.folder / title / "map.ply") for title in ("live", "again"))
+    np.testing.assert_array_equal(live_map.positions, again_map.positions)
+    np.testing.assert_array_equal(live_map.colours, again_map.colours)
+    assert len(np.unique(live_map.colours)) > 10
+    found = metrics_of(run.folder)["estimators"]
+    assert list(found) == ["live", "again"]
+    for name in CONTRACT - {"update_ms", "peak_memory_mb"}:
+        assert found["live"][name] == found["again"][name]
+
+
+# --------------------------------------------------------------------------------------------
+# fgslam compare
+
+
+def test_compare_gives_the_runs_own_bytes_and_a_table(
+    measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    out, baseline = tmp_path / "out", tmp_path / "baseline.json"
+    arguments = ("compare", measured, "--out", out, "--estimators", f"{KIND},world")
+    own = ("--set", "estimators.world.update=half", "--write-baseline", baseline)
+    assert main(monkeypatch, *arguments, *own) == 0
+    shown = capsys.readouterr().out
+    assert "SE3 aligned, 30 matched poses" in shown
+    assert "NEES" in shown
+    assert shown.count("world") >= 3
+    for name in SAME:
+        assert (out / KIND / name).read_bytes() == (measured / KIND / name).read_bytes()
+    assert (out / "world/final.tum").read_bytes() != (measured / "world/final.tum").read_bytes()
+    written = yaml.safe_load((out / "config.yaml").read_text(encoding="utf-8"))
+    assert [e["update"] for e in written["compare"]] == ["pixel", "half"]
+    assert written["provenance"]["run"] == str(measured)
+    assert (out / "report.html").is_file()
+    # The estimators of the configuration are the default; the second one differs from `half`.
+    assert main(monkeypatch, "compare", measured, "--out", out) == 2
+    assert "holds results already" in capsys.readouterr().err
+    check = ("--overwrite", "--check-baseline", baseline)
+    assert main(monkeypatch, "compare", measured, "--out", out, *check) == 1
+    shown = capsys.readouterr().out
+    assert "short_drive, world: ate_final_m: " in shown
+    assert f"short_drive, {KIND}: " not in shown
+
+
+def test_one_estimator_may_fail(
+    plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """A map too large for the EKF is told; the filter beside it goes on."""
+    out = tmp_path / "out"
+    arguments = ("--estimators", f"ekf,{KIND}", "--set", "estimators.ekf.max_landmarks=45")
+    assert main(monkeypatch, "compare", plain, "--out", out, *arguments) == 0
+    found = metrics_of(out)["estimators"]
+    assert found["ekf"]["failure"].startswith("frame ")
+    assert found[KIND]["failure"] is None
+    done = len(read_tum(out / "ekf/final.tum"))
+    assert 0 < done < FRAMES
+    assert len(read_tum(out / "ekf/online.tum")) == len(rows_of(out / "ekf/frames.csv")) == done
+    assert found["ekf"]["frames"] == done
+    assert f"failed      ekf: {found['ekf']['failure']}" in capsys.readouterr().out
+    # Alone, its failure is that of the command.
+    again = ("--overwrite", "--estimators", "ekf", "--set", "estimators.ekf.max_landmarks=45")
+    assert main(monkeypatch, "compare", plain, "--out", out, *again) == 1
+
+
+def test_two_runs_are_compared_side_by_side(
+    plain: Path, finished: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    out = tmp_path / "both"
+    arguments = ("--out", out, "--estimators", "odometry", "--jobs", 2)
+    assert main(monkeypatch, "compare", plain, finished.folder, *arguments) == 0
+    rows = rows_of(out / "comparison.csv")
+    assert [row["estimator"] for row in rows] == ["odometry", "odometry"]
+    assert "final ATE, cm, SE3 aligned" in capsys.readouterr().out
+    assert (out / plain.name / "odometry" / "final.tum").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--estimators", "isam3"), "no estimator 'isam3'"),
+        (("--out", "RUN", "--overwrite"), "holds the run itself; choose another folder"),
+        (("--seed", 3), "--seed means nothing without --trials"),
+        (("--check-baseline", "RUN/config.yaml"), "cannot be read as a baseline"),
+    ],
+)
+def test_mistakes_are_told_in_a_line(
+    plain: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+    arguments: tuple[object, ...],
+    words: str,
+) -> None:
+    given = [str(a).replace("RUN", str(plain)) for a in arguments]
+    out = () if "--out" in given else ("--out", tmp_path / "out")
+    assert main(monkeypatch, "compare", plain, *out, *given) == 2
+    message = capsys.readouterr().err.strip()
+    assert words in message
+    assert "\n" not in message.replace(message.splitlines()[0], "", 1).strip()
+    assert (plain / "measurements.npz").is_file()
+
+
+def test_what_is_no_run_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    assert main(monkeypatch, "compare", tmp_path) == 2
+    assert "not a run folder" in capsys.readouterr().err
+
+
+# --------------------------------------------------------------------------------------------
+# Trials
+
+
+def test_trials_repeat_to_the_byte_and_need_noise_to_vary(
+    plain: Path,
+    finished: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+) -> None:
+    config = write_config(tmp_path / "c.yaml", DRIVE)
+    common = ("--trials", 2, "--seed", 0)
+    outs = [tmp_path / "a", tmp_path / "b"]
+    assert main(monkeypatch, "compare", config, *common, "--out", outs[0], "--jobs", 2) == 0
+    assert "2 trials, mean [95 % interval]" in capsys.readouterr().out
+    assert main(monkeypatch, "compare", plain, *common, "--out", outs[1]) == 0
+    first, second = ((out / "trials.csv").read_bytes() for out in outs)
+    assert first == second
+    rows = rows_of(outs[0] / "trials.csv")
+    assert [(row["seed"], row["estimator"]) for row in rows] == [
+        (seed, title) for seed in ("0", "1") for title in (KIND, "world")
+    ]
+    # The first seed is the run's own.
+    own = metrics_of(plain)["estimators"][KIND]["ate_rmse_m"]
+    assert float(rows[0]["ate_final_m"]) == pytest.approx(own, rel=1e-6)
+    assert rows[0]["ate_final_m"] != rows[2]["ate_final_m"]
+    document = json.loads((outs[0] / "metrics.json").read_text(encoding="utf-8"))
+    assert document["seeds"] == [0, 1]
+    mean = np.mean([float(rows[k]["ate_final_m"]) for k in (0, 2)])
+    assert document["estimators"][KIND]["ate_rmse_m"] == pytest.approx(mean)
+    assert document["estimators"][KIND]["nees_pose"]["independent"] == 2
+    assert main(monkeypatch, "compare", finished.folder, "--trials", 2) == 2
+    assert "one world of noise" in capsys.readouterr().err
