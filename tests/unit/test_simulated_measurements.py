@@ -442,7 +442,7 @@ def test_there_are_simulated_experiments() -> None:
 
 @pytest.mark.parametrize("name", SIMULATED)
 def test_every_simulated_experiment_opens(name: str) -> None:
-    """Of the length asked for, with matches to live on (sparse ones too often not), and odometry."""
+    """Of the length asked for, with matches to live on (sparse ones often not) and odometry."""
     config = SIMULATED[name]
     dataset = config.dataset
     assert isinstance(dataset, SimulatedMeasurementsSettings)
