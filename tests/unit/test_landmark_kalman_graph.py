@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import gtsam
 import numpy as np
 import pytest
 from hypothesis import given
@@ -23,6 +24,10 @@ from fgslam import geometry as g
 from fgslam.backend.landmark_kalman import LandmarkKalman
 from fgslam.backend.landmark_kalman_graph import LandmarkKalmanGraph
 from fgslam.errors import EstimatorError
+from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.factors.motion import pose_prior
+from fgslam.factors.noise import Whitening
+from fgslam.factors.stereo import StereoFactors
 from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.settings.backend import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
 from fgslam.settings.frontend import EgoMotionSettings
@@ -244,3 +249,41 @@ def test_two_runs_give_the_same_bits() -> None:
     run(first, EgoMotionSettings())
     run(second, EgoMotionSettings())
     assert_same_bits(first.state(), second.state())
+
+
+# --------------------------------------------------------------------------------------------
+# What the missing edges cost: the numbers of docs/derivations/landmark_filter_as_graph.md
+
+
+def standing_still(frames: int) -> tuple[float, float]:
+    """Depth deviations (metres) of a landmark seen ``frames`` times from one uncertain pose.
+
+    Returns the filter's, which gives every frame a pose of its own, and the full graph's, in which
+    it is one and the same pose.
+    """
+    point = np.array([0.2, 0.1, 3.0])
+    measured = g.project(RIG, point[None])
+    _, estimator = both()
+    for k in range(frames):
+        there = tracked_at(Prediction(np.eye(4), UNCERTAIN), min(k, 1))
+        estimator.update(frame(k, measured, k == 0), there)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    values.insert(pose_key(0), gtsam.Pose3())
+    values.insert(landmark_key(0), point)
+    graph.add(pose_prior(pose_key(0), Prediction(np.eye(4), UNCERTAIN)))
+    factors = StereoFactors(RIG, Whitening())
+    for _ in range(frames):
+        graph.add(factors.factor(pose_key(0), landmark_key(0), measured[0], np.diag(SIGMA**2)))
+    marginal = gtsam.Marginals(graph, values).marginalCovariance(landmark_key(0))
+    claimed = estimator.landmarks().covariances[0]
+    return float(np.sqrt(claimed[2, 2])), float(np.sqrt(marginal[2, 2]))
+
+
+def test_the_same_pose_error_is_counted_anew_in_every_frame() -> None:
+    claimed_once, true_once = standing_still(1)
+    assert claimed_once == pytest.approx(true_once, rel=1e-9)
+    claimed, honest = standing_still(100)
+    assert claimed == pytest.approx(0.1 * claimed_once, rel=1e-9)
+    # Looking longer does not tell where one stands: the pose's own deviation remains.
+    assert honest > np.sqrt(UNCERTAIN[5, 5])
+    assert (honest / claimed) ** 2 > 3.0
