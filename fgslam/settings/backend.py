@@ -182,7 +182,7 @@ class EkfSettings(NamedSettings):
         Field(
             ge=1,
             description="refuse to hold more: the joint covariance takes 72 n^2 bytes, 1.2 GB for "
-            "4000 landmarks, and as much again while it is updated",
+            "4000 landmarks, and up to half as much again in reserve",
         ),
     ] = 4000
 
@@ -198,6 +198,9 @@ class FixedLagSettings(GraphSettings):
     lag_s: Annotated[
         float | None, Field(gt=0.0, description="lag in seconds; used where lag_frames is null")
     ] = None
+    relinearize_threshold: Annotated[
+        float, Field(gt=0.0, description="change (radians, metres) that relinearises a variable")
+    ] = 0.01
 
 
 @dataclass(frozen=True, config=STRICT)
