@@ -4,7 +4,7 @@ PYTEST = .venv/bin/python -m pytest -n 2
 DEMO_OUT ?= runs/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check bench clean
+.PHONY: help setup demo test test-all check bench baseline clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -34,6 +34,18 @@ check: setup ## linter, formatter and type checker; changes nothing
 
 bench: setup ## measure speed as ratios, write bench.json
 	.venv/bin/python -m tests.benchmark.bench
+
+# `make baseline BASELINE=write BASELINES="lab_trials outliers"` writes them anew.
+BASELINE ?= check
+BASELINES ?= $(basename $(notdir $(wildcard experiments/baselines/*.json)))
+BASELINE_ESTIMATORS ?= odometry,landmark_kalman,fixed_lag,isam2,batch
+
+baseline: .venv/.runtime-stamp ## repeat the experiments that have a committed baseline, check them (minutes)
+	@set -e; for name in $(BASELINES); do \
+	  .venv/bin/fgslam compare experiments/$$name.yaml --trials 3 --seed 0 --jobs 2 \
+	    --estimators $(BASELINE_ESTIMATORS) --out runs/baseline/$$name --overwrite \
+	    --$(BASELINE)-baseline experiments/baselines/$$name.json; \
+	done
 
 clean: ## remove the environment, caches and results
 	rm -rf .venv runs bench.json build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -261,7 +261,9 @@ _COST = (
 _TRIAL_COLUMNS = (
     _Column("ATE final cm", ("intervals.ate_rmse_m",), _interval(100.0, 3), _NO_TRUTH),
     _Column("ATE online cm", ("intervals_online.ate_rmse_m",), _interval(100.0, 3), _NO_TRUTH),
-    _Column("landmarks rms cm", ("intervals.landmark_rmse_m",), _interval(100.0, 2), _NO_LANDMARKS),
+    _Column(
+        "landmarks median cm", ("intervals.landmark_median_m",), _interval(100.0, 2), _NO_LANDMARKS
+    ),
     _Column("NEES pose", ("nees_pose",), _pooled, _NO_TRUTH),
     _Column("NEES landmarks", ("nees_landmark",), _pooled, _NO_LANDMARKS),
 )
