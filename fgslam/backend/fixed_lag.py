@@ -53,6 +53,7 @@ class FixedLagSmoother(Smoother):
         super().__init__(sensor, settings, floor, prior, remember=False)
         self._in_seconds = settings.lag_frames is None
         self._lag = float(settings.lag_frames or settings.lag_s or 0.0)
+        self._relinearize = settings.relinearize_threshold
         self._solver = self._new_solver()
         self._values = gtsam.Values()
         self._oldest = 0
@@ -108,7 +109,7 @@ class FixedLagSmoother(Smoother):
         params = gtsam.ISAM2Params()
         params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams())
         params.setFactorization("CHOLESKY")
-        params.setRelinearizeThreshold(0.01)
+        params.setRelinearizeThreshold(self._relinearize)
         params.relinearizeSkip = 1
         # Without it the list of factors, and the effort, grow with the run (gtsam.md 1).
         params.findUnusedFactorSlots = True

@@ -1,4 +1,7 @@
-"""What an estimator was given, frame by frame: the state of those that cannot show their inside."""
+"""What an estimator was given, frame by frame: the state of those that cannot show their inside.
+
+Of the tracking only what smoothers use is kept: pose, covariance, inliers.
+"""
 
 from __future__ import annotations
 
@@ -53,9 +56,6 @@ class RecordedInputs:
             "inliers": np.concatenate(
                 [np.empty(0, np.bool_), *(t.inliers for t in self.trackings)]
             ),
-            "residuals": np.concatenate([np.empty(0), *(t.residuals for t in self.trackings)]),
-            "status": np.array([t.status.value for t in self.trackings], "U32"),
-            "iterations": np.array([t.iterations for t in self.trackings], np.int64),
             "motion_known": known,
             "motion": np.array([m.motion for m in given]).reshape(-1, 4, 4),
             "motion_covariance": np.array([m.covariance for m in given]).reshape(-1, 6, 6),
@@ -72,7 +72,6 @@ class RecordedInputs:
         log = MeasurementLog.from_arrays(logged, "the smoother's saved state")
         ends = np.cumsum(state["matches"])[:-1]
         inliers = np.split(state["inliers"], ends)
-        residuals = np.split(state["residuals"], ends)
         row = np.cumsum(state["motion_known"]) - 1
         out = RecordedInputs()
         for k, increment in enumerate(log):
@@ -80,9 +79,9 @@ class RecordedInputs:
                 state["wTc"][k],
                 state["covariance"][k],
                 inliers[k],
-                residuals[k],
-                EgoMotionStatus(str(state["status"][k])),
-                int(state["iterations"][k]),
+                np.full(len(inliers[k]), np.nan),
+                EgoMotionStatus.OK,
+                0,
             )
             motion = None
             if state["motion_known"][k]:

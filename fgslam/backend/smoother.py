@@ -102,6 +102,8 @@ class Smoother(ABC):
 
     def estimate(self) -> Estimate:
         """All poses and landmarks as the graph has them now, with their marginals."""
+        if not self._inputs.increments:
+            return self._tracker.estimate()
         answer = self._solved()
         return Estimate(
             Trajectory(self._inputs.timestamps(), answer.poses),
@@ -112,7 +114,8 @@ class Smoother(ABC):
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
         """Marginal covariances (k, 3, 3) of the named landmarks."""
-        found = self._map(self._solved())
+        self._tracker.landmarks().rows(ids)
+        found = self.estimate().landmarks
         return found.covariances[found.rows(ids)]
 
     def joint_covariance(self, ids: IntArray) -> FloatArray:
@@ -162,13 +165,16 @@ class Smoother(ABC):
         matched = observed.select(~observed.is_new)
         used = tracking.inliers if self._gate else np.ones(len(matched), np.bool_)
         rejected = matched.select(~used)
-        moved = self._builder.contradicted(rejected)
+        moved = self._held(self._builder.contradicted(rejected))
         self._restart(moved)
         self._builder.note(rejected, increment.pruned_ids)
         accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
-        held = np.isin(accepted.ids, self._tracker.landmarks().ids)
         frame = len(self._inputs.increments) - 1
-        return TrackedFrame(frame, tracking.wTc, motion, accepted.select(held))
+        return TrackedFrame(frame, tracking.wTc, motion, self._held(accepted))
+
+    def _held(self, observed: Observations) -> Observations:
+        """Those of landmarks that are in the map, pruned ones no longer."""
+        return observed.select(np.isin(observed.ids, self._tracker.landmarks().ids))
 
     def _restart(self, moved: Observations) -> None:
         """Landmarks that were contradicted too often begin anew where they are seen now."""

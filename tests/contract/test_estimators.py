@@ -16,14 +16,20 @@ from simulated import RIG
 
 from fgslam import geometry as g
 from fgslam.backend.protocol import Estimator
+from fgslam.backend.smoother import Smoother
 from fgslam.errors import EstimatorError
 from fgslam.factory import make_estimator
 from fgslam.frontend.ego_motion import EgoMotionSolver
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
 from fgslam.settings.backend import (
+    BatchSettings,
     DeadReckoningSettings,
+    EkfSettings,
     EstimatorSettings,
+    FixedLagSettings,
+    Isam2Settings,
+    LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
 )
 from fgslam.settings.datasets import ConstantVelocitySettings
@@ -43,6 +49,15 @@ from fgslam.types import (
 
 SETTINGS: dict[str, EstimatorSettings] = {
     "odometry": DeadReckoningSettings(),
+    "landmark_kalman_graph": LandmarkKalmanGraphSettings(),
+    "landmark_kalman_graph, world update": LandmarkKalmanGraphSettings(update="world"),
+    "ekf": EkfSettings(),
+    "fixed_lag": FixedLagSettings(),
+    "isam2": Isam2Settings(),
+    "isam2, keyframes": Isam2Settings(keyframe_every=4),
+    "batch": BatchSettings(),
+    "batch, steering": BatchSettings(solve_every=5),
+    "batch, gnc": BatchSettings(method="gnc"),
     "landmark_kalman": LandmarkKalmanSettings(),
     "landmark_kalman, world update": LandmarkKalmanSettings(update="world"),
     "landmark_kalman, running mean": LandmarkKalmanSettings(update="running_mean"),
@@ -355,7 +370,9 @@ def test_a_frame_without_measurements_keeps_the_map(
     )
     prediction = estimator.predict(blind.odometry)
     stats = estimator.update(blind, unmeasured(prediction))
-    np.testing.assert_allclose(stats.wTc, prediction.wTc, rtol=0, atol=1e-12)
+    # A smoother's next iteration moves the frames before, by well below their sigmas (3 to 9 mm).
+    tolerance = 1e-3 if isinstance(estimator, Smoother) else 1e-12
+    np.testing.assert_allclose(stats.wTc, prediction.wTc, rtol=0, atol=tolerance)
     assert stats.nis_dof == 0
     np.testing.assert_array_equal(estimator.landmarks().positions, before)
     assert len(estimator.estimate().trajectory) == 6
