@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 EXIT_USER = 2
 EXIT_FAULT = 1
 EXIT_INTERRUPTED = 130  # as a shell reports a process that Ctrl-C ended
+_SAVED_WHEN_STOPPED = ("tracking", "replaying", "trials")
 # Typer exports only the child; its parent's home differs from one Typer to the next.
 _UsageError: type[typer.BadParameter] = typer.BadParameter.__bases__[0]
 
@@ -80,10 +81,11 @@ def _run_images(settings: ExperimentConfig, folder: Path, existing: ExistingFold
 
     with _stop_flag() as stopped, progress_bar() as progress:
         result = run_experiment(settings, folder, existing, _stoppable(progress, stopped), stopped)
+        interrupted = stopped() and result.compared is not None
     show_result(result, resume_command(folder))
     if result.compared is not None:
         show_comparisons([result.compared])
-    if result.status == "interrupted":
+    if interrupted or result.status == "interrupted":
         raise typer.Exit(EXIT_INTERRUPTED)
 
 
@@ -227,7 +229,8 @@ def _compare_trials(
     from fgslam.runs.trials import Seeds, run_trials
 
     with _stop_flag() as stopped, progress_bar() as progress:
-        trials = run_trials(source, Seeds(*seeds), choice, out, existing, jobs, progress, stopped)
+        tell = _stoppable(progress, stopped)
+        trials = run_trials(source, Seeds(*seeds), choice, out, existing, jobs, tell, stopped)
         interrupted = stopped()
     show_trials(trials)
     means = {title: together(trials.summary, title) for title in trials.summary.means}
@@ -366,10 +369,10 @@ def _stop_flag() -> Iterator[Callable[[], bool]]:
 
 
 def _stoppable(progress: Progress, stopped: Callable[[], bool]) -> Progress:
-    """While frames are rendered there is no run to save yet: stopping just ends it."""
+    """While frames are rendered there is nothing to save yet: stopping just ends it."""
 
     def tell(what: str, done: int, total: int) -> None:
-        if what != "tracking" and stopped():
+        if what not in _SAVED_WHEN_STOPPED and stopped():
             raise KeyboardInterrupt
         progress(what, done, total)
 

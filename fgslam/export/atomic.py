@@ -37,10 +37,10 @@ _RESULT_FILES = (
     "pictures/*.png",
     *(f"*/{name}" for name in _ESTIMATOR_FILES),
 )
-# What a run writes, and so all that overwriting one may delete; a comparison of it goes along.
+# What a run writes, and so all that overwriting one may delete; comparisons of it go along.
 _RUN_FILES = (
     *_RESULT_FILES,
-    *(f"compare/{name}" for name in _RESULT_FILES),
+    *(f"{inner}/{name}" for inner in ("compare", "trials") for name in _RESULT_FILES),
     "**/.*.partial*",
 )
 

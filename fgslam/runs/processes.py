@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 
 _POLL_S = 0.2
+_GRACE_S = 3.0
 _THREADS = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -86,7 +88,8 @@ def run_apart(
     finally:
         for worker in running:
             worker.process.terminate()
-            worker.process.join()
+        for worker in running:
+            _see_off(worker.process)
     for worker in running:
         yield worker.index, WorkerEnded(arguments[worker.index], "interrupted")
     for index, argument in waiting[::-1]:
@@ -105,12 +108,21 @@ def _start(index: int, function: Callable[[Argument], Result], argument: Argumen
 def _work(
     connection: Connection, function: Callable[[Argument], Result], argument: Argument
 ) -> None:
-    """In the worker: Ctrl-C is the parent's to answer."""
+    """In the worker: Ctrl-C is the parent's to answer; told to end, it clears up first."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
         connection.send(function(argument))
     except FgslamError as error:
         connection.send(error)
+
+
+def _see_off(process: SpawnProcess) -> None:
+    """Waits for a process that was told to end; one that is deep in a solver is killed."""
+    process.join(_GRACE_S)
+    if process.is_alive():
+        process.kill()
+        process.join()
 
 
 def _collect(worker: _Worker, argument: Argument) -> Result | WorkerEnded[Argument]:

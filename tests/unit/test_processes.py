@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from pathlib import Path
 
 import pytest
 
@@ -53,6 +54,22 @@ def test_a_crash_takes_nothing_else_along() -> None:
 def test_a_users_mistake_is_raised_here() -> None:
     with pytest.raises(ConfigError, match="a user's mistake"):
         list(run_apart(work, ["error"]))
+
+
+def clear_up(path: str) -> None:
+    """Leaves a mark when told to end."""
+    try:
+        Path(path, "begun").touch()
+        time.sleep(60.0)
+    finally:
+        Path(path, "cleared").touch()
+
+
+def test_a_process_that_is_stopped_clears_up(tmp_path: Path) -> None:
+    begun = tmp_path / "begun"
+    ((_, ended),) = run_apart(clear_up, [str(tmp_path)], stopped=begun.exists)
+    assert isinstance(ended, WorkerEnded)
+    assert (tmp_path / "cleared").exists()
 
 
 def test_stopping_ends_what_runs_and_starts_no_more() -> None:
