@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
@@ -143,8 +143,7 @@ def judge_replay(replay: Replay, truth: Truth) -> Judgement:
             "memory_before_mb": replay.memory_before_mb,
         }
     )
-    values = {name: getattr(metrics, name) for name in EstimatorMetrics.__slots__} | {"more": more}
-    return Judgement(EstimatorMetrics(**values), judged.nees)
+    return Judgement(replace(metrics, more=more), judged.nees)
 
 
 def seen_often(log: MeasurementLog, truth: LandmarkTruth) -> LandmarkTruth:
