@@ -21,6 +21,12 @@ from fgslam.factors.noise import Whitening
 from fgslam.factors.range_bearing import RangeBearingFactors
 from fgslam.factors.stereo import StereoFactors
 from fgslam.floor import Floor
+from fgslam.geometry import (
+    congruence,
+    transform_to_world,
+    triangulate,
+    triangulation_covariance,
+)
 from fgslam.settings.backend import GraphSettings
 from fgslam.types import (
     CameraRig,
@@ -31,6 +37,8 @@ from fgslam.types import (
     Prediction,
     Sensor,
 )
+
+_SAME_PLACE = 16.3  # 99.9 % quantile of chi-square with three degrees of freedom
 
 
 class LandmarkFactors(Protocol):
@@ -68,7 +76,8 @@ class Track:
         waiting: its sightings while it waits.
         last: its latest sighting.
         sightings: in how many frames it was seen.
-        rejections: in how many frames in a row it was matched and rejected.
+        elsewhere: world positions and covariances of its rejected sightings since the last one
+            that fitted.
         least_parallax: below this it waits; raised when a solver failed on it.
     """
 
@@ -77,7 +86,7 @@ class Track:
     variable: int = -1
     waiting: list[Sighting] = field(default_factory=list)
     sightings: int = 0
-    rejections: int = 0
+    elsewhere: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
 
 
 @dataclass(slots=True, eq=False)
@@ -159,30 +168,38 @@ class GraphBuilder:
         self._add_observations(new, tracked, landmarks)
         return new
 
-    def note(self, rejected: Observations, pruned: IntArray) -> None:
-        """Books matched observations that did not fit, and landmarks that the front-end dropped.
+    def note(self, pruned: IntArray) -> None:
+        """Books landmarks that the front-end dropped.
 
-        What a dropped landmark said stays in the graph, but it is no longer told.
+        What they said stays in the graph, but they are no longer told.
         """
-        for identity in rejected.ids.tolist():
-            if identity in self.tracks:
-                self.tracks[identity].rejections += 1
         for identity in pruned.tolist():
             self.tracks.pop(identity, None)
 
-    def contradicted(self, rejected: Observations) -> Observations:
+    def contradicted(self, rejected: Observations, wTc: FloatArray) -> Observations:
         """Those rejected observations whose landmark must have moved: they start it anew.
 
-        To be asked before :meth:`note` counts this frame's rejections.
+        It has when it was rejected in several frames in a row, and they agree on where it is: wrong
+        matches do not.
+
+        Args:
+            rejected: a frame's matched observations that do not fit.
+            wTc: (4, 4) the frame's pose.
         """
         after = self._settings.contradicted_after
-        if after == 0:
+        if after == 0 or not len(rejected):
             return rejected.select(np.zeros(len(rejected), np.bool_))
-        moved = [
-            identity in self.tracks and self.tracks[identity].rejections + 1 >= after
-            for identity in rejected.ids.tolist()
-        ]
-        return rejected.select(np.array(moved, np.bool_))
+        local = triangulate(self._sensor, rejected.measurement)
+        spread = triangulation_covariance(self._sensor, rejected.measurement, rejected.covariance)
+        places = transform_to_world(wTc, local)
+        covariances = congruence(wTc[:3, :3], spread)
+        moved = np.zeros(len(rejected), np.bool_)
+        for i, identity in enumerate(rejected.ids.tolist()):
+            track = self.tracks.get(identity)
+            if track is not None:
+                track.elsewhere.append((places[i], covariances[i]))
+                moved[i] = len(track.elsewhere) >= after and _agree(track.elsewhere[-after:])
+        return rejected.select(moved)
 
     def start_anew(self, identities: Iterable[int], why: str) -> None:
         """Closes the variables of landmarks; their next sighting begins new ones."""
@@ -290,7 +307,7 @@ class GraphBuilder:
                 track = self.tracks[identity] = Track(self._settings.least_parallax, sighting)
             track.last = sighting
             track.sightings += 1
-            track.rejections = 0
+            track.elsewhere.clear()
             if track.variable >= 0:
                 self._observe(new, track, sighting)
             else:
@@ -344,6 +361,16 @@ class GraphBuilder:
         if self._remember:
             self.graph.add(factor)
         return int(self.graph.size()) - 1
+
+
+def _agree(places: list[tuple[FloatArray, FloatArray]]) -> bool:
+    """Whether positions (3,) with covariances (3, 3) may be one place, each beside the last."""
+    last, uncertainty = places[-1]
+    for place, covariance in places[:-1]:
+        offset = place - last
+        if offset @ np.linalg.solve(covariance + uncertainty, offset) > _SAME_PLACE:
+            return False
+    return True
 
 
 def _parallax(rays: FloatArray, covariances: FloatArray) -> FloatArray:

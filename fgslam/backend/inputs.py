@@ -1,6 +1,6 @@
 """What an estimator was given, frame by frame: the state of those that cannot show their inside.
 
-Of the tracking only what smoothers use is kept: pose, covariance, inliers.
+Of the tracking only what smoothers use is kept: pose, covariance, inliers, residuals.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ class RecordedInputs:
             "inliers": np.concatenate(
                 [np.empty(0, np.bool_), *(t.inliers for t in self.trackings)]
             ),
+            "residuals": np.concatenate([np.empty(0), *(t.residuals for t in self.trackings)]),
             "motion_known": known,
             "motion": np.array([m.motion for m in given]).reshape(-1, 4, 4),
             "motion_covariance": np.array([m.covariance for m in given]).reshape(-1, 6, 6),
@@ -72,6 +73,7 @@ class RecordedInputs:
         log = MeasurementLog.from_arrays(logged, "the smoother's saved state")
         ends = np.cumsum(state["matches"])[:-1]
         inliers = np.split(state["inliers"], ends)
+        residuals = np.split(state["residuals"], ends)
         row = np.cumsum(state["motion_known"]) - 1
         out = RecordedInputs()
         for k, increment in enumerate(log):
@@ -79,7 +81,7 @@ class RecordedInputs:
                 state["wTc"][k],
                 state["covariance"][k],
                 inliers[k],
-                np.full(len(inliers[k]), np.nan),
+                residuals[k],
                 EgoMotionStatus.OK,
                 0,
             )

@@ -32,6 +32,8 @@ from fgslam.geometry import (
 )
 from fgslam.settings.backend import GraphSettings, LandmarkKalmanSettings
 from fgslam.types import (
+    BoolArray,
+    CameraRig,
     EgoMotion,
     Estimate,
     FloatArray,
@@ -66,7 +68,7 @@ class Smoother(ABC):
         """Starts at the prior pose with an empty map; ``remember`` as GraphBuilder's."""
         self._sensor = sensor
         self._floor = floor
-        self._gate = settings.gate
+        self._gate_px = settings.gate_px
         self._start = prior
         self._tracker = LandmarkKalman(sensor, LandmarkKalmanSettings(), prior)
         self._builder = GraphBuilder(sensor, settings, floor, prior, remember)
@@ -163,14 +165,22 @@ class Smoother(ABC):
         """The frame with those observations that fit; landmarks that moved have started anew."""
         observed = increment.observations
         matched = observed.select(~observed.is_new)
-        used = tracking.inliers if self._gate else np.ones(len(matched), np.bool_)
-        rejected = matched.select(~used)
-        moved = self._held(self._builder.contradicted(rejected))
+        used = self._within_gate(tracking)
+        rejected = self._held(matched.select(~used))
+        self._builder.note(increment.pruned_ids)
+        moved = self._builder.contradicted(rejected, tracking.wTc)
         self._restart(moved)
-        self._builder.note(rejected, increment.pruned_ids)
         accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
         frame = len(self._inputs.increments) - 1
         return TrackedFrame(frame, tracking.wTc, motion, self._held(accepted))
+
+    def _within_gate(self, tracking: EgoMotion) -> BoolArray:
+        """Which matched observations are used."""
+        if self._gate_px == 0.0:
+            return np.ones(len(tracking.inliers), np.bool_)
+        if not isinstance(self._sensor, CameraRig):
+            return tracking.inliers
+        return tracking.inliers | (tracking.residuals <= self._gate_px)
 
     def _held(self, observed: Observations) -> Observations:
         """Those of landmarks that are in the map, pruned ones no longer."""
@@ -178,7 +188,7 @@ class Smoother(ABC):
 
     def _restart(self, moved: Observations) -> None:
         """Landmarks that were contradicted too often begin anew where they are seen now."""
-        why = "was rejected in frame after frame (moved, or matched wrongly): started anew"
+        why = "was seen elsewhere in frame after frame: moved, started anew"
         self._builder.start_anew(moved.ids.tolist(), why)
         self._tracker.restart(moved)
         for identity in moved.ids.tolist():

@@ -71,13 +71,15 @@ class GraphSettings(NamedSettings):
 
     floor: FloorSettings = FloorSettings()
     kernel: KernelSettings = KernelSettings()
-    gate: Annotated[
-        bool,
+    gate_px: Annotated[
+        float,
         Field(
-            description="leave out matches that the frame's own least squares rejected, as the "
-            "filter does; off, the kernel alone deals with them"
+            ge=0.0,
+            description="matches that the frame's own least squares rejected are left out where "
+            "their image residual exceeds this; nearer ones may be right, and the map have "
+            "drifted: the kernel deals with them. A range sensor's are all left out. 0: none is",
         ),
-    ] = True
+    ] = 12.0
     least_sightings: Annotated[
         int,
         Field(ge=1, description="frames in which a landmark is seen before it enters the graph"),
@@ -106,8 +108,8 @@ class GraphSettings(NamedSettings):
         int,
         Field(
             ge=0,
-            description="rejected in so many frames in a row, a landmark counts as moved and "
-            "starts anew; 0: never",
+            description="left out in so many frames in a row, which agree on another place, a "
+            "landmark counts as moved and starts anew; 0: never",
         ),
     ] = 3
 
@@ -254,13 +256,10 @@ class BatchSettings(GraphSettings):
 
     kind: Literal["batch"] = "batch"
     kernel: KernelSettings = KernelSettings("cauchy", 3.0)
-    gate: Annotated[
-        bool,
-        Field(
-            description="leave out matches that the frame's own least squares rejected; off, the "
-            "whole problem decides"
-        ),
-    ] = False
+    gate_px: Annotated[
+        float,
+        Field(ge=0.0, description="as isam2's; 0: the whole problem decides what fits"),
+    ] = 0.0
     trim: Annotated[
         bool,
         Field(
