@@ -71,7 +71,8 @@ def trimmed(graph: Any, values: Any, params: Any) -> tuple[Any, Any]:
     """
     rough = solver_parameters(params.getMaxIterations(), _ROUGH)
     values = gtsam.LevenbergMarquardtOptimizer(graph, values, rough).optimize()
-    factors = [graph.at(row) for row in range(graph.size())]
+    # A robust factor whitens with its kernel's weight, after which everything would seem to fit.
+    factors = [_plain(graph.at(row)) for row in range(graph.size())]
     fits: list[bool] = []
     for _ in range(_ROUNDS):
         before, fits = fits, [_fits(factor, values) for factor in factors]
@@ -80,13 +81,13 @@ def trimmed(graph: Any, values: Any, params: Any) -> tuple[Any, Any]:
         kept = gtsam.NonlinearFactorGraph()
         for factor, fit in zip(factors, fits, strict=True):
             if fit:
-                kept.add(_plain(factor))
+                kept.add(factor)
         values = gtsam.LevenbergMarquardtOptimizer(kept, values, params).optimize()
     return values, kept
 
 
 def _fits(factor: Any, values: Any) -> bool:
-    """Whether a factor is no landmark observation, or one within the gate."""
+    """Whether a plain factor is no landmark observation, or one within the gate."""
     if _landmark(factor) is None:
         return True
     residual = factor.whitenedError(values)
