@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.backend.marginals import GraphMarginals
+from fgslam.backend.marginals import marginals_of
 from fgslam.errors import EstimatorError
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.floor import Floor
@@ -54,7 +54,7 @@ def solution(
     poses, points = poses_of(values, frames), points_of(values, variables)
     kept = np.full((len(poses), 6, 6), np.nan)
     try:
-        marginals = GraphMarginals.of(graph, values)
+        marginals = marginals_of(graph, values)
         by_key = dict(zip(marginals.landmark_keys.tolist(), marginals.landmarks(), strict=True))
         covariances = {v: by_key[landmark_key(v)] for v in variables}
         kept[frames] = allowed_parts(floor, poses[frames], marginals.poses())
@@ -74,7 +74,7 @@ def allowed_parts(floor: Floor, poses: FloatArray, covariances: FloatArray) -> F
 
 def joint_of(graph: Any, values: Any, floor: Floor, frame: int, variables: list[int]) -> FloatArray:
     """Joint covariance (6 + 3k, 6 + 3k) of a frame's pose and landmark variables."""
-    marginals = GraphMarginals.of(graph, values)
+    marginals = marginals_of(graph, values)
     pose = int(np.searchsorted(marginals.pose_keys, pose_key(frame)))
     keys = np.array([landmark_key(v) for v in variables], np.int64)
     rows: IntArray = np.searchsorted(marginals.landmark_keys, keys).astype(np.int64)

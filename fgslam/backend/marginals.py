@@ -12,13 +12,52 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.linalg import lapack, solve_triangular
+from scipy.linalg import cho_solve_banded, cholesky_banded, lapack, solve_triangular
 from scipy.sparse import csc_matrix, csr_matrix
 
 from fgslam.errors import EstimatorError
 from fgslam.factors.keys import is_pose
 from fgslam.geometry import inverse_spd3
 from fgslam.types import FloatArray, IntArray
+
+_UNDETERMINED = "the measurements do not determine all variables; no covariances"
+
+
+@dataclass(frozen=True, eq=False)
+class LinearSystem:
+    """A linearised graph: sparse information matrix, landmarks before poses, keys ascending."""
+
+    pose_keys: IntArray
+    landmark_keys: IntArray
+    information: csr_matrix
+
+    @property
+    def columns(self) -> int:
+        """How many rows and columns are landmarks'."""
+        return 3 * len(self.landmark_keys)
+
+    @staticmethod
+    def of(graph: Any, values: Any) -> LinearSystem:
+        """Linearises a nonlinear graph at ``values``; robust kernels weigh as they do there."""
+        keys = np.array(list(values.keys()), np.uint64)
+        poses = np.array([is_pose(int(key)) for key in keys], np.bool_)
+        size = 3 * int((~poses).sum()) + 6 * int(poses.sum())
+        information = _information(graph.linearize(values), size)
+        return LinearSystem(
+            keys[poses].astype(np.int64), keys[~poses].astype(np.int64), information
+        )
+
+
+def marginals_of(graph: Any, values: Any) -> GraphMarginals | ChainMarginals:
+    """Marginals of a graph of poses in a chain and landmarks; the larger group goes first.
+
+    Raises:
+        EstimatorError: the measurements do not determine all variables.
+    """
+    system = LinearSystem.of(graph, values)
+    if 6 * len(system.pose_keys) > system.columns:
+        return ChainMarginals.of(system)
+    return GraphMarginals.of(system)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,16 +78,13 @@ class GraphMarginals:
     pose_information: FloatArray
 
     @staticmethod
-    def of(graph: Any, values: Any) -> GraphMarginals:
-        """Linearises a nonlinear graph at ``values``; robust kernels weigh as they do there.
+    def of(system: LinearSystem) -> GraphMarginals:
+        """Eliminates the landmarks.
 
         Raises:
             EstimatorError: a landmark is not determined by its observations.
         """
-        keys = np.array(list(values.keys()), np.uint64)
-        poses = np.array([is_pose(int(key)) for key in keys], np.bool_)
-        columns = 3 * int((~poses).sum())
-        information = _information(graph.linearize(values), columns + 6 * int(poses.sum()))
+        columns, information = system.columns, system.information
         own = _diagonal_blocks(information[:columns, :columns])
         if information[:columns, :columns].nnz > 9 * len(own):
             raise EstimatorError("landmarks depend on each other directly; no joint elimination")
@@ -61,10 +97,7 @@ class GraphMarginals:
         if columns:
             eliminated = coupling @ _block_diagonal(inverse) @ coupling.T
             reduced -= eliminated.toarray()
-        order = np.int64
-        return GraphMarginals(
-            keys[poses].astype(order), keys[~poses].astype(order), own, coupling, reduced
-        )
+        return GraphMarginals(system.pose_keys, system.landmark_keys, own, coupling, reduced)
 
     @cached_property
     def pose_covariance(self) -> FloatArray:
@@ -119,6 +152,72 @@ class GraphMarginals:
         return rows, seen
 
 
+@dataclass(frozen=True, eq=False)
+class ChainMarginals:
+    """The same where poses are many and landmarks few: the chain of poses is eliminated first.
+
+    Poses are tied to their neighbours only, by odometry, so their block is a band, and its
+    Cholesky decomposition and the diagonal blocks of its inverse cost a constant a pose.
+
+    Attributes:
+        pose_keys, landmark_keys: ascending.
+        own: (n, 6, 6) covariances of the poses given the landmarks.
+        gain: (6n, 3m) how the poses' mean follows the landmarks, negated.
+        landmark_covariance: (3m, 3m) joint of all landmarks.
+    """
+
+    pose_keys: IntArray
+    landmark_keys: IntArray
+    own: FloatArray
+    gain: FloatArray
+    landmark_covariance: FloatArray
+
+    @staticmethod
+    def of(system: LinearSystem) -> ChainMarginals:
+        """Eliminates the poses.
+
+        Raises:
+            EstimatorError: poses are not in a chain, or not determined.
+        """
+        columns, information = system.columns, system.information
+        band, size = _scaled_band(information[columns:, columns:])
+        try:
+            factor = cholesky_banded(band, lower=True, check_finite=False)
+        except np.linalg.LinAlgError:
+            raise EstimatorError(_UNDETERMINED) from None
+        coupling = information[columns:, :columns].toarray() / size[:, None]
+        gain = cho_solve_banded((factor, True), coupling, check_finite=False)
+        reduced = information[:columns, :columns].toarray() - coupling.T @ gain
+        covariance = np.empty((0, 0))
+        if columns:
+            covariance = _from_cholesky(*_scaled_cholesky(reduced))
+        blocks = size.reshape(-1, 6)
+        own = _inverse_blocks(factor) / (blocks[:, :, None] * blocks[:, None, :])
+        return ChainMarginals(
+            system.pose_keys, system.landmark_keys, own, gain / size[:, None], covariance
+        )
+
+    def poses(self) -> FloatArray:
+        """(n, 6, 6) marginals, in the order of ``pose_keys``."""
+        gain = self.gain.reshape(len(self.own), 6, -1)
+        return np.asarray(self.own + gain @ self.landmark_covariance @ np.swapaxes(gain, 1, 2))
+
+    def landmarks(self) -> FloatArray:
+        """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
+        m = len(self.landmark_keys)
+        every = np.arange(m)
+        return np.asarray(self.landmark_covariance.reshape(m, 3, m, 3)[every, :, every, :])
+
+    def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
+        """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by row of the key lists."""
+        columns = (3 * landmarks[:, None] + np.arange(3)).ravel()
+        gain = self.gain[6 * pose : 6 * pose + 6]
+        cross = -(gain @ self.landmark_covariance[:, columns])
+        own = self.own[pose] + gain @ self.landmark_covariance @ gain.T
+        among = self.landmark_covariance[np.ix_(columns, columns)]
+        return np.block([[own, cross], [cross.T, among]])
+
+
 class DenseMarginals:
     """Covariances of a small graph, whatever its factors: one dense Cholesky decomposition."""
 
@@ -157,6 +256,39 @@ class DenseMarginals:
         return np.asarray(half.T @ half)
 
 
+def _scaled_band(matrix: csr_matrix) -> tuple[FloatArray, FloatArray]:
+    """Lower band (12, 6n) of a chain's information, scaled to a unit diagonal, and the scale."""
+    entries = matrix.tocoo()
+    distance = entries.row - entries.col
+    if len(distance) and np.abs(entries.row // 6 - entries.col // 6).max() > 1:
+        raise EstimatorError("poses depend on others than their neighbours; no elimination")
+    size = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
+    if not (size > 0.0).all():
+        raise EstimatorError(_UNDETERMINED)
+    band = np.zeros((12, len(size)))
+    lower = distance >= 0
+    row, column = entries.row[lower], entries.col[lower]
+    band[distance[lower], column] = entries.data[lower] / (size[row] * size[column])
+    return band, size
+
+
+def _inverse_blocks(factor: FloatArray) -> FloatArray:
+    """(n, 6, 6) diagonal blocks of the inverse of a matrix with banded Cholesky factor (12, 6n)."""
+    n = factor.shape[1] // 6
+    row, column = np.tril_indices(6)
+    below, beside = np.indices((6, 6)).reshape(2, -1)
+    starts = 6 * np.arange(n)[:, None]
+    own, next_to = np.zeros((n, 6, 6)), np.zeros((n, 6, 6))
+    own[:, row, column] = factor[row - column, starts + column]
+    next_to[:, below, beside] = factor[6 + below - beside, starts + beside]
+    inverse = np.linalg.inv(own)
+    carried = next_to @ inverse
+    out = np.swapaxes(inverse, 1, 2) @ inverse
+    for k in range(n - 2, -1, -1):
+        out[k] += carried[k].T @ out[k + 1] @ carried[k]
+    return out
+
+
 def _scaled_cholesky(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Lower Cholesky factor of a positive definite matrix scaled to a unit diagonal, and the scale.
 
@@ -164,10 +296,10 @@ def _scaled_cholesky(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     size = np.sqrt(np.maximum(np.diagonal(information), 0.0))
     if not (size > 0.0).all():
-        raise EstimatorError("a variable has no measurement at all; no covariances")
+        raise EstimatorError(_UNDETERMINED)
     factor, status = lapack.dpotrf(information / np.outer(size, size), lower=1, overwrite_a=1)
     if status != 0:
-        raise EstimatorError("the measurements do not determine all variables; no covariances")
+        raise EstimatorError(_UNDETERMINED)
     return factor, size
 
 

@@ -14,12 +14,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from fgslam.backend.graph_builder import GraphBuilder, NewFactors, Sighting
-from fgslam.backend.graph_solution import Solution
+from fgslam.backend.graph_solution import Solution, poses_of_frame
 from fgslam.backend.inputs import RecordedInputs
 from fgslam.backend.landmark_kalman import LandmarkKalman
 from fgslam.backend.segments import TrackedFrame
 from fgslam.errors import EstimatorError
-from fgslam.factors.keys import landmark_key
+from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.floor import Floor
 from fgslam.geometry import (
     adjoint,
@@ -76,6 +76,7 @@ class Smoother(ABC):
         self._smoothed = prior
         self._remarks: list[str] = []
         self._answer: Solution | None = None
+        self._anchors: dict[int, FloatArray] = {}
         self._frozen: dict[int, tuple[FloatArray, FloatArray]] = {}
 
     # -- the protocol ------------------------------------------------------------------------
@@ -196,13 +197,37 @@ class Smoother(ABC):
 
     def _enter(self, tracked: TrackedFrame) -> NewFactors:
         """Enters a frame into the graph."""
+        self._anchors[tracked.frame] = tracked.wTc
         return self._builder.add(tracked, self._tracker.landmarks())
 
     def _take_over(self, values: Any, current: Prediction) -> None:
         """Lets the tracker go on from smoothed values."""
         ids, positions = self._positions(values)
+        waiting_ids, waiting_positions = self._waiting(values)
         self._smoothed = current
-        self._tracker.correct(current, ids, positions)
+        self._tracker.correct(
+            current,
+            np.concatenate([ids, waiting_ids]),
+            np.concatenate([positions, waiting_positions]),
+        )
+
+    def _waiting(self, values: Any) -> tuple[IntArray, FloatArray]:
+        """Landmarks outside the graph, moved along with the pose that saw them last."""
+        last_seen: dict[int, list[int]] = {}
+        for identity, track in self._builder.waiting():
+            last_seen.setdefault(track.last.frame, []).append(identity)
+        known = self._tracker.landmarks()
+        ids, positions = [np.empty(0, np.int64)], [np.empty((0, 3))]
+        anchors = {}
+        for frame, identities in last_seen.items():
+            if values.exists(pose_key(frame)):
+                anchors[frame] = poses_of_frame(values, frame)
+                moved = anchors[frame] @ inverse(self._anchors[frame])
+                ids.append(np.array(identities, np.int64))
+                before = known.positions[known.rows(ids[-1])]
+                positions.append(transform_to_world(moved, before))
+        self._anchors = anchors
+        return np.concatenate(ids), np.concatenate(positions)
 
     def _positions(self, values: Any) -> tuple[IntArray, FloatArray]:
         """Identities and positions of the tracker's landmarks that ``values`` hold."""
