@@ -64,18 +64,28 @@ def fill_between(
     start = _starting_poses(poses, frames, motions)
     located, information = _locate(sensor, solved, frames, start, variable_of)
     values, marginals = _chain(floor, poses, frames, motions, located, information)
-    last = 0
-    for frame in range(total):
-        if np.isfinite(poses[frame, 0, 0]):
-            last = frame
-            continue
+    in_graph = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
+    for frame in np.setdiff1d(np.arange(total), in_graph).tolist():
         key = pose_key(frame)
         poses[frame] = values.atPose3(key).matrix()
-        # Given the graph's poses, and what those are uncertain by.
-        carried = congruence(adjoint(inverse(poses[frame]) @ poses[last]), covariances[last])
+        after = int(np.searchsorted(in_graph, frame))
+        carried = _carried(poses, covariances, frame, in_graph[max(after - 1, 0) : after + 1])
         own = np.array(marginals.marginalCovariance(key)) + carried
         covariances[frame] = allowed_parts(floor, poses[frame][None], own[None])[0]
     return Solution(poses, covariances, solved.points, solved.point_covariances, solved.remark)
+
+
+def _carried(
+    poses: FloatArray, covariances: FloatArray, frame: int, neighbours: IntArray
+) -> FloatArray:
+    """What a frame's pose (6, 6) is uncertain by although its neighbours in the graph are held.
+
+    The frame hangs on both; that of the less certain one is the safe answer.
+    """
+    carried = [
+        congruence(adjoint(inverse(poses[frame]) @ poses[k]), covariances[k]) for k in neighbours
+    ]
+    return max(carried, key=lambda covariance: float(np.trace(covariance)))
 
 
 def _starting_poses(

@@ -37,6 +37,7 @@ from fgslam.types import (
 )
 
 _ITERATIONS = 2  # of Gauss-Newton; the map is a fraction of a pixel away
+_LEAST_OBSERVATIONS = 6  # of a frame whose place in its block is known: fewer, and it is odometry's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,10 +154,11 @@ class Segments:
         if (tracked.frame + 1) % self._every:
             return None
         block, self._block = self._block, []
-        middle = block[len(block) // 2]
-        self.between = [frame for frame in self.between if frame.frame != middle.frame]
         held = [_held(frame, landmarks) for frame in block]
-        fused = summarise(self._sensor, held, middle, landmarks)
+        middle = _middle(held)
+        self.between = [frame for frame in self.between if frame.frame != middle.frame]
+        placed = [frame for frame in held if frame is middle or _is_placed(frame)]
+        fused = summarise(self._sensor, placed, middle, landmarks)
         return self._entering(middle, fused, tracked.frame - middle.frame)
 
     def forget(self, identities: list[int]) -> None:
@@ -171,6 +173,22 @@ class Segments:
         since, self._motions = self._motions[:here], self._motions[here:]
         motion = compose_odometry(since) if since else None
         return TrackedFrame(frame.frame, frame.wTc, motion, accepted)
+
+
+def _is_placed(frame: TrackedFrame) -> bool:
+    """Whether a frame saw enough of the map for the tracker to place it beside the others."""
+    return len(frame.accepted) >= _LEAST_OBSERVATIONS
+
+
+def _middle(block: list[TrackedFrame]) -> TrackedFrame:
+    """The frame nearest to the middle of those that are placed; of all where none is.
+
+    The fused observations claim to be its own: a blind frame, whose pose is the odometry's, would
+    pass for one that saw what its neighbours saw.
+    """
+    centre = len(block) // 2
+    order = sorted(range(len(block)), key=lambda i: (not _is_placed(block[i]), abs(i - centre)))
+    return block[order[0]]
 
 
 def _held(frame: TrackedFrame, landmarks: LandmarkMap) -> TrackedFrame:
