@@ -1,4 +1,4 @@
-"""What the tests of the smoothers share: drives that go wrong in one way, and judging of answers."""
+"""What the tests of the smoothers share: drives that go wrong in one way, and their judging."""
 
 from __future__ import annotations
 

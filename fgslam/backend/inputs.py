@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fgslam.errors import EstimatorError
 from fgslam.measurement_log import MeasurementLog
 from fgslam.types import (
     EgoMotion,
@@ -20,6 +21,26 @@ from fgslam.types import (
     Sensor,
     StateArrays,
 )
+
+
+def require_finite(increment: Increment, tracking: EgoMotion, motion: Odometry | None) -> None:
+    """Refuses numbers that are not finite: in a solver one of them would spoil all others.
+
+    Raises:
+        EstimatorError: which kind of number, and in which frame.
+    """
+    observed = increment.observations
+    given = {
+        "measurement": [observed.measurement, observed.covariance],
+        "tracked pose": [tracking.wTc, tracking.covariance],
+        "motion": [] if motion is None else [motion.motion, motion.covariance],
+    }
+    for what, arrays in given.items():
+        if not all(np.isfinite(array).all() for array in arrays):
+            raise EstimatorError(
+                f"frame {increment.index}: the {what} or its covariance is not finite; "
+                "look at that frame with fgslam inspect"
+            )
 
 
 @dataclass(slots=True, eq=False)

@@ -15,7 +15,7 @@ import numpy as np
 
 from fgslam.backend.graph_builder import GraphBuilder, NewFactors, Sighting
 from fgslam.backend.graph_solution import Solution, poses_of_frame
-from fgslam.backend.inputs import RecordedInputs
+from fgslam.backend.inputs import RecordedInputs, require_finite
 from fgslam.backend.landmark_kalman import LandmarkKalman
 from fgslam.backend.segments import TrackedFrame
 from fgslam.errors import EstimatorError
@@ -92,8 +92,14 @@ class Smoother(ABC):
     def update(
         self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
     ) -> UpdateStats:
-        """Tracks the frame, adds it to the graph, solves the graph if it is time to."""
+        """Tracks the frame, adds it to the graph, solves the graph if it is time to.
+
+        Raises:
+            EstimatorError: a number is not finite, or time does not increase; the state is then as
+                before. Or the solver failed beyond mending; the estimator is then at its end.
+        """
         motion = increment.odometry if increment.odometry is not None else motion
+        require_finite(increment, tracking, motion)
         stats = self._tracker.update(increment, tracking)
         self._inputs.append(increment, tracking, motion)
         self._answer = None
