@@ -32,8 +32,8 @@ def require_finite(increment: Increment, tracking: EgoMotion, motion: Odometry |
     observed = increment.observations
     given = {
         "measurement": [observed.measurement, observed.covariance],
-        "tracked pose": [tracking.wTc, tracking.covariance],
         "motion": [] if motion is None else [motion.motion, motion.covariance],
+        "tracked pose": [tracking.wTc, tracking.covariance],
     }
     for what, arrays in given.items():
         if not all(np.isfinite(array).all() for array in arrays):
