@@ -60,7 +60,8 @@ def _one_direction(directions: FloatArray, sigma: float) -> Any:
     """Noise model that weighs only the components along orthonormal ``directions`` (3, m)."""
     root = np.zeros((3, 3))
     root[: directions.shape[1]] = directions.T / sigma
-    return gtsam.noiseModel.Gaussian.SqrtInformation(root)
+    # GTSAM's shortcut for diagonal roots looks above the diagonal only; see the derivation.
+    return gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
 
 
 def weak_point_prior(landmark: int, position: FloatArray, sigma: float) -> Any:

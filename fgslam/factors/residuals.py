@@ -1,0 +1,181 @@
+"""What each factor measures, as pure functions of poses and points: no graph, no noise, no solver.
+
+The specification that the C++ factors are tested against (docs/derivations/factors.md). All
+residuals are *predicted minus measured*. Poses are (4, 4), points (3,) in the world, metres; the
+tangent space of a pose is [rotation, translation] on the right, ``T * Exp(xi)``.
+
+A point that is not in front of a camera has no image. GTSAM then answers twice the focal length
+for every coordinate and a Jacobian of zero, and so do these functions: such a factor adds to the
+cost and pulls at nothing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.floor import Floor
+from fgslam.geometry import (
+    inverse,
+    measurement_difference,
+    project,
+    se3_log,
+    so3_log,
+    transform_to_camera,
+)
+from fgslam.range_bearing import triangulate, triangulation_jacobian
+from fgslam.stereo_model import vertical_to_horizontal
+from fgslam.types import CameraRig, FloatArray, RangeBearingSensor
+
+# --------------------------------------------------------------------------------------------
+# Cameras
+
+
+def stereo(rig: CameraRig, wTc: FloatArray, point: FloatArray, measured: FloatArray) -> FloatArray:
+    """Residual (3,) of (column, row, disparity), pixels (Se et al. 2.2).
+
+    Args:
+        rig: the cameras; ``wTc`` is the right one's pose.
+        wTc: pose.
+        point: world point.
+        measured: (3,) column, row, disparity.
+    """
+    predicted = _image(rig, wTc, point)
+    return _behind(rig, 3) if predicted is None else np.asarray(predicted - measured)
+
+
+def stereo_coordinates(
+    rig: CameraRig, wTc: FloatArray, point: FloatArray, measured: FloatArray
+) -> FloatArray:
+    """Residual (3,) of GTSAM's (u_left, u_right, v), pixels; linear in :func:`stereo`'s.
+
+    Arguments as there: ``measured`` is (column, row, disparity), of the right camera.
+    """
+    predicted = _image(rig, wTc, point)
+    if predicted is None:
+        return _behind(rig, 3)
+    column, row, disparity = predicted - measured
+    return np.array([column + disparity, column, row])
+
+
+def pair(
+    rig: CameraRig, wTc: FloatArray, point: FloatArray, right: FloatArray, left: FloatArray
+) -> FloatArray:
+    """Residual (3,) of (u_left, u_right, v) of raw pixels (2,), v the mean of both rows, pixels."""
+    row = 0.5 * (right[1] + left[1])
+    return stereo_coordinates(rig, wTc, point, np.array([right[0], row, left[0] - right[0]]))
+
+
+def top(rig: CameraRig, wTc: FloatArray, point: FloatArray, pixel: FloatArray) -> FloatArray:
+    """Residual (2,) of the top camera's (column, row), pixels; ``wTc`` is the right camera's."""
+    predicted = _image(rig, wTc, point)
+    if predicted is None:
+        return _behind(rig, 2)
+    column, row, disparity = predicted
+    return np.array([column, row + disparity / vertical_to_horizontal(rig)]) - pixel
+
+
+def _image(rig: CameraRig, wTc: FloatArray, point: FloatArray) -> FloatArray | None:
+    local = transform_to_camera(wTc, point[None, :])
+    return project(rig, local)[0] if local[0, 2] > 0.0 else None
+
+
+def _behind(rig: CameraRig, coordinates: int) -> FloatArray:
+    return np.full(coordinates, 2.0 * rig.fx)
+
+
+# --------------------------------------------------------------------------------------------
+# Range and bearing
+
+
+def range_bearing(
+    sensor: RangeBearingSensor, wTc: FloatArray, point: FloatArray, measured: FloatArray
+) -> FloatArray:
+    """Residual (3,) of (azimuth, elevation, range), radians and metres, the azimuth wrapped.
+
+    The point must lie off the sensor's vertical axis.
+    """
+    predicted = project(sensor, transform_to_camera(wTc, point[None, :]))
+    return np.asarray(measurement_difference(sensor, predicted, measured[None, :])[0])
+
+
+def range_bearing_on_sphere(wTc: FloatArray, point: FloatArray, measured: FloatArray) -> FloatArray:
+    """Residual (4,): the turn from the measured to the predicted direction (3,), then the range.
+
+    The direction's part is a vector in the sensor's axes, perpendicular to the measured
+    direction, as long as the angle between both, radians: the sphere's logarithm. It knows
+    neither poles nor jumps of the azimuth.
+
+    Args:
+        wTc: pose of the sensor.
+        point: world point, away from the sensor's centre.
+        measured: (3,) azimuth, elevation, range.
+    """
+    local = transform_to_camera(wTc, point[None, :])[0]
+    distance = float(np.linalg.norm(local))
+    unit = np.array([measured[0], measured[1], 1.0])
+    turn = turn_between(triangulate(unit[None, :])[0], local / distance)
+    return np.append(turn, distance - measured[2])
+
+
+def range_bearing_as_image(wTc: FloatArray, point: FloatArray, measured: FloatArray) -> FloatArray:
+    """Residual (3,) of a camera that looks along the measured bearing, to first order the same.
+
+    Tangents of the angles towards growing azimuth and elevation, and the inverse of the distance
+    along the bearing, 1/m. A right angle away or more there is no image: the
+    constant that GTSAM's (u_left, u_right, v) = (2, 2, 2) is in these directions.
+
+    Args:
+        wTc: pose of the sensor.
+        point: world point.
+        measured: (3,) azimuth, elevation, range.
+    """
+    sensor_axes = triangulation_jacobian(np.array([[measured[0], measured[1], 1.0]]))[0]
+    axes = sensor_axes / np.linalg.norm(sensor_axes, axis=0)
+    azimuth, elevation, ahead = axes.T @ transform_to_camera(wTc, point[None, :])[0]
+    if ahead <= 0.0:
+        return np.array([2.0, -2.0, 0.0])
+    return np.array([azimuth / ahead, elevation / ahead, 1.0 / ahead - 1.0 / measured[2]])
+
+
+def turn_between(start: FloatArray, end: FloatArray) -> FloatArray:
+    """Logarithm (3,) at the unit vector ``start`` of the unit vector ``end``, radians.
+
+    Half a turn to the exact opposite goes in one of the directions that are equally good.
+    """
+    cosine = float(start @ end)
+    across = end - start * cosine
+    sine = float(np.linalg.norm(across))
+    if sine > 0.0:
+        return np.asarray(across * (np.arctan2(sine, cosine) / sine))
+    return across if cosine > 0.0 else np.asarray(np.pi * np.linalg.svd(start[None, :])[2][1])
+
+
+# --------------------------------------------------------------------------------------------
+# Poses
+
+
+def pose_prior(wTc: FloatArray, prior: FloatArray) -> FloatArray:
+    """Residual (6,) of a pose beside its prior, in the tangent space at the pose."""
+    return se3_log(inverse(prior) @ wTc)
+
+
+def odometry(wTp: FloatArray, wTn: FloatArray, pTn: FloatArray) -> FloatArray:
+    """Residual (6,) of a measured motion ``pTn`` between two poses, in the tangent at the later."""
+    return se3_log(inverse(pTn) @ inverse(wTp) @ wTn)
+
+
+def height(floor: Floor, wTc: FloatArray) -> float:
+    """How far the camera is below the floor's level (Se et al. 5; S27), metres."""
+    return float(floor.down @ wTc[:3, 3])
+
+
+def tilt(floor: Floor, wTc: FloatArray, upright: FloatArray) -> FloatArray:
+    """Tilt (2,) about the world's horizontal directions, from an upright rotation, radians.
+
+    Args:
+        floor: gives the directions.
+        wTc: pose.
+        upright: (3, 3) a rotation about the vertical; any near ``wTc``'s serves.
+    """
+    turn = upright @ so3_log(upright.T @ wTc[:3, :3])
+    return np.asarray(floor.horizontal.T @ turn)
