@@ -176,6 +176,13 @@ class GraphBuilder:
         for identity in pruned.tolist():
             self.tracks.pop(identity, None)
 
+    def confirmed(self, identities: IntArray) -> None:
+        """Books that landmarks were seen where they should be: nothing was said against them."""
+        for identity in identities.tolist():
+            track = self.tracks.get(identity)
+            if track is not None:
+                track.elsewhere.clear()
+
     def contradicted(self, rejected: Observations, wTc: FloatArray) -> Observations:
         """Those rejected observations whose landmark must have moved: they start it anew.
 
@@ -307,7 +314,6 @@ class GraphBuilder:
                 track = self.tracks[identity] = Track(self._settings.least_parallax, sighting)
             track.last = sighting
             track.sightings += 1
-            track.elsewhere.clear()
             if track.variable >= 0:
                 self._observe(new, track, sighting)
             else:

@@ -50,6 +50,8 @@ from fgslam.types import (
     UpdateStats,
 )
 
+_ASTRAY_PX = 12.0  # where nothing is left out: farther off, a match speaks against its landmark
+
 
 class Smoother(ABC):
     """Base of the smoothers; they say when the graph is solved, and how."""
@@ -172,22 +174,22 @@ class Smoother(ABC):
         """The frame with those observations that fit; landmarks that moved have started anew."""
         observed = increment.observations
         matched = observed.select(~observed.is_new)
-        used = self._within_gate(tracking)
-        rejected = self._held(matched.select(~used))
+        used, astray = self._judged(tracking)
         self._builder.note(increment.pruned_ids)
-        moved = self._builder.contradicted(rejected, tracking.wTc)
+        self._builder.confirmed(matched.ids[~astray])
+        moved = self._builder.contradicted(self._held(matched.select(astray)), tracking.wTc)
         self._restart(moved)
+        used &= ~np.isin(matched.ids, moved.ids)
         accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
         frame = len(self._inputs.increments) - 1
         return TrackedFrame(frame, tracking.wTc, motion, self._held(accepted))
 
-    def _within_gate(self, tracking: EgoMotion) -> BoolArray:
-        """Which matched observations are used."""
-        if self._gate_px == 0.0:
-            return np.ones(len(tracking.inliers), np.bool_)
-        if not isinstance(self._sensor, CameraRig):
-            return tracking.inliers
-        return tracking.inliers | (tracking.residuals <= self._gate_px)
+    def _judged(self, tracking: EgoMotion) -> tuple[BoolArray, BoolArray]:
+        """Which matched observations are used, and which speak against their landmark's place."""
+        astray = ~tracking.inliers
+        if isinstance(self._sensor, CameraRig):
+            astray = astray & ~(tracking.residuals <= (self._gate_px or _ASTRAY_PX))
+        return (~astray if self._gate_px else np.ones(len(astray), np.bool_)), astray
 
     def _held(self, observed: Observations) -> Observations:
         """Those of landmarks that are in the map, pruned ones no longer."""
