@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -10,6 +12,7 @@ import pytest
 from hypothesis import settings
 
 from fgslam.errors import MissingDependencyError
+from fgslam.runs.threads import one_blas_thread
 from fgslam.simulation.open3d_library import load_open3d
 
 # A red test must be red again on the next run, and slow machines must not make one red.
@@ -17,6 +20,14 @@ settings.register_profile("fgslam", derandomize=True, deadline=None, print_blob=
 settings.load_profile("fgslam")
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_blas_thread() -> Iterator[None]:
+    """As estimators run in the program, in the tests' own calls and in what they start."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    with one_blas_thread():
+        yield
 
 
 @pytest.fixture(scope="session")

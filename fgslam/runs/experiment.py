@@ -29,6 +29,7 @@ from fgslam.runs.pictures import draw_frame, draw_run, figures_of, frames_to_sho
 from fgslam.runs.recorder import RunRecorder
 from fgslam.runs.rendered_truth import TrueDepth
 from fgslam.runs.report import report_from_folder
+from fgslam.runs.threads import one_blas_thread
 from fgslam.types import Sequence, StereoFeatures
 
 Progress = Callable[[str, int, int], None]
@@ -51,6 +52,7 @@ class RunResult:
     compared: Compared | None = None
 
 
+@one_blas_thread()
 def run_experiment(
     config: ExperimentConfig,
     folder: Path,

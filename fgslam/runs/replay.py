@@ -21,6 +21,7 @@ from fgslam.frontend.ego_motion import EgoMotionSolver
 from fgslam.measurement_log import MeasurementLog
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import ReplayedFrame, replay_frame
+from fgslam.runs.threads import one_blas_thread
 from fgslam.settings.backend import EstimatorSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import EgoMotionSettings
@@ -97,6 +98,7 @@ class Replay:
         return np.array([getattr(row, name) for row in self.rows])
 
 
+@one_blas_thread()
 def replay(
     log: MeasurementLog,
     settings: EstimatorSettings,
