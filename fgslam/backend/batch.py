@@ -72,18 +72,23 @@ class BatchSmoother(Smoother):
         if self._optimised is not None:
             return self._optimised
         for _ in range(_ROUNDS):
-            found, graph = self._minimise(self._builder.kept_factors())
-            frames = self._builder.frames
-            points = points_of(found, self._variables())
-            lost = dict.fromkeys(self._builder.behind(poses_of(found, frames), points), _BEHIND)
-            lost |= dict.fromkeys(self._unseen(graph), _UNSEEN)
+            self._values, graph = self._minimise(self._builder.kept_factors())
+            lost = dict.fromkeys(self._behind(), _BEHIND) | dict.fromkeys(
+                self._unseen(graph), _UNSEEN
+            )
             if not lost:
                 break
             for variable, why in lost.items():
                 self._remarks.append(f"{self._builder.take_out(variable)} {why}: taken out")
                 self._values.erase(landmark_key(variable))
-        self._values, self._optimised = found, graph
+        else:
+            self._values, graph = self._minimise(self._builder.kept_factors())
+        self._optimised = graph
         return graph
+
+    def _behind(self) -> list[int]:
+        poses = poses_of(self._values, self._builder.frames)
+        return self._builder.behind(poses, points_of(self._values, self._variables()))
 
     def _unseen(self, graph: Any) -> list[int]:
         """Variables of which no observation fits the others."""
