@@ -1,4 +1,4 @@
-"""One landmark's Kalman update as a factor graph: prior and measurement, eliminated by GTSAM.
+"""A landmark's Kalman update as a factor graph: prior and measurement, eliminated by GTSAM.
 
 Every landmark is given a copy of the frame's pose of its own, whose prior is the pose's covariance.
 Eliminating the copy leaves ``R + J P J^T`` as the measurement's noise. That the copies know nothing
@@ -18,20 +18,21 @@ from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.types import FloatArray
 
 _POSE, _LANDMARK = pose_key(0), landmark_key(0)
+_UNIT, _ZERO = gtsam.noiseModel.Unit.Create(3), np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Eliminated:
-    """A landmark after its graph's elimination.
+    """Landmarks after their graphs' elimination.
 
     Attributes:
-        step: (3,) its offset from the point of linearisation, metres.
-        covariance: (3, 3) metres squared.
-        misfit: what remains of the squared whitened residual: the innovation squared.
+        steps: (k, 3) their offsets from the points of linearisation, metres.
+        covariances: (k, 3, 3) metres squared.
+        misfit: what remains of the squared whitened residuals: the innovations squared, summed.
     """
 
-    step: FloatArray
-    covariance: FloatArray
+    steps: FloatArray
+    covariances: FloatArray
     misfit: float
 
 
@@ -41,74 +42,89 @@ class LandmarkElimination:
     def __init__(self, pose_covariance: FloatArray | None) -> None:
         """``pose_covariance`` (6, 6) may be singular; None takes the pose as exact."""
         self._root = np.empty((6, 0)) if pose_covariance is None else _root(pose_covariance)
+        self._rank = self._root.shape[1]
         self._order = gtsam.Ordering()
-        if self._root.shape[1]:
+        if self._rank:
             self._order.push_back(_POSE)
         self._order.push_back(_LANDMARK)
+        self._by_itself = np.eye(self._rank), np.zeros(self._rank)
+        self._unit_pose = gtsam.noiseModel.Unit.Create(self._rank)
 
-    def observed(self, factor: Any, values: Any, prior: FloatArray | None) -> Eliminated:
-        """A factor of pose and landmark, and the landmark's prior.
+    def observed(self, linear: list[Any], priors: FloatArray | None) -> Eliminated:
+        """A factor of pose and landmark, and the landmark's prior, for each of them.
 
         Args:
-            factor: GTSAM's, between ``pose_key(0)`` and ``landmark_key(0)``.
-            values: the pose, and the landmark where the prior is centred.
-            prior: (3, 3) covariance of the landmark; None for a new one.
+            linear: GTSAM's factors between ``pose_key(0)`` and ``landmark_key(0)``, linearised
+                at the pose, and at the landmark where its prior is centred.
+            priors: (k, 3, 3) covariances of the landmarks; None for new ones.
         """
-        a, b = factor.linearize(values).jacobian()
-        return self._eliminate(a[:, :6] @ self._root, a[:, 6:], b, prior)
+        systems = [factor.jacobian() for factor in linear]
+        matrices = np.array([a for a, _ in systems]).reshape(-1, 3, 9)
+        by_pose = matrices[:, :, :6] @ self._root
+        known = [None] * len(linear) if priors is None else whitening(priors)
+        given = zip(by_pose, matrices[:, :, 6:], (b for _, b in systems), known, strict=True)
+        return _eliminated([self._graph(*of_one) for of_one in given], self._order)
 
-    def _eliminate(
+    def _graph(
         self,
         by_pose: FloatArray,
         by_landmark: FloatArray,
         rhs: FloatArray,
-        prior: FloatArray | None,
-    ) -> Eliminated:
+        known: FloatArray | None,
+    ) -> Any:
         graph = gtsam.GaussianFactorGraph()
-        rank = by_pose.shape[1]
-        unit = gtsam.noiseModel.Unit.Create
-        if rank:
-            graph.add(_POSE, np.eye(rank), np.zeros(rank), unit(rank))
-            graph.add(_POSE, by_pose, _LANDMARK, by_landmark, rhs, unit(3))
+        if self._rank:
+            matrix, zero = self._by_itself
+            graph.add(_POSE, matrix, zero, self._unit_pose)
+            graph.add(_POSE, by_pose, _LANDMARK, by_landmark, rhs, _UNIT)
         else:
-            graph.add(_LANDMARK, by_landmark, rhs, unit(3))
-        if prior is not None:
-            graph.add(_LANDMARK, whitening(prior), np.zeros(3), unit(3))
-        return _eliminated(gtsam.JacobianFactor(graph, self._order), self._order)
+            graph.add(_LANDMARK, by_landmark, rhs, _UNIT)
+        if known is not None:
+            graph.add(_LANDMARK, known, _ZERO, _UNIT)
+        return graph
 
 
-def fused(prior: FloatArray, offset: FloatArray, noise: FloatArray) -> Eliminated:
-    """A landmark's prior and a position measured ``offset`` (3,) from it with ``noise`` (3, 3)."""
+def fused(priors: FloatArray, offsets: FloatArray, noise: FloatArray) -> Eliminated:
+    """Landmarks' priors, and positions measured ``offsets`` (k, 3) from them with ``noise``."""
     values = gtsam.Values()
-    values.insert(_LANDMARK, np.zeros(3))
-    graph = gtsam.NonlinearFactorGraph()
-    for centre, covariance in ((np.zeros(3), prior), (offset, noise)):
-        model = gtsam.noiseModel.Gaussian.SqrtInformation(whitening(covariance))
-        graph.add(gtsam.PriorFactorPoint3(_LANDMARK, centre, model))
+    values.insert(_LANDMARK, _ZERO)
     order = gtsam.Ordering()
     order.push_back(_LANDMARK)
-    return _eliminated(gtsam.JacobianFactor(graph.linearize(values), order), order)
+    model = gtsam.noiseModel.Gaussian.SqrtInformation
+    graphs = []
+    for known, offset, measured in zip(whitening(priors), offsets, whitening(noise), strict=True):
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(gtsam.PriorFactorPoint3(_LANDMARK, _ZERO, model(known)))
+        graph.add(gtsam.PriorFactorPoint3(_LANDMARK, offset, model(measured)))
+        graphs.append(graph.linearize(values))
+    return _eliminated(graphs, order)
 
 
 def whitening(covariance: FloatArray) -> FloatArray:
-    """Upper triangular W with ``W^T W`` the inverse of a positive definite covariance (n, n).
+    """Upper triangular W with ``W^T W`` the inverse of positive definite covariances (..., n, n).
 
     Upper, because GTSAM's ``SqrtInformation`` takes a lower triangular matrix for its diagonal.
     """
-    upper = np.linalg.cholesky(covariance[::-1, ::-1])[::-1, ::-1]
+    upper = np.linalg.cholesky(covariance[..., ::-1, ::-1])[..., ::-1, ::-1]
     return np.asarray(np.linalg.inv(upper))
 
 
-def _eliminated(joint: Any, order: Any) -> Eliminated:
+def _eliminated(graphs: list[Any], order: Any) -> Eliminated:
     """By QR, the landmark last, so that its rows stand on their own.
 
     Cholesky would square the condition of a far landmark's long ellipsoid.
     """
-    conditional, _ = joint.eliminate(order)
-    inverse, rhs, kept = np.linalg.inv(conditional.R()[-3:, -3:]), joint.getb(), conditional.d()
-    # Q is orthogonal: what the right-hand side lost in length is the residual at the minimum.
-    misfit = max(float(rhs @ rhs - kept @ kept), 0.0)
-    return Eliminated(inverse @ kept[-3:], inverse @ inverse.T, misfit)
+    roots, kept, misfit = np.empty((len(graphs), 3, 3)), np.empty((len(graphs), 3)), 0.0
+    for i, graph in enumerate(graphs):
+        joint = gtsam.JacobianFactor(graph, order)
+        conditional, _ = joint.eliminate(order)
+        rhs, left = joint.getb(), conditional.d()
+        roots[i], kept[i] = conditional.R()[-3:, -3:], left[-3:]
+        # Q is orthogonal: what the right-hand side lost in length is the residual at the minimum.
+        misfit += max(float(rhs @ rhs - left @ left), 0.0)
+    inverse = np.linalg.inv(roots)
+    steps = (inverse @ kept[:, :, None])[:, :, 0]
+    return Eliminated(steps, inverse @ np.swapaxes(inverse, 1, 2), misfit)
 
 
 def _root(covariance: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ docs/derivations/landmark_filter_as_graph.md.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import gtsam
 import numpy as np
@@ -39,6 +39,8 @@ from fgslam.types import (
     Sensor,
     UpdateStats,
 )
+
+_POSE, _LANDMARK = pose_key(0), landmark_key(0)
 
 
 class LandmarkKalmanGraph(LandmarkKalman):
@@ -109,38 +111,35 @@ class LandmarkKalmanGraph(LandmarkKalman):
     def _world_update(self, rows: IntArray, observed: Observations) -> float:
         """Two priors on each landmark: what was known, and the position observed."""
         positions, noise = self._observed_positions(observed)
-        given = zip(self._covariances[rows], positions - self._positions[rows], noise, strict=True)
-        return self._apply(rows, [fused(*of_one) for of_one in given])
+        offsets = positions - self._positions[rows]
+        return self._apply(rows, fused(self._covariances[rows], offsets, noise))
 
     def _observed_positions(self, observed: Observations) -> tuple[FloatArray, FloatArray]:
         """A stereo factor alone, eliminated where it is met exactly."""
         points = triangulate(self._cameras, observed.measurement)
         positions = transform_to_world(self._current.wTc, points)
-        found = self._eliminated(positions, [None] * len(observed), observed)
-        covariances = np.array([one.covariance for one in found]).reshape(-1, 3, 3)
-        return positions, covariances
+        return positions, self._eliminated(positions, None, observed).covariances
 
     def _eliminated(
-        self, positions: FloatArray, priors: Any, observed: Observations
-    ) -> list[Eliminated]:
+        self, positions: FloatArray, priors: FloatArray | None, observed: Observations
+    ) -> Eliminated:
         by_pose = self._current.covariance if self._settings.pose_covariance else None
-        elimination = LandmarkElimination(by_pose)
         factors = StereoFactors(self._cameras, Whitening())
         values = gtsam.Values()
-        values.insert(pose_key(0), gtsam.Pose3(self._current.wTc))
-        values.insert(landmark_key(0), np.zeros(3))
-        out = []
-        given = zip(positions, priors, observed.measurement, observed.covariance, strict=True)
-        for position, prior, measured, noise in given:
-            values.update(landmark_key(0), position)
-            factor = factors.factor(pose_key(0), landmark_key(0), measured, noise)
-            out.append(elimination.observed(factor, values, prior))
-        return out
+        values.insert(_POSE, gtsam.Pose3(self._current.wTc))
+        values.insert(_LANDMARK, np.zeros(3))
+        linear = []
+        for position, measured, noise in zip(
+            positions, observed.measurement, observed.covariance, strict=True
+        ):
+            values.update(_LANDMARK, position)
+            linear.append(factors.factor(_POSE, _LANDMARK, measured, noise).linearize(values))
+        return LandmarkElimination(by_pose).observed(linear, priors)
 
-    def _apply(self, rows: IntArray, found: list[Eliminated]) -> float:
-        self._positions[rows] += np.array([one.step for one in found])
-        self._covariances[rows] = np.array([one.covariance for one in found])
-        return sum(one.misfit for one in found)
+    def _apply(self, rows: IntArray, found: Eliminated) -> float:
+        self._positions[rows] += found.steps
+        self._covariances[rows] = found.covariances
+        return found.misfit
 
 
 def _require_depth(increment: Increment, inliers: BoolArray, world: bool) -> None:
