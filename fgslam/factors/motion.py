@@ -7,13 +7,13 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.factors.noise import STIFF_SIGMA, positive_definite
+from fgslam.factors.noise import STIFF_M, STIFF_RAD, positive_definite
 from fgslam.floor import Floor
 from fgslam.types import FloatArray, Odometry, Prediction
 
 
 def pose_prior(pose: int, prior: Prediction) -> Any:
-    """Prior on a pose ``wTc``; directions without variance are held to ``STIFF_SIGMA``."""
+    """Prior on a pose ``wTc``; directions without variance are held stiffly."""
     model = gtsam.noiseModel.Gaussian.Covariance(positive_definite(prior.covariance))
     return gtsam.PriorFactorPose3(pose, gtsam.Pose3(prior.wTc), model)
 
@@ -41,14 +41,14 @@ def floor_factors(pose: int, floor: Floor, wTc: FloatArray) -> list[Any]:
     """
     if floor.dof == 6:
         return []
-    height_sigma = STIFF_SIGMA if floor.hard else floor.height_sigma_m
+    height_sigma = STIFF_M if floor.hard else floor.height_sigma_m
     origin = np.zeros(3)
     height = gtsam.PoseTranslationPrior3D(
         pose, origin, _one_direction(floor.down[:, None], height_sigma)
     )
     if floor.dof == 5:
         return [height]
-    tilt_sigma = STIFF_SIGMA if floor.hard else floor.tilt_sigma_rad
+    tilt_sigma = STIFF_RAD if floor.hard else floor.tilt_sigma_rad
     upright = floor.constrain(wTc)[:3, :3]
     tilt = gtsam.PoseRotationPrior3D(
         pose, gtsam.Rot3(upright), _one_direction(upright.T @ floor.horizontal, tilt_sigma)

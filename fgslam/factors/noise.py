@@ -15,9 +15,14 @@ from fgslam.types import FloatArray
 
 KernelName: TypeAlias = Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"]
 
-STIFF_SIGMA = 1e-6
-"""Radians and metres: stands for exact. Cholesky keeps nine digits beside it; GTSAM's constrained
-models would be exact, and make every solve fifteen times slower (they need QR)."""
+STIFF_RAD, STIFF_M = 1e-5, 1e-4
+"""Deviations of a hard floor. GTSAM's constrained models would be exact, and make every solve
+fifteen times slower (they need QR). Its Cholesky calls a pose indeterminate that is known some ten
+thousand times worse in one direction than in another, once these are no axes of the camera:
+stiffer, and a blind drive with a pitched camera fails (docs/derivations/factors.md)."""
+
+_EXACT = 1e-6  # radians and metres: the deviation of what has no variance
+_RELATIVE = 1e-3  # of the largest deviation of the same covariance, for the same reason
 
 
 class Whitening:
@@ -60,10 +65,13 @@ def _kernel(name: KernelName, width: float) -> Any:
 
 
 def positive_definite(covariance: FloatArray) -> FloatArray:
-    """A pose covariance (6, 6) whose exactly known directions are known to ``STIFF_SIGMA``."""
+    """A pose covariance (6, 6) whose exactly known directions are held stiffly.
+
+    Their deviation is a micrometre or a microradian, or a thousandth of the largest one.
+    """
     symmetric = 0.5 * (covariance + covariance.T)
     variances, directions = np.linalg.eigh(symmetric)
-    if variances[0] >= STIFF_SIGMA**2:
+    if variances[0] >= _EXACT**2:
         return np.asarray(symmetric)
-    kept = np.maximum(variances, STIFF_SIGMA**2)
+    kept = np.maximum(variances, max(_EXACT**2, _RELATIVE**2 * variances[-1]))
     return np.asarray((directions * kept) @ directions.T)
