@@ -1,0 +1,361 @@
+"""The graph doctor: who waits, who is let in, who starts anew, and what every smoother tells."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from simulated import RIG, Drive, Simulation, observations, play, simulate, tracked_at
+from smoothing import (
+    FREE,
+    PIXELS,
+    SMOOTHERS,
+    answer,
+    assert_finite,
+    ate,
+    build,
+    drawn,
+    keep,
+    moved,
+    run,
+    unseen,
+)
+
+from fgslam import geometry as g
+from fgslam.backend.graph_builder import GraphBuilder
+from fgslam.backend.segments import TrackedFrame
+from fgslam.errors import EstimatorError
+from fgslam.evaluation.consistency import judge, landmark_nees
+from fgslam.factors.keys import is_pose, landmark_key, pose_key
+from fgslam.floor import Floor
+from fgslam.settings.backend import BatchSettings, EstimatorSettings, GraphSettings
+from fgslam.types import Increment, LandmarkMap, Odometry, Prediction
+
+ORIGIN = Prediction(np.eye(4), np.zeros((6, 6)))
+STEP = g.se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.1]))
+GRAPHS = pytest.mark.parametrize("name", SMOOTHERS)
+OFTEN = 28
+"""In the drive of seed 8, a landmark that is seen in nearly every frame from the first on."""
+
+
+def builder(**settings: object) -> GraphBuilder:
+    return GraphBuilder(RIG, GraphSettings(**settings), Floor.under(RIG, 6), ORIGIN)
+
+
+def frame(k: int, points: dict[int, list[float]], is_new: bool = False) -> TrackedFrame:
+    """Frame k of a drive straight ahead, its exact observations of world points."""
+    wTc = np.linalg.matrix_power(STEP, k)
+    places = np.array(list(points.values())).reshape(-1, 3)
+    measured = g.project(RIG, g.transform_to_camera(wTc, places))
+    seen = observations(
+        np.array(list(points), np.int64), measured, PIXELS, np.full(len(points), is_new)
+    )
+    motion = Odometry(STEP, 1e-4 * np.eye(6)) if k else None
+    return TrackedFrame(k, wTc, motion, seen)
+
+
+def known(points: dict[int, list[float]], sigma: float = 0.02) -> LandmarkMap:
+    ids = np.array(sorted(points), np.int64)
+    places = np.array([points[i] for i in ids.tolist()]).reshape(-1, 3)
+    return LandmarkMap(ids, places, np.tile(sigma**2 * np.eye(3), (len(ids), 1, 1)))
+
+
+def landmarks_of(graph: object) -> list[tuple[int, ...]]:
+    """Keys of the factors that touch a landmark."""
+    factors = [graph.at(row) for row in range(graph.size()) if graph.exists(row)]
+    return [tuple(f.keys()) for f in factors if not is_pose(f.keys()[-1])]
+
+
+# --------------------------------------------------------------------------------------------
+# Waiting
+
+
+def test_a_landmark_waits_for_its_second_sighting_and_loses_none() -> None:
+    points = {4: [0.2, 0.1, 3.0]}
+    made = builder()
+    first = made.add(frame(0, points, True), known(points))
+    assert landmarks_of(first.graph) == []
+    assert [identity for identity, _ in made.waiting()] == [4]
+    second = made.add(frame(1, points), known(points))
+    key = landmark_key(0)
+    assert landmarks_of(second.graph) == [(pose_key(0), key), (pose_key(1), key)]
+    assert second.seen == [0]
+    assert list(made.waiting()) == []
+    np.testing.assert_array_equal(second.values.atPoint3(key), points[4])
+
+
+@pytest.mark.parametrize(
+    ("sigma", "expected"),
+    [(1.01 / 3, "waits"), (0.99 / 3, "weak"), (1.01 / 8, "weak"), (0.99 / 8, "plain")],
+)
+def test_parallax_decides_between_waiting_a_weak_prior_and_none(
+    sigma: float, expected: str
+) -> None:
+    """Range over its standard deviation, 3 and 8 by default; here 10 m in the direction of view."""
+    points = {7: [0.0, 0.0, 10.0]}
+    made = builder()
+    made.add(frame(0, points, True), known(points, 10 * sigma))
+    # One step nearer the range is 9.9 m.
+    new = made.add(frame(1, points), known(points, 9.9 * sigma))
+    keys = landmarks_of(new.graph)
+    prior = (landmark_key(0),)
+    assert {"waits": keys == [], "weak": prior in keys, "plain": len(keys) == 2}[expected]
+    assert (prior in keys) == (expected == "weak")
+
+
+def test_the_weak_prior_holds_two_ranges_about_the_place() -> None:
+    points = {7: [3.0, 0.0, 4.0]}
+    made = builder(least_sightings=1, weak_prior_ranges=2.0)
+    new = made.add(frame(0, points, True), known(points, 5.0 / 4))
+    rows = [new.graph.at(row) for row in range(new.graph.size())]
+    prior = next(f for f in rows if tuple(f.keys()) == (landmark_key(0),))
+    new.values.update(landmark_key(0), np.array([3.0, 10.0, 4.0]))
+    assert prior.error(new.values) == pytest.approx(0.5)  # one standard deviation: 2 x 5 m
+
+
+def test_waiting_landmarks_tell_nothing_about_poses() -> None:
+    """Those seen once enter or wait: the rest of the answer is the same."""
+    simulation = drawn(8, frames=9, miss_rate=0.4)
+    increments = simulation.increments
+    counts = np.bincount(np.concatenate([x.observations.ids for x in increments]))
+    once = np.flatnonzero(counts == 1)
+    assert len(once)
+    settings = BatchSettings(trim=False, weak_parallax=0.0, least_parallax=0.0)
+    waiting = answer(settings, increments)
+    without = answer(settings, keep(increments, lambda k, x: ~np.isin(x.observations.ids, once)))
+    inside = answer(dataclasses.replace(settings, least_sightings=1), increments)
+    for other in (without, inside):
+        np.testing.assert_allclose(
+            other.trajectory.poses, waiting.trajectory.poses, rtol=0, atol=1e-6
+        )
+        np.testing.assert_allclose(other.covariances, waiting.covariances, rtol=1e-3, atol=1e-12)
+    row = waiting.landmarks.rows(once)
+    np.testing.assert_allclose(
+        inside.landmarks.positions[row], waiting.landmarks.positions[row], rtol=0, atol=1e-4
+    )
+    np.testing.assert_allclose(
+        inside.landmarks.covariances[row], waiting.landmarks.covariances[row], rtol=0.05, atol=1e-6
+    )
+
+
+@GRAPHS
+def test_what_waits_is_told_with_an_honest_covariance(name: str) -> None:
+    """Landmarks seen once, over many drives: the pose's uncertainty is in their covariance."""
+    errors = []
+    for seed in range(20):
+        simulation = simulate(
+            Drive(frames=9, points=60, miss_rate=0.4, odometry_sigma=(0.02,) * 3 + (0.05,) * 3),
+            np.random.default_rng(seed),
+        )
+        found = answer(SMOOTHERS[name], simulation.increments).landmarks
+        counts = np.bincount(
+            np.concatenate([x.observations.ids for x in simulation.increments]),
+            minlength=len(simulation.points_by_id),
+        )
+        once = np.flatnonzero(counts[found.ids] == 1)
+        truth = simulation.points_by_id[found.ids[once]]
+        errors.append(landmark_nees(found.positions[once], found.covariances[once], truth))
+    verdict = judge(errors)
+    assert verdict is not None
+    assert verdict.items > 40
+    # A single sighting of a far point is no normal error; the band is widened by a fifth.
+    assert 0.8 * verdict.lower < verdict.per_dof < 1.2 * verdict.upper, verdict
+
+
+@GRAPHS
+def test_points_without_parallax_wait_and_are_in_the_map(name: str) -> None:
+    simulation = simulate(
+        Drive(frames=12, points=60, depth_m=(60.0, 200.0), sigma_px=(0.3, 0.3, 0.3)),
+        np.random.default_rng(3),
+    )
+    near = drawn(3, frames=12)
+    increments = [joined(a, b) for a, b in zip(near.increments, simulation.increments, strict=True)]
+    estimator, _ = run(SMOOTHERS[name], increments)
+    found = estimator.estimate()
+    assert_finite(found)
+    far = found.landmarks.ids[found.landmarks.ids >= SHIFT]
+    assert len(far) > 20
+    assert ate(found, near) < 0.02
+    waiting = [identity for identity, _ in estimator._builder.waiting() if identity >= SHIFT]
+    assert len(waiting) > 5
+    asked = np.array(waiting[:1])
+    assert np.linalg.eigvalsh(estimator.landmark_covariances(asked)[0])[0] > 0.0
+    with pytest.raises(EstimatorError, match=f"landmark {waiting[0]} waits outside the graph"):
+        estimator.joint_covariance(asked)
+
+
+SHIFT = 1000
+
+
+def joined(a: Increment, b: Increment) -> Increment:
+    """The landmarks of both, the second's with shifted identities."""
+    shifted = dataclasses.replace(b.observations, ids=b.observations.ids + SHIFT)
+    keep_front = shifted.measurement[:, 2] > 0.0
+    both = a.observations.join(shifted.select(keep_front))
+    return dataclasses.replace(a, observations=both, rejected=np.zeros(len(both), np.bool_))
+
+
+# --------------------------------------------------------------------------------------------
+# Moved, pruned, seen again
+
+
+@pytest.fixture(scope="module")
+def drive() -> Simulation:
+    return drawn(8, frames=24)
+
+
+def row_of(estimate, identity: int) -> int:
+    return int(estimate.landmarks.rows(np.array([identity]))[0])
+
+
+@GRAPHS
+def test_a_landmark_that_moved_starts_anew(name: str, drive: Simulation) -> None:
+    place = drive.points_by_id[OFTEN] + [0.3, 0.1, 0.3]
+    increments = moved(drive, OFTEN, 8, place, np.random.default_rng(1))
+    estimator, _ = run(SMOOTHERS[name], increments)
+    found = estimator.estimate()
+    told = [r for r in found.remarks if r.startswith(f"landmark {OFTEN} (seen ")]
+    assert len(told) == 1
+    assert "moved, started anew" in told[0]
+    offset = found.landmarks.positions[row_of(found, OFTEN)] - place
+    covariance = found.landmarks.covariances[row_of(found, OFTEN)]
+    assert offset @ np.linalg.solve(covariance, offset) < 16.3
+    assert np.sqrt(np.trace(covariance)) < 0.03
+    assert ate(found, drive) < 1.3 * ate(answer(SMOOTHERS[name], drive.increments), drive)
+    # Its first observations stay with the variable that they were made of.
+    variables = estimator._builder._id_of
+    assert variables.count(OFTEN) == 2
+
+
+def test_wrong_matches_do_not_start_a_landmark_anew(drive: Simulation) -> None:
+    """Rejected frame after frame, each time elsewhere."""
+    rng = np.random.default_rng(2)
+    increments = list(drive.increments)
+    for k in range(8, 14):
+        aside = drive.points_by_id[OFTEN] + rng.uniform(-0.6, 0.6, 3)
+        only = dataclasses.replace(drive, increments=increments)
+        increments[k] = moved(only, OFTEN, k, aside, rng)[k]
+    for settings in SMOOTHERS.values():
+        found = answer(settings, increments)
+        assert found.remarks == ()
+        offset = found.landmarks.positions[row_of(found, OFTEN)] - drive.points_by_id[OFTEN]
+        assert np.linalg.norm(offset) < 0.05
+
+
+def test_contradictions_count_in_a_row_and_not_at_all_where_switched_off() -> None:
+    points = {1: [0.2, 0.1, 3.0]}
+    elsewhere = {1: [0.6, 0.1, 3.0]}
+    for after, expected in ((0, [False] * 6), (2, [False, True, False, False, False, True])):
+        made = builder(contradicted_after=after)
+        made.add(frame(0, points, True), known(points))
+        found = []
+        for k in range(1, 7):
+            here = frame(k, elsewhere)
+            if k == 4:
+                made.confirmed(np.array([1]))
+            gone = made.contradicted(here.accepted, here.wTc)
+            found.append(len(gone) == 1)
+            if len(gone):
+                made.start_anew([1], "moved")
+                made.add(frame(k, points, True), known(points))
+            elif k == 4:
+                made.confirmed(np.array([1]))
+        assert found == expected, after
+        assert len(made.remarks) == sum(expected)
+
+
+@GRAPHS
+def test_pruned_landmarks_leave_the_map_and_their_information_stays(
+    name: str, drive: Simulation
+) -> None:
+    increments = list(drive.increments)
+    last = increments[-1]
+    gone = last.observations.ids[:5]
+    increments[-1] = dataclasses.replace(last, pruned_ids=np.union1d(last.pruned_ids, gone))
+    kept, pruned = (answer(SMOOTHERS[name], x) for x in (drive.increments, increments))
+    assert not np.isin(gone, pruned.landmarks.ids).any()
+    assert np.isin(gone, kept.landmarks.ids).all()
+    rows = kept.landmarks.rows(pruned.landmarks.ids)
+    # Pruned in the very frame that saw them, they lose that frame's sighting, and no other.
+    np.testing.assert_allclose(pruned.trajectory.poses, kept.trajectory.poses, rtol=0, atol=3e-3)
+    np.testing.assert_allclose(pruned.covariances[-2], kept.covariances[-2], rtol=0.1, atol=1e-7)
+    np.testing.assert_allclose(
+        pruned.landmarks.positions, kept.landmarks.positions[rows], rtol=0, atol=2e-2
+    )
+
+
+@GRAPHS
+def test_a_landmark_seen_again_after_a_gap_under_its_identity(name: str, drive: Simulation) -> None:
+    """The lag of five frames has forgotten it by then, and shows where it last was."""
+    increments = unseen(drive.increments, OFTEN, range(5, 14))
+    truth = drive.points_by_id[OFTEN]
+    half, _ = run(SMOOTHERS[name], increments[:13])
+    for found in (half.estimate(), answer(SMOOTHERS[name], increments)):
+        offset = found.landmarks.positions[row_of(found, OFTEN)] - truth
+        covariance = found.landmarks.covariances[row_of(found, OFTEN)]
+        assert offset @ np.linalg.solve(covariance, offset) < 16.3
+        assert np.sqrt(np.trace(covariance)) < 0.05
+        assert found.remarks == ()
+    estimator, _ = run(SMOOTHERS[name], increments)
+    variables = estimator._builder._id_of.count(OFTEN)
+    assert variables == (2 if name == "fixed_lag" else 1)
+
+
+def test_a_pruned_identity_that_comes_back_is_another_landmark(drive: Simulation) -> None:
+    """As databases never do, and damaged logs may: it must not join the old variable."""
+    increments = list(drive.increments)
+    increments[7] = dataclasses.replace(increments[7], pruned_ids=np.array([OFTEN]))
+    increments = keep(increments, lambda k, x: np.ones(len(x.observations), np.bool_))
+    assert any(OFTEN in x.observations.ids[x.observations.is_new] for x in increments[8:])
+    for settings in SMOOTHERS.values():
+        estimator, _ = run(settings, increments)
+        found = estimator.estimate()
+        assert estimator._builder._id_of.count(OFTEN) == 2
+        offset = found.landmarks.positions[row_of(found, OFTEN)] - drive.points_by_id[OFTEN]
+        assert np.linalg.norm(offset) < 0.05
+
+
+# --------------------------------------------------------------------------------------------
+# Numbers that are none
+
+
+@GRAPHS
+@pytest.mark.parametrize("what", ["measurement", "covariance", "motion", "motion's covariance"])
+def test_what_is_not_finite_is_refused_and_changes_nothing(what: str, name: str) -> None:
+    simulation = drawn(7, frames=10)
+    settings: EstimatorSettings = SMOOTHERS[name]
+    spoilt, clean = build(settings), build(settings)
+    for estimator in (spoilt, clean):
+        play(estimator, simulation.increments[:6], FREE)
+    increment = simulation.increments[6]
+    tracking = tracked_at(
+        spoilt.predict(increment.odometry), int((~increment.observations.is_new).sum())
+    )
+    with pytest.raises(EstimatorError, match=f"frame {increment.index}: .* not finite") as caught:
+        spoilt.update(damaged(increment, what), tracking)
+    assert "\n" not in str(caught.value)
+    for estimator in (spoilt, clean):
+        play(estimator, simulation.increments[6:], FREE)
+    a, b = spoilt.estimate(), clean.estimate()
+    assert_finite(a)
+    np.testing.assert_array_equal(a.trajectory.poses, b.trajectory.poses)
+    np.testing.assert_array_equal(a.landmarks.covariances, b.landmarks.covariances)
+
+
+def damaged(increment: Increment, what: str) -> Increment:
+    """One number of it is no number."""
+    seen, odometry = increment.observations, increment.odometry
+    assert odometry is not None
+    arrays = {
+        "measurement": seen.measurement.copy(),
+        "covariance": seen.covariance.copy(),
+        "motion": odometry.motion.copy(),
+        "motion's covariance": odometry.covariance.copy(),
+    }
+    arrays[what].flat[3] = np.inf
+    seen = dataclasses.replace(
+        seen, measurement=arrays["measurement"], covariance=arrays["covariance"]
+    )
+    odometry = Odometry(arrays["motion"], arrays["motion's covariance"])
+    return dataclasses.replace(increment, observations=seen, odometry=odometry)
