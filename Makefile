@@ -4,7 +4,7 @@ PYTEST = .venv/bin/python -m pytest -n 2
 DEMO_OUT ?= runs/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check bench baseline clean
+.PHONY: help setup demo test test-all check bench bench-long baseline clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -35,6 +35,9 @@ check: setup ## linter, formatter and type checker; changes nothing
 bench: setup ## measure speed as ratios, write bench.json
 	.venv/bin/python -m tests.benchmark.bench
 
+bench-long: setup ## estimators over 2,500 frames beside batch, write bench_long.json (minutes, 2 GB)
+	.venv/bin/python -m tests.benchmark.long_drive
+
 # `make baseline BASELINE=write BASELINES="lab_trials outliers"` writes them anew.
 BASELINE ?= check
 BASELINES ?= $(basename $(notdir $(wildcard experiments/baselines/*.json)))
@@ -48,5 +51,5 @@ baseline: .venv/.runtime-stamp ## repeat the experiments that have a committed b
 	done
 
 clean: ## remove the environment, caches and results
-	rm -rf .venv runs bench.json build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv runs bench.json bench_long.json build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

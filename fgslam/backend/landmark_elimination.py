@@ -124,7 +124,7 @@ def _eliminated(graphs: list[Any], order: Any) -> Eliminated:
         misfit += max(float(rhs @ rhs - left @ left), 0.0)
     inverse = np.linalg.inv(roots)
     steps = (inverse @ kept[:, :, None])[:, :, 0]
-    return Eliminated(steps, inverse @ np.swapaxes(inverse, 1, 2), misfit)
+    return Eliminated(steps, np.asarray(inverse @ np.swapaxes(inverse, 1, 2)), misfit)
 
 
 def _root(covariance: FloatArray) -> FloatArray:

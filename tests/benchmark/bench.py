@@ -1,5 +1,8 @@
 """Speed as ratios within one run: `make bench` prints a table and writes bench.json.
 
+Two parts: the whole system over images, here, and the estimators over simulated measurements, in
+`estimators.py` and `long_drive.py`. `--part` runs one of them.
+
 The drive goes round and round the rendered lab, so that the map saturates. It is cut into blocks.
 On each block raw SIFT is timed on the block's images in the best threading found, then the block
 goes through the system: whole (features found ahead, in threads, beside the loop) and with its
@@ -31,7 +34,10 @@ from fgslam.frontend.stream import FeatureFrame
 from fgslam.measurement_log import MeasurementLog
 from fgslam.pipeline import SlamPipeline
 from fgslam.runs.recorder import RunRecorder
+from fgslam.runs.threads import one_blas_thread
 from fgslam.types import CameraRig, FloatArray, Frame, Odometry, Sequence, Trajectory
+from tests.benchmark import estimators, long_drive
+from tests.benchmark.drives import open_drive
 
 BLOCK = 40
 LIMITS = {
@@ -40,6 +46,7 @@ LIMITS = {
     "time_last_fifth_over_first": 1.2,
     "memory_without_log_end_over_middle": 1.1,
 }
+EVERY_LIMIT = LIMITS | estimators.LIMITS | long_drive.LIMITS
 
 
 @dataclass(frozen=True)
@@ -240,32 +247,50 @@ def ratios_of(series: Series) -> dict[str, float]:
     }
 
 
-def show(ratios: dict[str, float], landmarks: int) -> None:
-    """The table."""
-    table = Table(title=f"speed, {landmarks} landmarks at the end")
-    for column in ("ratio", "measured", "at most"):
-        table.add_column(column)
-    for name, value in ratios.items():
-        limit = LIMITS.get(name)
-        table.add_row(name, f"{value:.3f}", "" if limit is None else f"{limit}")
-    Console().print(table)
-
-
-def main() -> None:
-    """Runs everything and writes bench.json."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=2000, help="length of the drive used")
-    parser.add_argument("--out", type=Path, default=Path("bench.json"))
-    arguments = parser.parse_args()
-    config = load_config(Path("experiments/lab_laps.yaml"), [f"dataset.stop={arguments.frames}"])
+def over_images(frames: int) -> dict[str, float]:
+    """The whole system over images, beside raw SIFT."""
+    config = load_config(Path("experiments/lab_laps.yaml"), [f"dataset.stop={frames}"])
     with progress_bar() as tell:
         sequence = open_sequence(config, lambda done, total: tell("rendering", done, total))
         series, landmarks = run_blocks(
             config, sequence, lambda done: tell("timing", done, len(sequence))
         )
-    ratios = ratios_of(series)
+    return ratios_of(series) | {"landmarks_at_the_end": float(landmarks)}
+
+
+@one_blas_thread()
+def over_measurements() -> dict[str, float]:
+    """The estimators on simulated measurements."""
+    found = estimators.ratios_of_estimators()
+    return found | long_drive.without_batch(open_drive("long_drive"))
+
+
+def show(ratios: dict[str, float]) -> None:
+    """The table."""
+    table = Table(title="speed")
+    for column in ("ratio", "measured", "at most"):
+        table.add_column(column)
+    for name, value in ratios.items():
+        limit = EVERY_LIMIT.get(name)
+        shown = f"{value:.3f}" if value == 0.0 or abs(value) >= 1e-3 else f"{value:.1e}"
+        table.add_row(name, shown, "" if limit is None else f"{limit:g}")
+    Console().print(table)
+
+
+def main() -> None:
+    """Runs what is asked for and writes bench.json."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=2000, help="length of the drive over images")
+    parser.add_argument("--part", choices=("all", "images", "estimators"), default="all")
+    parser.add_argument("--out", type=Path, default=Path("bench.json"))
+    arguments = parser.parse_args()
+    ratios: dict[str, float] = {}
+    if arguments.part != "estimators":
+        ratios |= over_images(arguments.frames)
+    if arguments.part != "images":
+        ratios |= over_measurements()
     arguments.out.write_text(json.dumps(ratios, indent=2) + "\n")
-    show(ratios, landmarks)
+    show(ratios)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,128 @@
+"""Simulated drives for timing estimators, and their replay with the estimator's own time."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.backend.protocol import Estimator
+from fgslam.config import load_config
+from fgslam.datasets.opening import open_measurements
+from fgslam.factory import make_estimator
+from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.measurement_log import MeasurementLog
+from fgslam.pipeline import replay_frame
+from fgslam.runs.replay import replay_motion
+from fgslam.settings.backend import EstimatorSettings
+from fgslam.settings.frontend import EgoMotionSettings
+from fgslam.settings.measurements import MeasurementDatasetSettings
+from fgslam.types import (
+    EgoMotion,
+    FloatArray,
+    Increment,
+    LandmarkMap,
+    Odometry,
+    Prediction,
+    Trajectory,
+    UpdateStats,
+)
+
+
+@dataclass(frozen=True)
+class MeasuredDrive:
+    """A log, the least squares that all estimators share, and the truth."""
+
+    log: MeasurementLog
+    ego_motion: EgoMotionSettings
+    truth: Trajectory
+
+
+def open_drive(experiment: str, overrides: tuple[str, ...] = ()) -> MeasuredDrive:
+    """Simulates the measurements of ``experiments/NAME.yaml`` with its seed."""
+    config = load_config(Path("experiments") / f"{experiment}.yaml", overrides)
+    assert isinstance(config.dataset, MeasurementDatasetSettings)
+    recording = open_measurements(config.dataset, config.seed, config.odometry)
+    assert recording.ground_truth is not None
+    return MeasuredDrive(recording.log, config.frontend.ego_motion, recording.ground_truth)
+
+
+@dataclass
+class Clocked:
+    """An estimator whose prediction and update are timed, without the ego-motion they share."""
+
+    inner: Estimator
+    cpu: list[float] = field(default_factory=list)
+    wall: list[float] = field(default_factory=list)
+    _spent: float = 0.0
+
+    def predict(self, odometry: Odometry | None) -> Prediction:
+        start = time.process_time()
+        found = self.inner.predict(odometry)
+        self._spent = time.process_time() - start
+        return found
+
+    def landmarks(self) -> LandmarkMap:
+        return self.inner.landmarks()
+
+    def update(
+        self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
+    ) -> UpdateStats:
+        cpu, wall = time.process_time(), time.perf_counter()
+        stats = self.inner.update(increment, tracking, motion)
+        self.wall.append(time.perf_counter() - wall)
+        self.cpu.append(self._spent + time.process_time() - cpu)
+        return stats
+
+
+@dataclass(frozen=True)
+class Played:
+    """A whole drive through one estimator.
+
+    Attributes:
+        estimator: after the last frame.
+        cpu_s, wall_s: (n,) its own seconds a frame, of the processor and on the clock.
+        online: (n, 4, 4) poses as first told.
+    """
+
+    estimator: Estimator
+    cpu_s: FloatArray
+    wall_s: FloatArray
+    online: FloatArray
+
+
+def play(drive: MeasuredDrive, settings: EstimatorSettings) -> Played:
+    """Replays the log through a new estimator."""
+    clocked = Clocked(make_estimator(drive.log.rig, settings, drive.ego_motion))
+    solver = EgoMotionSolver(drive.log.rig, drive.ego_motion)
+    motion = replay_motion(drive.log)
+    online = [
+        replay_frame(increment, clocked, solver, motion, k).stats.wTc  # type: ignore[arg-type]
+        for k, increment in enumerate(drive.log)
+    ]
+    return Played(clocked.inner, np.array(clocked.cpu), np.array(clocked.wall), np.array(online))
+
+
+def cpu_seconds(work: Callable[[], object]) -> float:
+    """Processor time of a call, all threads."""
+    start = time.process_time()
+    work()
+    return time.process_time() - start
+
+
+def interleaved(works: Mapping[str, Callable[[], float]], repeats: int) -> dict[str, float]:
+    """Medians of timings that take turns, so that a machine's moods meet all of them alike."""
+    series: dict[str, list[float]] = {name: [] for name in works}
+    for _ in range(repeats):
+        for name, work in works.items():
+            series[name].append(work())
+    return {name: statistics.median(values) for name, values in series.items()}
+
+
+def largest_offset_mm(one: FloatArray, other: FloatArray) -> float:
+    """Largest distance of positions of two trajectories (n, 4, 4), millimetres."""
+    return 1e3 * float(np.linalg.norm(one[:, :3, 3] - other[:, :3, 3], axis=1).max())

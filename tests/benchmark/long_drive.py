@@ -1,0 +1,107 @@
+"""2,500 frames, eight times round a corridor: does a frame's cost stay, and how near is batch?
+
+`make bench-long`, or `python -m tests.benchmark.long_drive`: some ten minutes and 2 GB, most of it
+batch; the parts without batch belong to `make bench`, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
+from fgslam.runs.threads import one_blas_thread
+from fgslam.settings.backend import (
+    BatchSettings,
+    FixedLagSettings,
+    Isam2Settings,
+    KernelSettings,
+    LandmarkKalmanSettings,
+)
+from fgslam.types import Estimate
+from tests.benchmark.drives import MeasuredDrive, cpu_seconds, open_drive, play
+
+KEYFRAMES = Isam2Settings(keyframe_every=5, update_every=10)
+LEAST_SQUARES = BatchSettings(kernel=KernelSettings("none"), trim=False)
+LIMITS = {
+    "fixed_lag_last_over_early": 1.1,
+    "isam2_keyframes_ms_per_frame": 10.0,
+    "isam2_keyframes_ate_over_batch": 1.3,
+}
+
+
+def fixed_lag_flat(drive: MeasuredDrive) -> dict[str, float]:
+    """Median update of the last 500 frames over that of frames 500 to 1000.
+
+    The number of landmarks in view is not the same everywhere on the way: beside the filter's
+    ratio, which tells how much of it is the drive.
+    """
+    lag = play(drive, FixedLagSettings()).cpu_s
+    simple = play(drive, LandmarkKalmanSettings()).cpu_s
+    return {
+        "fixed_lag_last_over_early": float(np.median(lag[-500:]) / np.median(lag[500:1000])),
+        "fixed_lag_ms_per_frame": 1e3 * float(lag.mean()),
+        "landmark_kalman_last_over_early": float(
+            np.median(simple[-500:]) / np.median(simple[500:1000])
+        ),
+    }
+
+
+def keyframes(drive: MeasuredDrive) -> tuple[dict[str, float], Estimate]:
+    """iSAM2 with keyframes: milliseconds of the processor a frame, and the answer."""
+    played = play(drive, KEYFRAMES)
+    cpu, answers = 1e3 * played.cpu_s, []
+    final = cpu_seconds(lambda: answers.append(played.estimator.estimate()))
+    ratios = {
+        "isam2_keyframes_ms_per_frame": float(cpu.mean()),
+        "isam2_keyframes_ms_median": float(np.median(cpu)),
+        "isam2_keyframes_ms_worst": float(cpu.max()),
+        "isam2_keyframes_final_s": final,
+    }
+    return ratios, answers[0]
+
+
+def without_batch(drive: MeasuredDrive) -> dict[str, float]:
+    """What `make bench` takes over."""
+    return fixed_lag_flat(drive) | keyframes(drive)[0]
+
+
+def ate_cm(estimate: Estimate, drive: MeasuredDrive) -> float:
+    """After alignment by a rigid motion."""
+    found = evaluate_trajectory(estimate.trajectory, drive.truth, Alignment.SE3)
+    return 100.0 * float(found.ate_rmse_m)
+
+
+def with_batch(drive: MeasuredDrive) -> dict[str, float]:
+    """The accuracy of keyframes beside that of batch on the same measurements."""
+    ratios, estimate = keyframes(drive)
+    played, answers = play(drive, LEAST_SQUARES), []
+    batch_s = cpu_seconds(lambda: answers.append(played.estimator.estimate()))
+    ours, best = ate_cm(estimate, drive), ate_cm(answers[0], drive)
+    return ratios | {
+        "isam2_keyframes_ate_cm": ours,
+        "batch_ate_cm": best,
+        "isam2_keyframes_ate_over_batch": ours / best,
+        "batch_final_s": batch_s,
+    }
+
+
+@one_blas_thread()
+def main() -> None:
+    """Writes bench_long.json."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("bench_long.json"))
+    arguments = parser.parse_args()
+    drive = open_drive("long_drive")
+    ratios = fixed_lag_flat(drive) | with_batch(drive)
+    arguments.out.write_text(json.dumps(ratios, indent=2) + "\n")
+    for name, value in ratios.items():
+        limit = LIMITS.get(name)
+        print(f"{name:40s} {value:9.3f}" + ("" if limit is None else f"   at most {limit}"))
+
+
+if __name__ == "__main__":
+    main()
