@@ -21,7 +21,7 @@ from fgslam.backend.graph_solution import (
     poses_of_frame,
     suspect,
 )
-from fgslam.backend.marginals import DenseMarginals
+from fgslam.backend.marginals import DenseMarginals, UndeterminedError
 from fgslam.backend.segments import TrackedFrame
 from fgslam.backend.smoother import Smoother
 from fgslam.errors import EstimatorError
@@ -156,7 +156,11 @@ class FixedLagSmoother(Smoother):
 
     def _marginals(self) -> DenseMarginals:
         """Of the window: all at once, faster than GTSAM's for one pose of a dense root clique."""
-        return DenseMarginals(_without_gaps(self._solver.getFactors()), self._values)
+        while True:  # each repair takes a landmark out, and after a few it raises
+            try:
+                return DenseMarginals(_without_gaps(self._solver.getFactors()), self._values)
+            except UndeterminedError as error:
+                self._repair(gtsam.Values(self._values), error)
 
     def _covariance(self, marginals: DenseMarginals, frame: int) -> FloatArray:
         covariance = marginals.pose(pose_key(frame))
@@ -165,18 +169,16 @@ class FixedLagSmoother(Smoother):
 
     def _repair(self, values: Any, error: Exception) -> None:
         """Builds the solver anew over the window, without the landmark that failed."""
-        dropped: set[int] = set()
         for _ in range(_REPAIRS):
             key = suspect(error)
-            if key is None or is_pose(key) or key in dropped:
+            if key is None or is_pose(key) or not self._builder.in_graph(number(key)):
                 break
-            dropped.add(key)
             self._remarks.append(
                 f"{self._builder.take_out(number(key))} left the system indeterminate at frame "
                 f"{self._recent[-1].frame}: taken out, solver built anew over the lag"
             )
             try:
-                self._rebuild(values, dropped)
+                self._rebuild(values)
                 return
             except RuntimeError as another:
                 error = another
@@ -185,7 +187,7 @@ class FixedLagSmoother(Smoother):
             f"({' '.join(str(error).split())}); look at that frame with fgslam inspect"
         )
 
-    def _rebuild(self, values: Any, dropped: set[int]) -> None:
+    def _rebuild(self, values: Any) -> None:
         oldest = self._oldest
         graph, kept = gtsam.NonlinearFactorGraph(), gtsam.Values()
         stamps: dict[int, float] = {}
@@ -197,8 +199,7 @@ class FixedLagSmoother(Smoother):
             for row in range(new.graph.size()):
                 factor = new.graph.at(row)
                 keys = list(factor.keys())
-                inside = all(not is_pose(key) or number(key) >= oldest for key in keys)
-                if inside and not dropped.intersection(keys):
+                if all(self._is_inside(key) for key in keys):
                     graph.add(factor)
                     stamps |= dict.fromkeys(keys, self._time(new.frame))
         for key in stamps:
@@ -206,6 +207,10 @@ class FixedLagSmoother(Smoother):
         self._solver = self._new_solver()
         self._solver.update(graph, kept, stamps)
         self._values = self._solver.calculateEstimate()
+
+    def _is_inside(self, key: int) -> bool:
+        """Whether a variable is within the lag and was not taken out."""
+        return number(key) >= self._oldest if is_pose(key) else self._builder.in_graph(number(key))
 
 
 def _without_gaps(graph: Any) -> Any:

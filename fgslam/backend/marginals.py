@@ -135,8 +135,8 @@ class GraphMarginals:
         inverse = inverse_spd3(self.landmark_information[landmarks])
         gain = np.zeros((6 * len(self.pose_keys), 6 + 3 * k))
         gain[rows, np.arange(6)] = 1.0
-        seen = self.coupling[:, columns].toarray().reshape(-1, k, 3)
-        gain[:, 6:] = -np.einsum("pki,kij->pkj", seen, inverse).reshape(-1, 3 * k)
+        seen = self.coupling[:, columns].toarray().reshape(len(gain), k, 3)
+        gain[:, 6:] = -np.einsum("pki,kij->pkj", seen, inverse).reshape(len(gain), 3 * k)
         out = gain.T @ self.pose_covariance @ gain
         at = 6 + 3 * np.arange(k)[:, None] + np.arange(3)
         out[at[:, :, None], at[:, None, :]] += inverse
@@ -218,6 +218,15 @@ class ChainMarginals:
         return np.block([[own, cross], [cross.T, among]])
 
 
+class UndeterminedError(EstimatorError):
+    """The measurements do not determine all variables; ``row`` of the first one's, as ordered."""
+
+    def __init__(self, row: int, message: str) -> None:
+        """Row of the information matrix and the line to tell."""
+        super().__init__(message)
+        self.row = row
+
+
 class DenseMarginals:
     """Covariances of a small graph, whatever its factors: one dense Cholesky decomposition."""
 
@@ -233,7 +242,11 @@ class DenseMarginals:
         for key in list(values.keys()):  # ascending, as the rows of the information matrix
             self._start[key] = rows
             rows += 6 if is_pose(key) else 3
-        self._factor, self._size = _scaled_cholesky(information)
+        try:
+            self._factor, self._size = _scaled_cholesky(information)
+        except UndeterminedError as error:
+            near = max(key for key, start in self._start.items() if start <= error.row)
+            raise UndeterminedError(error.row, f"indeterminate near variable {near}") from None
 
     def pose(self, key: int) -> FloatArray:
         """(6, 6) marginal of a pose."""
@@ -296,10 +309,10 @@ def _scaled_cholesky(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     size = np.sqrt(np.maximum(np.diagonal(information), 0.0))
     if not (size > 0.0).all():
-        raise EstimatorError(_UNDETERMINED)
+        raise UndeterminedError(int(np.argmin(size > 0.0)), _UNDETERMINED)
     factor, status = lapack.dpotrf(information / np.outer(size, size), lower=1, overwrite_a=1)
     if status != 0:
-        raise EstimatorError(_UNDETERMINED)
+        raise UndeterminedError(int(status) - 1, _UNDETERMINED)
     return factor, size
 
 

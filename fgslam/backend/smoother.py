@@ -230,7 +230,8 @@ class Smoother(ABC):
         for frame, identities in last_seen.items():
             if values.exists(pose_key(frame)):
                 anchors[frame] = poses_of_frame(values, frame)
-                moved = anchors[frame] @ inverse(self._anchors[frame])
+                # One just taken out of the graph is where the graph had it, and follows from here.
+                moved = anchors[frame] @ inverse(self._anchors.get(frame, anchors[frame]))
                 ids.append(np.array(identities, np.int64))
                 before = known.positions[known.rows(ids[-1])]
                 positions.append(transform_to_world(moved, before))
