@@ -1,0 +1,306 @@
+"""Marginals of whole graphs, both orders of elimination and the dense one, against GTSAM's own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+from factor_checks import assert_near, random_covariance, random_pose
+from simulated import RIG, points_in_view
+
+from fgslam import geometry as g
+from fgslam.backend.marginals import (
+    ChainMarginals,
+    DenseMarginals,
+    GraphMarginals,
+    LinearSystem,
+    marginals_of,
+)
+from fgslam.errors import EstimatorError
+from fgslam.factors.cameras import RawPixelFactors
+from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior
+from fgslam.factors.noise import Whitening
+from fgslam.factors.stereo import StereoFactors
+from fgslam.floor import Floor
+from fgslam.types import FloatArray, Odometry, Prediction
+
+Whole = type[GraphMarginals] | type[ChainMarginals]
+BOTH: list[Whole] = [GraphMarginals, ChainMarginals]
+PITCHED = g.so3_exp(np.array([0.3, 0.0, 0.1])) @ np.array([0.0, 1.0, 0.0])
+RELATIVE = 1e-8
+
+
+def whole(kind: Whole, graph: Any, values: Any) -> GraphMarginals | ChainMarginals:
+    return kind.of(LinearSystem.of(graph, values))
+
+
+class Problem:
+    """A chain of poses that see landmarks, some seen once; variables off the optimum."""
+
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        poses: int = 4,
+        landmarks: int = 7,
+        kernel: Whitening | None = None,
+        floor: Floor | None = None,
+    ) -> None:
+        self.graph, self.values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        start = np.eye(4) if floor else random_pose(rng)
+        points = g.transform_to_world(start, points_in_view(RIG, landmarks, (2.0, 5.0), rng))
+        factors = StereoFactors(RIG, kernel or Whitening())
+        for frame in range(poses):
+            shift = g.se3_exp(0.02 * rng.standard_normal(6))
+            wTc = floor.constrain(start @ shift) if floor else start @ shift
+            # Frame numbers and variables with gaps, as after a landmark was taken out.
+            self.pose(3 * frame, wTc, rng)
+            for n, point in enumerate(points):
+                if n == 0 and frame > 0:
+                    continue
+                seen = g.project(RIG, g.transform_to_camera(wTc, point[None, :]))[0]
+                measured = seen + 0.3 * rng.standard_normal(3)
+                covariance = random_covariance(rng, 3, 0.3)
+                key = landmark_key(2 * n)
+                self.graph.add(factors.factor(pose_key(3 * frame), key, measured, covariance))
+            if floor is not None:
+                for factor in floor_factors(pose_key(3 * frame), floor, wTc):
+                    self.graph.add(factor)
+        for n, point in enumerate(points):
+            self.values.insert(landmark_key(2 * n), point + 0.01 * rng.standard_normal(3))
+        self.poses = [pose_key(3 * frame) for frame in range(poses)]
+        self.landmarks = [landmark_key(2 * n) for n in range(landmarks)]
+
+    def pose(self, frame: int, wTc: FloatArray, rng: np.random.Generator) -> None:
+        key = pose_key(frame)
+        self.values.insert(key, gtsam.Pose3(wTc))
+        if frame == 0:
+            self.graph.add(pose_prior(key, Prediction(wTc, random_covariance(rng, 6, 0.01))))
+        else:
+            motion = g.se3_exp(0.02 * rng.standard_normal(6))
+            odometry = Odometry(motion, random_covariance(rng, 6, 0.05))
+            self.graph.add(odometry_factor(pose_key(frame - 3), key, odometry))
+
+    def reference(self) -> Any:
+        return gtsam.Marginals(self.graph, self.values)
+
+
+def reference_joint(reference: Any, keys: list[int]) -> FloatArray:
+    """GTSAM's joint covariance in the order of ``keys``, block by block."""
+    found = reference.jointMarginalCovariance(keys)
+    return np.block([[found.at(a, b) for b in keys] for a in keys])
+
+
+def assert_same(found: FloatArray, expected: FloatArray) -> None:
+    """Equal relative to the deviations of row and column."""
+    sigma = np.sqrt(np.diagonal(expected))
+    assert_near(found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), RELATIVE)
+
+
+# --------------------------------------------------------------------------------------------
+# Equal to GTSAM's
+
+
+def problems() -> dict[str, Callable[[np.random.Generator], Problem]]:
+    return {
+        "few poses": lambda rng: Problem(rng, 3, 12),
+        "many poses": lambda rng: Problem(rng, 15, 3),
+        "one pose": lambda rng: Problem(rng, 1, 4),
+        "no landmarks": lambda rng: Problem(rng, 5, 0),
+        "robust": lambda rng: Problem(rng, 4, 7, Whitening("cauchy", 0.5)),
+        "soft floor": lambda rng: Problem(rng, floor=Floor(3, PITCHED, False, 0.02, 0.01)),
+    }
+
+
+@pytest.mark.parametrize("kind", BOTH)
+@pytest.mark.parametrize("name", problems())
+def test_marginals_of_all_variables(name: str, kind: Whole, rng: np.random.Generator) -> None:
+    problem = problems()[name](rng)
+    reference = problem.reference()
+    found = whole(kind, problem.graph, problem.values)
+    assert found.pose_keys.tolist() == problem.poses
+    assert found.landmark_keys.tolist() == problem.landmarks
+    poses, landmarks = found.poses(), found.landmarks()
+    assert poses.shape == (len(problem.poses), 6, 6)
+    assert landmarks.shape == (len(problem.landmarks), 3, 3)
+    for key, covariance in zip(problem.poses, poses, strict=True):
+        assert_same(covariance, reference.marginalCovariance(key))
+    for key, covariance in zip(problem.landmarks, landmarks, strict=True):
+        assert_same(covariance, reference.marginalCovariance(key))
+
+
+@pytest.mark.parametrize("kind", BOTH)
+@pytest.mark.parametrize("which", [[0], [1, 4, 2], [6, 0, 5, 3, 1, 2, 4], []])
+def test_joint_marginals_in_the_order_asked_for(
+    which: list[int], kind: Whole, rng: np.random.Generator
+) -> None:
+    problem = Problem(rng)
+    reference = problem.reference()
+    found = whole(kind, problem.graph, problem.values)
+    for row, key in enumerate(problem.poses):
+        keys = [key, *(problem.landmarks[n] for n in which)]
+        expected = reference_joint(reference, keys) if which else reference.marginalCovariance(key)
+        assert_same(found.joint(row, np.array(which, np.int64)), expected)
+
+
+@pytest.mark.parametrize("name", problems())
+def test_dense_marginals(name: str, rng: np.random.Generator) -> None:
+    problem = problems()[name](rng)
+    reference = problem.reference()
+    found = DenseMarginals(problem.graph, problem.values)
+    for key in problem.poses:
+        assert_same(found.pose(key), reference.marginalCovariance(key))
+    landmarks = found.landmarks(problem.landmarks[::-1])
+    for key, covariance in zip(problem.landmarks[::-1], landmarks, strict=True):
+        assert_same(covariance, reference.marginalCovariance(key))
+    if len(problem.landmarks) > 2:
+        keys = [problem.poses[-1], problem.landmarks[2], problem.landmarks[0]]
+        assert_same(found.joint(keys[0], keys[1:]), reference_joint(reference, keys))
+
+
+def test_the_larger_group_is_eliminated_first(rng: np.random.Generator) -> None:
+    for poses, landmarks, kind in ((3, 12, GraphMarginals), (15, 3, ChainMarginals)):
+        problem = Problem(rng, poses, landmarks)
+        assert isinstance(marginals_of(problem.graph, problem.values), kind)
+
+
+@pytest.mark.parametrize("dof", [5, 3])
+def test_beside_a_hard_floor_all_three_agree_with_the_exact_constraint(
+    dof: Any, rng: np.random.Generator
+) -> None:
+    """What the floor allows, from a system of its own coordinates, where nothing is stiff."""
+    floor = Floor(dof, PITCHED, True)
+    problem = Problem(rng, 4, 7, floor=floor)
+    free = floorless(problem, dof)
+    matrices = [problem.values.atPose3(key).matrix() for key in problem.poses]
+    basis = np.zeros((21 + 24, 21 + 4 * dof))
+    basis[:21, :21] = np.eye(21)
+    for k, wTc in enumerate(matrices):
+        basis[21 + 6 * k : 27 + 6 * k, 21 + dof * k : 21 + dof * (k + 1)] = floor.basis(wTc)
+    information, _ = free.linearize(problem.values).hessian()
+    exact = basis @ np.linalg.inv(basis.T @ information @ basis) @ basis.T
+    dense = DenseMarginals(problem.graph, problem.values)
+    answers = [whole(kind, problem.graph, problem.values) for kind in BOTH]
+    for k, wTc in enumerate(matrices):
+        rows = slice(21 + 6 * k, 27 + 6 * k)
+        size = np.abs(exact[rows, rows]).max()
+        for found in [dense.pose(problem.poses[k]), *(a.poses()[k] for a in answers)]:
+            # The floor's stiffness is seen beside centimetres, squared: 1e-4 here.
+            assert_near(floor.allowed_part(wTc, found), exact[rows, rows], 1e-3 * size)
+    for a, b in zip(answers[0].poses(), answers[1].poses(), strict=True):
+        assert_near(a, b, RELATIVE * np.abs(b).max())
+
+
+def floorless(problem: Problem, dof: int) -> Any:
+    """The graph without the factors of the floor, which have poses alone for keys."""
+    kept, left = gtsam.NonlinearFactorGraph(), 0
+    for row in range(problem.graph.size()):
+        factor = problem.graph.at(row)
+        if isinstance(factor, gtsam.PoseTranslationPrior3D | gtsam.PoseRotationPrior3D):
+            left += 1
+        else:
+            kept.add(factor)
+    assert left == (8 if dof == 3 else 4)
+    return kept
+
+
+# --------------------------------------------------------------------------------------------
+# Refused
+
+
+@pytest.mark.parametrize("kind", BOTH)
+def test_a_graph_without_a_prior_is_refused(kind: Whole, rng: np.random.Generator) -> None:
+    problem = Problem(rng)
+    problem.graph.remove(0)
+    loose = gtsam.NonlinearFactorGraph()
+    for row in range(problem.graph.size()):
+        if problem.graph.exists(row):
+            loose.add(problem.graph.at(row))
+    with pytest.raises(EstimatorError, match="determine"):
+        whole(kind, loose, problem.values).poses()
+    with pytest.raises(EstimatorError, match="determine"):
+        DenseMarginals(loose, problem.values)
+
+
+@pytest.mark.parametrize("kind", BOTH)
+def test_a_landmark_behind_the_camera_is_refused(kind: Whole, rng: np.random.Generator) -> None:
+    """Its factor has no Jacobian."""
+    problem = Problem(rng)
+    key = landmark_key(99)
+    wTc = problem.values.atPose3(problem.poses[0]).matrix()
+    problem.values.insert(key, g.transform_to_world(wTc, np.array([[0.1, 0.2, -3.0]]))[0])
+    seen = StereoFactors(RIG, Whitening()).factor(
+        problem.poses[0], key, np.array([160.0, 120.0, 8.0]), np.eye(3)
+    )
+    problem.graph.add(seen)
+    with pytest.raises(EstimatorError, match=r"determine|no covariances"):
+        whole(kind, problem.graph, problem.values).poses()
+    with pytest.raises(EstimatorError, match=r"determine|no covariances"):
+        DenseMarginals(problem.graph, problem.values)
+
+
+@pytest.mark.parametrize("kind", BOTH)
+def test_a_landmark_seen_once_by_one_camera_is_refused(
+    kind: Whole, rng: np.random.Generator
+) -> None:
+    """Two numbers for three unknowns: its distance is open."""
+    problem = Problem(rng)
+    key = landmark_key(99)
+    wTc = problem.values.atPose3(problem.poses[0]).matrix()
+    problem.values.insert(key, g.transform_to_world(wTc, np.array([[0.13, 0.21, 3.1]]))[0])
+    top = RawPixelFactors(RIG, 0.37, Whitening()).top(
+        problem.poses[0], key, np.array([171.0, 147.0])
+    )
+    problem.graph.add(top)
+    with pytest.raises(EstimatorError, match="determine"):
+        whole(kind, problem.graph, problem.values).poses()
+    with pytest.raises(EstimatorError, match="determine"):
+        DenseMarginals(problem.graph, problem.values)
+
+
+def test_landmarks_that_depend_on_each_other_are_refused(rng: np.random.Generator) -> None:
+    """Only by the elimination of landmarks first; the other two take them."""
+    problem = Problem(rng)
+    between = gtsam.BetweenFactorPoint3(
+        problem.landmarks[1],
+        problem.landmarks[2],
+        np.array([0.1, 0.2, 0.3]),
+        gtsam.noiseModel.Isotropic.Sigma(3, 0.1),
+    )
+    problem.graph.add(between)
+    with pytest.raises(EstimatorError, match="depend on each other"):
+        whole(GraphMarginals, problem.graph, problem.values)
+    reference = problem.reference()
+    chain = whole(ChainMarginals, problem.graph, problem.values).landmarks()
+    dense = DenseMarginals(problem.graph, problem.values).landmarks(problem.landmarks)
+    for n, key in enumerate(problem.landmarks):
+        assert_same(chain[n], reference.marginalCovariance(key))
+        assert_same(dense[n], reference.marginalCovariance(key))
+
+
+def test_poses_that_close_a_loop_are_refused(rng: np.random.Generator) -> None:
+    """Only by the elimination of poses first; the other two take them."""
+    problem = Problem(rng)
+    loop = Odometry(g.se3_exp(0.02 * rng.standard_normal(6)), random_covariance(rng, 6, 0.05))
+    problem.graph.add(odometry_factor(problem.poses[0], problem.poses[3], loop))
+    with pytest.raises(EstimatorError, match="neighbours"):
+        whole(ChainMarginals, problem.graph, problem.values)
+    reference = problem.reference()
+    found = whole(GraphMarginals, problem.graph, problem.values).poses()
+    dense = DenseMarginals(problem.graph, problem.values)
+    for k, key in enumerate(problem.poses):
+        assert_same(found[k], reference.marginalCovariance(key))
+        assert_same(dense.pose(key), reference.marginalCovariance(key))
+
+
+def test_values_and_graph_are_left_alone(rng: np.random.Generator) -> None:
+    problem = Problem(rng)
+    values, size = gtsam.Values(problem.values), problem.graph.size()
+    for kind in BOTH:
+        found = whole(kind, problem.graph, problem.values)
+        found.poses(), found.landmarks(), found.joint(0, np.array([1]))
+    assert problem.values.equals(values, 0.0)
+    assert problem.graph.size() == size
