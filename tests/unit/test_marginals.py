@@ -221,7 +221,7 @@ def test_a_graph_without_a_prior_is_refused(kind: Whole, rng: np.random.Generato
             loose.add(problem.graph.at(row))
     with pytest.raises(EstimatorError, match="determine"):
         whole(kind, loose, problem.values).poses()
-    with pytest.raises(EstimatorError, match="determine"):
+    with pytest.raises(EstimatorError, match="indeterminate"):
         DenseMarginals(loose, problem.values)
 
 
@@ -238,7 +238,7 @@ def test_a_landmark_behind_the_camera_is_refused(kind: Whole, rng: np.random.Gen
     problem.graph.add(seen)
     with pytest.raises(EstimatorError, match=r"determine|no covariances"):
         whole(kind, problem.graph, problem.values).poses()
-    with pytest.raises(EstimatorError, match=r"determine|no covariances"):
+    with pytest.raises(EstimatorError, match=f"indeterminate near variable {key}"):
         DenseMarginals(problem.graph, problem.values)
 
 
@@ -257,7 +257,7 @@ def test_a_landmark_seen_once_by_one_camera_is_refused(
     problem.graph.add(top)
     with pytest.raises(EstimatorError, match="determine"):
         whole(kind, problem.graph, problem.values).poses()
-    with pytest.raises(EstimatorError, match="determine"):
+    with pytest.raises(EstimatorError, match=f"indeterminate near variable {key}"):
         DenseMarginals(problem.graph, problem.values)
 
 

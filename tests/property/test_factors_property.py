@@ -1,0 +1,132 @@
+"""Laws of the factors over all poses and measurements: nothing depends on where the world is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gtsam
+import numpy as np
+from factor_checks import values_of
+from hypothesis import assume, example, given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from simulated import RIG
+
+from fgslam import geometry as g
+from fgslam.factors import residuals
+from fgslam.factors.motion import floor_factors, odometry_factor
+from fgslam.factors.noise import Whitening, positive_definite
+from fgslam.factors.range_bearing import RangeBearingFactors
+from fgslam.factors.stereo import StereoFactors
+from fgslam.floor import Floor
+from fgslam.types import FloatArray, Odometry, RangeBearingSensor
+
+SENSOR = RangeBearingSensor(20.0, g.BODY_FORWARD_LEFT_UP_FROM_CAMERA)
+
+
+def vectors(size: float, n: int = 3) -> st.SearchStrategy[FloatArray]:
+    return arrays(np.float64, n, elements=st.floats(-size, size, allow_subnormal=False))
+
+
+@st.composite
+def poses(draw: st.DrawFn) -> FloatArray:
+    return g.pose(g.so3_exp(draw(vectors(1.8))), draw(vectors(50.0)))
+
+
+@st.composite
+def verticals(draw: st.DrawFn) -> FloatArray:
+    down = draw(vectors(1.0))
+    assume(np.linalg.norm(down) > 1e-2)
+    return down / np.linalg.norm(down)
+
+
+@st.composite
+def covariances(draw: st.DrawFn, sigma: float, n: int = 3) -> FloatArray:
+    """Full, of condition numbers up to a million."""
+    root = sigma * draw(arrays(np.float64, (n, n), elements=st.floats(-1.0, 1.0)))
+    return np.asarray(root @ root.T + (1e-3 * sigma) ** 2 * np.eye(n))
+
+
+def cost(factor: Any, *variables: FloatArray) -> float:
+    return float(factor.error(values_of(*variables)))
+
+
+def close(a: float, b: float, relative: float = 1e-6, absolute: float = 1e-9) -> bool:
+    return abs(a - b) <= absolute + relative * max(abs(a), abs(b))
+
+
+@given(poses(), vectors(1.0), covariances(0.5), poses())
+def test_a_stereo_factor_is_its_specification_and_knows_no_world(
+    wTc: FloatArray, offset: FloatArray, covariance: FloatArray, move: FloatArray
+) -> None:
+    local = np.array([0.3, -0.2, 2.5]) + offset
+    point = g.transform_to_world(wTc, local[None, :])[0]
+    measured = g.project(RIG, local[None, :])[0] + [1.0, -0.5, 0.3]
+    factor = StereoFactors(RIG, Whitening()).factor(0, 1, measured, covariance)
+    residual = residuals.stereo(RIG, wTc, point, measured)
+    found = cost(factor, wTc, point)
+    assert close(found, 0.5 * float(residual @ np.linalg.solve(covariance, residual)))
+    elsewhere = g.transform_to_world(move, point[None, :])[0]
+    assert close(found, cost(factor, move @ wTc, elsewhere))
+
+
+@given(
+    poses(),
+    st.floats(-np.pi, np.pi),
+    st.floats(-np.pi / 2, np.pi / 2),
+    st.floats(0.3, 15.0),
+    covariances(0.02),
+)
+@example(np.eye(4), 0.0, 0.0, 1.0, np.diag([1e-4, 1e-6, 1e-4]))
+@example(np.eye(4), np.pi, 0.0, 1.0, np.diag([1e-4, 1e-4, 1e-4]))
+@example(np.eye(4), 0.3, np.pi / 2, 1.0, np.diag([1e-4, 1e-4, 1e-4]))
+def test_a_range_bearing_factor_is_zero_and_finite_where_it_was_measured(
+    wTc: FloatArray, azimuth: float, elevation: float, distance: float, covariance: FloatArray
+) -> None:
+    measured = np.array([azimuth, elevation, distance])
+    point = g.transform_to_world(wTc, g.triangulate(SENSOR, measured[None, :]))[0]
+    factor = RangeBearingFactors(Whitening()).factor(0, 1, measured, covariance)
+    values = values_of(wTc, point)
+    assert np.abs(factor.unwhitenedError(values)).max() < 1e-11 * (1.0 + 15.0 / distance**2)
+    jacobian, rhs = factor.linearize(values).jacobian()
+    assert np.isfinite(jacobian).all()
+    assert np.isfinite(rhs).all()
+
+
+@given(poses(), poses(), vectors(0.3, 6), poses())
+def test_odometry_knows_no_world(
+    before: FloatArray, motion: FloatArray, off: FloatArray, move: FloatArray
+) -> None:
+    after = before @ motion @ g.se3_exp(off)
+    factor = odometry_factor(0, 1, Odometry(motion, 0.01 * np.eye(6)))
+    found = cost(factor, before, after)
+    assert close(found, 50.0 * float(off @ off), absolute=1e-8)
+    assert close(found, cost(factor, move @ before, move @ after), absolute=1e-8)
+
+
+@given(verticals(), poses(), st.floats(-np.pi, np.pi), vectors(50.0, 2))
+def test_a_floor_costs_nothing_on_it_and_the_same_everywhere_at_a_heading(
+    down: FloatArray, wTc: FloatArray, heading: float, shift: FloatArray
+) -> None:
+    """Sliding over the floor changes nothing; nor does turning, factor and pose together."""
+    floor = Floor(3, down, False, 0.01, 0.01)
+    on_it = floor.constrain(wTc)
+    along = g.pose(g.so3_exp(heading * down), floor.horizontal @ shift)
+    for here, there in zip(
+        floor_factors(0, floor, wTc), floor_factors(0, floor, along @ wTc), strict=True
+    ):
+        assert cost(here, on_it) < 1e-12 * 50.0**2 / 0.01**2
+        assert close(cost(here, wTc), cost(there, along @ wTc), absolute=1e-6)
+
+
+@given(arrays(np.float64, (6, 3), elements=st.floats(-1.0, 1.0)), st.floats(1e-9, 1e3))
+def test_a_singular_covariance_becomes_definite_and_never_smaller(
+    root: FloatArray, size: float
+) -> None:
+    covariance = size**2 * root @ root.T
+    found = positive_definite(covariance)
+    largest = max(float(np.linalg.eigvalsh(covariance)[-1]), 1e-12)
+    gtsam.noiseModel.Gaussian.Covariance(found)
+    assert np.linalg.eigvalsh(found)[0] > 0.5e-12
+    assert np.linalg.eigvalsh(found - covariance)[0] > -1e-14 * largest
+    assert np.linalg.eigvalsh(found - covariance)[-1] <= 1.01 * max(1e-12, 1e-6 * largest)
