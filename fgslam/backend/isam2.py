@@ -75,11 +75,7 @@ class Isam2Smoother(Smoother):
     def _solve(self) -> Solution:
         self._flush()
         for _ in range(self._settings.final_iterations):
-            moved = self._isam.update(
-                gtsam.NonlinearFactorGraph(), gtsam.Values(), [], self._groups(), None, None, True
-            ).getVariablesRelinearized()
-            self._values = self._isam.calculateEstimate()
-            if moved == 0:
+            if not self._relinearise():
                 break
         self._take_out_behind()
         graph = self._builder.kept_factors()
@@ -124,6 +120,17 @@ class Isam2Smoother(Smoother):
             together.insert(values)
             self._repair(together, error)
 
+    def _relinearise(self) -> bool:
+        """One more iteration without new measurements; whether anything had moved."""
+        nothing = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        try:
+            result = self._isam.update(*nothing, [], self._groups(), None, None, True)
+            self._values = self._isam.calculateEstimate()
+        except RuntimeError as error:
+            self._repair(gtsam.Values(self._values), error)
+            return True
+        return bool(result.getVariablesRelinearized())
+
     def _groups(self) -> Any:
         """Constrained ordering: the last poses in the last group; None for GTSAM's own."""
         window = self._settings.ordering_window
@@ -159,7 +166,10 @@ class Isam2Smoother(Smoother):
         for variable in behind:
             self._take_out(variable, values, "came out behind a camera")
         if behind:
-            self._rebuild(values)
+            try:
+                self._rebuild(values)
+            except RuntimeError as error:
+                self._repair(values, error)
 
     def _take_out(self, variable: int, values: Any, why: str) -> None:
         what = self._builder.take_out(variable)

@@ -359,3 +359,65 @@ def damaged(increment: Increment, what: str) -> Increment:
     )
     odometry = Odometry(arrays["motion"], arrays["motion's covariance"])
     return dataclasses.replace(increment, observations=seen, odometry=odometry)
+
+
+# --------------------------------------------------------------------------------------------
+# Behind a camera
+
+
+def test_behind_names_variables_that_any_of_their_cameras_has_behind_it() -> None:
+    points = {1: [0.2, 0.1, 3.0], 2: [0.0, 0.1, 4.0], 3: [0.0, -0.1, 5.0]}
+    made = builder()
+    for k in range(3):
+        seen = {i: at for i, at in points.items() if i != 3 or k < 2}
+        made.add(frame(k, seen, k == 0), known(points))
+    poses = np.array([np.linalg.matrix_power(STEP, k) for k in range(3)])
+    places = dict(enumerate(np.array(list(points.values()))))
+    assert made.behind(poses, places) == []
+    # Between the second and the third camera: behind the third, which saw 1 and 2 only.
+    between = np.array([0.0, 0.0, 0.15])
+    assert made.behind(poses, places | {1: between, 2: between}) == [1]
+    assert made.behind(poses, {0: places[0], 2: -places[2]}) == [2]
+    words = made.take_out(2)
+    assert words == "landmark 3 (seen 2 times, last from frame 1)"
+    assert not made.in_graph(2)
+    assert made.behind(poses, {0: places[0], 1: places[1]}) == []
+
+
+@pytest.mark.parametrize("name", ["batch", "isam2", "isam2, keyframes"])
+def test_what_came_out_behind_a_camera_is_taken_out(
+    name: str, drive: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    estimator, _ = run(SMOOTHERS[name], drive.increments)
+    variable = estimator._builder.tracks[OFTEN].variable
+    answers = [[variable]]
+    monkeypatch.setattr(
+        estimator._builder, "behind", lambda poses, points: answers.pop() if answers else []
+    )
+    found = estimator.estimate()
+    assert_finite(found)
+    assert len(found.remarks) == 1
+    assert found.remarks[0].startswith(f"landmark {OFTEN} (seen ")
+    assert "came out behind a camera" in found.remarks[0]
+    assert ate(found, drive) < 0.01
+    # It is still in the map, from its last sighting.
+    offset = found.landmarks.positions[row_of(found, OFTEN)] - drive.points_by_id[OFTEN]
+    assert np.linalg.norm(offset) < 0.2
+
+
+@GRAPHS
+def test_points_at_infinity_let_in_at_once_spoil_nothing(name: str) -> None:
+    """No waiting, no weak prior: disparities of half a pixel, with as much noise."""
+    far = simulate(
+        Drive(frames=12, points=40, depth_m=(40.0, 90.0), sigma_px=(0.3, 0.3, 0.3)),
+        np.random.default_rng(3),
+    )
+    near = drawn(3, frames=12)
+    both = [joined(a, b) for a, b in zip(near.increments, far.increments, strict=True)]
+    careless = dataclasses.replace(
+        SMOOTHERS[name], least_sightings=1, least_parallax=0.0, weak_parallax=0.0
+    )
+    found = answer(careless, both)
+    assert np.isfinite(found.trajectory.poses).all()
+    assert np.isfinite(found.landmarks.positions).all()
+    assert ate(found, near) < 0.02

@@ -1,0 +1,235 @@
+"""iSAM2: solver failures are mended or told, orderings agree, covariances tell the truth."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from simulated import assert_same_bits, play
+from smoothing import (
+    FREE,
+    answer,
+    assert_finite,
+    ate,
+    blackout,
+    build,
+    drawn,
+    nees_of,
+    position_sigma,
+    run,
+    unseen,
+)
+
+from fgslam.backend.isam2 import Isam2Smoother
+from fgslam.errors import EstimatorError
+from fgslam.evaluation.consistency import judge
+from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.settings.backend import Isam2Settings
+
+EVERY_FRAME = Isam2Settings(update_every=1)
+FAILED = """
+Indeterminant linear system detected while working near variable
+{key} (Symbol: l5).
+
+Thrown when a linear system is ill-posed.
+"""
+
+
+class Failing:
+    """A solver that fails near a variable when it is next updated, and works otherwise."""
+
+    def __init__(self, solver: Any, message: str) -> None:
+        self._solver = solver
+        self._message = message
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._solver, name)
+
+    def update(self, *arguments: Any) -> None:
+        raise RuntimeError(self._message)
+
+
+def spoil(estimator: Isam2Smoother, key: int) -> None:
+    estimator._isam = Failing(estimator._isam, FAILED.format(key=key))
+
+
+def played(frames: int, settings: Isam2Settings = EVERY_FRAME) -> tuple[Any, Isam2Smoother]:
+    simulation = drawn(8, frames=24)
+    estimator = build(settings)
+    assert isinstance(estimator, Isam2Smoother)
+    play(estimator, simulation.increments[:frames], FREE)
+    return simulation, estimator
+
+
+# --------------------------------------------------------------------------------------------
+# When the solver fails
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [EVERY_FRAME, Isam2Settings(), Isam2Settings(keyframe_every=4)],
+    ids=["every frame", "buffered", "keyframes"],
+)
+def test_a_failure_at_a_landmark_is_mended_and_told(settings: Isam2Settings) -> None:
+    simulation, estimator = played(13, settings)
+    variable = estimator._builder.tracks[5].variable
+    sightings = estimator._builder.tracks[5].sightings
+    spoil(estimator, landmark_key(variable))
+    play(estimator, simulation.increments[13:], FREE)
+    found = estimator.estimate()
+    assert_finite(found)
+    (remark,) = found.remarks
+    assert remark.startswith("landmark 5 (seen ")
+    assert "left the system indeterminate at frame " in remark
+    assert remark.endswith("taken out of the graph, iSAM2 built anew from the last estimate")
+    assert int(remark.split("seen ")[1].split()[0]) >= sightings
+    assert "\n" not in remark
+    assert ate(found, simulation) < 0.01
+
+
+def test_after_the_repair_it_is_as_if_the_landmark_had_never_been_in() -> None:
+    settings = Isam2Settings(update_every=1, relinearize_threshold=1e-9)
+    simulation, estimator = played(15, settings)
+    spoil(estimator, landmark_key(estimator._builder.tracks[5].variable))
+    play(estimator, simulation.increments[15:16], FREE)
+    without = answer(settings, unseen(simulation.increments[:16], 5, range(16)))
+    found = estimator.estimate()
+    np.testing.assert_allclose(found.trajectory.poses, without.trajectory.poses, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(found.covariances, without.covariances, rtol=1e-2, atol=1e-10)
+    rows = found.landmarks.rows(without.landmarks.ids)
+    sigma = np.sqrt(np.diagonal(without.landmarks.covariances, axis1=1, axis2=2))
+    offset = found.landmarks.positions[rows] - without.landmarks.positions
+    assert np.abs(offset / sigma).max() < 0.05
+
+
+def test_one_taken_out_comes_back_when_it_is_known_twice_as_well() -> None:
+    simulation, estimator = played(6)
+    before = estimator._builder.tracks[5].variable
+    spoil(estimator, landmark_key(before))
+    play(estimator, simulation.increments[6:7], FREE)
+    track = estimator._builder.tracks[5]
+    assert track.least_parallax == 6.0
+    play(estimator, simulation.increments[7:], FREE)
+    assert track.variable > before
+    found = estimator.estimate()
+    offset = found.landmarks.positions[found.landmarks.rows(np.array([5]))[0]]
+    assert np.linalg.norm(offset - simulation.points_by_id[5]) < 0.1
+
+
+@pytest.mark.parametrize(
+    "message",
+    [FAILED.format(key=pose_key(3)), "something\nelse", FAILED.format(key=landmark_key(9999))],
+    ids=["a pose", "no variable", "a stranger"],
+)
+def test_what_cannot_be_mended_ends_in_one_clear_line(message: str) -> None:
+    simulation, estimator = played(10)
+    estimator._isam = Failing(estimator._isam, message)
+    with pytest.raises(EstimatorError, match=r"^isam2: the solver failed at frame 10 \(") as told:
+        play(estimator, simulation.increments[10:11], FREE)
+    assert "\n" not in str(told.value)
+    assert "fgslam inspect" in str(told.value)
+
+
+def test_a_solver_that_fails_again_and_again_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulation, estimator = played(10)
+    solver = estimator._isam
+    variables = iter(range(10_000))
+
+    def failing() -> Failing:
+        return Failing(solver, FAILED.format(key=landmark_key(next(variables))))
+
+    monkeypatch.setattr(estimator, "_new_solver", failing)
+    estimator._isam = failing()
+    with pytest.raises(EstimatorError, match="isam2: the solver failed at frame 10"):
+        play(estimator, simulation.increments[10:11], FREE)
+    assert next(variables) <= 22
+
+
+# --------------------------------------------------------------------------------------------
+# Rhythm, ordering, covariances
+
+
+def test_orderings_give_the_same_estimate() -> None:
+    simulation = drawn(9, frames=24)
+    found = [
+        answer(Isam2Settings(relinearize_threshold=1e-9, ordering_window=w), simulation.increments)
+        for w in (0, 3, 30)
+    ]
+    for other in found[1:]:
+        np.testing.assert_allclose(
+            other.trajectory.poses, found[0].trajectory.poses, rtol=0, atol=1e-6
+        )
+        np.testing.assert_allclose(
+            other.landmarks.covariances, found[0].landmarks.covariances, rtol=1e-4, atol=1e-9
+        )
+
+
+def test_updates_come_in_their_rhythm_and_the_tracker_answers_between() -> None:
+    simulation, estimator = played(0, Isam2Settings(update_every=5))
+    sizes = []
+    for increment in simulation.increments[:12]:
+        play(estimator, [increment], FREE)
+        sizes.append(estimator._values.size())
+    grown = np.flatnonzero(np.diff(sizes, prepend=0))
+    assert grown.tolist() == [0, 5, 10]
+    assert len(estimator.estimate().trajectory) == 12
+
+
+def test_asking_on_the_way_changes_the_end_by_less_than_its_deviation() -> None:
+    simulation = drawn(9, frames=18)
+    asked = build(Isam2Settings())
+    for increment in simulation.increments:
+        play(asked, [increment], FREE)
+        assert_finite(asked.estimate())
+    found, plain = asked.estimate(), answer(Isam2Settings(), simulation.increments)
+    offset = found.trajectory.poses[1:, :3, 3] - plain.trajectory.poses[1:, :3, 3]
+    assert (np.linalg.norm(offset, axis=1) < 0.3 * position_sigma(plain.covariances[1:])).all()
+
+
+def test_pose_and_landmarks_are_consistent_over_20_drives() -> None:
+    found = [
+        nees_of(answer(Isam2Settings(), simulation.increments), simulation)
+        for simulation in (drawn(100 + seed) for seed in range(20))
+    ]
+    for runs in zip(*found, strict=True):
+        verdict = judge(runs)
+        assert verdict is not None
+        assert verdict.verdict == "consistent", verdict
+
+
+def test_a_blackout_is_bridged_and_the_uncertainty_shows_it() -> None:
+    simulation = drawn(3, frames=26)
+    dark = range(10, 20)
+    estimator, stats = run(EVERY_FRAME, blackout(simulation.increments, dark))
+    online = position_sigma(np.array([s.covariance for s in stats]))
+    assert (np.diff(online[9:20]) > 0).all()
+    assert online[19] > 5 * online[9]
+    assert online[-1] < 0.3 * online[19]
+    found = estimator.estimate()
+    sigma = position_sigma(found.covariances)
+    assert sigma[12:17].min() > 2 * max(sigma[9], sigma[20])
+    error = np.linalg.norm(found.trajectory.poses[:, :3, 3] - simulation.poses[:, :3, 3], axis=1)
+    assert (error[1:] < 4 * sigma[1:]).all()
+    assert error[-1] < 0.03
+
+
+@pytest.mark.parametrize("every", [1, 4])
+@pytest.mark.parametrize("at", [5, 10, 13])
+def test_restored_between_updates_and_keyframes_it_continues_to_the_bit(
+    every: int, at: int
+) -> None:
+    settings = dataclasses.replace(Isam2Settings(), keyframe_every=every)
+    increments = drawn(9, frames=18).increments
+    straight, first, second = build(settings), build(settings), build(settings)
+    play(straight, increments, FREE)
+    play(first, increments[:at], FREE)
+    second.restore({name: np.array(array) for name, array in first.state().items()})
+    assert_same_bits(second.estimate(), first.estimate())
+    third = build(settings)
+    third.restore(second.state())
+    play(third, increments[at:], FREE)
+    assert_same_bits(third.estimate(), straight.estimate())
+    with pytest.raises(EstimatorError, match="only a new estimator"):
+        straight.restore(first.state())
