@@ -14,7 +14,6 @@ from factor_checks import (
     numerical_jacobian,
     random_covariance,
     random_pose,
-    root_information,
     values_of,
 )
 
@@ -39,44 +38,25 @@ def gentle(rng: np.random.Generator, size: float) -> FloatArray:
 # Prior and odometry
 
 
-def test_a_prior_is_as_specified(rng: np.random.Generator) -> None:
-    for _ in range(10):
+@pytest.mark.parametrize("off", [1e-9, 0.05, 0.5])
+def test_a_prior_is_as_specified(off: float, rng: np.random.Generator) -> None:
+    """Also far from it: GTSAM's Jacobian has the logarithm's in it."""
+    for _ in range(5):
         mean, covariance = random_pose(rng, 3.0), random_covariance(rng, 6, 0.1)
         factor = pose_prior(0, Prediction(mean, covariance))
         residual = partial(residuals.pose_prior, prior=mean)
-        at_mean = mean @ gentle(rng, 1e-9)
-        assert_as_specified(factor, residual, [at_mean], covariance)
-        far = mean @ gentle(rng, 0.5)
-        expected = root_information(covariance) @ residual(far)
-        found = factor.whitenedError(values_of(far))
-        assert_near(found, expected, 1e-10 * np.abs(expected).max())
+        assert_as_specified(factor, residual, [mean @ gentle(rng, off)], covariance)
 
 
-def test_odometry_is_as_specified(rng: np.random.Generator) -> None:
-    for _ in range(10):
+@pytest.mark.parametrize("off", [1e-9, 0.05, 0.5])
+def test_odometry_is_as_specified(off: float, rng: np.random.Generator) -> None:
+    for _ in range(5):
         before, motion = random_pose(rng, 3.0), random_pose(rng, 1.0)
         covariance = random_covariance(rng, 6, 0.1)
         factor = odometry_factor(0, 1, Odometry(motion, covariance))
         residual = partial(residuals.odometry, pTn=motion)
-        exact = [before, before @ motion @ gentle(rng, 1e-9)]
-        assert_as_specified(factor, residual, exact, covariance)
-        far = [before, before @ motion @ gentle(rng, 0.5)]
-        expected = root_information(covariance) @ residual(*far)
-        found = factor.whitenedError(values_of(*far))
-        assert_near(found, expected, 1e-10 * np.abs(expected).max())
-
-
-def test_odometrys_jacobian_is_exact_far_from_the_measurement_too(
-    rng: np.random.Generator,
-) -> None:
-    for size in (0.1, 0.7):
-        before, motion = random_pose(rng, 1.0), random_pose(rng, 1.0)
-        after = before @ motion @ gentle(rng, size)
-        factor = odometry_factor(0, 1, Odometry(motion, np.eye(6)))
-        theirs, _ = factor.linearize(values_of(before, after)).jacobian()
-        residual = partial(residuals.odometry, pTn=motion)
-        ours = [numerical_jacobian(residual, [before, after], i) for i in (0, 1)]
-        assert_near(theirs, np.hstack(ours), 1e-7 * np.abs(theirs).max())
+        after = before @ motion @ gentle(rng, off)
+        assert_as_specified(factor, residual, [before, after], covariance)
 
 
 @pytest.mark.parametrize("angle", [np.pi - 1e-3, np.pi - 1e-9, np.pi])
