@@ -81,7 +81,7 @@ class Clocked:
 
 @dataclass(frozen=True)
 class Played:
-    """A whole drive through one estimator.
+    """A drive, or its beginning, through one estimator.
 
     Attributes:
         estimator: after the last frame.
@@ -95,16 +95,40 @@ class Played:
     online: FloatArray
 
 
+class Player:
+    """Replays a log through a new estimator, as far as it is told to at a time."""
+
+    def __init__(self, drive: MeasuredDrive, settings: EstimatorSettings) -> None:
+        self._log = drive.log
+        self._clocked = Clocked(make_estimator(drive.log.rig, settings, drive.ego_motion))
+        self._solver = EgoMotionSolver(drive.log.rig, drive.ego_motion)
+        self._motion = replay_motion(drive.log)
+        self._online: list[FloatArray] = []
+
+    def on_to(self, stop: int) -> None:
+        """Goes on to the frame before ``stop``."""
+        for k in range(len(self._online), stop):
+            frame = replay_frame(
+                self._log.increments[k],
+                self._clocked,  # type: ignore[arg-type]
+                self._solver,
+                self._motion,
+                k,
+            )
+            self._online.append(frame.stats.wTc)
+
+    def played(self) -> Played:
+        """What has been so far."""
+        clocked = self._clocked
+        cpu, wall = np.array(clocked.cpu), np.array(clocked.wall)
+        return Played(clocked.inner, cpu, wall, np.array(self._online))
+
+
 def play(drive: MeasuredDrive, settings: EstimatorSettings) -> Played:
-    """Replays the log through a new estimator."""
-    clocked = Clocked(make_estimator(drive.log.rig, settings, drive.ego_motion))
-    solver = EgoMotionSolver(drive.log.rig, drive.ego_motion)
-    motion = replay_motion(drive.log)
-    online = [
-        replay_frame(increment, clocked, solver, motion, k).stats.wTc  # type: ignore[arg-type]
-        for k, increment in enumerate(drive.log)
-    ]
-    return Played(clocked.inner, np.array(clocked.cpu), np.array(clocked.wall), np.array(online))
+    """Replays the whole log through a new estimator."""
+    player = Player(drive, settings)
+    player.on_to(len(drive.log))
+    return player.played()
 
 
 def cpu_seconds(work: Callable[[], object]) -> float:
