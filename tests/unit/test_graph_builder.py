@@ -139,7 +139,7 @@ def test_waiting_landmarks_tell_nothing_about_poses() -> None:
     )
 
 
-@GRAPHS
+@pytest.mark.parametrize("name", ["batch", "isam2, keyframes", "fixed_lag"])
 def test_what_waits_is_told_with_an_honest_covariance(name: str) -> None:
     """Landmarks seen once, over many drives: the pose's uncertainty is in their covariance."""
     errors = []

@@ -1,0 +1,150 @@
+"""Batch: plain least squares at the end, wrong matches out, honest covariances and messages."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from simulated import assert_same_bits, play
+from smoothing import (
+    FREE,
+    SMOOTHERS,
+    answer,
+    assert_finite,
+    ate,
+    blackout,
+    build,
+    drawn,
+    nees_of,
+    position_sigma,
+    run,
+    wrong_matches,
+)
+
+from fgslam.backend import refinement
+from fgslam.backend.batch import BatchSmoother
+from fgslam.errors import EstimatorError
+from fgslam.evaluation.consistency import judge
+from fgslam.settings.backend import BatchSettings
+
+METHODS = pytest.mark.parametrize("name", ["batch", "gnc"])
+
+
+@METHODS
+def test_pose_and_landmarks_are_consistent_over_20_drives(name: str) -> None:
+    found = [
+        nees_of(answer(SMOOTHERS[name], simulation.increments), simulation)
+        for simulation in (drawn(100 + seed) for seed in range(20))
+    ]
+    for runs in zip(*found, strict=True):
+        verdict = judge(runs)
+        assert verdict is not None
+        assert verdict.verdict == "consistent", verdict
+
+
+def test_it_stays_consistent_among_wrong_matches() -> None:
+    """The last solution is plain least squares over what fits: its covariances hold."""
+    found = []
+    for seed in range(20):
+        simulation = drawn(100 + seed)
+        spoilt = wrong_matches(simulation.increments, 0.2, np.random.default_rng(seed))
+        found.append(nees_of(answer(BatchSettings(), spoilt), simulation)[0])
+    verdict = judge(found)
+    assert verdict is not None
+    assert verdict.verdict == "consistent", verdict
+
+
+def test_the_end_is_the_minimum_of_what_fits() -> None:
+    simulation = drawn(5)
+    spoilt = wrong_matches(simulation.increments, 0.3, np.random.default_rng(5))
+    estimator, _ = run(BatchSettings(), spoilt)
+    assert isinstance(estimator, BatchSmoother)
+    refined = estimator._refined_graph()
+    graph, values = refined.graph, refined.values
+    total = estimator._builder.kept_factors().size()
+    assert 0.7 * total < graph.size() < 0.85 * total
+    gradient = graph.linearize(values).gradientAtZero()
+    step = graph.linearize(values).optimize()
+    assert max(np.abs(step.at(key)).max() for key in values.keys()) < 1e-4  # noqa: SIM118
+    assert gradient.size() == values.size()
+    # 3 numbers an observation, 3 a landmark, 6 a pose but the first; the motions have 6 as well.
+    freedom = 3 * (graph.size() - 16) - 3 * len(refined.variables)
+    assert 2.0 * graph.error(values) == pytest.approx(freedom, rel=0.2)
+
+
+def test_steering_answers_with_the_smoothed_pose() -> None:
+    """At the frames that are solved; in between the tracker goes on from there."""
+    increments = drawn(60, frames=8).increments
+    _, stats = run(BatchSettings(solve_every=4), increments)
+    _, alone = run(BatchSettings(), increments)
+    smoothed = answer(BatchSettings(), increments[:4])
+    np.testing.assert_allclose(stats[3].wTc, smoothed.trajectory.poses[-1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(stats[3].covariance, smoothed.covariances[-1], rtol=1e-6)
+    assert (stats[2].wTc == alone[2].wTc).all()
+    assert (stats[4].wTc != alone[4].wTc).any()
+
+
+def test_a_blackout_is_bridged_and_the_uncertainty_shows_it() -> None:
+    simulation = drawn(3, frames=26)
+    found = answer(BatchSettings(), blackout(simulation.increments, range(10, 20)))
+    sigma = position_sigma(found.covariances)
+    assert (np.diff(sigma[9:14]) > 0).all()
+    assert (np.diff(sigma[16:21]) < 0).all()
+    assert sigma[14] > 4 * max(sigma[9], sigma[20])
+    error = np.linalg.norm(found.trajectory.poses[:, :3, 3] - simulation.poses[:, :3, 3], axis=1)
+    assert (error[1:] < 4 * sigma[1:]).all()
+    assert error[20:].max() < 0.03
+
+
+def test_a_solver_that_fails_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    estimator, _ = run(BatchSettings(), drawn(7, frames=6).increments)
+
+    def failing(*arguments: object) -> None:
+        raise RuntimeError("\nout of\nluck\n")
+
+    monkeypatch.setattr(gtsam, "LevenbergMarquardtOptimizer", failing)
+    with pytest.raises(EstimatorError, match=r"^batch: the solver failed after frame 5 \(out of l"):
+        estimator.estimate()
+
+
+def test_a_landmark_of_which_nothing_fits_is_left_out_and_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    simulation = drawn(7)
+    estimator, _ = run(BatchSettings(), simulation.increments)
+    variable = estimator._builder.tracks[3].variable
+    told = [{variable: "has no observation that fits the others"}]
+    monkeypatch.setattr(refinement, "_lost", lambda *given: told.pop() if told else {})
+    found = estimator.estimate()
+    assert_finite(found)
+    assert len(found.remarks) == 1
+    assert found.remarks[0].startswith("landmark 3 (seen ")
+    assert found.remarks[0].endswith("has no observation that fits the others: left out")
+    assert 3 in found.landmarks.ids
+    assert ate(found, simulation) < 0.01
+    with pytest.raises(EstimatorError, match=r"landmark 3 .* was left out of the graph"):
+        estimator.joint_covariance(np.array([3]))
+
+
+def test_landmarks_lost_in_every_round_come_to_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulation = drawn(7)
+    estimator, _ = run(BatchSettings(), simulation.increments)
+
+    def lost(builder: object, values: gtsam.Values, kept: object) -> dict[int, str]:
+        return {refinement.landmark_variables(values)[0]: "is lost"}
+
+    monkeypatch.setattr(refinement, "_lost", lost)
+    found = estimator.estimate()
+    assert_finite(found)
+    assert len(found.remarks) == 5
+
+
+@METHODS
+def test_restored_it_continues_to_the_bit(name: str) -> None:
+    increments = drawn(9, frames=12).increments
+    straight, first, second = (build(SMOOTHERS[name]) for _ in range(3))
+    play(straight, increments, FREE)
+    play(first, increments[:7], FREE)
+    second.restore({key: np.array(array) for key, array in first.state().items()})
+    play(second, increments[7:], FREE)
+    assert_same_bits(second.estimate(), straight.estimate())

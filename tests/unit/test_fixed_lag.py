@@ -1,0 +1,220 @@
+"""Fixed lag: what leaves is frozen and told, effort and memory stay, failures are mended."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from simulated import assert_same_bits, play
+from smoothing import (
+    FREE,
+    answer,
+    assert_finite,
+    ate,
+    blackout,
+    build,
+    drawn,
+    nees_of,
+    position_sigma,
+    run,
+    unseen,
+)
+
+from fgslam.backend.fixed_lag import FixedLagSmoother
+from fgslam.errors import EstimatorError
+from fgslam.evaluation.consistency import judge
+from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.settings.backend import FixedLagSettings
+
+LAG = FixedLagSettings(lag_frames=5)
+
+
+class Failing:
+    """A solver that fails when it is next updated."""
+
+    def __init__(self, solver: Any, message: str) -> None:
+        self._solver = solver
+        self._message = message
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._solver, name)
+
+    def update(self, *arguments: Any) -> None:
+        raise RuntimeError(self._message)
+
+
+def smoother(settings: FixedLagSettings = LAG) -> FixedLagSmoother:
+    made = build(settings)
+    assert isinstance(made, FixedLagSmoother)
+    return made
+
+
+def test_no_lag_at_all_is_refused() -> None:
+    with pytest.raises(EstimatorError, match="no lag; set"):
+        build(FixedLagSettings(lag_frames=None, lag_s=None))
+
+
+@pytest.mark.parametrize("lag", [{"lag_frames": 4}, {"lag_frames": None, "lag_s": 2.0}])
+def test_poses_older_than_the_lag_never_change_again(lag: dict[str, float | None]) -> None:
+    """Frames come every half second."""
+    simulation, estimator = drawn(1, frames=14), smoother(FixedLagSettings(**lag))
+    history = []
+    for increment in simulation.increments:
+        play(estimator, [increment], FREE)
+        history.append(estimator.estimate())
+    for earlier, later in itertools.pairwise(history):
+        kept = max(len(earlier.trajectory) - 5, 0)
+        for a, b in (
+            (earlier.trajectory.poses, later.trajectory.poses),
+            (earlier.covariances, later.covariances),
+        ):
+            np.testing.assert_array_equal(a[:kept], b[:kept])
+    last, before = history[-1].trajectory.poses, history[-2].trajectory.poses
+    assert (last[-5:-1] != before[-4:]).any()
+
+
+def test_a_frame_s_covariance_when_it_leaves_is_the_last_one_within() -> None:
+    simulation, estimator = drawn(1, frames=14), smoother()
+    inside = {}
+    for k, increment in enumerate(simulation.increments):
+        play(estimator, [increment], FREE)
+        if k >= 5:
+            inside[k - 5] = estimator.estimate().covariances[k - 5]
+    final = estimator.estimate().covariances
+    for frame, covariance in inside.items():
+        np.testing.assert_allclose(final[frame], covariance, rtol=1e-9, atol=1e-18)
+
+
+def test_factors_and_variables_do_not_grow_with_the_run() -> None:
+    simulation = drawn(2, frames=70, points=140, prune_after=8)
+    estimator = smoother()
+    counts = []
+    for increment in simulation.increments:
+        play(estimator, [increment], FREE)
+        counts.append(
+            (
+                estimator._solver.getFactors().nrFactors(),
+                estimator._values.size(),
+                len(estimator._recent),
+                estimator._builder.graph.size() + len(estimator._builder._seen_frame),
+                estimator._solver.getFactors().size(),
+            )
+        )
+    seen = np.array([len(x.observations) for x in simulation.increments])
+    early, late = np.array(counts[10:30]), np.array(counts[50:])
+    # The views differ by what there is to see.
+    per_frame = seen[50:].mean() / seen[10:30].mean()
+    assert (late[:, :2].mean(axis=0) <= 1.3 * per_frame * early[:, :2].mean(axis=0)).all()
+    assert (late[:, 2] == 6).all()
+    assert (late[:, 3] == 0).all()
+    assert late[-1, 4] <= np.array(counts[:45])[:, 4].max()  # slots of factors are used again
+
+
+def test_the_frozen_place_is_shown_until_the_landmark_is_seen_again() -> None:
+    simulation = drawn(8, frames=24)
+    estimator = smoother()
+    increments = unseen(simulation.increments, 28, range(5, 16))
+    places = []
+    for k, increment in enumerate(increments):
+        play(estimator, [increment], FREE)
+        found = estimator.estimate().landmarks
+        row = found.rows(np.array([28]))[0]
+        places.append((found.positions[row], found.covariances[row]))
+        if k in (12, 15):
+            assert estimator._builder.tracks[28].variable == -1
+            with pytest.raises(EstimatorError, match="landmark 28 waits outside the graph"):
+                estimator.joint_covariance(np.array([28]))
+    for k in range(11, 16):
+        np.testing.assert_array_equal(places[k][0], places[10][0])
+        np.testing.assert_array_equal(places[k][1], places[10][1])
+    offset = places[15][0] - simulation.points_by_id[28]
+    assert offset @ np.linalg.solve(places[15][1], offset) < 16.3
+    assert (places[-1][0] != places[15][0]).any()
+
+
+def test_pose_and_landmarks_are_consistent_over_20_drives() -> None:
+    found = [
+        nees_of(answer(LAG, simulation.increments), simulation)
+        for simulation in (drawn(100 + seed) for seed in range(20))
+    ]
+    for runs in zip(*found, strict=True):
+        verdict = judge(runs)
+        assert verdict is not None
+        assert verdict.verdict == "consistent", verdict
+
+
+def test_a_blackout_longer_than_the_lag_is_bridged_and_never_forgotten() -> None:
+    """All landmarks have left: what follows is as uncertain as the way through the dark."""
+    simulation = drawn(3, frames=26)
+    estimator, stats = run(LAG, blackout(simulation.increments, range(10, 20)))
+    found = estimator.estimate()
+    online = position_sigma(np.array([s.covariance for s in stats]))
+    assert (np.diff(online[9:20]) > 0).all()
+    assert online[19] > 5 * online[9]
+    assert position_sigma(found.covariances)[20:].min() > 0.9 * online[19]
+    error = np.linalg.norm(found.trajectory.poses[:, :3, 3] - simulation.poses[:, :3, 3], axis=1)
+    assert (error[1:] < 4 * position_sigma(found.covariances)[1:]).all()
+
+
+def test_a_failure_at_a_landmark_is_mended_again_and_again() -> None:
+    simulation = drawn(8, frames=24)
+    estimator = smoother()
+    play(estimator, simulation.increments[:9], FREE)
+    for k, identity in ((9, 28), (11, 5)):
+        variable = estimator._builder.tracks[identity].variable
+        message = f"\nIndeterminate near variable\n{landmark_key(variable)} (Symbol: l1).\n\nWhy."
+        estimator._solver = Failing(estimator._solver, message)
+        play(estimator, simulation.increments[k : k + 2], FREE)
+        assert not estimator._builder.in_graph(variable)
+    play(estimator, simulation.increments[13:], FREE)
+    found = estimator.estimate()
+    assert_finite(found)
+    assert [r.split(" (")[0] for r in found.remarks] == ["landmark 28", "landmark 5"]
+    for frame, remark in zip((9, 11), found.remarks, strict=True):
+        assert f"left the system indeterminate at frame {frame}: taken out" in remark
+        assert "\n" not in remark
+    assert ate(found, simulation) < 0.015
+    assert ate(found, simulation) < 1.5 * ate(answer(LAG, simulation.increments), simulation)
+
+
+def test_the_rebuilt_window_is_as_uncertain_as_the_one_that_failed() -> None:
+    simulation = drawn(8, frames=24)
+    mended, whole = smoother(), smoother()
+    for estimator in (mended, whole):
+        play(estimator, simulation.increments[:12], FREE)
+    variable = mended._builder.tracks[28].variable
+    mended._solver = Failing(mended._solver, f"variable {landmark_key(variable)} (")
+    for estimator in (mended, whole):
+        play(estimator, simulation.increments[12:13], FREE)
+    a, b = (position_sigma(e.estimate().covariances[-6:]) for e in (mended, whole))
+    # Of the landmarks' shared past only the oldest pose's part is kept.
+    assert ((a > 0.95 * b) & (a < 2.0 * b)).all(), a / b
+
+
+@pytest.mark.parametrize(
+    "message", [f"variable {pose_key(4)} (", "odd\nwords", f"variable {landmark_key(999)} ("]
+)
+def test_what_cannot_be_mended_ends_in_one_clear_line(message: str) -> None:
+    simulation, estimator = drawn(8, frames=12), smoother()
+    play(estimator, simulation.increments[:9], FREE)
+    estimator._solver = Failing(estimator._solver, message)
+    with pytest.raises(EstimatorError, match=r"^fixed_lag: the solver failed at frame 9 \(") as e:
+        play(estimator, simulation.increments[9:10], FREE)
+    assert "\n" not in str(e.value)
+    assert "fgslam inspect" in str(e.value)
+
+
+@pytest.mark.parametrize("at", [3, 9])
+def test_restored_it_continues_to_the_bit(at: int) -> None:
+    increments = drawn(9, frames=14).increments
+    straight, first, second = smoother(), smoother(), smoother()
+    play(straight, increments, FREE)
+    play(first, increments[:at], FREE)
+    second.restore({name: np.array(array) for name, array in first.state().items()})
+    play(second, increments[at:], FREE)
+    assert_same_bits(second.estimate(), straight.estimate())
+    held = [i for i, track in second._builder.tracks.items() if track.variable >= 0][:2]
+    ids = np.array(held)
+    assert_same_bits(second.joint_covariance(ids), straight.joint_covariance(ids))

@@ -1,0 +1,107 @@
+"""Wrong matches: kernels, trim and graduated non-convexity against 30 % gross ones."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import gtsam
+import numpy as np
+import pytest
+from smoothing import SMOOTHERS, answer, ate, build, drawn, run, wrong_matches
+
+from fgslam.backend.outliers import graduated, observed_variables, solver_parameters, trimmed
+from fgslam.settings.backend import BatchSettings, EstimatorSettings, KernelSettings
+from fgslam.types import FloatArray
+
+CAUCHY = KernelSettings("cauchy", 3.0)
+ROBUST: dict[str, EstimatorSettings] = SMOOTHERS | {
+    f"{name}, cauchy": dataclasses.replace(SMOOTHERS[name], kernel=CAUCHY)
+    for name in ("isam2", "isam2, keyframes", "fixed_lag")
+}
+PLAIN = BatchSettings(kernel=KernelSettings("none"), trim=False, contradicted_after=0)
+
+
+@pytest.mark.parametrize("name", ROBUST)
+def test_30_percent_gross_errors_less_than_double_the_error(name: str) -> None:
+    for seed in range(3):
+        simulation = drawn(seed)
+        spoilt = wrong_matches(simulation.increments, 0.3, np.random.default_rng(100 + seed))
+        clean = ate(answer(ROBUST[name], simulation.increments), simulation)
+        assert ate(answer(ROBUST[name], spoilt), simulation) < 2.0 * clean, seed
+
+
+def test_without_kernel_and_trim_they_would() -> None:
+    """The errors above are gross indeed."""
+    simulation = drawn(0)
+    spoilt = wrong_matches(simulation.increments, 0.3, np.random.default_rng(100))
+    assert ate(answer(PLAIN, spoilt), simulation) > 0.1
+
+
+def problem(kernel: KernelSettings, share: float) -> tuple[gtsam.NonlinearFactorGraph, object, int]:
+    """A graph, its initial values, and how many of its matches are wrong."""
+    simulation = drawn(0)
+    spoilt = wrong_matches(simulation.increments, share, np.random.default_rng(100))
+    pairs = zip(simulation.increments, spoilt, strict=True)
+    wrong = sum(
+        int((a.observations.measurement != b.observations.measurement).any(axis=1).sum())
+        for a, b in pairs
+    )
+    settings = dataclasses.replace(PLAIN, kernel=kernel)
+    estimator, _ = run(settings, spoilt)
+    return estimator._builder.kept_factors(), estimator._values, wrong
+
+
+def residuals(graph: gtsam.NonlinearFactorGraph, values: object) -> FloatArray:
+    """Squared whitened residuals of the landmark observations, without kernels."""
+    out = []
+    for row in range(graph.size()):
+        factor = graph.at(row)
+        model = factor.noiseModel()
+        if isinstance(factor, gtsam.GenericStereoFactor3D):
+            plain = model.noise() if isinstance(model, gtsam.noiseModel.Robust) else model
+            out.append(plain.whiten(factor.unwhitenedError(values)))
+    return np.array([r @ r for r in out])
+
+
+@pytest.mark.parametrize("name", ["huber", "cauchy", "geman_mcclure"])
+def test_the_trim_keeps_what_is_within_the_quantile_and_nothing_else(name: str) -> None:
+    graph, values, wrong = problem(KernelSettings(name, 3.0), 0.3)
+    found, kept = trimmed(graph, values, solver_parameters(100, 1e-9))
+    everything, inside = residuals(graph, found), residuals(kept, found)
+    assert len(inside) == (everything <= 16.2662).sum()
+    assert inside.max() <= 16.2663
+    left_out = len(everything) - len(inside)
+    assert 0.9 * wrong < left_out < 1.1 * wrong
+    # What it keeps carries no kernel any more.
+    models = [kept.at(row).noiseModel() for row in range(kept.size())]
+    assert not any(isinstance(model, gtsam.noiseModel.Robust) for model in models)
+
+
+def test_the_trim_leaves_a_clean_problem_nearly_whole() -> None:
+    graph, values, wrong = problem(CAUCHY, 0.0)
+    assert wrong == 0
+    _, kept = trimmed(graph, values, solver_parameters(100, 1e-9))
+    assert graph.size() - 5 <= kept.size() <= graph.size()
+
+
+def test_graduated_non_convexity_finds_the_wrong_ones() -> None:
+    graph, values, wrong = problem(KernelSettings("none"), 0.3)
+    found, kept = graduated(graph, values, solver_parameters(100, 1e-9))
+    left_out = graph.size() - kept.size()
+    assert 0.9 * wrong < left_out < 1.1 * wrong
+    assert residuals(kept, found).max() < 20.0
+    others = graph.size() - len(residuals(graph, values))
+    assert kept.size() - len(residuals(kept, values)) == others
+
+
+def test_observed_variables_are_those_with_an_observation() -> None:
+    estimator, _ = run(PLAIN, drawn(0).increments)
+    builder = estimator._builder
+    graph = builder.kept_factors()
+    assert observed_variables(graph) == set(range(builder.variables))
+    priors = gtsam.NonlinearFactorGraph()
+    for row in range(graph.size()):
+        if len(graph.at(row).keys()) == 1:
+            priors.add(graph.at(row))
+    assert observed_variables(priors) == set()
+    assert observed_variables(build(PLAIN)._builder.kept_factors()) == set()
