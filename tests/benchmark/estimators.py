@@ -16,6 +16,7 @@ from fgslam.backend.batch import BatchSmoother
 from fgslam.backend.landmark_kalman import LandmarkKalman
 from fgslam.backend.landmark_kalman_graph import LandmarkKalmanGraph
 from fgslam.backend.marginals import marginals_of
+from fgslam.backend.outliers import solver_parameters
 from fgslam.factory import make_estimator
 from fgslam.frontend.ego_motion import EgoMotionSolver
 from fgslam.measurement_log import MeasurementLog
@@ -55,7 +56,7 @@ ISAM2 = {
     "buffered_10": Isam2Settings(update_every=10),
 }
 LEAST_SQUARES = BatchSettings(kernel=KernelSettings("none"), trim=False)
-BIG_MAP = ("dataset.world.landmarks=16000", "dataset.detection.features=250")
+BIG_MAP = ("dataset.world.landmarks=16000", "dataset.detection.features=320")
 SAMPLE = 100
 
 
@@ -96,14 +97,21 @@ def poses_of(played: Played) -> FloatArray:
 
 def batch_solve_s(drive: MeasuredDrive) -> float:
     """One plain least-squares solution from the tracker's initial values, without marginals."""
-    return cpu_seconds(entered(drive)._optimise)
+    graph, values = problem(drive)
+    return cpu_seconds(lambda: minimum(graph, values))
 
 
-def entered(drive: MeasuredDrive) -> BatchSmoother:
-    """Batch with all frames in its graph, not yet solved."""
+def problem(drive: MeasuredDrive) -> tuple[Any, Any]:
+    """Batch's factors and initial values of a whole drive."""
     estimator = play(drive, LEAST_SQUARES).estimator
     assert isinstance(estimator, BatchSmoother)
-    return estimator
+    return estimator._builder.kept_factors(), estimator._values
+
+
+def minimum(graph: Any, values: Any) -> Any:
+    """By Levenberg-Marquardt, as batch does it."""
+    params = solver_parameters(LEAST_SQUARES.max_iterations, 1e-9)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
 
 def graph_filter(drive: MeasuredDrive, repeats: int) -> dict[str, float]:
@@ -159,9 +167,8 @@ def all_marginals(repeats: int, seed: int = 0) -> dict[str, float]:
 
     GTSAM's are measured on a sample of the landmarks, and extrapolated to all.
     """
-    estimator = entered(open_drive("lab_trials", BIG_MAP))
-    graph = estimator._optimise()
-    values = estimator._values
+    graph, start = problem(open_drive("lab_trials", BIG_MAP))
+    values = minimum(graph, start)
     keys = marginals_of(graph, values).landmark_keys
     sample = np.random.default_rng(seed).choice(keys, SAMPLE, replace=False)
 

@@ -25,7 +25,7 @@ from fgslam.settings.backend import (
 from fgslam.types import Estimate
 from tests.benchmark.drives import MeasuredDrive, Player, cpu_seconds, open_drive, play
 
-KEYFRAMES = Isam2Settings(keyframe_every=5, update_every=10)
+KEYFRAMES = Isam2Settings(keyframe_every=4, update_every=40, ordering_window=10)
 WINDOW = 500
 LEAST_SQUARES = BatchSettings(kernel=KernelSettings("none"), trim=False)
 LIMITS = {
