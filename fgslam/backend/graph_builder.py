@@ -134,7 +134,9 @@ class GraphBuilder:
         self._settings = settings
         self._floor = floor
         self._prior = prior
-        self._factors = landmark_factors(sensor, Whitening(kernel.name, kernel.width))
+        self._noise = settings.noise_factor**2
+        whitening = Whitening(kernel.name, kernel.width / settings.noise_factor)
+        self._factors = landmark_factors(sensor, whitening)
         self._rows: dict[int, list[int]] = {}
         self._id_of: list[int] = []
         self._first_frame = 0
@@ -228,12 +230,20 @@ class GraphBuilder:
         for row in self._rows.pop(variable, []):
             if self._remember:
                 self.graph.remove(row)
+        words = self.describe(variable)
+        track = self.tracks.get(identity)
+        if track is not None and track.variable == variable:
+            track.variable = -1
+            track.waiting = []
+            track.least_parallax = 2.0 * max(track.least_parallax, 1.0)
+        return words
+
+    def describe(self, variable: int) -> str:
+        """A landmark variable's identity and sightings, in words."""
+        identity = self._id_of[variable]
         track = self.tracks.get(identity)
         if track is None or track.variable != variable:
             return f"landmark {identity} (no longer in use)"
-        track.variable = -1
-        track.waiting = []
-        track.least_parallax = 2.0 * max(track.least_parallax, 1.0)
         return (
             f"landmark {identity} (seen {track.sightings} times, last from frame "
             f"{track.last.frame})"
@@ -353,7 +363,7 @@ class GraphBuilder:
             pose_key(sighting.frame),
             landmark_key(track.variable),
             sighting.measurement,
-            sighting.covariance,
+            self._noise * sighting.covariance,
         )
         self._rows[track.variable].append(self._push(new, factor))
         if self._remember:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -24,14 +24,38 @@ class Solution:
         pose_covariances: (n, 6, 6); NaN where they cannot be had.
         points: positions (3,) of landmark variables.
         point_covariances: (3, 3) of the same.
-        remark: why covariances are missing; empty where they are not.
+        remarks: what was left out, why covariances are missing; in words.
     """
 
     poses: FloatArray
     pose_covariances: FloatArray
     points: dict[int, FloatArray]
     point_covariances: dict[int, FloatArray]
-    remark: str = ""
+    remarks: tuple[str, ...] = ()
+
+
+class SolvedGraph(Protocol):
+    """Factors, values of all variables, and what was left out."""
+
+    @property
+    def graph(self) -> Any:
+        """The factors that count."""
+        ...
+
+    @property
+    def values(self) -> Any:
+        """Values of all variables."""
+        ...
+
+    @property
+    def variables(self) -> list[int]:
+        """Landmark variables, ascending."""
+        ...
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """In words."""
+        ...
 
 
 def poses_of(values: Any, frames: list[int]) -> FloatArray:
@@ -47,10 +71,9 @@ def points_of(values: Any, variables: list[int]) -> dict[int, FloatArray]:
     return {v: np.asarray(values.atPoint3(landmark_key(v))) for v in variables}
 
 
-def solution(
-    graph: Any, values: Any, frames: list[int], variables: list[int], floor: Floor
-) -> Solution:
-    """Everything about frames of the graph and landmark variables, at the given values."""
+def solution(refined: SolvedGraph, frames: list[int], floor: Floor) -> Solution:
+    """Everything about frames of a solved graph and its landmark variables."""
+    graph, values, variables = refined.graph, refined.values, refined.variables
     poses, points = poses_of(values, frames), points_of(values, variables)
     kept = np.full((len(poses), 6, 6), np.nan)
     try:
@@ -60,8 +83,8 @@ def solution(
         kept[frames] = allowed_parts(floor, poses[frames], marginals.poses())
     except EstimatorError as error:
         missing = {v: np.full((3, 3), np.nan) for v in variables}
-        return Solution(poses, kept, points, missing, str(error))
-    return Solution(poses, kept, points, covariances)
+        return Solution(poses, kept, points, missing, (*refined.remarks, str(error)))
+    return Solution(poses, kept, points, covariances, refined.remarks)
 
 
 def allowed_parts(floor: Floor, poses: FloatArray, covariances: FloatArray) -> FloatArray:

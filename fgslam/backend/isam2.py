@@ -11,13 +11,12 @@ from fgslam.backend.between import fill_between
 from fgslam.backend.graph_solution import (
     Solution,
     allowed_parts,
-    joint_of,
-    points_of,
-    poses_of,
     poses_of_frame,
     solution,
     suspect,
 )
+from fgslam.backend.outliers import solver_parameters, trimmed
+from fgslam.backend.refinement import Refined, refine
 from fgslam.backend.segments import Segments, TrackedFrame
 from fgslam.backend.smoother import Smoother
 from fgslam.errors import EstimatorError
@@ -27,6 +26,7 @@ from fgslam.geometry import adjoint, congruence, inverse, reorthonormalise
 from fgslam.settings.backend import Isam2Settings
 from fgslam.types import FloatArray, Observations, Prediction, Sensor
 
+_RELATIVE_TOLERANCE = 1e-9  # of the cost
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
 
 
@@ -73,22 +73,27 @@ class Isam2Smoother(Smoother):
         return Prediction(reorthonormalise(pose), covariance)
 
     def _solve(self) -> Solution:
-        self._flush()
-        for _ in range(self._settings.final_iterations):
-            if not self._relinearise():
-                break
-        self._take_out_behind()
-        graph = self._builder.kept_factors()
+        refined = self._refined_graph()
         frames = self._builder.frames
-        solved = solution(graph, self._values, frames, self._variables(), self._floor)
+        solved = solution(refined, frames, self._floor)
         variable_of = {i: track.variable for i, track in self._builder.tracks.items()}
         between, motions = self._segments.between, self._inputs.motions
         return fill_between(self._sensor, self._floor, solved, between, motions, variable_of)
 
-    def _joint(self, variables: list[int]) -> FloatArray:
-        self._flush()
-        graph = self._builder.kept_factors()
-        return joint_of(graph, self._values, self._floor, self._builder.frames[-1], variables)
+    def _refine(self) -> Refined:
+        values = gtsam.Values(self._values)
+        values.insert(self._new_values)
+        iterations = self._settings.final_iterations
+        if iterations == 0:
+            return Refined(self._builder.kept_factors(), values)
+        params = solver_parameters(iterations, _RELATIVE_TOLERANCE)
+        try:
+            factor = self._settings.noise_factor
+            return refine(
+                self._builder, values, lambda graph, at: trimmed(graph, at, params, factor)
+            )
+        except RuntimeError as error:
+            raise self._failed(error) from None
 
     # ----------------------------------------------------------------------------------------
 
@@ -99,9 +104,6 @@ class Isam2Smoother(Smoother):
         params.setRelinearizeThreshold(self._settings.relinearize_threshold)
         params.relinearizeSkip = self._settings.relinearize_skip
         return gtsam.ISAM2(params)
-
-    def _variables(self) -> list[int]:
-        return [v for v in range(self._builder.variables) if self._builder.in_graph(v)]
 
     def _flush(self) -> None:
         """Brings the frames since the last update in."""
@@ -119,17 +121,6 @@ class Isam2Smoother(Smoother):
             together = gtsam.Values(self._values)
             together.insert(values)
             self._repair(together, error)
-
-    def _relinearise(self) -> bool:
-        """One more iteration without new measurements; whether anything had moved."""
-        nothing = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        try:
-            result = self._isam.update(*nothing, [], self._groups(), None, None, True)
-            self._values = self._isam.calculateEstimate()
-        except RuntimeError as error:
-            self._repair(gtsam.Values(self._values), error)
-            return True
-        return bool(result.getVariablesRelinearized())
 
     def _groups(self) -> Any:
         """Constrained ordering: the last poses in the last group; None for GTSAM's own."""
@@ -157,19 +148,6 @@ class Isam2Smoother(Smoother):
             except RuntimeError as another:
                 error = another
         raise self._failed(error)
-
-    def _take_out_behind(self) -> None:
-        """A landmark behind a camera that saw it is wrong, and says nothing to the solver."""
-        poses = poses_of(self._values, self._builder.frames)
-        behind = self._builder.behind(poses, points_of(self._values, self._variables()))
-        values = gtsam.Values(self._values)
-        for variable in behind:
-            self._take_out(variable, values, "came out behind a camera")
-        if behind:
-            try:
-                self._rebuild(values)
-            except RuntimeError as error:
-                self._repair(values, error)
 
     def _take_out(self, variable: int, values: Any, why: str) -> None:
         what = self._builder.take_out(variable)

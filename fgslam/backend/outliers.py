@@ -13,8 +13,7 @@ from scipy.stats import chi2
 
 from fgslam.factors.keys import is_pose, number
 
-_CONFIDENCE = 0.999  # of a right match's residual
-_GATE = float(chi2.ppf(_CONFIDENCE, 3))  # 16.3, of a landmark observation's three numbers
+_GATE = float(chi2.ppf(0.999, 3))  # 16.3, of a landmark observation's three numbers
 _KEPT = 0.5  # weights end at 0 or 1
 _ROUNDS = 10  # trims until the observations that fit do not change any more
 _ROUGH = 1e-4  # of the cost: the minimum with the kernel only chooses what fits
@@ -29,7 +28,7 @@ def solver_parameters(max_iterations: int, relative_tolerance: float) -> Any:
     return params
 
 
-def graduated(graph: Any, values: Any, inner: Any) -> tuple[Any, Any]:
+def graduated(graph: Any, values: Any, inner: Any, noise_factor: float = 1.0) -> tuple[Any, Any]:
     """Graduated non-convexity (Yang et al. 2020) with truncated least squares, by GTSAM.
 
     Landmark observations are the possible outliers.
@@ -38,6 +37,7 @@ def graduated(graph: Any, values: Any, inner: Any) -> tuple[Any, Any]:
         graph: factors without kernels.
         values: initial values.
         inner: parameters of the Levenberg-Marquardt steps.
+        noise_factor: by which the factors' deviations exceed the stated ones.
 
     Returns:
         Values at the minimum, and the graph without the observations that were rejected.
@@ -48,7 +48,8 @@ def graduated(graph: Any, values: Any, inner: Any) -> tuple[Any, Any]:
     params.setLossType(gtsam.GncLossType.TLS)
     params.setKnownInliers([row for row, is_one in enumerate(observed) if not is_one])
     optimizer = gtsam.GncLMOptimizer(graph, values, params)
-    optimizer.setInlierCostThresholdsAtProbability(_CONFIDENCE)
+    # GTSAM's threshold is on the cost, half of the squared residual.
+    optimizer.setInlierCostThresholds(0.5 * _GATE / noise_factor**2)
     found = optimizer.optimize()
     weights = optimizer.getWeights()
     kept = gtsam.NonlinearFactorGraph()
@@ -58,13 +59,14 @@ def graduated(graph: Any, values: Any, inner: Any) -> tuple[Any, Any]:
     return found, kept
 
 
-def trimmed(graph: Any, values: Any, params: Any) -> tuple[Any, Any]:
+def trimmed(graph: Any, values: Any, params: Any, noise_factor: float = 1.0) -> tuple[Any, Any]:
     """Minimises with the factors' own kernels, then without them over what fits.
 
     Args:
         graph: factors, landmark observations with a kernel.
         values: initial values.
         params: of Levenberg-Marquardt.
+        noise_factor: by which the factors' deviations exceed the stated ones, which judge.
 
     Returns:
         Values at the minimum, and the plain factors that were kept.
@@ -73,25 +75,27 @@ def trimmed(graph: Any, values: Any, params: Any) -> tuple[Any, Any]:
     values = gtsam.LevenbergMarquardtOptimizer(graph, values, rough).optimize()
     # A robust factor whitens with its kernel's weight, after which everything would seem to fit.
     factors = [_plain(graph.at(row)) for row in range(graph.size())]
+    observed = [_landmark(factor) is not None for factor in factors]
+    gate = _GATE / noise_factor**2
     fits: list[bool] = []
     for _ in range(_ROUNDS):
-        before, fits = fits, [_fits(factor, values) for factor in factors]
+        before = fits
+        pairs = zip(factors, observed, strict=True)
+        fits = [not is_one or _squared(factor, values) <= gate for factor, is_one in pairs]
         if fits == before:
             break
         kept = gtsam.NonlinearFactorGraph()
         for factor, fit in zip(factors, fits, strict=True):
             if fit:
                 kept.add(factor)
-        values = gtsam.LevenbergMarquardtOptimizer(kept, values, params).optimize()
-    return values, kept
+        values = gtsam.LevenbergMarquardtOptimizer(kept, values, rough).optimize()
+    return gtsam.LevenbergMarquardtOptimizer(kept, values, params).optimize(), kept
 
 
-def _fits(factor: Any, values: Any) -> bool:
-    """Whether a plain factor is no landmark observation, or one within the gate."""
-    if _landmark(factor) is None:
-        return True
+def _squared(factor: Any, values: Any) -> float:
+    """Whitened residual squared of a plain factor."""
     residual = factor.whitenedError(values)
-    return bool(residual @ residual <= _GATE)
+    return float(residual @ residual)
 
 
 def _plain(factor: Any) -> Any:

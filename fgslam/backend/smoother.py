@@ -14,9 +14,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from fgslam.backend.graph_builder import GraphBuilder, NewFactors, Sighting
-from fgslam.backend.graph_solution import Solution, poses_of_frame
+from fgslam.backend.graph_solution import Solution, joint_of, poses_of_frame
 from fgslam.backend.inputs import RecordedInputs, require_finite
 from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.backend.refinement import Refined
 from fgslam.backend.segments import TrackedFrame
 from fgslam.errors import EstimatorError
 from fgslam.factors.keys import landmark_key, pose_key
@@ -78,6 +79,7 @@ class Smoother(ABC):
         self._smoothed = prior
         self._remarks: list[str] = []
         self._answer: Solution | None = None
+        self._refined: Refined | None = None
         self._anchors: dict[int, FloatArray] = {}
         self._frozen: dict[int, tuple[FloatArray, FloatArray]] = {}
 
@@ -104,7 +106,7 @@ class Smoother(ABC):
         require_finite(increment, tracking, motion)
         stats = self._tracker.update(increment, tracking)
         self._inputs.append(increment, tracking, motion)
-        self._answer = None
+        self._answer = self._refined = None
         self._absorb(self._sorted_out(increment, tracking, motion))
         current = self._current(tracking)
         return UpdateStats(
@@ -120,7 +122,7 @@ class Smoother(ABC):
             Trajectory(self._inputs.timestamps(), answer.poses),
             answer.pose_covariances,
             self._map(answer),
-            (*self._remarks, *self._builder.remarks),
+            (*self._remarks, *self._builder.remarks, *answer.remarks),
         )
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
@@ -162,9 +164,23 @@ class Smoother(ABC):
     def _solve(self) -> Solution:
         """All poses and landmarks, with covariances."""
 
-    @abstractmethod
+    def _refine(self) -> Refined:
+        """The whole graph, solved; for smoothers that keep it."""
+        raise NotImplementedError
+
+    def _refined_graph(self) -> Refined:
+        if self._refined is None:
+            self._refined = self._refine()
+        return self._refined
+
     def _joint(self, variables: list[int]) -> FloatArray:
-        """Joint covariance of the last pose and landmark variables."""
+        """Joint covariance of the graph's last pose and landmark variables."""
+        refined = self._refined_graph()
+        lost = set(variables) - set(refined.variables)
+        if lost:
+            raise EstimatorError(f"{self._builder.describe(min(lost))} was left out of the graph")
+        last = self._builder.frames[-1]
+        return joint_of(refined.graph, refined.values, self._floor, last, variables)
 
     # -- common steps ------------------------------------------------------------------------
 

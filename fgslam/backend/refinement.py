@@ -1,0 +1,85 @@
+"""The last word on a graph: what does not fit is left out, the rest solved once more.
+
+It changes neither the builder nor the solver that it starts from, so that asking for an estimate
+in the middle of a run leaves the run as it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import gtsam
+
+from fgslam.backend.graph_builder import GraphBuilder
+from fgslam.backend.graph_solution import points_of, poses_of
+from fgslam.backend.outliers import observed_variables
+from fgslam.factors.keys import is_pose, landmark_key, number
+
+_ROUNDS = 5  # solutions until no landmark lies behind a camera any more
+_BEHIND = "came out behind a camera"
+_UNSEEN = "has no observation that fits the others"
+
+Minimise: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
+"""From a graph and initial values to values at the minimum and the factors that count there."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refined:
+    """A solved graph.
+
+    Attributes:
+        graph: the factors that count.
+        values: of all variables that are left.
+        remarks: what was left out, in words.
+    """
+
+    graph: Any
+    values: Any
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def variables(self) -> list[int]:
+        """Landmark variables that are left, ascending."""
+        return landmark_variables(self.values)
+
+
+def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
+    """Solves, without landmarks that come out behind a camera or that nothing supports."""
+    graph = builder.kept_factors()
+    remarks: list[str] = []
+    for _ in range(_ROUNDS):
+        found, kept = minimise(graph, values)
+        lost = _lost(builder, found, kept)
+        if not lost:
+            return Refined(kept, found, tuple(remarks))
+        remarks += [f"{builder.describe(v)} {why}: left out" for v, why in lost.items()]
+        graph = _without(graph, {landmark_key(v) for v in lost})
+        values = gtsam.Values(found)
+        for variable in lost:
+            values.erase(landmark_key(variable))
+    found, kept = minimise(graph, values)
+    return Refined(kept, found, tuple(remarks))
+
+
+def landmark_variables(values: Any) -> list[int]:
+    """Landmark variables among GTSAM values, ascending."""
+    return [number(key) for key in list(values.keys()) if not is_pose(key)]
+
+
+def _lost(builder: GraphBuilder, values: Any, kept: Any) -> dict[int, str]:
+    variables = landmark_variables(values)
+    poses, points = poses_of(values, builder.frames), points_of(values, variables)
+    behind = dict.fromkeys(builder.behind(poses, points), _BEHIND)
+    unseen = sorted(set(variables) - observed_variables(kept))
+    return behind | dict.fromkeys(unseen, _UNSEEN)
+
+
+def _without(graph: Any, keys: set[int]) -> Any:
+    kept = gtsam.NonlinearFactorGraph()
+    for row in range(graph.size()):
+        factor = graph.at(row)
+        if keys.isdisjoint(factor.keys()):
+            kept.add(factor)
+    return kept
