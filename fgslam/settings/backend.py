@@ -204,6 +204,7 @@ class FixedLagSettings(GraphSettings):
     """Incremental fixed-lag smoother: what is older than the lag is marginalised."""
 
     kind: Literal["fixed_lag"] = "fixed_lag"
+    kernel: KernelSettings = KernelSettings("huber", 4.0)
     lag_frames: Annotated[
         int | None, Field(ge=1, description="lag in frames; null: the lag is given in seconds")
     ] = 10
