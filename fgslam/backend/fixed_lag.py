@@ -79,8 +79,9 @@ class FixedLagSmoother(Smoother):
 
     def _solve(self) -> Solution:
         marginals = self._marginals()
+        covariances = np.array(self._covariances)  # our own stay as the updates left them
         for frame in range(self._oldest, len(self._poses)):
-            self._covariances[frame] = self._covariance(marginals, frame)
+            covariances[frame] = self._covariance(marginals, frame)
         inside = [
             track.variable
             for track in self._builder.tracks.values()
@@ -89,7 +90,7 @@ class FixedLagSmoother(Smoother):
         found = marginals.landmarks([landmark_key(v) for v in inside])
         return Solution(
             np.array(self._poses),
-            np.array(self._covariances),
+            covariances,
             points_of(self._values, inside),
             dict(zip(inside, found, strict=True)),
         )
@@ -191,17 +192,19 @@ class FixedLagSmoother(Smoother):
         oldest = self._oldest
         graph, kept = gtsam.NonlinearFactorGraph(), gtsam.Values()
         stamps: dict[int, float] = {}
-        covariance = self._covariances[oldest]
-        if not np.isfinite(covariance).all():
-            covariance = np.zeros((6, 6))
-        graph.add(pose_prior(pose_key(oldest), Prediction(self._poses[oldest], covariance)))
+        if oldest:  # the first frame has its own prior among its factors
+            covariance = self._covariances[oldest]
+            if not np.isfinite(covariance).all():
+                covariance = np.zeros((6, 6))
+            graph.add(pose_prior(pose_key(oldest), Prediction(self._poses[oldest], covariance)))
         for new in self._recent:
             for row in range(new.graph.size()):
                 factor = new.graph.at(row)
                 keys = list(factor.keys())
                 if all(self._is_inside(key) for key in keys):
                     graph.add(factor)
-                    stamps |= dict.fromkeys(keys, self._time(new.frame))
+                    # A landmark is as old as its last sighting, a pose as its frame.
+                    stamps |= {k: self._time(number(k) if is_pose(k) else new.frame) for k in keys}
         for key in stamps:
             kept.insert(key, values.atPose3(key) if is_pose(key) else values.atPoint3(key))
         self._solver = self._new_solver()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from typing import Any
 
@@ -25,8 +26,9 @@ from smoothing import (
 from fgslam.backend.fixed_lag import FixedLagSmoother
 from fgslam.errors import EstimatorError
 from fgslam.evaluation.consistency import judge
-from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 from fgslam.settings.backend import FixedLagSettings
+from fgslam.types import Prediction
 
 LAG = FixedLagSettings(lag_frames=5)
 
@@ -191,6 +193,47 @@ def test_the_rebuilt_window_is_as_uncertain_as_the_one_that_failed() -> None:
     a, b = (position_sigma(e.estimate().covariances[-6:]) for e in (mended, whole))
     # Of the landmarks' shared past only the oldest pose's part is kept.
     assert ((a > 0.95 * b) & (a < 2.0 * b)).all(), a / b
+
+
+def test_a_window_rebuilt_from_the_first_frame_on_has_one_prior() -> None:
+    simulation = drawn(8, frames=8)
+    prior = Prediction(np.eye(4), np.diag([1e-4] * 3 + [1e-2] * 3))
+    mended, whole = build(LAG, prior), build(LAG, prior)
+    for estimator in (mended, whole):
+        play(estimator, simulation.increments[:3], FREE)
+    assert isinstance(mended, FixedLagSmoother)
+    variable = mended._builder.tracks[28].variable
+    mended._solver = Failing(mended._solver, f"variable {landmark_key(variable)} (")
+    for estimator in (mended, whole):
+        play(estimator, simulation.increments[3:4], FREE)
+    found = mended.estimate()
+    np.testing.assert_allclose(found.covariances[0], prior.covariance, rtol=1e-6, atol=1e-12)
+    a, b = (position_sigma(e.estimate().covariances) for e in (mended, whole))
+    assert (a > 0.999 * b).all()
+
+
+def test_rebuilt_poses_leave_when_their_lag_is_over() -> None:
+    simulation, estimator = drawn(8, frames=24), smoother()
+    play(estimator, simulation.increments[:12], FREE)
+    variable = estimator._builder.tracks[28].variable
+    estimator._solver = Failing(estimator._solver, f"variable {landmark_key(variable)} (")
+    play(estimator, simulation.increments[12:15], FREE)
+    inside = sorted(number(key) for key in estimator._values.keys() if is_pose(key))
+    assert inside == list(range(9, 15))
+
+
+def test_asking_changes_nothing_where_several_frames_leave_at_once() -> None:
+    increments = [
+        dataclasses.replace(x, timestamp=x.timestamp + (1.0 if x.index >= 9 else 0.0))
+        for x in drawn(9, frames=14).increments
+    ]
+    step = increments[1].timestamp - increments[0].timestamp
+    asked, left = (smoother(FixedLagSettings(lag_frames=None, lag_s=5.5 * step)) for _ in range(2))
+    for increment in increments:
+        play(asked, [increment], FREE)
+        asked.estimate()
+    play(left, increments, FREE)
+    assert_same_bits(asked.estimate(), left.estimate())
 
 
 @pytest.mark.parametrize(
