@@ -80,6 +80,19 @@ class Isam2Smoother(Smoother):
         between, motions = self._segments.between, self._inputs.motions
         return fill_between(self._sensor, self._floor, solved, between, motions, variable_of)
 
+    def _joint(self, variables: list[int]) -> FloatArray:
+        """As the base's; carried on to the last frame where that one has no pose in the graph."""
+        joint = super()._joint(variables)
+        entered, last = self._builder.frames[-1], len(self._inputs.increments) - 1
+        if entered == last:
+            return joint
+        answer = self._solved()
+        carry = np.eye(len(joint))
+        carry[:6, :6] = adjoint(inverse(answer.poses[last]) @ answer.poses[entered])
+        joint = congruence(carry, joint)
+        joint[:6, :6] = answer.pose_covariances[last]
+        return joint
+
     def _refine(self) -> Refined:
         values = gtsam.Values(self._values)
         values.insert(self._new_values)

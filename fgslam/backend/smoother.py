@@ -134,7 +134,8 @@ class Smoother(ABC):
     def joint_covariance(self, ids: IntArray) -> FloatArray:
         """Joint covariance of the last pose and the named landmarks."""
         self._tracker.landmarks().rows(ids)
-        variables = [self._builder.tracks[i].variable for i in ids.tolist()]
+        tracks = [self._builder.tracks.get(i) for i in ids.tolist()]
+        variables = [-1 if track is None else track.variable for track in tracks]
         outside = [i for i, v in zip(ids.tolist(), variables, strict=True) if v < 0]
         if outside:
             raise EstimatorError(
