@@ -118,7 +118,8 @@ def _locate(
         hessian, gradient, squared = _normal_equations(
             sensor, poses, which[fits], points[fits], measured[fits], weights[fits]
         )
-        enough = np.bincount(which[fits], minlength=len(frames)) >= _LEAST_OBSERVATIONS
+        ahead = which[fits][np.isfinite(squared)]  # the others have no weight
+        enough = np.bincount(ahead, minlength=len(frames)) >= _LEAST_OBSERVATIONS
         hessian[~enough] = 0.0
         steps = np.zeros((len(frames), 6))
         steps[enough] = np.linalg.solve(hessian[enough], gradient[enough][:, :, None])[:, :, 0]

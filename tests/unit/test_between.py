@@ -148,3 +148,18 @@ def test_a_hard_floor_is_kept() -> None:
         covariance = found.pose_covariances[k]
         top = np.abs(covariance).max()
         assert np.linalg.matrix_rank(covariance, hermitian=True, tol=1e-9 * top) == 3
+
+
+def test_a_frame_whose_landmarks_all_came_out_behind_it_is_left_to_the_odometry() -> None:
+    simulation = drawn(3)
+    before = solved(simulation, 3)
+    pose = simulation.poses[1]
+    backwards = pose[:3, 3] - 5.0 * pose[:3, 2]
+    points = {v: backwards + 0.1 * before.points[v] for v in before.points}
+    behind = dataclasses.replace(before, points=points)
+    motions = [x.odometry for x in simulation.increments[:3]]
+    frames = tracked(simulation, 3)
+    found = fill_between(RIG, FREE, behind, frames, motions, {v: v for v in points})
+    blind = filled(simulation, total=3, sees=False)
+    np.testing.assert_allclose(found.poses, blind.poses, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.pose_covariances, blind.pose_covariances, rtol=1e-6)
