@@ -169,6 +169,8 @@ def load_arrays(path: Path) -> StateArrays:
         raise MeasurementLogError(f"{path}: no such file; give the run folder's own") from None
     except _UNREADABLE as error:
         cause = " ".join(str(error).split()) or type(error).__name__
+        if "pickle" in cause:  # NumPy advises to unpickle, which would run what the file says
+            cause = "neither arrays nor an archive of them"
         raise MeasurementLogError(
             f"{path}: not a readable .npz file ({cause}); it may be truncated, run again"
         ) from None

@@ -141,7 +141,10 @@ def load_run(run: Path) -> tuple[ExperimentConfig, MeasurementLog]:
         FgslamError: one of the two cannot be read.
     """
     if not is_run_folder(run):
-        raise DatasetError(f"{run}: not a run folder (no {RUN_MARKER}); give what fgslam run wrote")
+        what = f"not a run folder (no {RUN_MARKER}); give what fgslam run wrote"
+        if run.is_file():
+            what = "not a run folder; give it to fgslam run first, or add --trials N"
+        raise DatasetError(f"{run}: {what}")
     config = load_config(run / RUN_MARKER)
     log = MeasurementLog.load(run / LOG_FILE)
     if not len(log):
