@@ -218,7 +218,7 @@ def test_rebuilt_poses_leave_when_their_lag_is_over() -> None:
     variable = estimator._builder.tracks[28].variable
     estimator._solver = Failing(estimator._solver, f"variable {landmark_key(variable)} (")
     play(estimator, simulation.increments[12:15], FREE)
-    inside = sorted(number(key) for key in estimator._values.keys() if is_pose(key))
+    inside = sorted(number(key) for key in list(estimator._values.keys()) if is_pose(key))
     assert inside == list(range(9, 15))
 
 

@@ -249,7 +249,7 @@ def test_with_keyframes_the_joint_covariance_is_of_the_last_frame(frames: int) -
 
 
 def test_a_landmark_seen_since_the_last_keyframe_only_is_told_to_wait() -> None:
-    simulation, estimator = played(14, Isam2Settings(keyframe_every=4))
+    _, estimator = played(14, Isam2Settings(keyframe_every=4))
     outside = set(estimator.landmarks().ids.tolist()) - set(estimator._builder.tracks)
     for identity in sorted(outside):
         with pytest.raises(EstimatorError, match=f"landmark {identity} waits outside"):
