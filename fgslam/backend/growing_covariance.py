@@ -23,7 +23,7 @@ class GrowingCovariance:
 
     def __init__(self, front: FloatArray) -> None:
         """Starts with the pose's block (6, 6) alone."""
-        self._buffer = np.empty((FRONT, FRONT))
+        self._buffer = np.zeros((FRONT, FRONT))
         self._size = 0
         self.reserve(20)
         self._size = FRONT
@@ -40,7 +40,9 @@ class GrowingCovariance:
         if needed <= len(self._buffer):
             return
         n, room = self._size, int(_GROWTH * needed)
-        larger = np.empty((room, room))
+        # Never read above the diagonal, yet a slab's update takes it along: memory as it comes may
+        # hold signalling NaNs.
+        larger = np.zeros((room, room))
         larger[:n, :n] = self._buffer[:n, :n]
         self._buffer = larger
         self._scratch = np.empty(_SLAB * room)

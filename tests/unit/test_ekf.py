@@ -172,6 +172,23 @@ def whole(covariance: GrowingCovariance) -> FloatArray:
     return covariance.square(np.arange(6 + 3 * covariance.blocks))
 
 
+def test_what_memory_held_before_does_no_harm(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    """Above the diagonal nothing is ever read, but a slab's update touches it (and may warn)."""
+
+    def soiled(shape: int | tuple[int, ...]) -> FloatArray:
+        return np.full(shape, 0x7FF0000000000001, np.uint64).view(np.float64)  # signalling NaNs
+
+    root, a, b = rng.standard_normal((66, 66)), *rng.standard_normal((2, 66, 5))
+    p = root @ root.T
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "empty", soiled)
+        covariance = grown(p)
+    covariance.subtract(a, b)
+    np.testing.assert_allclose(whole(covariance), p - a @ b.T - b @ a.T, rtol=0, atol=1e-11)
+
+
 @pytest.mark.parametrize("landmarks", [0, 3, 150])
 def test_a_correction_is_the_dense_kalman_filter(landmarks: int, rng: np.random.Generator) -> None:
     """Information form, dense, on random linear measurements of pose and landmarks."""
