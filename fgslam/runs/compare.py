@@ -20,6 +20,7 @@ from fgslam.runs.comparison import (
     Compared,
     Progress,
     load_run,
+    load_truth,
     remark_of,
     replay_apart,
     tasks_of,
@@ -57,7 +58,7 @@ def compare_runs(
         FgslamError: a run cannot be read, a name is unknown, or the results cannot be written.
     """
     folders = _folders(runs, out)
-    chosen = [choose(load_run(run)[0], choice) for run in runs]
+    chosen = [_estimators_for(run, choice) for run in runs]
     compared = []
     for run, folder in zip(runs, folders, strict=True):
         _require_apart(run, folder, existing)
@@ -109,6 +110,13 @@ def write_comparison(
     write_comparison_csv(out / COMPARISON_FILE, [(config.name, metrics)])
     if config.output.report:
         report_from_folder(out, run)
+
+
+def _estimators_for(run: Path, choice: Choice) -> tuple[EstimatorSettings, ...]:
+    """What is to be replayed; a run that cannot be judged is told before anything is written."""
+    config, log = load_run(run)
+    load_truth(run, log)
+    return choose(config, choice)
 
 
 def _notes(run: Path) -> list[str]:

@@ -127,7 +127,8 @@ def replay(
             frame = replay_frame(increment, estimator, solver, motion, k)
             run.book(increment, frame)
         except ESTIMATOR_FAULTS as error:
-            return run.result(estimator, before_mb, f"frame {increment.index}: {reason(error)}")
+            where, why = f"frame {increment.index}: ", reason(error)
+            return run.result(estimator, before_mb, where + why.removeprefix(where))
         progress(k + 1, len(log))
     return run.result(estimator, before_mb, "")
 

@@ -230,6 +230,20 @@ def test_what_is_no_run_is_told(
 ) -> None:
     assert main(monkeypatch, "compare", tmp_path) == 2
     assert "not a run folder" in capsys.readouterr().err
+    experiment = tmp_path / "experiment.yaml"
+    experiment.write_text("name: x\n", encoding="utf-8")
+    assert main(monkeypatch, "compare", experiment) == 2
+    assert "give it to fgslam run first, or add --trials" in capsys.readouterr().err
+
+
+def test_a_damaged_truth_is_told_before_anything_is_written(
+    plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    run, out = Path(shutil.copytree(plain, tmp_path / "run")), tmp_path / "out"
+    (run / "ground_truth.tum").write_text("1 2 3\n", encoding="utf-8")
+    assert main(monkeypatch, "compare", run, "--out", out) == 2
+    assert "ground_truth.tum, line 1" in capsys.readouterr().err
+    assert not out.exists()
 
 
 # --------------------------------------------------------------------------------------------

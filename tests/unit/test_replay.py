@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from fgslam.measurement_log import MeasurementLog
 from fgslam.runs import replay as module
 from fgslam.runs.judging import Truth, judge_replay
 from fgslam.runs.replay import Replay, memory_mb, peak_memory_mb, replay, replay_motion
-from fgslam.settings.backend import LandmarkKalmanSettings
+from fgslam.settings.backend import BatchSettings, LandmarkKalmanSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import EgoMotionSettings
 from fgslam.types import Estimate, Trajectory, UpdateStats
@@ -173,3 +174,15 @@ def test_the_header_tells_the_motion() -> None:
     assert replay_motion(nested).description() == CONSTANT_VELOCITY
     with pytest.raises(MeasurementLogError, match="not known to this fgslam; repeat the run"):
         replay_motion(MeasurementLog(RIG, {"kind": "warp"}))
+
+
+def test_a_frame_that_the_estimator_names_itself_is_named_once() -> None:
+    log = a_log()
+    measurement = log.increments[4].observations.measurement.copy()
+    measurement[0] = np.nan
+    increments = list(log.increments)
+    seen = dataclasses.replace(increments[4].observations, measurement=measurement)
+    increments[4] = dataclasses.replace(increments[4], observations=seen)
+    spoilt = MeasurementLog(RIG, log.motion_model, increments)
+    replayed = replay(spoilt, BatchSettings(), EgoMotionSettings())
+    assert replayed.failure.startswith(f"frame {increments[4].index}: the measurement or its")
