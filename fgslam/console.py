@@ -67,7 +67,8 @@ def show_result(result: RunResult, resume: str) -> None:
     if result.pictures:
         console.out(f"pictures    {result.pictures[0].parent}{'/'}")
     console.out(f"metrics     {folder / 'metrics.json'}")
-    if (folder / "report.html").is_file():
+    compared = bool(result.outputs.config.compare)  # then named below the comparison
+    if not compared and (folder / "report.html").is_file():
         console.out(f"report      {folder / 'report.html'}  (open it in a browser)")
     if result.status == "interrupted":
         console.out(f"interrupted after {len(result.outputs.recorder)} frames; go on: {resume}")
