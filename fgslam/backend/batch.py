@@ -12,7 +12,6 @@ from fgslam.backend.outliers import graduated, solver_parameters, trimmed
 from fgslam.backend.refinement import Refined, refine
 from fgslam.backend.segments import TrackedFrame
 from fgslam.backend.smoother import Smoother
-from fgslam.errors import EstimatorError
 from fgslam.floor import Floor
 from fgslam.settings.backend import BatchSettings, KernelSettings
 from fgslam.types import Prediction, Sensor
@@ -53,10 +52,7 @@ class BatchSmoother(Smoother):
         try:
             return refine(self._builder, self._values, self._minimise)
         except RuntimeError as error:
-            raise EstimatorError(
-                f"batch: the solver failed after frame {self._builder.frames[-1]} "
-                f"({' '.join(str(error).split())}); look at that frame with fgslam inspect"
-            ) from None
+            raise self._failed(error, "after") from None
 
     def _minimise(self, graph: Any, values: Any) -> tuple[Any, Any]:
         """Values at the minimum, and the factors that have a say in it."""

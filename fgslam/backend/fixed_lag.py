@@ -13,9 +13,10 @@ from typing import Any, ClassVar
 import gtsam
 import numpy as np
 
-from fgslam.backend.graph_builder import NewFactors
+from fgslam.backend.graph_builder import NewFactors, without_gaps
 from fgslam.backend.graph_solution import (
     Solution,
+    allowed_joint,
     allowed_parts,
     points_of,
     poses_of_frame,
@@ -98,11 +99,7 @@ class FixedLagSmoother(Smoother):
     def _joint(self, variables: list[int]) -> FloatArray:
         last = len(self._poses) - 1
         joint = self._marginals().joint(pose_key(last), [landmark_key(v) for v in variables])
-        project = np.eye(len(joint))
-        if self._floor.rigid_dof < 6:
-            basis = self._floor.basis(self._poses[-1])
-            project[:6, :6] = basis @ basis.T
-        return congruence(project, joint)
+        return allowed_joint(self._floor, self._poses[-1], joint)
 
     # ----------------------------------------------------------------------------------------
 
@@ -159,7 +156,7 @@ class FixedLagSmoother(Smoother):
         """Of the window: all at once, faster than GTSAM's for one pose of a dense root clique."""
         while True:  # each repair takes a landmark out, and after a few it raises
             try:
-                return DenseMarginals(_without_gaps(self._solver.getFactors()), self._values)
+                return DenseMarginals(without_gaps(self._solver.getFactors()), self._values)
             except UndeterminedError as error:
                 self._repair(gtsam.Values(self._values), error)
 
@@ -183,10 +180,7 @@ class FixedLagSmoother(Smoother):
                 return
             except RuntimeError as another:
                 error = another
-        raise EstimatorError(
-            f"fixed_lag: the solver failed at frame {self._recent[-1].frame} "
-            f"({' '.join(str(error).split())}); look at that frame with fgslam inspect"
-        )
+        raise self._failed(error)
 
     def _rebuild(self, values: Any) -> None:
         oldest = self._oldest
@@ -214,12 +208,3 @@ class FixedLagSmoother(Smoother):
     def _is_inside(self, key: int) -> bool:
         """Whether a variable is within the lag and was not taken out."""
         return number(key) >= self._oldest if is_pose(key) else self._builder.in_graph(number(key))
-
-
-def _without_gaps(graph: Any) -> Any:
-    """A graph without empty slots."""
-    kept = gtsam.NonlinearFactorGraph()
-    for row in range(graph.size()):
-        if graph.exists(row):
-            kept.add(graph.at(row))
-    return kept

@@ -152,10 +152,6 @@ class GraphBuilder:
         """Number of landmark variables made so far."""
         return len(self._id_of)
 
-    def id_of(self, variable: int) -> int:
-        """Identity of a landmark variable."""
-        return self._id_of[variable]
-
     def add(self, tracked: TrackedFrame, landmarks: LandmarkMap) -> NewFactors:
         """Adds a frame's pose and observations.
 
@@ -286,11 +282,7 @@ class GraphBuilder:
 
     def kept_factors(self) -> Any:
         """The graph without its empty slots."""
-        kept = gtsam.NonlinearFactorGraph()
-        for row in range(self.graph.size()):
-            if self.graph.exists(row):
-                kept.add(self.graph.at(row))
-        return kept
+        return without_gaps(self.graph)
 
     def waiting(self) -> Iterator[tuple[int, Track]]:
         """Landmarks that are not in the graph."""
@@ -377,6 +369,15 @@ class GraphBuilder:
         if self._remember:
             self.graph.add(factor)
         return int(self.graph.size()) - 1
+
+
+def without_gaps(graph: Any) -> Any:
+    """A nonlinear graph without its empty slots."""
+    kept = gtsam.NonlinearFactorGraph()
+    for row in range(graph.size()):
+        if graph.exists(row):
+            kept.add(graph.at(row))
+    return kept
 
 
 def _agree(places: list[tuple[FloatArray, FloatArray]]) -> bool:

@@ -101,10 +101,14 @@ def joint_of(graph: Any, values: Any, floor: Floor, frame: int, variables: list[
     pose = int(np.searchsorted(marginals.pose_keys, pose_key(frame)))
     keys = np.array([landmark_key(v) for v in variables], np.int64)
     rows: IntArray = np.searchsorted(marginals.landmark_keys, keys).astype(np.int64)
-    joint = marginals.joint(pose, rows)
+    return allowed_joint(floor, poses_of_frame(values, frame), marginals.joint(pose, rows))
+
+
+def allowed_joint(floor: Floor, wTc: FloatArray, joint: FloatArray) -> FloatArray:
+    """Joint covariance of a pose ``wTc`` and others without what a hard floor excludes of it."""
     if floor.rigid_dof == 6:
         return joint
-    basis = floor.basis(poses_of_frame(values, frame))
+    basis = floor.basis(wTc)
     project = np.eye(len(joint))
     project[:6, :6] = basis @ basis.T
     return congruence(project, joint)

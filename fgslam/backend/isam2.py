@@ -19,7 +19,6 @@ from fgslam.backend.outliers import solver_parameters, trimmed
 from fgslam.backend.refinement import Refined, refine
 from fgslam.backend.segments import Segments, TrackedFrame
 from fgslam.backend.smoother import Smoother
-from fgslam.errors import EstimatorError
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 from fgslam.floor import Floor
 from fgslam.geometry import adjoint, congruence, inverse, reorthonormalise
@@ -178,12 +177,6 @@ class Isam2Smoother(Smoother):
     def _restart(self, moved: Observations) -> None:
         super()._restart(moved)
         self._segments.forget(moved.ids.tolist())
-
-    def _failed(self, error: Exception) -> EstimatorError:
-        return EstimatorError(
-            f"isam2: the solver failed at frame {self._builder.frames[-1]} "
-            f"({' '.join(str(error).split())}); look at that frame with fgslam inspect"
-        )
 
     def _covariance(self, frame: int) -> FloatArray:
         """Marginal of a pose."""

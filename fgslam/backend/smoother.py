@@ -72,7 +72,6 @@ class Smoother(ABC):
         self._sensor = sensor
         self._floor = floor
         self._gate_px = settings.gate_px
-        self._start = prior
         self._tracker = LandmarkKalman(sensor, LandmarkKalmanSettings(), prior)
         self._builder = GraphBuilder(sensor, settings, floor, prior, remember)
         self._inputs = RecordedInputs()
@@ -182,6 +181,13 @@ class Smoother(ABC):
             raise EstimatorError(f"{self._builder.describe(min(lost))} was left out of the graph")
         last = self._builder.frames[-1]
         return joint_of(refined.graph, refined.values, self._floor, last, variables)
+
+    def _failed(self, error: Exception, when: str = "at") -> EstimatorError:
+        """What to raise where a solver's failure is beyond mending."""
+        return EstimatorError(
+            f"{self.kind}: the solver failed {when} frame {self._builder.frames[-1]} "
+            f"({' '.join(str(error).split())}); look at that frame with fgslam inspect"
+        )
 
     # -- common steps ------------------------------------------------------------------------
 
