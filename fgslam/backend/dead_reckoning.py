@@ -10,10 +10,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from fgslam.backend.filtered import FilteredTrajectory, FirstSights
+from fgslam.backend.filtered import FilteredTrajectory, FirstSights, moved
 from fgslam.geometry import (
     adjoint,
-    compose_covariance,
     congruence,
     inverse,
     point_pose_jacobian,
@@ -54,12 +53,7 @@ class DeadReckoning:
 
     def predict(self, odometry: Odometry | None) -> Prediction:
         """Pose after the camera moved by ``odometry``."""
-        if odometry is None:
-            return self._current
-        return Prediction(
-            self._current.wTc @ odometry.motion,
-            compose_covariance(odometry.motion, self._current.covariance, odometry.covariance),
-        )
+        return moved(self._current, odometry)
 
     def landmarks(self) -> LandmarkMap:
         """Landmarks as first seen; the arrays are read only by agreement."""

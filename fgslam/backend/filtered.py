@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fgslam.errors import EstimatorError
-from fgslam.geometry import in_front, triangulate, triangulation_covariance
+from fgslam.geometry import compose_covariance, in_front, triangulate, triangulation_covariance
 from fgslam.types import (
     BoolArray,
     CameraRig,
@@ -39,16 +39,20 @@ class FilteredTrajectory:
         self.poses.append(current.wTc)
         self.covariances.append(current.covariance)
 
-    def motion_to(self, increment: Increment, motion: Odometry | None) -> Odometry | None:
-        """The increment's odometry, or else the stand-in; None for the first frame alone.
-
-        Raises EstimatorError where time does not increase, or a later frame has no motion at all.
-        """
+    def require_later(self, increment: Increment) -> None:
+        """Raises EstimatorError where time does not increase."""
         if self.timestamps and not increment.timestamp > self.timestamps[-1]:
             raise EstimatorError(
                 f"frame {increment.index}: time stamp {increment.timestamp:.9f} s does not come "
                 f"after {self.timestamps[-1]:.9f} s; sort the measurements by time"
             )
+
+    def motion_to(self, increment: Increment, motion: Odometry | None) -> Odometry | None:
+        """The increment's odometry, or else the stand-in; None for the first frame alone.
+
+        Raises EstimatorError where time does not increase, or a later frame has no motion at all.
+        """
+        self.require_later(increment)
         known = increment.odometry if increment.odometry is not None else motion
         if known is None and self.timestamps:
             raise EstimatorError(
@@ -83,6 +87,16 @@ class FilteredTrajectory:
             list(state["poses"]),
             list(state["pose_covariances"]),
         )
+
+
+def moved(current: Prediction, odometry: Odometry | None) -> Prediction:
+    """The pose after the camera moved by ``odometry``; the same one for None."""
+    if odometry is None:
+        return current
+    return Prediction(
+        current.wTc @ odometry.motion,
+        compose_covariance(odometry.motion, current.covariance, odometry.covariance),
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,10 +12,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from fgslam.errors import EstimatorError
+from fgslam.backend.filtered import FilteredTrajectory, moved
 from fgslam.geometry import (
     block_diagonal,
-    compose_covariance,
     congruence,
     inverse_spd3,
     measurement_difference,
@@ -41,7 +40,6 @@ from fgslam.types import (
     Prediction,
     Sensor,
     StateArrays,
-    Trajectory,
     UpdateStats,
 )
 
@@ -65,9 +63,7 @@ class LandmarkKalman:
         self._rig = rig
         self._settings = settings
         self._current = prior
-        self._timestamps: list[float] = []
-        self._poses: list[FloatArray] = []
-        self._pose_covariances: list[FloatArray] = []
+        self._past = FilteredTrajectory()
         self._ids: IntArray = np.empty(0, np.int64)
         self._positions: FloatArray = np.empty((0, 3))
         self._covariances: FloatArray = np.empty((0, 3, 3))
@@ -75,12 +71,7 @@ class LandmarkKalman:
 
     def predict(self, odometry: Odometry | None) -> Prediction:
         """Pose after the camera moved by ``odometry``."""
-        if odometry is None:
-            return self._current
-        return Prediction(
-            self._current.wTc @ odometry.motion,
-            compose_covariance(odometry.motion, self._current.covariance, odometry.covariance),
-        )
+        return moved(self._current, odometry)
 
     def landmarks(self) -> LandmarkMap:
         """Current landmarks; the arrays are read only by agreement."""
@@ -90,20 +81,14 @@ class LandmarkKalman:
         self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
     ) -> UpdateStats:
         """Pose from the tracking; matched landmarks filtered, missed ones grown, new ones added."""
-        if self._timestamps and not increment.timestamp > self._timestamps[-1]:
-            raise EstimatorError(
-                f"frame {increment.index}: time stamp {increment.timestamp:.9f} s does not come "
-                f"after {self._timestamps[-1]:.9f} s; sort the measurements by time"
-            )
+        self._past.require_later(increment)
         self._current = Prediction(tracking.wTc, tracking.covariance)
         matched = increment.observations.select(~increment.observations.is_new)
         nis, dof = self._update_matched(matched.select(tracking.inliers))
         self._grow(increment.missed_ids)
         self._add(increment.observations.select(increment.observations.is_new))
         self._remove(increment.pruned_ids)
-        self._timestamps.append(increment.timestamp)
-        self._poses.append(tracking.wTc)
-        self._pose_covariances.append(tracking.covariance)
+        self._past.append(increment.timestamp, self._current)
         return UpdateStats(tracking.wTc, tracking.covariance, len(self._ids), nis, dof)
 
     def correct(self, current: Prediction, ids: IntArray, positions: FloatArray) -> None:
@@ -123,10 +108,9 @@ class LandmarkKalman:
 
     def estimate(self) -> Estimate:
         """Trajectory as filtered, and the map."""
-        count = len(self._poses)
         return Estimate(
-            Trajectory(np.array(self._timestamps), np.array(self._poses).reshape(count, 4, 4)),
-            np.array(self._pose_covariances).reshape(count, 6, 6),
+            self._past.trajectory(),
+            self._past.pose_covariances(),
             LandmarkMap(self._ids, self._positions.copy(), self._covariances.copy()),
         )
 
@@ -140,24 +124,18 @@ class LandmarkKalman:
 
     def state(self) -> StateArrays:
         """Everything needed to continue; a snapshot, which later updates leave alone."""
-        estimate = self.estimate()
-        return {
-            "timestamps": estimate.trajectory.timestamps,
-            "poses": estimate.trajectory.poses,
-            "pose_covariances": estimate.covariances,
+        return self._past.state() | {
             "current_pose": self._current.wTc,
             "current_covariance": self._current.covariance,
             "ids": self._ids,
-            "positions": estimate.landmarks.positions,
-            "covariances": estimate.landmarks.covariances,
+            "positions": self._positions.copy(),
+            "covariances": self._covariances.copy(),
             "counts": self._counts.copy(),
         }
 
     def restore(self, state: StateArrays) -> None:
         """Continues from :meth:`state`."""
-        self._timestamps = [float(t) for t in state["timestamps"]]
-        self._poses = list(state["poses"])
-        self._pose_covariances = list(state["pose_covariances"])
+        self._past = FilteredTrajectory.restored(state)
         self._current = Prediction(state["current_pose"], state["current_covariance"])
         self._ids = state["ids"]
         self._positions = state["positions"].copy()
