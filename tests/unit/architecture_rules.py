@@ -23,10 +23,13 @@ BASE = frozenset(
         "measurement_log",
         "recordings",
         "system_check",
+        "planar",
+        "omni_cameras",
+        "homing_types",
     }
 )
 STAGES = frozenset({"datasets", "simulation", "frontend", "factors", "evaluation", "export"})
-COMPOSITION = frozenset({"runs", "inspection"})
+COMPOSITION = frozenset({"runs", "inspection", "homing"})
 PACKAGES = BASE | STAGES | COMPOSITION | {"config", "backend", "pipeline", "cli"}
 
 FOUNDATION_ALLOWS: dict[str, frozenset[str]] = {
@@ -38,6 +41,9 @@ FOUNDATION_ALLOWS: dict[str, frozenset[str]] = {
     "geometry": frozenset({"types", "errors", "range_bearing"}),
     "floor": frozenset({"types", "geometry"}),
     "settings": frozenset({"types", "errors"}),
+    "planar": frozenset({"types"}),
+    "omni_cameras": frozenset({"types", "errors", "planar"}),
+    "homing_types": frozenset({"types", "planar"}),
     "measurement_log": frozenset({"types", "errors", "geometry"}),
     "recordings": frozenset({"types", "errors", "geometry", "measurement_log"}),
 }

@@ -1,0 +1,25 @@
+"""What every homing estimator offers: started once, updated with each image, asked at any time."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Protocol
+
+from fgslam.homing_types import HomingEstimate, TrackedBearings
+
+
+class HomingEstimator(Protocol):
+    """Estimates robot, target and local map from bearings alone; made from one HomingStart.
+
+    A time that does not increase, or an identity that the map never had, raises EstimatorError
+    and leaves the state as it was. Arguments are never mutated.
+    """
+
+    kind: ClassVar[str]
+
+    def update(self, tracked: TrackedBearings) -> None:
+        """Takes in one image; features that are absent are deleted from the map (G28)."""
+        ...
+
+    def estimate(self) -> HomingEstimate:
+        """The present state; changes nothing."""
+        ...

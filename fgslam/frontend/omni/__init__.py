@@ -1,0 +1,1 @@
+"""Front-end of omnidirectional homing: features, matching, the homing vector, tracking."""

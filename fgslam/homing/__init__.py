@@ -1,0 +1,1 @@
+"""Behaviour: homing step by step, path following, topological maps."""

@@ -1,0 +1,331 @@
+"""Values that cross the border between two stages of visual homing (Goedemé et al. 2005).
+
+Frames: the robot's axes are x forward, y left, z up. Bearings are counter-clockwise from the
+robot's heading, elevations up, both in radians. The *start* is the robot's pose when a homing
+begins, at the origin with heading 0; the *target* is where the target image was taken. Lengths are
+in units of the distance from start to target (R = 1, section III-B), unless said otherwise.
+Planar poses and their covariances are as in :mod:`fgslam.planar`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from fgslam.planar import between, rotation, wrap
+from fgslam.types import BoolArray, ByteArray, FloatArray, IntArray
+
+# --------------------------------------------------------------------------------------------
+# Features of one image, and matches between two
+
+
+class FeatureKind(int, Enum):
+    """Which front-end found a feature; stored as a number."""
+
+    SIFT = 0
+    COLUMN = 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UprightFeatures:
+    """Rotation-reduced colour SIFT features of one image (III-A1).
+
+    Attributes:
+        pixels: (n, 2) in the image that was given, column and row.
+        bearing, elevation: (n,) radians.
+        covariance: (n, 2, 2) of (bearing, elevation).
+        scale: (n,) SIFT scale in radians of elevation (pixels over pixels a radian).
+        descriptors: (n, 128) uint8.
+        colour: (n, 3) C_RB, C_RG, C_GB over the patch (eq. 1 as in E-G1).
+    """
+
+    pixels: FloatArray
+    bearing: FloatArray
+    elevation: FloatArray
+    covariance: FloatArray
+    scale: FloatArray
+    descriptors: ByteArray
+    colour: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.bearing)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColumnSegments:
+    """Invariant column segments of one image (III-A2, design B1).
+
+    Attributes:
+        bearing: (n,) radians of the segment's column.
+        sigma_bearing: (n,) radians.
+        tangents: (n, 2) tangent of the elevation at the segment's lower and upper end.
+        sigma_tangents: (n, 2).
+        descriptors: (n, 11) g, C_RB, C_RG, C_GB, DCT-II coefficients 1 to 7; not whitened.
+    """
+
+    bearing: FloatArray
+    sigma_bearing: FloatArray
+    tangents: FloatArray
+    sigma_tangents: FloatArray
+    descriptors: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.bearing)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OmniFeatures:
+    """All that is kept of a path image: features, no pixels of it (G10)."""
+
+    sift: UprightFeatures
+    columns: ColumnSegments
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BearingMatches:
+    """Tentative or accepted correspondences of two views; ``a`` is the present, ``b`` the target.
+
+    Attributes:
+        kind: (n,) :class:`FeatureKind` values.
+        index_a, index_b: (n,) rows of the feature in its view's list of that kind.
+        bearing_a, elevation_a, bearing_b, elevation_b: (n,) radians.
+        sigma: (n, 4) standard deviations in that order, radians.
+        quality: (n,) in [0, 1], 1 for the most distinctive: 1 - (nearest over second nearest).
+    """
+
+    kind: IntArray
+    index_a: IntArray
+    index_b: IntArray
+    bearing_a: FloatArray
+    elevation_a: FloatArray
+    bearing_b: FloatArray
+    elevation_b: FloatArray
+    sigma: FloatArray
+    quality: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    def taken(self, which: BoolArray | IntArray) -> BearingMatches:
+        """Those matches alone."""
+        return BearingMatches(
+            self.kind[which],
+            self.index_a[which],
+            self.index_b[which],
+            self.bearing_a[which],
+            self.elevation_a[which],
+            self.bearing_b[which],
+            self.elevation_b[which],
+            self.sigma[which],
+            self.quality[which],
+        )
+
+
+# --------------------------------------------------------------------------------------------
+# The initialisation step's answer (section III)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HomingVector:
+    """(R, theta, psi) with R = 1: where the target lies and how it is turned (III-B).
+
+    Attributes:
+        direction: theta, of the target as seen from the present pose, radians.
+        rotation: psi, heading of the target minus the present one, radians.
+        covariance: (2, 2) of (direction, rotation).
+        inliers: (n,) of the matches that were given.
+        rival_support: inliers of the best *different* solution; 0 for none.
+    """
+
+    direction: float
+    rotation: float
+    covariance: FloatArray
+    inliers: BoolArray
+    rival_support: int
+
+    @property
+    def support(self) -> int:
+        """Number of inliers."""
+        return int(np.count_nonzero(self.inliers))
+
+
+class RefusalReason(str, Enum):
+    """Why no homing vector is given; the value is written into files."""
+
+    TOO_DARK = "too_dark"
+    NO_FEATURES = "no_features"
+    TOO_FEW_MATCHES = "too_few_matches"
+    TOO_FEW_INLIERS = "too_few_inliers"
+    AMBIGUOUS = "ambiguous"
+    UNCERTAIN = "uncertain"
+    AT_TARGET = "at_target"
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """No homing vector, and why; ``details`` is one clear clause with the numbers.
+
+    ``AT_TARGET`` is an answer of its own: both views are from one place (D6), ``rotation`` holds
+    the turn (radians); it is None for all other reasons.
+    """
+
+    reason: RefusalReason
+    details: str
+    rotation: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalMap:
+    """Features triangulated from start and target, polar around the start (III-C, fig. 4).
+
+    Attributes:
+        ids: (n,) identities, ascending.
+        bearing, distance: (n,) delta_{i,0} in radians and d_{i,0} in legs (eq. 3).
+        covariance: (n, 2, 2) of (distance, bearing).
+    """
+
+    ids: IntArray
+    bearing: FloatArray
+    distance: FloatArray
+    covariance: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def points(self) -> FloatArray:
+        """(n, 2) positions in the start frame, legs."""
+        return np.column_stack(
+            [self.distance * np.cos(self.bearing), self.distance * np.sin(self.bearing)]
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HomingStart:
+    """All that a homing estimator is told once: the two views' measurements and first guesses.
+
+    Attributes:
+        time: of the start image, seconds.
+        vector: as estimated from the two views.
+        local_map: the features that are tracked from now on; row i belongs to match i.
+        matches: (n) the same features as seen from start (a) and target (b).
+    """
+
+    time: float
+    vector: HomingVector
+    local_map: LocalMap
+    matches: BearingMatches
+
+
+# --------------------------------------------------------------------------------------------
+# The update step (section IV)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackedBearings:
+    """What one image on the way says: eq. 6. A feature that is absent is lost for good (G28).
+
+    Attributes:
+        time: seconds.
+        ids: (m,) of the local map, ascending.
+        bearing: (m,) radians from the present heading.
+        sigma_bearing: (m,).
+        elevation: (m,) radians, NaN where it is not known.
+        sigma_elevation: (m,), NaN likewise.
+    """
+
+    time: float
+    ids: IntArray
+    bearing: FloatArray
+    sigma_bearing: FloatArray
+    elevation: FloatArray
+    sigma_elevation: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HomeVector:
+    """The steering vector (E-G13): the target relative to the *present* pose.
+
+    Attributes:
+        distance: in legs; 1 at the start, so it is the fraction of the way that is left.
+        direction: of the target from the present heading, radians.
+        rotation: heading of the target minus the present one, radians.
+        covariance: (3, 3) of (distance, direction, rotation).
+    """
+
+    distance: float
+    direction: float
+    rotation: float
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HomingEstimate:
+    """State of a homing estimator, in the start frame.
+
+    Attributes:
+        time: seconds.
+        robot, target: (3,) planar poses; a target whose distance is not estimated lies at 1.
+        covariance: (6, 6) joint of (robot, target); NaN where an estimator has none.
+        ids: (n,) features still in the map, ascending.
+        landmarks: (n, 2); landmark_covariances: (n, 2, 2), NaN where an estimator has none.
+    """
+
+    time: float
+    robot: FloatArray
+    target: FloatArray
+    covariance: FloatArray
+    ids: IntArray
+    landmarks: FloatArray
+    landmark_covariances: FloatArray
+
+    def home(self) -> HomeVector:
+        """The steering vector with its first-order covariance."""
+        offset = self.target[:2] - self.robot[:2]
+        distance = float(np.hypot(*offset))
+        jacobian = home_vector_jacobian(self.robot, self.target)
+        relative = between(self.robot, self.target)
+        direction = float(np.arctan2(relative[1], relative[0]))
+        turn = float(wrap(self.target[2] - self.robot[2]))
+        return HomeVector(distance, direction, turn, jacobian @ self.covariance @ jacobian.T)
+
+
+def home_vector_jacobian(robot: FloatArray, target: FloatArray) -> FloatArray:
+    """(3, 6) derivative of (distance, direction, rotation) by (robot, target), each (3,).
+
+    At the target itself the direction has no derivative; its row is then infinite, not an error.
+    """
+    offset = target[:2] - robot[:2]
+    distance = float(np.hypot(*offset))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = offset / distance
+        across = rotation(np.pi / 2) @ along / distance
+    out = np.zeros((3, 6))
+    out[0, :2], out[0, 3:5] = -along, along
+    out[1, :2], out[1, 2], out[1, 3:5] = -across, -1.0, across
+    out[2, 2], out[2, 5] = -1.0, 1.0
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HomingTruth:
+    """Truth of a simulated homing, in the start frame and in *metres*.
+
+    Attributes:
+        target: (3,) planar pose.
+        robots: (k, 3) planar pose at each tracked image.
+        landmarks: (n, 2) of the local map's rows; NaN where a match was wrong.
+    """
+
+    target: FloatArray
+    robots: FloatArray
+    landmarks: FloatArray
+
+    @property
+    def leg_m(self) -> float:
+        """Distance from start to target, metres: the unit of estimates."""
+        return float(np.hypot(*self.target[:2]))

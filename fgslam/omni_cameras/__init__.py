@@ -1,0 +1,1 @@
+"""Omnidirectional camera models: pixels to rays and back, for cameras that see all around."""

@@ -1,0 +1,65 @@
+"""Poses and bearings in the plane: the geometry of homing.
+
+A planar pose is an array (x, y, psi): metres (or legs, where scale is unknown) and radians,
+counter-clockwise. ``wTr`` = (x, y, psi) takes a point from the robot's axes (x forward, y left)
+to the world's. Arrays of poses are (n, 3). Covariances of planar poses are of these three numbers
+themselves, in the order (x, y, psi) and along the *world's* axes; unlike spatial poses they are not
+in a tangent space.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.types import FloatArray
+
+
+def wrap(angle: FloatArray) -> FloatArray:
+    """Angles in radians, wrapped to [-pi, pi)."""
+    return (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def unit(angle: FloatArray) -> FloatArray:
+    """(..., 2) unit vectors (cos, sin) of angles (...)."""
+    angle = np.asarray(angle, dtype=np.float64)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def rotation(angle: float) -> FloatArray:
+    """(2, 2) matrix that turns a vector counter-clockwise by ``angle`` radians."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s], [s, c]])
+
+
+def compose(aTb: FloatArray, bTc: FloatArray) -> FloatArray:
+    """(..., 3) ``aTc`` of poses (..., 3) and (..., 3)."""
+    aTb, bTc = np.asarray(aTb, dtype=np.float64), np.asarray(bTc, dtype=np.float64)
+    c, s = np.cos(aTb[..., 2]), np.sin(aTb[..., 2])
+    x = aTb[..., 0] + c * bTc[..., 0] - s * bTc[..., 1]
+    y = aTb[..., 1] + s * bTc[..., 0] + c * bTc[..., 1]
+    return np.stack([x, y, wrap(aTb[..., 2] + bTc[..., 2])], axis=-1)
+
+
+def inverse(aTb: FloatArray) -> FloatArray:
+    """(..., 3) ``bTa``."""
+    aTb = np.asarray(aTb, dtype=np.float64)
+    c, s = np.cos(aTb[..., 2]), np.sin(aTb[..., 2])
+    x = -c * aTb[..., 0] - s * aTb[..., 1]
+    y = s * aTb[..., 0] - c * aTb[..., 1]
+    return np.stack([x, y, wrap(-aTb[..., 2])], axis=-1)
+
+
+def between(wTa: FloatArray, wTb: FloatArray) -> FloatArray:
+    """(..., 3) ``aTb``: pose b as seen from a."""
+    return compose(inverse(wTa), wTb)
+
+
+def to_robot(wTr: FloatArray, points: FloatArray) -> FloatArray:
+    """(n, 2) points of the world in the robot's axes: R(psi)^T (P - p), eq. 8 as in E-G2."""
+    return (np.asarray(points) - wTr[:2]) @ rotation(float(wTr[2]))
+
+
+def bearings(wTr: FloatArray, points: FloatArray) -> FloatArray:
+    """(n,) bearings of points (n, 2) from a pose, counter-clockwise from its heading (eqs 7, 9)."""
+    seen = to_robot(wTr, points)
+    return np.arctan2(seen[:, 1], seen[:, 0])

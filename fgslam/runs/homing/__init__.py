@@ -1,0 +1,1 @@
+"""Homing experiments: what `fgslam run` does for each task."""

@@ -1,0 +1,1 @@
+"""Simulated omnidirectional camera, colour world, wheelchair and bearings."""
