@@ -6,16 +6,13 @@ known one suggested.
 
 from __future__ import annotations
 
-import copy
-import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, TypeAlias, TypeVar
 
-import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
+from fgslam.config_reading import Reader, read_mapping
 from fgslam.errors import ConfigError
 from fgslam.settings.backend import EstimatorSettings, LandmarkKalmanSettings
 from fgslam.settings.datasets import (
@@ -56,6 +53,8 @@ def _with_default_kind(value: Any) -> Any:
 
 ComparedEstimator: TypeAlias = Annotated[EstimatorSettings, BeforeValidator(_as_settings)]
 
+_Values = TypeVar("_Values", bound=Mapping[str, Any])
+
 _TAKEN_FOLDERS = ("pictures", "compare", "trials")
 _GROUPS_OF_KINDS = ("dataset", "odometry", "estimator")
 
@@ -93,34 +92,41 @@ class ExperimentConfig(BaseModel):
         return self.model_dump(mode="json", exclude={"provenance"})
 
 
+_READER = Reader(ExperimentConfig, _GROUPS_OF_KINDS)
+
+
 def load_config(path: Path, overrides: Iterable[str] = ()) -> ExperimentConfig:
     """Reads a configuration file and applies ``a.b=value`` overrides.
 
     Raises:
-        ConfigError: the file is missing or no YAML mapping, or a key or value is wrong.
+        ConfigError: the file is missing or no YAML mapping, a key or value is wrong, or it is
+            about homing (:func:`fgslam.homing_config.load_experiment` reads both).
     """
-    return make_config(_read_mapping(path), overrides, str(path))
+    return make_config(read_mapping(path), overrides, str(path))
 
 
 def make_config(values: dict[str, Any], overrides: Iterable[str], where: str) -> ExperimentConfig:
     """Plain values with ``a.b=value`` overrides applied, checked; ``where`` as in parse_config."""
-    values, overrides = copy.deepcopy(values), tuple(overrides)
-    before = {group: _kind(values, group) for group in _GROUPS_OF_KINDS}
-    for override in overrides:
-        _apply(values, override)
-    given = {override.partition("=")[0].strip() for override in overrides}
-    for group, kind in before.items():
-        if _kind(values, group) != kind:
-            _drop_unknown(values[group], group, given)
-    return parse_config(values, where)
+    return _checked(_READER.make(_of_slam(values, where), overrides, where), where)
 
 
 def parse_config(values: Mapping[str, Any], where: str) -> ExperimentConfig:
     """Checks plain values against the schema; ``where`` names their source in messages."""
-    try:
-        config = ExperimentConfig.model_validate(values)
-    except ValidationError as error:
-        raise ConfigError(_describe(error.errors(), where)) from None
+    return _checked(_READER.parse(_of_slam(values, where), where), where)
+
+
+def _of_slam(values: _Values, where: str) -> _Values:
+    """The values themselves, unless they are of a homing experiment."""
+    task = values.get("task")
+    if task is not None:
+        raise ConfigError(
+            f"{where}: task {task} is a homing experiment, and this needs one of SLAM; `fgslam "
+            "run` and `fgslam compare` take both"
+        )
+    return values
+
+
+def _checked(config: ExperimentConfig, where: str) -> ExperimentConfig:
     _require_own_folders(config, where)
     return config
 
@@ -139,185 +145,3 @@ def _require_own_folders(config: ExperimentConfig, where: str) -> None:
             raise ConfigError(
                 f"{where}: two different estimators are called {title}; give one of them a label"
             )
-
-
-def _kind(values: Mapping[str, Any], group: str) -> Any:
-    inner = values.get(group)
-    return inner.get("kind") if isinstance(inner, dict) else None
-
-
-def _drop_unknown(inner: Any, group: str, given: set[str]) -> None:
-    """Drops keys that meant something to the file's kind, not to the one an override chose.
-
-    Keys that are overrides themselves (``given``, dotted) stay: a misspelt one must be told.
-    """
-    if not isinstance(inner, dict):
-        return
-    schema = ExperimentConfig.model_json_schema()
-    _, nodes = _descend(schema, [group])
-    for node in nodes:
-        if _has_tag(node, str(inner.get("kind"))):
-            for key in set(inner) - set(node["properties"]):
-                if f"{group}.{key}" not in given:
-                    del inner[key]
-
-
-def _read_mapping(path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_text(encoding="utf-8")
-        values = yaml.safe_load(text)
-        repeated = _repeated_key(yaml.SafeLoader(text).get_single_node())
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; give a YAML file, e.g. of experiments/") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error}); give a YAML text file") from None
-    except yaml.YAMLError as error:
-        message = " ".join(str(error).split())
-        raise ConfigError(f"{path}: not valid YAML ({message}); mend that line") from None
-    except RecursionError:
-        raise ConfigError(f"{path}: not valid YAML (nested too deeply); mend it") from None
-    if repeated is not None:
-        line = repeated.start_mark.line + 1
-        raise ConfigError(f"{path}, line {line}: key {repeated.value} is given twice; remove one")
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path}: holds no `key: value` pairs; see experiments/ for examples")
-    return values
-
-
-def _repeated_key(node: Any) -> Any:
-    """First key node that repeats one of its mapping, or None: YAML forbids it, PyYAML does not."""
-    if node is None or node.id == "scalar":
-        return None
-    if node.id == "sequence":
-        return next(filter(None, map(_repeated_key, node.value)), None)
-    known: set[Any] = set()
-    for key, value in node.value:
-        if key.id == "scalar" and key.value in known:
-            return key
-        known.add(key.value if key.id == "scalar" else None)
-        inner = _repeated_key(value)
-        if inner is not None:
-            return inner
-    return None
-
-
-def _apply(values: dict[str, Any], override: str) -> None:
-    """Sets one dotted key, e.g. ``frontend.sift.octave_layers=3``; the value is YAML."""
-    dotted, separator, text = override.partition("=")
-    keys = dotted.strip().split(".")
-    if not separator or not all(keys):
-        raise ConfigError(f"--set {override}: not of the form a.b=value; e.g. --set seed=3")
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise ConfigError(f"--set {override}: the value is not valid YAML; quote it") from None
-    at = values
-    for key in keys[:-1]:
-        inner = at.setdefault(key, {})
-        if not isinstance(inner, dict):
-            raise ConfigError(f"--set {override}: {key} holds a value, not a group of keys")
-        at = inner
-    at[keys[-1]] = value
-
-
-# --------------------------------------------------------------------------------------------
-# Messages
-
-
-_PLAIN_WORDS = {
-    "tuple_type": "give a list, e.g. [a, b]",
-    "list_type": "give a list, e.g. [a, b]",
-    "dict_type": "give a group of keys",
-    "dataclass_type": "give a group of keys",
-    "model_attributes_type": "give a group of keys, or the name of a kind where one will do",
-    "int_type": "give a whole number",
-    "int_parsing": "give a whole number",
-    "int_from_float": "give a whole number",
-    "float_type": "give a number",
-    "float_parsing": "give a number",
-    "bool_type": "give true or false",
-    "bool_parsing": "give true or false",
-    "string_type": "give text, in quotes where it looks like a number",
-    "finite_number": "give a finite number",
-}
-"""What a value must be, by pydantic's type of error; others speak for themselves."""
-
-
-def _describe(errors: list[ErrorDetails], where: str) -> str:
-    unknown = ("extra_forbidden", "unexpected_keyword_argument")
-    # A misspelt key also leaves the right one missing; the misspelling is the cause.
-    first = sorted(errors, key=lambda e: e["type"] not in unknown)[0]
-    schema = ExperimentConfig.model_json_schema()
-    names = [str(part) for part in first["loc"]]
-    key = ".".join(_without_tags(schema, names))
-    more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-    if first["type"] in unknown:
-        return f"{where}: unknown key {key}{_suggestion(schema, names)}{more}"
-    if first["type"] in ("missing", "missing_argument"):
-        return f"{where}: key {key} is missing; add it{more}"
-    if first["type"] == "union_tag_not_found":
-        return f"{where}: {key}.kind is missing; add one of {_kinds(schema, names)}{more}"
-    if first["type"] == "union_tag_invalid":
-        kinds, tag = _kinds(schema, names), first["ctx"]["tag"]
-        return f"{where}: {key}.kind is {tag!r}; use one of {kinds}{more}"
-    words = _PLAIN_WORDS.get(first["type"], first["msg"])
-    return f"{where}: {key} = {first['input']!r} is not usable: {words}{more}"
-
-
-def _kinds(schema: dict[str, Any], names: list[str]) -> str:
-    _, nodes = _descend(schema, names)
-    return ", ".join(str(n["properties"]["kind"]["const"]) for n in nodes)
-
-
-def _nodes(schema: dict[str, Any], node: dict[str, Any]) -> list[dict[str, Any]]:
-    """The object schemas that a schema node may stand for."""
-    if "$ref" in node:
-        return _nodes(schema, schema["$defs"][node["$ref"].rsplit("/", 1)[-1]])
-    inner = [*node.get("oneOf", []), *node.get("anyOf", []), *node.get("allOf", [])]
-    if isinstance(node.get("items"), dict):
-        inner.append(node["items"])
-    if inner:
-        return [found for part in inner for found in _nodes(schema, part)]
-    return [node]
-
-
-def _descend(schema: dict[str, Any], names: list[str]) -> tuple[list[str], list[dict[str, Any]]]:
-    """Follows a location through the schema, dropping the tags of unions on the way.
-
-    Items of lists are written `key[3]`.
-    """
-    nodes: list[dict[str, Any]] = [schema]
-    kept: list[str] = []
-    for name in names:
-        if name.isdigit() and kept:  # an item of a list; `_nodes` has looked inside already
-            kept[-1] += f"[{name}]"
-            continue
-        found = [n["properties"][name] for n in nodes if name in n.get("properties", {})]
-        if not found:
-            tagged = [n for n in nodes if _has_tag(n, name)]
-            if not tagged:
-                break
-            nodes = tagged
-            continue
-        kept.append(name)
-        nodes = [inner for node in found for inner in _nodes(schema, node)]
-    return kept, nodes
-
-
-def _has_tag(node: dict[str, Any], tag: str) -> bool:
-    kind = node.get("properties", {}).get("kind", {})
-    return bool(kind.get("const") == tag)
-
-
-def _without_tags(schema: dict[str, Any], names: list[str]) -> list[str]:
-    kept, nodes = _descend(schema, names[:-1])
-    if names and names[-1].isdigit():
-        return _descend(schema, names)[0]
-    return kept if any(_has_tag(n, names[-1]) for n in nodes) else [*kept, names[-1]]
-
-
-def _suggestion(schema: dict[str, Any], names: list[str]) -> str:
-    _, nodes = _descend(schema, names[:-1])
-    known = sorted({key for node in nodes for key in node.get("properties", {})})
-    close = difflib.get_close_matches(names[-1], known, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]}?" if close else f"; known here: {', '.join(known)}"

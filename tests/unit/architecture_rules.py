@@ -52,7 +52,9 @@ FOUNDATION_ALLOWS: dict[str, frozenset[str]] = {
 STAGE_EXTRAS: dict[str, frozenset[str]] = {
     "datasets": frozenset({"simulation"}),
     "backend": frozenset({"factors"}),
-    "config": frozenset(),
+    "config_reading": frozenset(),
+    "config": frozenset({"config_reading"}),
+    "homing_config": frozenset({"config_reading", "config"}),
 }
 
 THIRD_PARTY_HOMES: dict[str, frozenset[str]] = {
