@@ -17,6 +17,9 @@
     return select === null ? null : Number(select.value);
   };
 
+  const sliderOf = (figure) => document.querySelector(`input[type=range][data-figure="${figure}"]`);
+  const stepIn = (figure) => Number(sliderOf(figure)?.value ?? 0);
+
   function isVisible(figure, owner) {
     const asked = owner.when.every((key) => isOn(figure, key));
     if (!asked || owner.unless.some((key) => isOn(figure, key))) return false;
@@ -89,7 +92,9 @@
         ? [["toImage", "resetCameraDefault3d"]]
         : [["toImage", "zoom2d", "pan2d", "zoomIn2d", "zoomOut2d", "resetScale2d"]],
     };
-    const dressed = traces.map((trace) => dressedTrace(key, trace));
+    // What belongs to another moment is not even handed over: there may be thousands.
+    const now = traces.filter(({ meta }) => meta.step === undefined || meta.step === stepIn(key));
+    const dressed = now.map((trace) => dressedTrace(key, trace));
     return Plotly.react(`plot-${key}`, dressed, dressedLayout(key, layout), config);
   }
 
@@ -97,10 +102,39 @@
 
   document.addEventListener("change", (event) => {
     const { figure, estimator } = event.target.dataset;
+    if (event.target.type === "range") return; // has been drawn while it moved
     if (estimator !== undefined) drawAll();
     else if (figure !== undefined) draw(figure);
   });
   for (const query of [dark, touch, narrow]) query.addEventListener("change", drawAll);
+
+  function showMoment(slider) {
+    const moments = slider.closest(".moments");
+    moments.querySelector("output").textContent = JSON.parse(slider.dataset.steps)[slider.value];
+    return draw(slider.dataset.figure);
+  }
+
+  document.addEventListener("input", (event) => {
+    if (event.target.type === "range") showMoment(event.target);
+  });
+  for (const button of document.querySelectorAll("button[data-play]")) {
+    const slider = sliderOf(button.dataset.play);
+    let playing = 0; // which press of the button runs; 0: none
+    let presses = 0;
+    const stop = () => { playing = 0; button.textContent = "Play"; };
+    button.addEventListener("click", async () => {
+      if (playing) return stop();
+      const own = (playing = ++presses);
+      button.textContent = "Stop";
+      if (slider.value === slider.max) slider.value = 0;
+      while (playing === own && Number(slider.value) < Number(slider.max)) {
+        slider.value = Number(slider.value) + 1;
+        await showMoment(slider);
+        await new Promise((next) => setTimeout(next, 120));
+      }
+      if (playing === own) stop();
+    });
+  }
 
   const dialog = document.getElementById("closer");
   for (const button of document.querySelectorAll("button.enlarge")) {

@@ -33,6 +33,7 @@ class Owner:
         unless: switches that must all be off.
         chosen: seen while the figure's selector names the estimator, whether its lines are or not.
         paint: its colour.
+        step: which of the figure's moments it belongs to; None of what is there all the time.
     """
 
     name: str
@@ -41,16 +42,18 @@ class Owner:
     unless: tuple[str, ...] = ()
     chosen: bool = False
     paint: Paint = "estimator"
+    step: int | None = None
 
     def as_values(self) -> dict[str, Any]:
         """As the page's script reads it."""
-        return {
+        values: dict[str, Any] = {
             "estimator": self.estimator,
             "when": list(self.when),
             "unless": list(self.unless),
             "chosen": self.chosen,
             "paint": self.paint,
         }
+        return values if self.step is None else {**values, "step": self.step}
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +78,7 @@ class Figure:
         switches: checkboxes above it.
         selects: whether one estimator at a time is chosen for part of it.
         note: what is not drawn, in words.
+        steps: names of its moments, shown one at a time by a slider; none where it has no time.
     """
 
     key: str
@@ -85,6 +89,7 @@ class Figure:
     switches: tuple[Switch, ...] = ()
     selects: bool = False
     note: str = ""
+    steps: tuple[str, ...] = ()
 
 
 def trace(owner: Owner, axes: Mapping[str, FloatArray], **more: Any) -> Trace:
