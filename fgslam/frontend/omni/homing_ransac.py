@@ -1,0 +1,291 @@
+"""The homing vector from wide-baseline matches: RANSAC over pairs, refinement, honest refusal.
+
+Section III-B of Goedemé et al. (2005). Samples of two matches give one or two hypotheses each
+(:mod:`two_point`); each is supported by the matches that keep the epipolar constraint with positive
+distances; the best is refined on its inliers. An answer is given only if its support cannot be
+chance and no different solution comes near it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import binom
+
+from fgslam.frontend.omni.epipolar import EpipolarTest
+from fgslam.frontend.omni.homing_refinement import HomingRefinement, Refined, RefinementPrior
+from fgslam.frontend.omni.two_point import TwoPointSamples, solve_two_point
+from fgslam.homing_types import BearingMatches, HomingVector, Refusal, RefusalReason
+from fgslam.planar import wrap
+from fgslam.settings.homing_vector import HomingVectorSettings
+from fgslam.types import BoolArray, FloatArray, IntArray
+
+_BATCH = 50  # samples between two looks at the confidence
+_MAX_LOG_RATIO_SIGMA = 0.7  # of ln rho: matches near the horizon support, but are not sampled
+_SHUFFLES = 10  # times the matches are paired wrongly to learn what chance supports
+_REFINED = 3  # different hypotheses that are refined, the best supported first
+_CELL = np.deg2rad(2.0)  # matches within one cell in both views are one witness
+
+
+def estimate_homing_vector(
+    matches: BearingMatches, settings: HomingVectorSettings, rng: np.random.Generator
+) -> HomingVector | Refusal:
+    """The homing vector that the matches support best, or why there is none.
+
+    Args:
+        matches: tentative ones, wrong ones among them.
+        settings: number of samples, thresholds.
+        rng: chooses the samples; the same generator state gives the same answer.
+    """
+    if len(matches) < settings.min_inliers:
+        return Refusal(
+            RefusalReason.TOO_FEW_MATCHES,
+            f"{len(matches)} matches, of {settings.min_inliers} needed",
+        )
+    search = _Search(matches, settings, rng)
+    candidates = search.candidates()
+    if not candidates:
+        return Refusal(
+            RefusalReason.TOO_FEW_INLIERS, "no pair of matches agrees on any homing vector"
+        )
+    refined = [search.refined(c) for c in candidates]
+    refined.sort(key=lambda r: -search.witnesses(r.inliers))
+    best = refined[0]
+    at_target = search.turn_at_target(best)
+    if at_target is not None:
+        return at_target
+    rival = max(
+        (search.witnesses(r.inliers) for r in refined[1:] if search.differ(r, best)), default=0
+    )
+    refusal = search.refusal(best, rival)
+    if refusal is not None:
+        return refusal
+    theta, psi = (float(v) for v in best.parameters[:2])
+    return HomingVector(theta, psi, best.covariance[:2, :2], best.inliers, rival)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate:
+    direction: float
+    rotation: float
+    support: int
+
+
+class _Search:
+    """One search: matches prepared for sampling, testing and refining."""
+
+    def __init__(
+        self, matches: BearingMatches, settings: HomingVectorSettings, rng: np.random.Generator
+    ) -> None:
+        self._matches = matches
+        self._settings = settings
+        self._rng = rng
+        self._least_parallax = np.deg2rad(settings.least_parallax_deg)
+        tilt = np.deg2rad(settings.tilt_sigma_deg)
+        self._test = EpipolarTest.of(matches, tilt)
+        self._refinement = HomingRefinement(
+            matches,
+            RefinementPrior(tilt, settings.height_sigma),
+            settings.inlier_sigmas,
+            self._least_parallax,
+        )
+        self._cells = _cells(matches)
+        self._tilt = tilt
+
+    # ----------------------------------------------------------------------------------------
+    # Sampling
+
+    def candidates(self) -> list[_Candidate]:
+        """The best supported hypotheses that differ from each other, best first."""
+        log_ratio, sigma_log, eligible = _log_ratios(self._matches, self._tilt)
+        if len(eligible) < 2:
+            return []
+        found: list[FloatArray] = []
+        drawn, best = 0, 0
+        while drawn < self._settings.samples and drawn < self._needed(best):
+            count = min(_BATCH, self._settings.samples - drawn)
+            pairs = eligible[_distinct_pairs(len(eligible), count, self._rng)]
+            solutions = self._hypotheses(pairs, log_ratio, sigma_log)
+            drawn += count
+            if solutions.shape[1]:
+                found.append(solutions)
+                best = max(best, int(np.max(solutions[2])))
+        return self._different(np.hstack(found)) if found else []
+
+    def _needed(self, support: int) -> float:
+        """Samples until one of two inliers was drawn with the wanted confidence."""
+        share = support / len(self._matches)
+        if share <= 0.0:
+            return np.inf
+        if share >= 1.0:
+            return 1.0
+        return float(np.log(1.0 - self._settings.confidence) / np.log1p(-(share**2)))
+
+    def _hypotheses(
+        self, pairs: IntArray, log_ratio: FloatArray, sigma_log: FloatArray
+    ) -> FloatArray:
+        """(4, c) direction, rotation, number of inliers and their squared residuals' sum."""
+        m = self._matches
+        bearing_sigma = np.sqrt(0.5 * (m.sigma[:, 0] ** 2 + m.sigma[:, 2] ** 2))
+        solved = solve_two_point(
+            TwoPointSamples(
+                m.bearing_a[pairs],
+                m.bearing_b[pairs],
+                log_ratio[pairs],
+                bearing_sigma[pairs],
+                sigma_log[pairs],
+            )
+        )
+        direction, rotation = solved.direction[solved.valid], solved.rotation[solved.valid]
+        inliers, residuals = self._test.inliers(
+            direction, rotation, self._settings.inlier_sigmas, self._least_parallax
+        )
+        misfit = np.sum(np.where(inliers, residuals**2, 0.0), axis=0)
+        return np.stack([direction, rotation, np.sum(inliers, axis=0), misfit])
+
+    def _different(self, hypotheses: FloatArray) -> list[_Candidate]:
+        """The best of each group of like hypotheses."""
+        # Support decides; among equals the better fit.
+        order = np.lexsort((hypotheses[3], -hypotheses[2]))
+        chosen: list[_Candidate] = []
+        limit = np.deg2rad(self._settings.rival_angle_deg)
+        ordered = hypotheses[:, order]
+        open_ = np.ones(ordered.shape[1], dtype=np.bool_)
+        while len(chosen) < _REFINED and np.any(open_):
+            k = int(np.argmax(open_))
+            theta, psi, support, _ = ordered[:, k]
+            chosen.append(_Candidate(float(theta), float(psi), int(support)))
+            open_ &= _angle_apart(ordered[:2], ordered[:2, k : k + 1]) > limit
+        return chosen
+
+    # ----------------------------------------------------------------------------------------
+    # Refining and judging
+
+    def refined(self, candidate: _Candidate) -> Refined:
+        """The candidate after least squares."""
+        return self._refinement.refine(candidate.direction, candidate.rotation)
+
+    def differ(self, one: Refined, other: Refined) -> bool:
+        """Whether two solutions are not one and the same."""
+        apart = _angle_apart(one.parameters[:2, None], other.parameters[:2, None])[0]
+        return bool(apart > np.deg2rad(self._settings.rival_angle_deg))
+
+    def witnesses(self, which: BoolArray) -> int:
+        """Number of inliers that are independent of each other."""
+        return len(np.unique(self._cells[which]))
+
+    def turn_at_target(self, best: Refined) -> Refusal | None:
+        """Both views from one place (D6): there is a turn, but no direction."""
+        m, limit = self._matches, np.deg2rad(self._settings.at_target_parallax_deg)
+        if not np.any(best.inliers):
+            return None
+        turns = wrap(m.bearing_a - m.bearing_b)[best.inliers]
+        psi = float(np.angle(np.mean(np.exp(1j * turns))))
+        parallax = float(np.median(np.abs(wrap(turns - psi))))
+        if parallax >= limit:
+            return None
+        return Refusal(
+            RefusalReason.AT_TARGET,
+            f"median parallax {np.rad2deg(parallax):.2f} deg: both views are from one place",
+            psi,
+        )
+
+    def refusal(self, best: Refined, rival: int) -> Refusal | None:
+        """Why the best solution is no answer, or None."""
+        s = self._settings
+        support = self.witnesses(best.inliers)
+        alarms = self._log_false_alarms(best)
+        if support < s.min_inliers:
+            reason, text = (
+                RefusalReason.TOO_FEW_INLIERS,
+                f"{support} inliers of {len(self._matches)}",
+            )
+        elif alarms > np.log(s.max_false_alarms):
+            reason = RefusalReason.TOO_FEW_INLIERS
+            text = (
+                f"{support} inliers of {len(self._matches)} matches may be chance "
+                f"(1e{alarms / np.log(10.0):.1f} expected)"
+            )
+        elif rival >= s.rival_share * support:
+            reason = RefusalReason.AMBIGUOUS
+            text = f"{support} inliers, {rival} for a different solution"
+        elif (sigma := float(np.sqrt(best.covariance[0, 0]))) > np.deg2rad(
+            s.max_direction_sigma_deg
+        ):
+            reason = RefusalReason.UNCERTAIN
+            text = f"direction is uncertain by {np.rad2deg(sigma):.1f} deg"
+        else:
+            return None
+        return Refusal(reason, text)
+
+    def _log_false_alarms(self, best: Refined) -> float:
+        """Log of the number of equally supported hypotheses expected if all matches were wrong.
+
+        What a wrong match's chance is to support this hypothesis is read off wrong matches: the
+        same features paired by lot (an *a contrario* test, Moisan and Stival 2004).
+        """
+        n = len(self._matches)
+        total, support = len(np.unique(self._cells)), self.witnesses(best.inliers)
+        shuffled = np.concatenate([self._rng.permutation(n) for _ in range(_SHUFFLES)])
+        pairs = _repaired(self._matches, shuffled)
+        good, _ = EpipolarTest.of(pairs, self._tilt).inliers(
+            best.parameters[:1], best.parameters[1:2],
+            self._settings.inlier_sigmas, self._least_parallax,
+        )  # fmt: skip
+        chance = (np.count_nonzero(good) + 1.0) / (len(good) + 2.0)
+        tests = np.log(float(total * (total - 1)))  # two solutions for each pair
+        return float(tests + binom.logsf(support - 1, total, chance))
+
+
+def _distinct_pairs(n: int, count: int, rng: np.random.Generator) -> IntArray:
+    """(count, 2) of two different numbers below n each."""
+    first = rng.integers(0, n, count)
+    second = (first + rng.integers(1, n, count)) % n
+    return np.column_stack([first, second])
+
+
+def _angle_apart(one: FloatArray, other: FloatArray) -> FloatArray:
+    """(c,) larger of the differences in direction and rotation, of (2, c) hypotheses."""
+    return np.asarray(np.max(np.abs(wrap(one - other)), axis=0))
+
+
+def _log_ratios(
+    matches: BearingMatches, tilt_sigma: float
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """(n,) ln rho and its standard deviation, and which matches may be sampled (D6).
+
+    sigma(ln tan alpha) = 2 sigma / sin(2 alpha): it explodes towards the horizon and the zenith.
+    Where both elevations have different signs there is no ratio (D1).
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.tan(matches.elevation_a) / np.tan(matches.elevation_b)
+        log_ratio = np.log(np.where(ratio > 0.0, ratio, np.nan))
+        sigma_a = (
+            2.0 * np.hypot(matches.sigma[:, 1], tilt_sigma) / np.sin(2.0 * matches.elevation_a)
+        )
+        sigma_b = (
+            2.0 * np.hypot(matches.sigma[:, 3], tilt_sigma) / np.sin(2.0 * matches.elevation_b)
+        )
+    sigma = np.hypot(sigma_a, sigma_b)
+    eligible = np.flatnonzero(np.isfinite(log_ratio) & (sigma < _MAX_LOG_RATIO_SIGMA))
+    return log_ratio, sigma, eligible
+
+
+def _cells(matches: BearingMatches) -> IntArray:
+    """(n,) number of the cell of both views that a match lies in: one cell, one witness."""
+    grid = np.column_stack(
+        [matches.bearing_a, matches.bearing_b, matches.elevation_a, matches.elevation_b]
+    )
+    _, cells = np.unique(np.round(grid / _CELL), axis=0, return_inverse=True)
+    return np.asarray(cells.ravel(), dtype=np.int64)
+
+
+def _repaired(matches: BearingMatches, order: IntArray) -> BearingMatches:
+    """Each feature of the first view with another one of the second, repeatedly."""
+    first = np.resize(np.arange(len(matches)), len(order))
+    a, b = matches.taken(first), matches.taken(order)
+    return BearingMatches(
+        a.kind, a.index_a, b.index_b, a.bearing_a, a.elevation_a, b.bearing_b, b.elevation_b,
+        np.column_stack([a.sigma[:, :2], b.sigma[:, 2:]]), a.quality,
+    )  # fmt: skip

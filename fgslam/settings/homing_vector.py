@@ -1,0 +1,78 @@
+"""Settings of the homing vector: RANSAC, refinement, and when to refuse."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fgslam.settings.base import STRICT
+
+
+@dataclass(frozen=True, config=STRICT)
+class HomingVectorSettings:
+    """Two-point RANSAC, refinement by least squares, refusals (III-B; design D3, D6, D7)."""
+
+    samples: Annotated[
+        int, Field(ge=1, description="at most so many random pairs of matches (200 in the paper)")
+    ] = 200
+    confidence: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            lt=1.0,
+            description="stop earlier once a better answer is this unlikely to have been missed",
+        ),
+    ] = 0.999
+    inlier_sigmas: Annotated[
+        float,
+        Field(gt=0.0, description="normalised epipolar residual of an inlier (D7: 2.5 to 3)"),
+    ] = 3.0
+    least_parallax_deg: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="of two rays; the distances' signs are tested above it only (D7: 3)",
+        ),
+    ] = 3.0
+    tilt_sigma_deg: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="camera's roll and pitch at each view, estimated along with this prior",
+        ),
+    ] = 0.5
+    height_sigma: Annotated[
+        float,
+        Field(ge=0.0, description="difference of the cameras' heights, in legs; estimated, too"),
+    ] = 0.01
+    min_inliers: Annotated[int, Field(ge=3, description="fewer are refused")] = 8
+    max_false_alarms: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="expected number of equally supported vectors if all matches were wrong",
+        ),
+    ] = 1e-4
+    rival_share: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            le=1.0,
+            description="a different solution with this share of the inliers makes it ambiguous",
+        ),
+    ] = 0.8
+    rival_angle_deg: Annotated[
+        float, Field(gt=0.0, description="solutions closer than this are one and the same")
+    ] = 15.0
+    max_direction_sigma_deg: Annotated[
+        float, Field(gt=0.0, description="less certain directions are refused")
+    ] = 5.0
+    at_target_parallax_deg: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="median parallax below which both views are from one place (D6)",
+        ),
+    ] = 0.5
