@@ -9,6 +9,7 @@ from __future__ import annotations
 import gtsam
 
 _POSE, _LANDMARK = "x", "l"
+_TARGET, _VELOCITY, _HEIGHT = "t", "v", "h"
 
 
 def pose_key(frame: int) -> int:
@@ -29,3 +30,22 @@ def is_pose(key: int) -> bool:
 def number(key: int) -> int:
     """Frame or variable number of a key."""
     return int(gtsam.Symbol(key).index())
+
+
+# --------------------------------------------------------------------------------------------
+# Homing: the start is pose 0, images on the way are poses from 1 on
+
+
+def target_key() -> int:
+    """Key of the target's planar pose."""
+    return int(gtsam.symbol(_TARGET, 0))
+
+
+def velocity_key(image: int) -> int:
+    """Key of the velocity at pose ``image``."""
+    return int(gtsam.symbol(_VELOCITY, image))
+
+
+def height_key(variable: int) -> int:
+    """Key of the height of landmark ``variable``."""
+    return int(gtsam.symbol(_HEIGHT, variable))

@@ -1,0 +1,71 @@
+"""What every homing estimator checks before it believes its input."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.errors import EstimatorError
+from fgslam.homing_types import HomingStart, TrackedBearings
+from fgslam.types import BoolArray, IntArray
+
+
+class TrackedFeatures:
+    """Time and identities of a homing: which features were known, which are lost (G28)."""
+
+    def __init__(self, start: HomingStart) -> None:
+        """All features of the start's local map are alive.
+
+        Raises:
+            EstimatorError: the start's parts do not belong together.
+        """
+        ids = start.local_map.ids
+        if len(start.matches) != len(ids) or not _ascend(ids):
+            raise EstimatorError(
+                f"homing start: {len(start.matches)} matches for {len(ids)} features of the local "
+                "map; give one match a feature, identities ascending"
+            )
+        self._known = ids
+        self.alive = ids
+        self.time = start.time
+
+    def take(self, tracked: TrackedBearings) -> tuple[float, BoolArray]:
+        """Notes one image: seconds since the last, and which of its rows are features alive.
+
+        Features absent from it are lost from now on; one that comes back later is not taken up.
+
+        Raises:
+            EstimatorError: time does not increase, an identity the map never had, or a value
+                that is no number. Nothing is noted then.
+        """
+        step = tracked.time - self.time
+        if not step > 0.0:
+            raise EstimatorError(
+                f"image at {tracked.time:.9f} s does not come after {self.time:.9f} s; give images "
+                "in the order of their times"
+            )
+        self._require_sound(tracked)
+        self.time = tracked.time
+        self.alive = self.alive[np.isin(self.alive, tracked.ids)]
+        return float(step), np.isin(tracked.ids, self.alive)
+
+    def _require_sound(self, tracked: TrackedBearings) -> None:
+        unknown = np.setdiff1d(tracked.ids, self._known)
+        if len(unknown):
+            raise EstimatorError(
+                f"image at {tracked.time:.3f} s: feature {unknown[0]} is not in the local map; "
+                "track the map's features only"
+            )
+        if not _ascend(tracked.ids):
+            raise EstimatorError(
+                f"image at {tracked.time:.3f} s: identities do not ascend; sort them, each once"
+            )
+        sound = np.isfinite(tracked.bearing) & (tracked.sigma_bearing > 0.0)
+        if not sound.all():
+            raise EstimatorError(
+                f"image at {tracked.time:.3f} s: feature {tracked.ids[~sound][0]} has no finite "
+                "bearing with a positive deviation; leave it out"
+            )
+
+
+def _ascend(ids: IntArray) -> bool:
+    return bool((np.diff(ids) > 0).all())

@@ -1,0 +1,122 @@
+"""Factors of homing: bearings, elevations, the leg, its measured direction, and motion.
+
+Variables: planar poses of the start, of every image on the way and of the target (``Pose2``),
+velocities in the robot's axes, landmarks in the plane, and their heights where elevations are
+used. GTSAM's own factors serve wherever there is one; residuals are specified in
+:mod:`fgslam.factors.bearing_residuals`. Derivation: docs/derivations/homing_graph.md.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from fgslam.factors.bearing_residuals import (
+    direction_and_turn,
+    elevation,
+    elevation_jacobians,
+)
+from fgslam.factors.noise import KernelName, Whitening
+from fgslam.planar import rotation
+from fgslam.types import FloatArray
+
+STIFF = 1e-4
+"""Deviation, legs and radians, of what defines the frame: the start's pose, and the leg's length.
+Constrained models would be exact and make GTSAM fall back to QR, several times slower."""
+
+
+class BearingFactors:
+    """Makes the factors of measured bearings and elevations, robust or not."""
+
+    def __init__(self, kernel: KernelName = "none", width: float = 1.0) -> None:
+        """``width`` is the kernel's scale in standard deviations."""
+        self._whitening = Whitening(kernel, width)
+
+    def bearing(self, pose: int, landmark: int, measured: float, sigma: float) -> Any:
+        """Bearing of a landmark from a pose; radians (eqs 7, 9)."""
+        return gtsam.BearingFactor2D(pose, landmark, gtsam.Rot2(measured), self._model(sigma))
+
+    def elevation(
+        self, pose: int, landmark: int, height: int, measured: float, sigma: float
+    ) -> Any:
+        """Elevation of a landmark of unknown height from a pose; radians."""
+        keys = [pose, landmark, height]
+        value = np.array([measured])
+
+        def error(_: Any, values: Any, jacobians: list[FloatArray] | None) -> FloatArray:
+            at = values.atPose2(pose)
+            place = np.array([at.x(), at.y(), at.theta()])
+            point = values.atPoint2(landmark)[None, :]
+            tall = np.array([values.atDouble(height)])
+            if jacobians is not None:
+                by_pose, by_point, by_height = elevation_jacobians(place, point, tall)
+                jacobians[0] = by_pose @ tangent_to_pose(place)
+                jacobians[1], jacobians[2] = by_point, by_height[:, None]
+            return elevation(place, point, tall, value)
+
+        return gtsam.CustomFactor(self._model(sigma), keys, error)
+
+    def _model(self, sigma: float) -> Any:
+        return self._whitening.model(np.array([[sigma**2]]))
+
+
+def start_prior(pose: int) -> Any:
+    """The start is the frame's origin."""
+    return gtsam.PriorFactorPose2(pose, gtsam.Pose2(), gtsam.noiseModel.Isotropic.Sigma(3, STIFF))
+
+
+def leg_factor(start: int, target: int) -> Any:
+    """The distance from start to target is the unit of length (R = 1, III-B; E-G5)."""
+    return gtsam.RangeFactorPose2(start, target, 1.0, gtsam.noiseModel.Isotropic.Sigma(1, STIFF))
+
+
+def vector_factor(target: int, direction: float, turn: float, covariance: FloatArray) -> Any:
+    """The initialisation's (theta, psi) with its covariance (2, 2), on the target's pose."""
+
+    def error(_: Any, values: Any, jacobians: list[FloatArray] | None) -> FloatArray:
+        at = values.atPose2(target)
+        place = np.array([at.x(), at.y(), at.theta()])
+        residual, derivative = direction_and_turn(place, direction, turn)
+        if jacobians is not None:
+            jacobians[0] = derivative @ tangent_to_pose(place)
+        return residual
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(covariance), [target], error)
+
+
+def velocity_prior(velocity: int, mean: FloatArray, sigmas: FloatArray) -> Any:
+    """Prior (3,) on a velocity: forward, left, turning."""
+    return gtsam.PriorFactorVector(velocity, mean, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+
+
+def motion_factor(
+    before: tuple[int, int, float], after: tuple[int, int, float], density: FloatArray
+) -> Any:
+    """Constant velocity up to white noise on the acceleration (eqs 4 and 5 as in E-G4).
+
+    Args:
+        before, after: keys of pose and of velocity, and time in seconds.
+        density: (3,) of the accelerations' noise, forward, left and turning.
+    """
+    return gtsam.WnoaMotionFactorPose2(
+        gtsam.StateData(*before), gtsam.StateData(*after), np.asarray(density)
+    )
+
+
+def weak_landmark_prior(landmark: int, position: FloatArray, sigma: float) -> Any:
+    """Keeps a landmark determined when too few bearings say where it is."""
+    return gtsam.PriorFactorPoint2(landmark, position, gtsam.noiseModel.Isotropic.Sigma(2, sigma))
+
+
+def weak_height_prior(height: int, value: float, sigma: float) -> Any:
+    """The same for a height."""
+    return gtsam.PriorFactorDouble(height, value, gtsam.noiseModel.Isotropic.Sigma(1, sigma))
+
+
+def tangent_to_pose(pose: FloatArray) -> FloatArray:
+    """(3, 3) derivative of a pose's (x, y, psi) by GTSAM's tangent, which is in its own axes."""
+    out = np.eye(3)
+    out[:2, :2] = rotation(float(pose[2]))
+    return out

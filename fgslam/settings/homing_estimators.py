@@ -1,0 +1,202 @@
+"""Settings of the homing estimators, as a tagged union over ``kind``.
+
+Lengths are in legs, the distance from start to target, so that speeds are in legs a second: a
+wheelchair at 0.4 m/s on a leg of 2 m drives 0.2 legs a second.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, TypeAlias
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fgslam.settings.backend import KernelSettings, NamedSettings
+from fgslam.settings.base import STRICT
+
+
+@dataclass(frozen=True, config=STRICT)
+class FilterMotionSettings:
+    """Noise of the filter's motion (eqs 4 and 5, with what E-G4 adds); the paper states none."""
+
+    heading_deg: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="deviation of the heading after a second, degrees: a random walk. The "
+            "filter expects no turning, so that this must cover the robot's turns",
+        ),
+    ] = 20.0
+    speed: Annotated[
+        float, Field(gt=0.0, description="deviation of the speed after a second, legs/s")
+    ] = 0.1
+    slip: Annotated[
+        float,
+        Field(gt=0.0, description="deviation of the position after a second, legs: wheels slip"),
+    ] = 0.02
+    initial_speed: Annotated[
+        float, Field(gt=0.0, description="deviation of the speed at the start, around 0, legs/s")
+    ] = 0.5
+
+
+@dataclass(frozen=True, config=STRICT)
+class HomingEkfSettings(NamedSettings):
+    """The two filters of section IV with the corrected model (E-G2, E-G3, E-G4, E-G6).
+
+    The defaults are the honest variant; :data:`PAPER` holds what the paper says.
+    """
+
+    kind: Literal["homing_ekf"] = "homing_ekf"
+    gauge: Annotated[
+        Literal["one_distance", "unit_leg"],
+        Field(
+            description="what fixes the scale: `one_distance` that of one feature, the best known, "
+            "as printed; `unit_leg` the distance from start to target (E-G5)"
+        ),
+    ] = "unit_leg"
+    exact_bearings: Annotated[
+        bool,
+        Field(
+            description="the bearings from the start have no variance, as printed (E-G5); else "
+            "that of the image"
+        ),
+    ] = False
+    target: Annotated[
+        Literal["separate", "joint"],
+        Field(
+            description="`separate`: a filter of its own, told the target's bearings anew with "
+            "every image, as printed (E-G7); `joint`: the target is part of the state and its "
+            "bearings count once, in the initial triangulation"
+        ),
+    ] = "joint"
+    map_covariance: Annotated[
+        bool,
+        Field(
+            description="target separate: the map's covariance is added to that of the target's "
+            "bearings; as printed it is not"
+        ),
+    ] = True
+    gate_sigmas: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="bearings whose innovation exceeds so many deviations are left out; 0: "
+            "none is, as printed",
+        ),
+    ] = 3.0
+    max_relative_distance_sigma: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="features whose distance has a larger deviation, relative to itself, do "
+            "not enter the map; 0: all enter, as printed",
+        ),
+    ] = 0.3
+    motion: FilterMotionSettings = FilterMotionSettings()
+
+
+PAPER = HomingEkfSettings(
+    label="paper_ekf",
+    gauge="one_distance",
+    exact_bearings=True,
+    target="separate",
+    map_covariance=False,
+    gate_sigmas=0.0,
+    max_relative_distance_sigma=0.0,
+)
+"""The filters as the paper describes them, the model corrected."""
+
+
+@dataclass(frozen=True, config=STRICT)
+class GraphMotionSettings:
+    """White noise on the acceleration between two images."""
+
+    forward: Annotated[
+        float, Field(gt=0.0, description="deviation of the speed after a second, legs/s")
+    ] = 0.1
+    sideways: Annotated[
+        float, Field(gt=0.0, description="the same of the sideways speed: slip")
+    ] = 0.03
+    turning_deg: Annotated[
+        float, Field(gt=0.0, description="the same of the turning rate, degrees/s")
+    ] = 60.0
+    initial_speed: Annotated[
+        float, Field(gt=0.0, description="deviation of the speed at the start, around 0, legs/s")
+    ] = 0.5
+    initial_turning_deg: Annotated[
+        float, Field(gt=0.0, description="of the turning rate at the start, degrees/s")
+    ] = 30.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class HomingGraphSettings(NamedSettings):
+    """The same problem as one graph of bearings (design H)."""
+
+    kind: Literal["homing_graph"] = "homing_graph"
+    solver: Annotated[
+        Literal["isam2", "fixed_lag", "batch"],
+        Field(
+            description="`isam2` incremental over the whole homing; `fixed_lag` over the last "
+            "images, older ones marginalised; `batch` Levenberg-Marquardt anew with every image"
+        ),
+    ] = "isam2"
+    kernel: KernelSettings = KernelSettings("cauchy", 2.0)
+    elevations: Annotated[
+        bool,
+        Field(
+            description="elevations are used too, with a height for each landmark; the "
+            "initialisation's direction and rotation, which were found with those of the first "
+            "two views, are then left out"
+        ),
+    ] = False
+    max_relative_distance_sigma: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="a feature enters once its distance, triangulated from the start and the "
+            "target or the present place, has a deviation below this part of itself: worse ones "
+            "may cross the camera's centre and take the solution along",
+        ),
+    ] = 0.3
+    prior_distances: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="deviation of the weak prior on a landmark's place, in initial distances",
+        ),
+    ] = 2.0
+    lag_s: Annotated[
+        float, Field(gt=0.0, description="fixed_lag: how long poses stay variables, seconds")
+    ] = 1.0
+    relinearize_threshold: Annotated[
+        float,
+        Field(gt=0.0, description="change (legs, radians) that relinearises a variable"),
+    ] = 0.01
+    trust_radius: Annotated[
+        float,
+        Field(gt=0.0, description="isam2, fixed_lag: first trust region of Powell's dog leg"),
+    ] = 1.0
+    max_iterations: Annotated[
+        int, Field(ge=1, description="batch: of Levenberg-Marquardt with every image")
+    ] = 50
+    motion: GraphMotionSettings = GraphMotionSettings()
+
+
+@dataclass(frozen=True, config=STRICT)
+class AverageLandmarkVectorSettings(NamedSettings):
+    """Average landmark vector (Lambrinos et al. 2000): direction alone, no distance (G35)."""
+
+    kind: Literal["alv"] = "alv"
+
+
+@dataclass(frozen=True, config=STRICT)
+class SnapshotSettings(NamedSettings):
+    """Average displacement of the bearings against the target's snapshot (G35): no distance."""
+
+    kind: Literal["snapshot"] = "snapshot"
+
+
+HomingEstimatorSettings: TypeAlias = Annotated[
+    HomingEkfSettings | HomingGraphSettings | AverageLandmarkVectorSettings | SnapshotSettings,
+    Field(discriminator="kind"),
+]
