@@ -17,6 +17,7 @@ from fgslam.errors import FgslamError
 if TYPE_CHECKING:
     from fgslam.config import ExperimentConfig
     from fgslam.export.atomic import ExistingFolder
+    from fgslam.homing_config import HomingExperiment
     from fgslam.runs.baseline import Results
     from fgslam.runs.choosing import Choice
     from fgslam.runs.comparison import Compared
@@ -57,21 +58,35 @@ def run(
         bool, typer.Option("--resume", help="continue an interrupted run to the same bytes")
     ] = False,
 ) -> None:
-    """Run an experiment: images in, run folder out; measurements without images, too.
+    """Run an experiment: images in, run folder out; measurements without images, homing, too.
 
     Ctrl-C ends it early with all files valid; --resume goes on from there.
     """
-    from fgslam.config import load_config
     from fgslam.errors import ConfigError
+    from fgslam.homing_config import HomingExperiment, load_experiment
     from fgslam.runs.measured import holds_measurements
 
     if overwrite and resume:
         raise ConfigError("--overwrite and --resume exclude each other; give one of them")
-    settings = load_config(config, overrides or ())
+    settings = load_experiment(config, overrides or ())
     folder = out or Path("runs") / settings.name
     existing: ExistingFolder = "resume" if resume else "overwrite" if overwrite else "refuse"
+    if isinstance(settings, HomingExperiment):
+        return _run_homing(settings, folder, existing)
     run_it = _run_measurements if holds_measurements(settings) else _run_images
-    run_it(settings, folder, existing)
+    return run_it(settings, folder, existing)
+
+
+def _run_homing(settings: HomingExperiment, folder: Path, existing: ExistingFolder) -> None:
+    from fgslam.console import progress_bar
+    from fgslam.homing_console import show_homing
+    from fgslam.runs.homing.run import run_homing
+
+    with _stop_flag() as stopped, progress_bar() as progress:
+        result = run_homing(settings, folder, existing, progress, stopped)
+    show_homing(result)
+    if result.status == "interrupted":
+        raise typer.Exit(EXIT_INTERRUPTED)
 
 
 def _run_images(settings: ExperimentConfig, folder: Path, existing: ExistingFolder) -> None:

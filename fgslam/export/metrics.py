@@ -127,7 +127,7 @@ def write_metrics(
         **(more or {}),
         "estimators": {kind: metrics.as_json() for kind, metrics in estimators.items()},
     }
-    write_text(path, json.dumps(_plain(document), indent=2, allow_nan=False) + "\n")
+    write_text(path, json.dumps(plain(document), indent=2, allow_nan=False) + "\n")
 
 
 def read_metrics(path: Path) -> dict[str, Any]:
@@ -156,14 +156,14 @@ def write_timing(path: Path, times: Sequence[StageTime]) -> None:
     write_text(path, "\n".join(lines) + "\n")
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Plain JSON types: NumPy numbers unwrapped, what is not finite as None."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):

@@ -27,6 +27,7 @@ from fgslam.export.metrics import (
 from fgslam.export.point_cloud import MapPoints
 from fgslam.export.trajectories import write_tum
 from fgslam.frontend.database import LandmarkDatabase
+from fgslam.homing_config import HomingExperiment
 from fgslam.pipeline import SlamPipeline
 from fgslam.runs.checkpoint import save_log
 from fgslam.runs.comparison import GROUND_TRUTH_FILE, load_truth, remark_of
@@ -134,7 +135,9 @@ class RunOutputs:
         }
 
 
-def write_config(folder: Path, config: ExperimentConfig, provenance: dict[str, Any]) -> None:
+def write_config(
+    folder: Path, config: ExperimentConfig | HomingExperiment, provenance: dict[str, Any]
+) -> None:
     """config.yaml: every default filled in, with the versions and where the data came from."""
     values = config.as_values() | {"provenance": {"versions": versions()} | provenance}
     write_text(folder / RUN_MARKER, yaml.safe_dump(values, sort_keys=False))

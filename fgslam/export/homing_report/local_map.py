@@ -1,0 +1,190 @@
+"""The local map of one homing, moment by moment (fig. 4 of Goedemé et al. 2005)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from fgslam.export.report.traces import Figure, Owner, Switch, Trace, thinned, trace
+from fgslam.homing_types import HomingEstimate, HomingTruth
+from fgslam.types import FloatArray
+
+MAX_MOMENTS = 60
+SIGMAS = 3.0
+_CORNERS = 33
+_HEADING = 0.12  # length of the tick that points ahead, legs
+_BULK = (2.0, 98.0)
+_TOLD = "<b>%{fullData.name}</b><br>%{y:.3f} legs ahead, %{x:.3f} legs right<extra></extra>"
+
+
+def local_map_figure(
+    estimates: Sequence[HomingEstimate],
+    truth: HomingTruth | None = None,
+    key: str = "local-map",
+    heading: str = "The local map, moment by moment",
+) -> Figure:
+    """Start, robot, target and features as one estimator knew them at each image.
+
+    Args:
+        estimates: one or more, in order of time.
+        truth: of the same homing, row k of ``robots`` at estimate k; None where it is not known.
+        key: unique in the page.
+        heading: its title.
+    """
+    rows = thinned(len(estimates), MAX_MOMENTS)
+    traces = [*_true_path(truth)]
+    for step, row in enumerate(rows):
+        known = [] if truth is None else [truth.robots[min(int(row), len(truth.robots) - 1)]]
+        traces += _moment(estimates, int(row), step, known, truth)
+    start = estimates[0].time if len(estimates) else 0.0
+    return Figure(
+        key,
+        heading,
+        "Squares: start, present pose (with a tick ahead) and target. Numbered diamonds: features "
+        "that are followed; stars: features that were lost, where they were last. Ellipses reach "
+        f"{SIGMAS:.0f} standard deviations as the estimator claims them. Lengths are in legs: 1 is "
+        "the way from start to target. Dashed: the truth.",
+        tuple(traces),
+        _layout(estimates),
+        (
+            Switch("features", "features"),
+            Switch("ellipses", "ellipses"),
+            Switch("feature-ellipses", "ellipses of the features", on=False),
+            *([Switch("truth", "truth")] if truth is not None else []),
+        ),
+        steps=tuple(f"{estimates[int(k)].time - start:.1f} s" for k in rows),
+    )
+
+
+def upwards(points: FloatArray) -> dict[str, FloatArray]:
+    """Coordinates of points (n, 2), x ahead and y left, on a page where ahead is up."""
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+    return {"x": -points[:, 1], "y": points[:, 0]}
+
+
+def ellipse(centre: FloatArray, covariance: FloatArray, sigmas: float = SIGMAS) -> FloatArray:
+    """(m, 2) outline of a covariance (2, 2); nothing where it is not known or not one."""
+    if not np.isfinite(covariance).all():
+        return np.empty((0, 2))
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    scaled = vectors * (sigmas * np.sqrt(np.maximum(values, 0.0)))
+    return np.asarray(centre + (scaled @ circle).T)
+
+
+def _moment(
+    estimates: Sequence[HomingEstimate],
+    row: int,
+    step: int,
+    true_robot: Sequence[FloatArray],
+    truth: HomingTruth | None,
+) -> Iterator[Trace]:
+    now = estimates[row]
+    yield _dots("start", step, np.zeros((1, 2)), "square-open", paint="grey", size=13)
+    yield from _features(estimates, row, step)
+    path = np.array([e.robot[:2] for e in estimates[: row + 1]])
+    owner = Owner("estimated path", 0, step=step)
+    yield trace(owner, upwards(path), mode="lines", line={"width": 1.6}, hoverinfo="skip")
+    for name, pose, block, number in (
+        ("robot", now.robot, now.covariance[:3, :3], 0),
+        ("target", now.target, now.covariance[3:, 3:], 1),
+    ):
+        yield from _place(name, pose, block[:2, :2], number, step)
+    if truth is not None:
+        places = np.array([pose[:2] / truth.leg_m for pose in (*true_robot, truth.target)])
+        yield _dots("truth", step, places, "x-thin-open", paint="truth", when=("truth",), size=9)
+
+
+def _place(
+    name: str, pose: FloatArray, covariance: FloatArray, number: int, step: int
+) -> Iterator[Trace]:
+    """A square with its heading and its ellipse."""
+    ahead = pose[:2] + _HEADING * np.array([np.cos(pose[2]), np.sin(pose[2])])
+    owner = Owner(name, number, step=step)
+    line: dict[str, Any] = {"line": {"width": 2}, "hoverinfo": "skip"}
+    yield trace(owner, upwards(np.array([pose[:2], ahead])), mode="lines", **line)
+    marker = {"symbol": "square", "size": 13}
+    yield trace(owner, upwards(pose[:2]), mode="markers", marker=marker, hovertemplate=_TOLD)
+    outline = ellipse(pose[:2], covariance)
+    if len(outline):
+        claimed = Owner(f"{name}, {SIGMAS:.0f} sigma", number, ("ellipses",), step=step)
+        yield trace(claimed, upwards(outline), mode="lines", line={"width": 1}, hoverinfo="skip")
+
+
+def _features(estimates: Sequence[HomingEstimate], row: int, step: int) -> Iterator[Trace]:
+    now = estimates[row]
+    names = [str(identity) for identity in now.ids.tolist()]
+    yield trace(
+        Owner("feature", paint="grey", when=("features",), step=step),
+        upwards(now.landmarks),
+        mode="markers+text",
+        marker={"symbol": "diamond-open", "size": 8},
+        text=names,
+        textposition="top right",
+        textfont={"size": 9},
+        hovertemplate=_TOLD,
+    )
+    lost = _lost(estimates, row)
+    if len(lost):
+        yield _dots("lost feature", step, lost, "star", paint="grey", when=("features",), size=7)
+    outlines = [
+        ellipse(*pair) for pair in zip(now.landmarks, now.landmark_covariances, strict=True)
+    ]
+    joined = [np.vstack([one, np.full((1, 2), np.nan)]) for one in outlines if len(one)]
+    if joined:
+        owner = Owner("features, 3 sigma", paint="grey", when=("feature-ellipses",), step=step)
+        yield trace(
+            owner, upwards(np.vstack(joined)), mode="lines", line={"width": 1}, hoverinfo="skip"
+        )
+
+
+def _lost(estimates: Sequence[HomingEstimate], row: int) -> FloatArray:
+    """(m, 2) last positions of the features that are no longer followed."""
+    last: dict[int, FloatArray] = {}
+    for estimate in estimates[:row]:
+        last |= dict(zip(estimate.ids.tolist(), estimate.landmarks, strict=True))
+    present = set(estimates[row].ids.tolist())
+    return np.array([last[i] for i in sorted(last.keys() - present)]).reshape(-1, 2)
+
+
+def _dots(
+    name: str,
+    step: int,
+    points: FloatArray,
+    symbol: str,
+    *,
+    paint: Any,
+    when: tuple[str, ...] = (),
+    size: int = 8,
+) -> Trace:
+    owner = Owner(name, paint=paint, when=when, step=step)
+    marker = {"symbol": symbol, "size": size}
+    return trace(owner, upwards(points), mode="markers", marker=marker, hovertemplate=_TOLD)
+
+
+def _true_path(truth: HomingTruth | None) -> Iterator[Trace]:
+    if truth is not None:
+        path = np.vstack([np.zeros((1, 2)), truth.robots[:, :2] / truth.leg_m])
+        owner = Owner("true path", paint="truth", when=("truth",))
+        line = {"width": 1.4, "dash": "dash"}
+        yield trace(owner, upwards(path), mode="lines", line=line, hoverinfo="skip")
+
+
+def _layout(estimates: Sequence[HomingEstimate]) -> dict[str, Any]:
+    """Axes that do not jump from moment to moment; far features may lie outside."""
+    points = [np.array([[0.0, 0.0], [1.0, 0.0]])]
+    points += [np.vstack([e.landmarks, e.robot[None, :2], e.target[None, :2]]) for e in estimates]
+    seen = upwards(np.vstack(points))
+    ranges = {axis: np.percentile(values, _BULK) for axis, values in seen.items()}
+    padded = {
+        axis: [float(low - 0.1 * (high - low) - 0.2), float(high + 0.1 * (high - low) + 0.2)]
+        for axis, (low, high) in ranges.items()
+    }
+    return {
+        "xaxis": {"title": {"text": "right (legs)"}, "range": padded["x"], "constrain": "domain"},
+        "yaxis": {"title": {"text": "ahead (legs)"}, "range": padded["y"], "scaleanchor": "x"},
+        "hovermode": "closest",
+    }

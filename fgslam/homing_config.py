@@ -1,0 +1,161 @@
+"""Configurations of homing experiments: a file with a key `task`; strict as those of SLAM.
+
+One model for each task. :func:`load_experiment` reads both worlds and tells them apart.
+"""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+from fgslam.config import ExperimentConfig, make_config
+from fgslam.config_reading import Reader, apply_overrides, read_mapping
+from fgslam.errors import ConfigError
+from fgslam.settings.homing_estimators import HomingEstimatorSettings, HomingGraphSettings
+from fgslam.settings.homing_output import HomingOutputSettings
+
+_TAKEN_FOLDERS = ("pictures", "compare", "logs", "runs")
+_GROUPS_OF_KINDS = ("dataset", "estimator")
+
+
+def _as_settings(value: Any) -> Any:
+    """A bare kind stands for that estimator with its defaults."""
+    return {"kind": value} if isinstance(value, str) else value
+
+
+def _with_default_kind(value: Any) -> Any:
+    """Keys without a kind mean the graph."""
+    if isinstance(value, dict) and "kind" not in value:
+        return {"kind": HomingGraphSettings.kind, **value}
+    return value
+
+
+ComparedHoming: TypeAlias = Annotated[HomingEstimatorSettings, BeforeValidator(_as_settings)]
+LiveHoming: TypeAlias = Annotated[HomingEstimatorSettings, BeforeValidator(_with_default_kind)]
+ComparedList: TypeAlias = Annotated[
+    tuple[ComparedHoming, ...],
+    Field(
+        description="estimators that are given the same bearings: kinds, or groups of keys as "
+        "under `estimator`"
+    ),
+]
+
+
+class HomingExperiment(BaseModel):
+    """What the experiments of all tasks have."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    task: Annotated[str, Field(description="which kind of homing experiment")]
+    name: Annotated[
+        str, Field(pattern=r"^[\w.-]+$", description="short name; the default run folder's")
+    ]
+    seed: Annotated[int, Field(ge=0, description="of everything random in the run")] = 0
+    output: HomingOutputSettings = HomingOutputSettings()
+    jobs: Annotated[
+        int | None,
+        Field(
+            ge=1, description="processes at a time; null: one a core. Results do not depend on it"
+        ),
+    ] = None
+    provenance: Annotated[
+        dict[str, Any] | None,
+        Field(description="written into a run's own config.yaml: versions and data; not read"),
+    ] = None
+
+    def as_values(self) -> dict[str, Any]:
+        """Plain values for YAML or JSON, every default filled in."""
+        return self.model_dump(mode="json", exclude={"provenance"})
+
+    @property
+    def estimators(self) -> tuple[HomingEstimatorSettings, ...]:
+        """The live estimator, then those of `compare`; the same one twice counts once."""
+        live = getattr(self, "estimator", None)
+        others: Sequence[HomingEstimatorSettings] = getattr(self, "compare", ())
+        return tuple(dict.fromkeys((*([] if live is None else [live]), *others)))
+
+
+TASKS: dict[str, type[HomingExperiment]] = {}
+"""The model of each task."""
+
+
+def _task_of(model: type[HomingExperiment]) -> str:
+    return str(typing.get_args(model.model_fields["task"].annotation)[0])
+
+
+# --------------------------------------------------------------------------------------------
+# Reading
+
+
+def load_experiment(
+    path: Path, overrides: Iterable[str] = ()
+) -> ExperimentConfig | HomingExperiment:
+    """Reads an experiment of SLAM or of homing and applies ``a.b=value`` overrides.
+
+    Raises:
+        ConfigError: the file is missing or no YAML mapping, or a key or value is wrong.
+    """
+    return make_experiment(read_mapping(path), tuple(overrides), str(path))
+
+
+def make_experiment(
+    values: dict[str, Any], overrides: Iterable[str], where: str
+) -> ExperimentConfig | HomingExperiment:
+    """Plain values with overrides applied, checked; ``where`` names their source in messages."""
+    overrides = tuple(overrides)
+    asked: dict[str, Any] = {"task": values.get("task")}
+    apply_overrides(asked, [o for o in overrides if o.partition("=")[0].strip() == "task"])
+    if asked["task"] is None and "task" not in values:
+        return make_config(values, overrides, where)
+    config = _reader(asked["task"], where).make(values, overrides, where)
+    _require_own_names(config, where)
+    return config
+
+
+def parse_homing(values: Mapping[str, Any], where: str) -> HomingExperiment:
+    """Checks plain values of a homing experiment; ``where`` names their source in messages."""
+    config = _reader(values.get("task"), where).parse(values, where)
+    _require_own_names(config, where)
+    return config
+
+
+def load_homing(path: Path, overrides: Iterable[str] = ()) -> HomingExperiment:
+    """Reads a homing experiment. Raises ConfigError where it is one of SLAM, too."""
+    config = load_experiment(path, overrides)
+    if isinstance(config, ExperimentConfig):
+        raise ConfigError(f"{path}: has no task, so it is no homing experiment; give one")
+    return config
+
+
+def is_homing(path: Path) -> bool:
+    """Whether a configuration file is of a homing experiment. Raises ConfigError."""
+    return "task" in read_mapping(path)
+
+
+def _reader(task: Any, where: str) -> Reader[HomingExperiment]:
+    model = TASKS.get(task) if isinstance(task, str) else None
+    if model is None:
+        close = get_close_matches(str(task), TASKS, n=1, cutoff=0.5)
+        hint = f"did you mean {close[0]}?" if close else f"use one of {', '.join(TASKS)}"
+        raise ConfigError(f"{where}: task is {task!r}; {hint} (SLAM has no key task)")
+    return Reader(model, _GROUPS_OF_KINDS)
+
+
+def _require_own_names(config: HomingExperiment, where: str) -> None:
+    """Each estimator needs a name of its own in tables and files."""
+    titles = [settings.title for settings in config.estimators]
+    for title in titles:
+        if title in _TAKEN_FOLDERS:
+            raise ConfigError(
+                f"{where}: an estimator cannot be called {title}, a folder of the run; choose "
+                "another label"
+            )
+        if titles.count(title) > 1:
+            raise ConfigError(
+                f"{where}: two different estimators are called {title}; give one of them a label"
+            )

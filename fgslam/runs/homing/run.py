@@ -1,0 +1,41 @@
+"""Homing experiments: each task to its own module."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fgslam.errors import ConfigError, OutputError
+from fgslam.export.atomic import ExistingFolder, is_run_folder
+from fgslam.homing_config import HomingExperiment
+from fgslam.runs.homing.results import HomingResult, Progress, Stopped
+from fgslam.runs.threads import one_blas_thread
+
+
+@one_blas_thread()
+def run_homing(
+    config: HomingExperiment,
+    folder: Path,
+    existing: ExistingFolder = "refuse",
+    progress: Progress = lambda what, done, total: None,
+    stopped: Stopped = lambda: False,
+) -> HomingResult:
+    """Runs a homing experiment into a run folder.
+
+    Args:
+        config: the experiment, of any task.
+        folder: the run folder itself.
+        existing: what to do where it holds a run already; homing runs cannot be resumed.
+        progress: told of each step of the work.
+        stopped: asked after each step; True ends the run early, with all files valid.
+
+    Raises:
+        FgslamError: of any kind, with a message for the user.
+    """
+    if existing == "resume":
+        raise ConfigError(
+            f"--resume: a homing experiment (task {config.task}) cannot be resumed; run it again "
+            "with --overwrite"
+        )
+    if existing == "refuse" and is_run_folder(folder):  # now, not after minutes of work
+        raise OutputError(f"{folder} holds a run already; choose another --out, or add --overwrite")
+    raise AssertionError(f"task {config.task} has no module")
