@@ -9,7 +9,7 @@ Planar poses and their covariances are as in :mod:`fgslam.planar`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -244,6 +244,21 @@ class TrackedBearings:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def taken(self, which: BoolArray | IntArray) -> TrackedBearings:
+        """Those features alone."""
+        return TrackedBearings(
+            self.time,
+            self.ids[which],
+            self.bearing[which],
+            self.sigma_bearing[which],
+            self.elevation[which],
+            self.sigma_elevation[which],
+        )
+
+    def renumbered(self, ids: IntArray) -> TrackedBearings:
+        """The same bearings under other identities (m,), ascending too."""
+        return replace(self, ids=ids)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,0 +1,109 @@
+"""Settings of simulated homings that consist of bearings alone."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Annotated, Literal
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fgslam.settings.base import STRICT
+
+
+@dataclass(frozen=True, config=STRICT)
+class SimulatedBearingsSettings:
+    """A room of points, a start, a target, and a robot that drives from one towards the other."""
+
+    features: Annotated[int, Field(ge=3, description="points that both views see")] = 30
+    surrounding: Annotated[
+        Literal["isotropic", "anisotropic"],
+        Field(
+            description="`isotropic`: points lie all around, at all distances; `anisotropic`: four "
+            "in five on one side, where they are near, the others far, as beside a wall (G35)"
+        ),
+    ] = "isotropic"
+    nearest_m: Annotated[
+        float, Field(gt=0.0, description="distance of the nearest points from the way, metres")
+    ] = 1.0
+    farthest_m: Annotated[float, Field(gt=0.0, description="and of the farthest ones")] = 6.0
+    lowest_m: Annotated[
+        float, Field(gt=0.0, description="points are at least so far above or below the camera")
+    ] = 0.2
+    highest_m: Annotated[float, Field(gt=0.0, description="and at most so far")] = 1.5
+    leg_m: Annotated[
+        float, Field(gt=0.0, description="from start to target, metres (paper: about 2 m)")
+    ] = 2.0
+    direction_deg: Annotated[
+        float, Field(ge=0.0, description="the target lies up to so far off the start's heading")
+    ] = 20.0
+    rotation_deg: Annotated[
+        float, Field(ge=0.0, description="and is turned by up to so much against it")
+    ] = 30.0
+    part: Annotated[
+        float, Field(gt=0.0, lt=1.0, description="part of the way after which the drive ends")
+    ] = 0.8
+    speed_mps: Annotated[float, Field(gt=0.0, description="of the robot")] = 0.3
+    images_per_s: Annotated[
+        float, Field(gt=0.0, description="tracked images a second (paper: 10)")
+    ] = 10.0
+    wander_deg: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="deviation of the turning rate that comes on top of the steering, "
+            "degrees/s, correlated over half a second: the way is curved",
+        ),
+    ] = 10.0
+    slip: Annotated[
+        float,
+        Field(ge=0.0, description="deviation of the sideways speed, as part of the speed; likewise"),
+    ] = 0.05
+    bearing_sigma_deg: Annotated[
+        float, Field(gt=0.0, description="noise of all bearings (B7: 0.5 to 1)")
+    ] = 1.0
+    elevation_sigma_deg: Annotated[
+        float, Field(gt=0.0, description="noise of all elevations")
+    ] = 1.0
+    tracked_elevations: Annotated[
+        bool, Field(description="images on the way state elevations, too")
+    ] = False
+    wrong_matches: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            lt=1.0,
+            description="part of the matches between start and target whose target end belongs to "
+            "another one of them",
+        ),
+    ] = 0.0
+    jumping_tracks: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            lt=1.0,
+            description="part of the tracks that jump to another point of the room once, at any "
+            "time, and follow that one from then on",
+        ),
+    ] = 0.0
+    gross_bearings: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            lt=1.0,
+            description="part of the tracked bearings, each for itself, that point anywhere",
+        ),
+    ] = 0.0
+    lost_per_s: Annotated[
+        float, Field(ge=0.0, description="part of the tracks that get lost in a second")
+    ] = 0.05
+
+
+def with_outliers(settings: SimulatedBearingsSettings, part: float) -> SimulatedBearingsSettings:
+    """The same with so many outliers: of matches, and of the bearings tracked at the drive's end.
+
+    Half of the latter come from tracks that jumped, half are single gross errors.
+    """
+    return dataclasses.replace(
+        settings, wrong_matches=part, jumping_tracks=0.5 * part, gross_bearings=0.5 * part
+    )
