@@ -97,7 +97,8 @@ def motion_factor(
     """Constant velocity up to white noise on the acceleration (eqs 4 and 5 as in E-G4).
 
     Args:
-        before, after: keys of pose and of velocity, and time in seconds.
+        before: keys of pose and of velocity, and time in seconds.
+        after: the same, later.
         density: (3,) of the accelerations' noise, forward, left and turning.
     """
     return gtsam.WnoaMotionFactorPose2(

@@ -129,8 +129,10 @@ def constant_velocity(
     """Residual (6,) of white noise on acceleration between two poses (Barfoot 2017, 11.1).
 
     Args:
-        before, after: (3,) poses.
-        speed, next_speed: (3,) velocities in the robot's own axes: forward, left, turning.
+        before: (3,) pose.
+        speed: (3,) velocity there, in the robot's own axes: forward, left, turning.
+        after: (3,) pose.
+        next_speed: (3,) velocity there.
         step: seconds between them.
     """
     moved = se2_log(between(before, after))

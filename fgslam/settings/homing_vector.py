@@ -55,14 +55,14 @@ class HomingVectorSettings:
             description="expected number of equally supported vectors if all matches were wrong",
         ),
     ] = 1e-4
-    rival_share: Annotated[
+    rival_sigmas: Annotated[
         float,
         Field(
-            gt=0.0,
-            le=1.0,
-            description="a different solution with this share of the inliers makes it ambiguous",
+            ge=0.0,
+            description="sign test over the matches that support only one of two different "
+            "solutions; below it the answer is ambiguous",
         ),
-    ] = 0.8
+    ] = 2.0
     rival_angle_deg: Annotated[
         float, Field(gt=0.0, description="solutions closer than this are one and the same")
     ] = 15.0

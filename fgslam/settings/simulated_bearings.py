@@ -57,14 +57,16 @@ class SimulatedBearingsSettings:
     ] = 10.0
     slip: Annotated[
         float,
-        Field(ge=0.0, description="deviation of the sideways speed, as part of the speed; likewise"),
+        Field(
+            ge=0.0, description="deviation of the sideways speed, as part of the speed; likewise"
+        ),
     ] = 0.05
     bearing_sigma_deg: Annotated[
         float, Field(gt=0.0, description="noise of all bearings (B7: 0.5 to 1)")
     ] = 1.0
-    elevation_sigma_deg: Annotated[
-        float, Field(gt=0.0, description="noise of all elevations")
-    ] = 1.0
+    elevation_sigma_deg: Annotated[float, Field(gt=0.0, description="noise of all elevations")] = (
+        1.0
+    )
     tracked_elevations: Annotated[
         bool, Field(description="images on the way state elevations, too")
     ] = False

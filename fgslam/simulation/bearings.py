@@ -100,11 +100,9 @@ def _points(
         near = rng.random(drawn) < _NEAR_SIDE
         angle = np.abs(angle) * np.where(near, 1.0, -1.0) + np.arctan2(target[1], target[0])
         reach = low + _NEAR_REACH * (high - low)
-        distance = np.where(
-            near, rng.uniform(low, reach, drawn), rng.uniform(reach, high, drawn)
-        )
+        distance = np.where(near, rng.uniform(low, reach, drawn), rng.uniform(reach, high, drawn))
     points = 0.5 * target[:2] + distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-    return points[_from_way(points, target) >= low][:count]
+    return np.asarray(points[_from_way(points, target) >= low][:count])
 
 
 def _from_way(points: FloatArray, target: FloatArray) -> FloatArray:
@@ -172,7 +170,7 @@ def _drive(
     spread = np.array([np.deg2rad(settings.wander_deg), settings.slip * settings.speed_mps])
     spread = spread * np.sqrt(1.0 - keep**2)
     disturbance = np.zeros(2)
-    pose, poses = np.zeros(3), []
+    pose, poses = np.zeros(3), list[FloatArray]()
     left = settings.leg_m
     longest = _LONGEST * settings.leg_m / (settings.speed_mps * step)
     while left > (1.0 - settings.part) * settings.leg_m and len(poses) < longest:

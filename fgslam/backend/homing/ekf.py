@@ -132,7 +132,7 @@ def _within_gate(
     finite = np.isfinite(seen.jacobian).all(axis=1)
     if sigmas == 0.0:
         return np.asarray(finite)
-    variance = np.einsum("ij,jk,ik->i", seen.jacobian, state.covariance, seen.jacobian)
+    variance = ((seen.jacobian @ state.covariance) * seen.jacobian).sum(axis=1)
     variance = variance + seen.variance + (0.0 if extra is None else np.diagonal(extra))
     return np.asarray(finite & (seen.innovation**2 <= sigmas**2 * variance))
 

@@ -101,9 +101,7 @@ def _joint_covariance(start: HomingStart, kept: BoolArray, exact: bool) -> Float
     """
     vector, matches = start.vector, start.matches.taken(kept)
     n = len(matches)
-    _, by = triangulated(
-        (vector.direction, vector.rotation), matches.bearing_a, matches.bearing_b
-    )
+    _, by = triangulated((vector.direction, vector.rotation), matches.bearing_a, matches.bearing_b)
     root = np.zeros((3 + 2 * n, 2 + 2 * n))  # by (theta, psi; delta_i; delta'_i)
     root[1:3, :2] = np.eye(2)
     rows, columns = 3 + 2 * np.arange(n), 2 + np.arange(n)

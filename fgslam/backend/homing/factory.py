@@ -1,0 +1,33 @@
+"""Builds homing estimators from their settings; the only place where their kinds are told apart."""
+
+from __future__ import annotations
+
+from fgslam.backend.homing.baselines import AverageDisplacement, AverageLandmarkVector
+from fgslam.backend.homing.ekf import HomingEkf
+from fgslam.backend.homing.graph import HomingGraph
+from fgslam.backend.homing.protocol import HomingEstimator
+from fgslam.homing_types import HomingStart
+from fgslam.settings.homing_estimators import (
+    AverageLandmarkVectorSettings,
+    HomingEkfSettings,
+    HomingEstimatorSettings,
+    HomingGraphSettings,
+    SnapshotSettings,
+)
+
+
+def make_homing_estimator(start: HomingStart, settings: HomingEstimatorSettings) -> HomingEstimator:
+    """The estimator, at the start.
+
+    Raises:
+        EstimatorError: the start's parts do not belong together, or cannot be solved.
+    """
+    match settings:
+        case HomingEkfSettings():
+            return HomingEkf(start, settings)
+        case HomingGraphSettings():
+            return HomingGraph(start, settings)
+        case AverageLandmarkVectorSettings():
+            return AverageLandmarkVector(start)
+        case SnapshotSettings():
+            return AverageDisplacement(start)

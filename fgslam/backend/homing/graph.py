@@ -1,0 +1,103 @@
+"""Homing as one bearing-only factor graph, solved with every image."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+
+from fgslam.backend.homing.graph_problem import HomingProblem, Motion
+from fgslam.backend.homing.graph_solvers import make_solver
+from fgslam.backend.homing.inputs import TrackedFeatures
+from fgslam.factors.bearing import tangent_to_pose
+from fgslam.factors.keys import landmark_key, pose_key, target_key, velocity_key
+from fgslam.homing_types import HomingEstimate, HomingStart, TrackedBearings
+from fgslam.settings.homing_estimators import HomingGraphSettings
+from fgslam.types import FloatArray
+
+
+class HomingGraph:
+    """Estimator of kind ``homing_graph``.
+
+    On :class:`fgslam.backend.homing.protocol.HomingEstimator`. Lost features simply get no more
+    factors (G28); what they taught stays.
+    """
+
+    kind: ClassVar[str] = "homing_graph"
+
+    def __init__(self, start: HomingStart, settings: HomingGraphSettings) -> None:
+        """Solves start and target alone.
+
+        Raises:
+            EstimatorError: they cannot be solved.
+        """
+        self._features = TrackedFeatures(start)
+        self._problem = HomingProblem(start, settings)
+        self._solver = make_solver(settings)
+        self._image = 0
+        self._covariance: FloatArray | None = None
+        self._solver.add(self._problem.first(), start.time)
+
+    def update(self, tracked: TrackedBearings) -> None:
+        """Takes in one image; see the protocol."""
+        before = self._motion()
+        _, taken = self._features.take(tracked)
+        self._covariance = None
+        self._image += 1
+        self._solver.add(self._problem.image(tracked, taken, before), tracked.time)
+
+    def estimate(self) -> HomingEstimate:
+        """The present state; see the protocol."""
+        values = self._solver.values
+        robot = _pose(values, pose_key(self._image))
+        target = _pose(values, target_key())
+        ids, rows = self._alive()
+        covariance = self._joint(rows)
+        turn = np.eye(len(covariance))
+        turn[:3, :3], turn[3:6, 3:6] = tangent_to_pose(robot), tangent_to_pose(target)
+        covariance = turn @ covariance @ turn.T
+        n = len(ids)
+        every = np.arange(n)
+        points = [values.atPoint2(landmark_key(row)) for row in rows]
+        return HomingEstimate(
+            time=self._features.time,
+            robot=robot,
+            target=target,
+            covariance=covariance[:6, :6],
+            ids=ids,
+            landmarks=np.array(points, np.float64).reshape(n, 2),
+            landmark_covariances=covariance[6:, 6:].reshape(n, 2, n, 2)[every, :, every, :],
+        )
+
+    def _alive(self) -> tuple[Any, list[int]]:
+        """Identities of landmarks that are tracked still, and their variables' numbers."""
+        ids = self._features.alive
+        ids = ids[np.isin(ids, self._problem.entered)]
+        return ids, self._problem.variables(ids).tolist()
+
+    def _joint(self, rows: list[int]) -> FloatArray:
+        """Covariance of robot, target and landmarks, in GTSAM's tangent spaces."""
+        if self._covariance is None:
+            keys = [pose_key(self._image), target_key(), *(landmark_key(row) for row in rows)]
+            self._covariance = self._solver.joint_covariance(keys)
+        return self._covariance
+
+    def _motion(self) -> Motion:
+        values = self._solver.values
+        key = pose_key(self._image)
+        pose = _pose(values, key)
+        velocity = values.atVector(velocity_key(self._image))
+        variances = partial(self._variances, self._image)
+        return Motion(self._image, self._features.time, pose, velocity, variances)
+
+    def _variances(self, image: int) -> FloatArray:
+        """Of the robot's (x, y, psi) at an image."""
+        key = pose_key(image)
+        turn = tangent_to_pose(_pose(self._solver.values, key))
+        return np.asarray(np.diagonal(turn @ self._solver.joint_covariance([key]) @ turn.T))
+
+
+def _pose(values: Any, key: int) -> FloatArray:
+    at = values.atPose2(key)
+    return np.array([at.x(), at.y(), at.theta()])

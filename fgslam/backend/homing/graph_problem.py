@@ -1,0 +1,224 @@
+"""The homing problem as a growing graph: factors and first guesses of each image, no solver.
+
+Start, target and every image on the way are planar poses, landmarks points. The start's and the
+target's bearings enter once, with the landmark; scale is the leg from start to target.
+Derivation: docs/derivations/homing_graph.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from fgslam.factors.bearing import (
+    BearingFactors,
+    leg_factor,
+    motion_factor,
+    start_prior,
+    vector_factor,
+    velocity_prior,
+    weak_height_prior,
+    weak_landmark_prior,
+)
+from fgslam.factors.bearing_residuals import triangulated
+from fgslam.factors.keys import height_key, landmark_key, pose_key, target_key, velocity_key
+from fgslam.homing_types import HomingStart, TrackedBearings
+from fgslam.planar import compose, unit, wrap
+from fgslam.settings.homing_estimators import HomingGraphSettings
+from fgslam.types import BoolArray, FloatArray, IntArray
+
+_LEAST_SIGMA = 1e-3  # radians: of the initialisation's direction and rotation, stated smaller
+
+
+@dataclass
+class NewPart:
+    """What one image adds: factors, first guesses, and the variables that it touches."""
+
+    graph: Any = field(default_factory=gtsam.NonlinearFactorGraph)
+    values: Any = field(default_factory=gtsam.Values)
+    keys: set[int] = field(default_factory=set)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """The robot as last estimated: number and time of the image, pose (3,), velocity (3,).
+
+    ``variances`` answers those of the pose, (3,); it is asked only where a feature waits to enter.
+    """
+
+    image: int
+    time: float
+    pose: FloatArray
+    velocity: FloatArray
+    variances: Callable[[], FloatArray]
+
+
+class HomingProblem:
+    """Turns a homing start and images into factors."""
+
+    def __init__(self, start: HomingStart, settings: HomingGraphSettings) -> None:
+        """Nothing is in the graph yet; see :meth:`first`."""
+        self._start, self._settings = start, settings
+        self._plain = BearingFactors()
+        self._robust = BearingFactors(settings.kernel.name, settings.kernel.width)
+        motion = settings.motion
+        turning = float(np.deg2rad(motion.turning_deg))
+        self._density = np.array([motion.forward, motion.sideways, turning]) ** 2
+        self._ids = start.local_map.ids
+        self._entered = np.zeros(len(self._ids), np.bool_)
+
+    @property
+    def entered(self) -> IntArray:
+        """Identities of the features that are variables, ascending."""
+        return self._ids[self._entered]
+
+    def variables(self, ids: IntArray) -> IntArray:
+        """Numbers of the landmark variables of identities (k,)."""
+        return np.asarray(np.searchsorted(self._ids, ids))
+
+    def first(self) -> NewPart:
+        """Start, target and the features that both views triangulate well."""
+        new = NewPart()
+        start, vector, motion = self._start, self._start.vector, self._settings.motion
+        new.values.insert(pose_key(0), gtsam.Pose2())
+        at = unit(np.array(vector.direction))
+        new.values.insert(target_key(), gtsam.Pose2(at[0], at[1], vector.rotation))
+        new.values.insert(velocity_key(0), np.zeros(3))
+        turning = np.deg2rad(motion.initial_turning_deg)
+        sigmas = np.array([motion.initial_speed, motion.sideways, turning])
+        new.graph.add(start_prior(pose_key(0)))
+        new.graph.add(velocity_prior(velocity_key(0), np.zeros(3), sigmas))
+        new.graph.add(leg_factor(pose_key(0), target_key()))
+        if not self._settings.elevations:
+            covariance = vector.covariance + _LEAST_SIGMA**2 * np.eye(2)
+            new.graph.add(
+                vector_factor(target_key(), vector.direction, vector.rotation, covariance)
+            )
+        chart = start.local_map
+        spread = np.sqrt(chart.covariance[:, 0, 0])
+        good = self._good(chart.distance, spread)
+        for row in np.flatnonzero(good).tolist():
+            self._enter(new, row, chart.points()[row], float(chart.distance[row]))
+        return new
+
+    def image(self, tracked: TrackedBearings, taken: BoolArray, before: Motion) -> NewPart:
+        """The robot's next pose with what it sees.
+
+        Args:
+            tracked: the image.
+            taken: (m,) its rows that count.
+            before: the robot at the last image.
+        """
+        new = NewPart()
+        image, step = before.image + 1, tracked.time - before.time
+        pose = compose(before.pose, _travelled(before.velocity, step))
+        new.values.insert(pose_key(image), gtsam.Pose2(*pose))
+        new.values.insert(velocity_key(image), before.velocity)
+        earlier = (pose_key(before.image), velocity_key(before.image), before.time)
+        now = (pose_key(image), velocity_key(image), tracked.time)
+        new.graph.add(motion_factor(earlier, now, self._density))
+        rows = np.searchsorted(self._ids, tracked.ids)
+        self._enter_seen(new, rows, tracked, taken, before)
+        for k in np.flatnonzero(taken & self._entered[rows]).tolist():
+            self._see(new, pose_key(image), int(rows[k]), tracked, k)
+        new.keys |= {pose_key(image), velocity_key(image)}
+        return new
+
+    def _see(self, new: NewPart, pose: int, row: int, tracked: TrackedBearings, k: int) -> None:
+        landmark = landmark_key(row)
+        new.keys.add(landmark)
+        sigma = float(tracked.sigma_bearing[k])
+        new.graph.add(self._robust.bearing(pose, landmark, float(tracked.bearing[k]), sigma))
+        if self._settings.elevations and np.isfinite(tracked.elevation[k]):
+            new.keys.add(height_key(row))
+            measured, sigma = float(tracked.elevation[k]), float(tracked.sigma_elevation[k])
+            new.graph.add(self._robust.elevation(pose, landmark, height_key(row), measured, sigma))
+
+    # ----------------------------------------------------------------------------------------
+    # Landmarks
+
+    def _good(self, distance: FloatArray, spread: FloatArray) -> BoolArray:
+        limit = self._settings.max_relative_distance_sigma
+        with np.errstate(invalid="ignore"):
+            known = (distance > 0.0) & (spread <= limit * distance)
+        return np.asarray(known & np.isfinite(distance) & np.isfinite(spread))
+
+    def _enter(self, new: NewPart, row: int, point: FloatArray, distance: float) -> None:
+        """A landmark with its bearings from start and target."""
+        settings, matches = self._settings, self._start.matches
+        landmark = landmark_key(row)
+        new.values.insert(landmark, point)
+        new.keys |= {landmark, pose_key(0), target_key()}
+        spread = settings.prior_distances * distance
+        new.graph.add(weak_landmark_prior(landmark, point, spread))
+        from_start, _, from_target, _ = matches.sigma[row].tolist()
+        at_start, at_target = float(matches.bearing_a[row]), float(matches.bearing_b[row])
+        new.graph.add(self._plain.bearing(pose_key(0), landmark, at_start, from_start))
+        new.graph.add(self._robust.bearing(target_key(), landmark, at_target, from_target))
+        if settings.elevations:
+            self._enter_height(new, row, distance)
+        self._entered[row] = True
+
+    def _enter_height(self, new: NewPart, row: int, distance: float) -> None:
+        """Its height, with its elevations from start and target."""
+        matches, height, landmark = self._start.matches, height_key(row), landmark_key(row)
+        up, up_target = float(matches.elevation_a[row]), float(matches.elevation_b[row])
+        _, sigma, _, sigma_target = matches.sigma[row].tolist()
+        tall = distance * float(np.tan(up))
+        new.values.insert(height, tall)
+        new.keys.add(height)
+        new.graph.add(weak_height_prior(height, tall, self._settings.prior_distances * distance))
+        new.graph.add(self._plain.elevation(pose_key(0), landmark, height, up, sigma))
+        new.graph.add(
+            self._robust.elevation(target_key(), landmark, height, up_target, sigma_target)
+        )
+
+    def _enter_seen(
+        self,
+        new: NewPart,
+        rows: IntArray,
+        tracked: TrackedBearings,
+        taken: BoolArray,
+        before: Motion,
+    ) -> None:
+        """Features that were too uncertain until now and have parallax to the last pose.
+
+        Judged with the bearing of this image from where the robot is expected.
+        """
+        waiting = np.flatnonzero(taken & ~self._entered[rows])
+        reach = float(np.hypot(*before.pose[:2]))
+        if len(waiting) == 0 or reach == 0.0:
+            return
+        pose = compose(before.pose, _travelled(before.velocity, tracked.time - before.time))
+        matches = self._start.matches
+        start = matches.bearing_a[rows[waiting]]
+        legs, by = triangulated(
+            (float(np.arctan2(pose[1], pose[0])), float(pose[2])), start, tracked.bearing[waiting]
+        )
+        length = float(np.hypot(*pose[:2]))
+        x, y, turn = before.variances().tolist()
+        variance = np.column_stack(
+            [
+                np.full(len(waiting), (x + y) / reach**2),
+                np.full(len(waiting), turn),
+                matches.sigma[rows[waiting], 0] ** 2,
+                tracked.sigma_bearing[waiting] ** 2,
+            ]
+        )
+        spread = np.sqrt((by**2 * variance).sum(axis=1))
+        for k in np.flatnonzero(self._good(legs, spread)).tolist():
+            distance = float(length * legs[k])
+            self._enter(new, int(rows[waiting[k]]), distance * unit(start[k]), distance)
+
+
+def _travelled(velocity: FloatArray, step: float) -> FloatArray:
+    """Motion (3,) of a constant velocity (3,) in the robot's axes over ``step`` seconds."""
+    forward, left, turn = velocity * step
+    half = 0.5 * turn
+    chord = np.sinc(half / np.pi)
+    c, s = np.cos(half) * chord, np.sin(half) * chord
+    return np.array([c * forward - s * left, s * forward + c * left, wrap(turn)])
