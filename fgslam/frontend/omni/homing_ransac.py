@@ -55,14 +55,13 @@ def estimate_homing_vector(
     at_target = search.turn_at_target(best)
     if at_target is not None:
         return at_target
-    rival = max(
-        (search.witnesses(r.inliers) for r in refined[1:] if search.differ(r, best)), default=0
-    )
-    refusal = search.refusal(best, rival)
+    rivals = [r for r in refined[1:] if search.differ(r, best)]
+    refusal = search.refusal(best, rivals)
     if refusal is not None:
         return refusal
     theta, psi = (float(v) for v in best.parameters[:2])
-    return HomingVector(theta, psi, best.covariance[:2, :2], best.inliers, rival)
+    support = max((search.witnesses(r.inliers) for r in rivals), default=0)
+    return HomingVector(theta, psi, best.covariance[:2, :2], best.inliers, support)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,7 +190,14 @@ class _Search:
             psi,
         )
 
-    def refusal(self, best: Refined, rival: int) -> Refusal | None:
+    def _undecided(self, best: Refined, rival: Refined) -> bool:
+        """Sign test over the witnesses that support only one of two solutions."""
+        only_best = self.witnesses(best.inliers & ~rival.inliers)
+        only_rival = self.witnesses(rival.inliers & ~best.inliers)
+        needed = self._settings.rival_sigmas * np.sqrt(only_best + only_rival)
+        return bool(only_best - only_rival <= needed)
+
+    def refusal(self, best: Refined, rivals: list[Refined]) -> Refusal | None:
         """Why the best solution is no answer, or None."""
         s = self._settings
         support = self.witnesses(best.inliers)
@@ -207,9 +213,11 @@ class _Search:
                 f"{support} inliers of {len(self._matches)} matches may be chance "
                 f"(1e{alarms / np.log(10.0):.1f} expected)"
             )
-        elif rival >= s.rival_share * support:
+        elif undecided := [r for r in rivals if self._undecided(best, r)]:
             reason = RefusalReason.AMBIGUOUS
-            text = f"{support} inliers, {rival} for a different solution"
+            text = (
+                f"{support} inliers, {self.witnesses(undecided[0].inliers)} for a different solution"
+            )
         elif (sigma := float(np.sqrt(best.covariance[0, 0]))) > np.deg2rad(
             s.max_direction_sigma_deg
         ):

@@ -19,9 +19,13 @@ from fgslam.planar import rotation as planar_rotation
 from fgslam.planar import wrap
 from fgslam.types import BoolArray, FloatArray
 
+_WIDENED = (4.0, 3.0, 2.0, 1.5)
+"""Inliers' threshold in the first iterations: a hypothesis from two matches is a few degrees off,
+and the matches that would pull it right are its outliers (D7: 1 to 2 degrees)."""
 _ITERATIONS = 15
 _CONVERGED = 1e-7  # radians; a thousandth of the best covariance's square root
 _MAD_TO_SIGMA = 1.4826
+_DAMPING = 1e-3  # of the information: a handful of inliers may leave a direction open
 _LEAST_SIGMA = 1e-6  # of a parameter that is not to be estimated; less spoils the conditioning
 
 
@@ -66,12 +70,15 @@ class HomingRefinement:
         inlier_sigmas: float,
         least_parallax: float,
     ) -> None:
-        self._a = unit_rays(matches.bearing_a, matches.elevation_a)
-        self._b = unit_rays(matches.bearing_b, matches.elevation_b)
+        a = unit_rays(matches.bearing_a, matches.elevation_a)
+        b = unit_rays(matches.bearing_b, matches.elevation_b)
         by_a = ray_derivatives(matches.bearing_a, matches.elevation_a)
         by_b = ray_derivatives(matches.bearing_b, matches.elevation_b)
-        self._noise_a = [d * matches.sigma[:, k, None] for k, d in enumerate(by_a)]
-        self._noise_b = [d * matches.sigma[:, k + 2, None] for k, d in enumerate(by_b)]
+        # a^T E b is linear in E: one product of matrices gives all residuals and derivatives.
+        self._outer = _outer(a, b)
+        noisy = [_outer(d * matches.sigma[:, k, None], b) for k, d in enumerate(by_a)]
+        noisy += [_outer(a, d * matches.sigma[:, k + 2, None]) for k, d in enumerate(by_b)]
+        self._noisy = np.concatenate(noisy)
         self._test = EpipolarTest.of(matches)
         self._prior = prior.information()
         self._sigmas = inlier_sigmas
@@ -81,14 +88,15 @@ class HomingRefinement:
         """Gauss-Newton from a hypothesis; inliers are chosen anew in each iteration."""
         parameters = np.zeros(7)
         parameters[:2] = direction, rotation
-        for _ in range(_ITERATIONS):
+        for k in range(_ITERATIONS):
             residuals, jacobian = self._linearised(parameters)
-            weights = self._weights(parameters, residuals)
+            widened = _WIDENED[k] if k < len(_WIDENED) else 1.0
+            weights = self._weights(parameters, residuals, widened)
             information = (jacobian * weights[:, None]).T @ jacobian + np.diag(self._prior)
             gradient = jacobian.T @ (weights * residuals) + self._prior * parameters
-            step = np.linalg.lstsq(information, -gradient, rcond=None)[0]
+            step = np.linalg.solve(information + _DAMPING * np.eye(7), -gradient)
             parameters = parameters + np.clip(step, -0.3, 0.3)
-            if np.max(np.abs(step)) < _CONVERGED:
+            if k >= len(_WIDENED) and np.max(np.abs(step)) < _CONVERGED:
                 break
         parameters[:2] = wrap(parameters[:2])
         return self._finished(parameters)
@@ -102,44 +110,66 @@ class HomingRefinement:
         covariance = np.linalg.pinv(information) * max(1.0, spread) ** 2
         return Refined(parameters, np.asarray(covariance, dtype=np.float64), residuals, inliers)
 
-    def _weights(self, parameters: FloatArray, residuals: FloatArray) -> FloatArray:
+    def _weights(self, parameters: FloatArray, residuals: FloatArray, widened: float) -> FloatArray:
         """(n,) Cauchy weights of the inliers: those near the border count little."""
-        inliers = self._inliers(parameters, residuals)
-        return inliers / (1.0 + (residuals / 2.0) ** 2)
+        inliers = self._inliers(parameters, residuals, widened)
+        return inliers / (1.0 + (residuals / (2.0 * widened)) ** 2)
 
-    def _inliers(self, parameters: FloatArray, residuals: FloatArray) -> BoolArray:
+    def _inliers(
+        self, parameters: FloatArray, residuals: FloatArray, widened: float = 1.0
+    ) -> BoolArray:
         ahead = self._test.in_front(parameters[:1], parameters[1:2], self._least_parallax)[:, 0]
-        return np.asarray((np.abs(residuals) < self._sigmas) & ahead)
+        return np.asarray((np.abs(residuals) < widened * self._sigmas) & ahead)
 
     def _linearised(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(n,) normalised residuals and their (n, 7) Jacobian, noise held at the estimate."""
-        leg = np.array([np.cos(p[0]), np.sin(p[0]), p[6]])
-        tilt_a, tilt_b, turn = _tilt(p[2], p[3]), _tilt(p[4], p[5]), _turn(p[1])
-        a, b = self._a @ tilt_a.T, self._b @ (turn @ tilt_b).T
-        normal_b, normal_a = np.cross(leg, b), np.cross(a, leg)  # r = a . (leg x b) = b . (a x leg)
-        residual = np.sum(a * normal_b, axis=1)
-        level_b = self._b @ tilt_b.T
-        by = np.stack(
-            [
-                np.sum(a * np.cross([-leg[1], leg[0], 0.0], b), axis=1),
-                np.sum(normal_a * np.cross([0.0, 0.0, 1.0], b), axis=1),
-                *(np.sum(np.cross(axis, a) * normal_b, axis=1) for axis in np.eye(3)[:2]),
-                *(
-                    np.sum(np.cross(axis, level_b) @ turn.T * normal_a, axis=1)
-                    for axis in np.eye(3)[:2]
-                ),
-                np.sum(a * np.cross([0.0, 0.0, 1.0], b), axis=1),
-            ],
-            axis=1,
-        )
-        noise = [np.sum((d @ tilt_a.T) * normal_b, axis=1) for d in self._noise_a]
-        noise += [np.sum((d @ (turn @ tilt_b).T) * normal_a, axis=1) for d in self._noise_b]
-        sigma = np.maximum(np.linalg.norm(noise, axis=0), 1e-12)
+        essential, derivatives = _essential(p)
+        residual = self._outer @ essential.ravel()
+        by = self._outer @ derivatives.reshape(7, 9).T
+        noise = (self._noisy @ essential.ravel()).reshape(4, -1)
+        sigma = np.sqrt(np.maximum(np.sum(noise**2, axis=0), 1e-24))
         return residual / sigma, by / sigma[:, None]
 
 
+def _outer(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(n, 9) products of all coordinates of two rays (n, 3)."""
+    return np.asarray((a[:, :, None] * b[:, None, :]).reshape(len(a), 9))
+
+
+def _essential(p: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """E (3, 3) with a^T E b = 0, and its (7, 3, 3) derivatives.
+
+    E = A^T [t]x Rz(psi) B, with tilts A and B. Their derivatives are taken as if by a further small
+    tilt, exact where the tilt itself vanishes.
+    """
+    c, s = np.cos(p[0]), np.sin(p[0])
+    tilt_a, tilt_b, turn = _tilt(p[2], p[3]).T, _tilt(p[4], p[5]), _turn(p[1])
+    right = turn @ tilt_b
+    left = tilt_a @ _skew(c, s, p[6])
+    middle = _skew(c, s, p[6]) @ right
+    derivatives = np.stack(
+        [
+            tilt_a @ _skew(-s, c, 0.0) @ right,
+            left @ turn @ _AXES[2] @ tilt_b,
+            -tilt_a @ _AXES[0] @ middle,
+            -tilt_a @ _AXES[1] @ middle,
+            left @ turn @ _AXES[0] @ tilt_b,
+            left @ turn @ _AXES[1] @ tilt_b,
+            tilt_a @ _AXES[2] @ right,
+        ]
+    )
+    return left @ right, derivatives
+
+
+def _skew(x: float, y: float, z: float) -> FloatArray:
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+_AXES = (_skew(1.0, 0.0, 0.0), _skew(0.0, 1.0, 0.0), _skew(0.0, 0.0, 1.0))
+
+
 def _turn(angle: float) -> FloatArray:
-    turned = np.eye(3)
+    turned: FloatArray = np.eye(3)
     turned[:2, :2] = planar_rotation(angle)
     return turned
 
@@ -147,7 +177,7 @@ def _turn(angle: float) -> FloatArray:
 def _tilt(roll: float, pitch: float) -> FloatArray:
     """Rotation by a small vector (roll, pitch, 0): Rodrigues' formula."""
     angle = float(np.hypot(roll, pitch))
-    cross = np.array([[0.0, 0.0, pitch], [0.0, 0.0, -roll], [-pitch, roll, 0.0]])
+    cross = _skew(roll, pitch, 0.0)
     if angle < 1e-12:
         return np.eye(3) + cross
     axis = cross / angle
