@@ -1,0 +1,174 @@
+"""Seen from above: the drive past its targets (fig. 6), and from where homing succeeds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fgslam.export.report.traces import Figure, Owner, Switch, Trace, joined, thinned, trace
+from fgslam.types import BoolArray, FloatArray, IntArray
+
+MAX_MOMENTS = 80
+MAX_POSES = 4_000
+PASS_RADIUS_M = 0.2
+_HEADING_M = 0.3
+_CORNERS = 25
+_TOLD = "<b>%{fullData.name}</b><br>%{x:.2f}, %{y:.2f} m<extra></extra>"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """A driven path in the world's plane, metres and radians.
+
+    Attributes:
+        time: (n,) seconds.
+        poses: (n, 3) true poses.
+        legs: (n,) number of the target that is driven to; the leg's colour follows it.
+        headings: (n,) direction of home in the world as estimated; NaN where there is none.
+        targets: (m, 3) where the targets' images were taken.
+        outlines: polylines (k, 2) of walls and furniture.
+    """
+
+    time: FloatArray
+    poses: FloatArray
+    legs: IntArray
+    headings: FloatArray
+    targets: FloatArray
+    outlines: tuple[FloatArray, ...] = ()
+
+
+def drive_figure(
+    drive: Drive, key: str = "drive", heading: str = "The drive, from above"
+) -> Figure:
+    """The true trajectory past its targets, and the robot at each moment."""
+    rows = thinned(len(drive.time), MAX_MOMENTS)
+    moving = [t for step, row in enumerate(rows) for t in _robot(drive, int(row), step)]
+    return Figure(
+        key,
+        heading,
+        "The path as it was truly driven, coloured by the leg. Squares: where the target images "
+        f"were taken, with a tick ahead and a circle of {PASS_RADIUS_M:g} m. The robot's arrow "
+        "points where the estimator says that the target lies. Grey: walls and furniture.",
+        (*_outlines(drive), *_targets(drive), *_paths(drive), *moving),
+        _axes(),
+        (Switch("outlines", "walls"), Switch("targets", "targets")),
+        steps=tuple(f"{drive.time[int(k)] - drive.time[0]:.1f} s" for k in rows),
+    )
+
+
+def catchment_figure(
+    offsets: FloatArray, succeeded: BoolArray, told: Sequence[str], key: str = "catchment"
+) -> Figure:
+    """From where homing arrives (G36).
+
+    Args:
+        offsets: (n, 2) starts relative to the target, metres, target's heading up the page.
+        succeeded: (n,) whether it arrived.
+        told: what the pointer says of each.
+        key: unique in the page.
+    """
+    traces = []
+    for series, name, which, symbol in (
+        (0, "arrived", succeeded, "circle"),
+        (1, "did not arrive", ~succeeded, "x-thin-open"),
+    ):
+        if which.any():
+            texts = [text for text, shown in zip(told, which, strict=True) if shown]
+            traces.append(
+                trace(
+                    Owner(name, series),
+                    {"x": -offsets[which, 1], "y": offsets[which, 0]},
+                    mode="markers",
+                    marker={"symbol": symbol, "size": 9},
+                    text=texts,
+                    hovertemplate="%{text}<br>%{y:.2f} m ahead, %{x:.2f} m right<extra></extra>",
+                )
+            )
+    square = {"symbol": "square-open", "size": 14}
+    target = trace(
+        Owner("target", paint="grey"),
+        {"x": np.zeros(1), "y": np.zeros(1)},
+        mode="markers",
+        marker=square,
+    )
+    return Figure(
+        key,
+        "From where homing succeeds",
+        "Starts relative to their target (square), whose heading is up the page. Dots: homing "
+        "arrived; crosses: it did not.",
+        (target, *traces) if traces else (),
+        _axes(),
+    )
+
+
+def _paths(drive: Drive) -> Iterator[Trace]:
+    rows = thinned(len(drive.time), MAX_POSES)
+    for leg in np.unique(drive.legs[rows]).tolist():
+        inside = np.flatnonzero(drive.legs[rows] == leg)
+        # The first pose of the next leg belongs to both, else the path has gaps.
+        last = min(inside[-1] + 1, len(rows) - 1)
+        own = drive.poses[rows[inside[0] : last + 1], :2]
+        owner = Owner(f"leg {leg + 1}", leg)
+        yield trace(owner, _xy(own), mode="lines", line={"width": 2}, hovertemplate=_TOLD)
+
+
+def _robot(drive: Drive, row: int, step: int) -> Iterator[Trace]:
+    pose, leg = drive.poses[row], int(drive.legs[row])
+    owner = Owner("robot", leg, step=step)
+    ahead = np.array([pose[:2], pose[:2] + _HEADING_M * _unit(pose[2])])
+    yield trace(owner, _xy(ahead), mode="lines", line={"width": 4}, hoverinfo="skip")
+    marker = {"symbol": "circle", "size": 12}
+    yield trace(owner, _xy(pose[None, :2]), mode="markers", marker=marker, hovertemplate=_TOLD)
+    if np.isfinite(drive.headings[row]):
+        arrow = np.array([pose[:2], pose[:2] + 2.0 * _HEADING_M * _unit(drive.headings[row])])
+        home = Owner("direction of home", leg, step=step)
+        line = {"width": 2, "dash": "dot"}
+        yield trace(home, _xy(arrow), mode="lines", line=line, hoverinfo="skip")
+
+
+def _targets(drive: Drive) -> Iterator[Trace]:
+    angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
+    circle = PASS_RADIUS_M * np.column_stack([np.cos(angle), np.sin(angle)])
+    circles = drive.targets[:, None, :2] + circle
+    ticks = np.stack(
+        [drive.targets[:, :2], drive.targets[:, :2] + _HEADING_M * _unit(drive.targets[:, 2])],
+        axis=1,
+    )
+    owner = Owner("targets", paint="truth", when=("targets",))
+    for lines in (circles, ticks):
+        yield trace(owner, _xy(joined(lines)), mode="lines", line={"width": 1}, hoverinfo="skip")
+    yield trace(
+        owner,
+        _xy(drive.targets[:, :2]),
+        mode="markers+text",
+        marker={"symbol": "square-open", "size": 10},
+        text=[str(i + 1) for i in range(len(drive.targets))],
+        textposition="top right",
+        hovertemplate=_TOLD,
+    )
+
+
+def _outlines(drive: Drive) -> Iterator[Trace]:
+    if drive.outlines:
+        lines = np.vstack([np.vstack([one, np.full((1, 2), np.nan)]) for one in drive.outlines])
+        owner = Owner("walls", paint="grey", when=("outlines",))
+        yield trace(owner, _xy(lines), mode="lines", line={"width": 1}, hoverinfo="skip")
+
+
+def _xy(points: FloatArray) -> dict[str, FloatArray]:
+    return {"x": points[:, 0], "y": points[:, 1]}
+
+
+def _unit(angle: FloatArray) -> FloatArray:
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _axes() -> dict[str, Any]:
+    return {
+        "xaxis": {"title": {"text": "x (m)"}, "constrain": "domain"},
+        "yaxis": {"title": {"text": "y (m)"}, "scaleanchor": "x"},
+        "hovermode": "closest",
+    }

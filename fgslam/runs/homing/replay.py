@@ -1,0 +1,53 @@
+"""Gives the bearings of one homing to one estimator, and keeps what it says after each image."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.errors import EstimatorError
+from fgslam.homing_types import HomingEstimate, HomingStart, TrackedBearings
+from fgslam.settings.homing_estimators import HomingEstimatorSettings
+from fgslam.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReplayedHoming:
+    """What one estimator made of one homing.
+
+    Attributes:
+        title, kind: which estimator.
+        estimates: one after each image.
+        update_ms: (k,) time of each update and estimate, milliseconds.
+        failure: why it ended early; empty where it did not.
+    """
+
+    title: str
+    kind: str
+    estimates: tuple[HomingEstimate, ...]
+    update_ms: FloatArray
+    failure: str = ""
+
+
+def replay_homing(
+    start: HomingStart, tracks: Sequence[TrackedBearings], settings: HomingEstimatorSettings
+) -> ReplayedHoming:
+    """Runs one estimator over all images; an error ends it, with what it had until then."""
+    estimates: list[HomingEstimate] = []
+    times: list[float] = []
+    failure = ""
+    try:
+        estimator = make_homing_estimator(start, settings)
+        for tracked in tracks:
+            began = time.perf_counter()
+            estimator.update(tracked)
+            estimate = estimator.estimate()
+            times.append(1e3 * (time.perf_counter() - began))
+            estimates.append(estimate)
+    except EstimatorError as error:
+        failure = f"image {len(estimates)}: {error}"
+    return ReplayedHoming(settings.title, settings.kind, tuple(estimates), np.array(times), failure)
