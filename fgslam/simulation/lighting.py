@@ -54,7 +54,11 @@ def flat_light(patches: PatchArrays, towards: FloatArray) -> LightMaps:
 
 
 def bake(
-    patches: PatchArrays, caster: RayCaster, lamps: FloatArray, rng: np.random.Generator
+    patches: PatchArrays,
+    caster: RayCaster,
+    lamps: FloatArray,
+    rng: np.random.Generator,
+    spacing_m: float = _SPACING_M,
 ) -> LightMaps:
     """Irradiance of all patches.
 
@@ -63,9 +67,10 @@ def bake(
         caster: of the same scene, for the shadows.
         lamps: (k, 3, 3) corner and two edges of each rectangular lamp, shining down, metres.
         rng: for the directions of the sky light and the points on the lamps.
+        spacing_m: greatest distance of the grid's points, but for very large patches, metres.
     """
-    columns = _grid_size(np.linalg.norm(patches.edge_u, axis=1))
-    rows = _grid_size(np.linalg.norm(patches.edge_v, axis=1))
+    columns = _grid_size(np.linalg.norm(patches.edge_u, axis=1), spacing_m)
+    rows = _grid_size(np.linalg.norm(patches.edge_v, axis=1), spacing_m)
     count = columns * rows
     offset = np.concatenate([[0], np.cumsum(count)[:-1]])
     patch = np.repeat(np.arange(len(patches)), count)
@@ -78,8 +83,8 @@ def bake(
     return LightMaps(values.astype(np.float32), offset, columns, rows)
 
 
-def _grid_size(metres: FloatArray) -> IntArray:
-    return np.clip(np.ceil(metres / _SPACING_M).astype(np.int64) + 1, 2, _MAX_CELLS)
+def _grid_size(metres: FloatArray, spacing_m: float) -> IntArray:
+    return np.clip(np.ceil(metres / spacing_m).astype(np.int64) + 1, 2, _MAX_CELLS)
 
 
 def _grid_points(

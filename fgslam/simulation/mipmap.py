@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.types import IntArray
+from fgslam.types import FloatArray, IntArray
 
 Float32 = npt.NDArray[np.float32]
 Int32 = npt.NDArray[np.int32]
@@ -16,6 +17,19 @@ Int32 = npt.NDArray[np.int32]
 _FIXED = 256.0
 # Sharper than the textbook's choice, whose tent of two texels is wider than a pixel.
 _LOD_BIAS = -0.35
+
+
+class TextureSizes(Protocol):
+    """What a scene must know of its textures: their numbers and sizes in texels.
+
+    Attributes:
+        index: number of each texture by name.
+        full_width, full_height: (n,) of the finest level.
+    """
+
+    index: dict[str, int]
+    full_width: FloatArray
+    full_height: FloatArray
 
 
 class TextureBank:
@@ -100,6 +114,6 @@ def _pyramid(texture: Float32) -> list[Float32]:
     return out
 
 
-def texture_indices(bank: TextureBank, names: tuple[str, ...]) -> IntArray:
+def texture_indices(bank: TextureSizes, names: tuple[str, ...]) -> IntArray:
     """(n,) index of each name. Raises KeyError for a texture that the bank lacks."""
     return np.array([bank.index[name] for name in names], dtype=np.int64)

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.simulation.lighting import LightMaps
-from fgslam.simulation.mipmap import TextureBank, texture_indices
+from fgslam.simulation.mipmap import TextureBank, TextureSizes, texture_indices
 from fgslam.simulation.patches import PatchArrays
 from fgslam.simulation.raycaster import RayCaster
 from fgslam.types import FloatArray, IntArray
@@ -25,7 +25,7 @@ Int32 = npt.NDArray[np.int32]
 _EDGE_SAMPLES = np.array([[-0.25, -0.375], [0.375, -0.25], [0.25, 0.375], [-0.375, 0.25]])
 
 # Keeps the rare hit on a patch seen edge-on finite; nothing is a kilometre away.
-_LEAST_INVERSE_DEPTH = 1e-3
+LEAST_INVERSE_DEPTH = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class Layer:
     """A scene ready to be shaded: patches, their textures and light, and a ray caster."""
 
     def __init__(
-        self, patches: PatchArrays, caster: RayCaster, light: LightMaps, bank: TextureBank
+        self, patches: PatchArrays, caster: RayCaster, light: LightMaps, bank: TextureSizes
     ) -> None:
         self.patches = patches
         self.caster = caster
@@ -134,7 +134,7 @@ class Renderer:
             g = layer.planes(pose, self._inverse)[8:, hits.patch[chosen]]
             p = self._pixels[chosen].astype(np.float64)
             inverse_depth = g[0] * p[:, 0] + g[1] * p[:, 1] + g[2]
-            depth[chosen] = 1.0 / np.maximum(inverse_depth, _LEAST_INVERSE_DEPTH)
+            depth[chosen] = 1.0 / np.maximum(inverse_depth, LEAST_INVERSE_DEPTH)
         return depth.reshape(self._camera.height, self._camera.width)
 
     def things(self, layers: list[Layer], pose: FloatArray) -> IntArray:
@@ -175,7 +175,7 @@ class Renderer:
         gathered = planes.take(patch, axis=1)
         column, row = np.ascontiguousarray(pixels.T)
         inverse_depth = gathered[8] * column + gathered[9] * row + gathered[10]
-        depth = 1.0 / np.maximum(inverse_depth, np.float32(_LEAST_INVERSE_DEPTH))
+        depth = 1.0 / np.maximum(inverse_depth, np.float32(LEAST_INVERSE_DEPTH))
         size = layer.size.astype(np.float32)
         u, u_column, u_row = _coordinate(gathered[0:4], gathered[8:], column, row, depth)
         v, v_column, v_row = _coordinate(gathered[4:8], gathered[8:], column, row, depth)
@@ -184,7 +184,7 @@ class Renderer:
         down = np.square(u_row * width) + np.square(v_row * height)
         footprint = np.sqrt(np.maximum(across, down))
         albedo = self._bank.sample(layer.texture.take(patch), u, v, footprint)
-        return np.asarray(albedo * _light(layer, patch, u, v))
+        return np.asarray(albedo * light_at(layer, patch, u, v))
 
     def _refine_edges(
         self,
@@ -227,7 +227,7 @@ def _coordinate(
     return ratio + g[3], (g[0] - ratio * w[0]) * depth, (g[1] - ratio * w[1]) * depth
 
 
-def _light(layer: Layer, patch: Int32, u: Float32, v: Float32) -> Float32:
+def light_at(layer: Layer, patch: Int32, u: Float32, v: Float32) -> Float32:
     """Bilinear light (n,) at texture coordinates."""
     scale, last = layer.light_scale, layer.light_last
     x = np.clip(u * scale[:, 0].take(patch), 0.0, last[:, 0].take(patch) - np.float32(1e-3))

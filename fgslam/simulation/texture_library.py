@@ -78,11 +78,22 @@ def _materials(rng: np.random.Generator) -> dict[str, Grey]:
 
 def photograph(name: str, side: int) -> Grey:
     """One of scikit-image's photographs as (side, side) grey levels with a white margin."""
-    picture = getattr(import_module("skimage.data"), name)()
-    image = np.asarray(picture[0] if isinstance(picture, tuple) else picture)
+    image = _picture(name)
     if image.ndim == 3:
         image = image[..., :3] @ np.array([0.299, 0.587, 0.114])
     return _framed(_resized(image.astype(np.float32), side))
+
+
+def colour_photograph(name: str, side: int) -> Grey:
+    """The same in colour, (side, side, 3) levels of red, green, blue; grey where it is grey."""
+    image = _picture(name)
+    channels = [image] * 3 if image.ndim == 2 else [image[..., k] for k in range(3)]
+    return np.stack([_framed(_resized(c.astype(np.float32), side)) for c in channels], axis=-1)
+
+
+def _picture(name: str) -> npt.NDArray[np.generic]:
+    picture = getattr(import_module("skimage.data"), name)()
+    return np.asarray(picture[0] if isinstance(picture, tuple) else picture)
 
 
 def _muted(image: Grey, contrast: float) -> Grey:
