@@ -86,7 +86,7 @@ def _moment(
     yield _dots("start", step, np.zeros((1, 2)), "square-open", paint="grey", size=13)
     yield from _features(estimates, row, step)
     path = np.array([e.robot[:2] for e in estimates[: row + 1]])
-    owner = Owner("estimated path", 0, step=step)
+    owner = Owner("estimated path", colour=0, step=step)
     yield trace(owner, upwards(path), mode="lines", line={"width": 1.6}, hoverinfo="skip")
     for name, pose, block, number in (
         ("robot", now.robot, now.covariance[:3, :3], 0),
@@ -103,14 +103,14 @@ def _place(
 ) -> Iterator[Trace]:
     """A square with its heading and its ellipse."""
     ahead = pose[:2] + _HEADING * np.array([np.cos(pose[2]), np.sin(pose[2])])
-    owner = Owner(name, number, step=step)
+    owner = Owner(name, colour=number, step=step)
     line: dict[str, Any] = {"line": {"width": 2}, "hoverinfo": "skip"}
     yield trace(owner, upwards(np.array([pose[:2], ahead])), mode="lines", **line)
     marker = {"symbol": "square", "size": 13}
     yield trace(owner, upwards(pose[:2]), mode="markers", marker=marker, hovertemplate=_TOLD)
     outline = ellipse(pose[:2], covariance)
     if len(outline):
-        claimed = Owner(f"{name}, {SIGMAS:.0f} sigma", number, ("ellipses",), step=step)
+        claimed = Owner(f"{name}, {SIGMAS:.0f} sigma", when=("ellipses",), colour=number, step=step)
         yield trace(claimed, upwards(outline), mode="lines", line={"width": 1}, hoverinfo="skip")
 
 

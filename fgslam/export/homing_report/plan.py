@@ -79,7 +79,7 @@ def catchment_figure(
             texts = [text for text, shown in zip(told, which, strict=True) if shown]
             traces.append(
                 trace(
-                    Owner(name, series),
+                    Owner(name, colour=series),
                     {"x": -offsets[which, 1], "y": offsets[which, 0]},
                     mode="markers",
                     marker={"symbol": symbol, "size": 9},
@@ -100,7 +100,7 @@ def catchment_figure(
         "Starts relative to their target (square), whose heading is up the page. Dots: homing "
         "arrived; crosses: it did not.",
         (target, *traces) if traces else (),
-        _axes(),
+        _axes("right of the target (m)", "ahead of the target (m)"),
     )
 
 
@@ -111,20 +111,20 @@ def _paths(drive: Drive) -> Iterator[Trace]:
         # The first pose of the next leg belongs to both, else the path has gaps.
         last = min(inside[-1] + 1, len(rows) - 1)
         own = drive.poses[rows[inside[0] : last + 1], :2]
-        owner = Owner(f"leg {leg + 1}", leg)
+        owner = Owner(f"leg {leg + 1}", colour=leg)
         yield trace(owner, _xy(own), mode="lines", line={"width": 2}, hovertemplate=_TOLD)
 
 
 def _robot(drive: Drive, row: int, step: int) -> Iterator[Trace]:
     pose, leg = drive.poses[row], int(drive.legs[row])
-    owner = Owner("robot", leg, step=step)
+    owner = Owner("robot", colour=leg, step=step)
     ahead = np.array([pose[:2], pose[:2] + _HEADING_M * _unit(pose[2])])
     yield trace(owner, _xy(ahead), mode="lines", line={"width": 4}, hoverinfo="skip")
     marker = {"symbol": "circle", "size": 12}
     yield trace(owner, _xy(pose[None, :2]), mode="markers", marker=marker, hovertemplate=_TOLD)
     if np.isfinite(drive.headings[row]):
         arrow = np.array([pose[:2], pose[:2] + 2.0 * _HEADING_M * _unit(drive.headings[row])])
-        home = Owner("direction of home", leg, step=step)
+        home = Owner("direction of home", colour=leg, step=step)
         line = {"width": 2, "dash": "dot"}
         yield trace(home, _xy(arrow), mode="lines", line=line, hoverinfo="skip")
 
@@ -166,9 +166,9 @@ def _unit(angle: FloatArray) -> FloatArray:
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def _axes() -> dict[str, Any]:
+def _axes(x: str = "x (m)", y: str = "y (m)") -> dict[str, Any]:
     return {
-        "xaxis": {"title": {"text": "x (m)"}, "constrain": "domain"},
-        "yaxis": {"title": {"text": "y (m)"}, "scaleanchor": "x"},
+        "xaxis": {"title": {"text": x}, "constrain": "domain"},
+        "yaxis": {"title": {"text": y}, "scaleanchor": "x"},
         "hovermode": "closest",
     }

@@ -30,7 +30,7 @@
   function colourOf(owner) {
     if (owner.paint === "truth") return css("--ink");
     if (owner.paint === "grey") return css("--dots");
-    return css(`--e${owner.estimator % report.colours}`);
+    return css(`--e${(owner.colour ?? owner.estimator) % report.colours}`);
   }
 
   function dressedTrace(figure, trace) {

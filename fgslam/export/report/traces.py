@@ -33,6 +33,7 @@ class Owner:
         unless: switches that must all be off.
         chosen: seen while the figure's selector names the estimator, whether its lines are or not.
         paint: its colour.
+        colour: number of its colour where that is not its estimator's.
         step: which of the figure's moments it belongs to; None of what is there all the time.
     """
 
@@ -42,6 +43,7 @@ class Owner:
     unless: tuple[str, ...] = ()
     chosen: bool = False
     paint: Paint = "estimator"
+    colour: int | None = None
     step: int | None = None
 
     def as_values(self) -> dict[str, Any]:
@@ -53,7 +55,8 @@ class Owner:
             "chosen": self.chosen,
             "paint": self.paint,
         }
-        return values if self.step is None else {**values, "step": self.step}
+        optional = {"colour": self.colour, "step": self.step}
+        return values | {name: value for name, value in optional.items() if value is not None}
 
 
 @dataclass(frozen=True, slots=True)
