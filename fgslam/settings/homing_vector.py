@@ -62,7 +62,7 @@ class HomingVectorSettings:
             description="sign test over the matches that support only one of two different "
             "solutions; below it the answer is ambiguous",
         ),
-    ] = 2.0
+    ] = 1.0
     rival_angle_deg: Annotated[
         float, Field(gt=0.0, description="solutions closer than this are one and the same")
     ] = 15.0

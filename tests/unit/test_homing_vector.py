@@ -1,0 +1,200 @@
+"""The homing vector from noisy and partly wrong matches; refusals; the local map."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from fgslam.frontend.omni.epipolar import EpipolarTest
+from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
+from fgslam.frontend.omni.homing_refinement import HomingRefinement, RefinementPrior
+from fgslam.frontend.omni.local_map import make_local_map, triangulable, triangulate
+from fgslam.homing_types import BearingMatches, HomingVector, Refusal, RefusalReason
+from fgslam.planar import wrap
+from fgslam.settings.homing_vector import HomingVectorSettings
+from fgslam.types import FloatArray
+from tests.homing import TwoViews, make_matches, two_views
+
+HALF_DEGREE = np.deg2rad(0.5)
+SETTINGS = HomingVectorSettings()
+
+
+def answer(views: TwoViews, settings: HomingVectorSettings = SETTINGS) -> HomingVector | Refusal:
+    return estimate_homing_vector(views.matches, settings, np.random.default_rng(7))
+
+
+def error(views: TwoViews, vector: HomingVector) -> FloatArray:
+    """(2,) radians: direction and rotation."""
+    return wrap(np.array([vector.direction - views.direction, vector.rotation - views.rotation]))
+
+
+@pytest.mark.parametrize(("count", "wrong"), [(30, 0.0), (30, 0.3), (50, 0.3)])
+def test_median_error_at_half_a_degree(count: int, wrong: float) -> None:
+    errors, nees = [], []
+    for seed in range(100):
+        views = two_views(seed, count, HALF_DEGREE, wrong)
+        vector = answer(views)
+        if isinstance(vector, HomingVector):
+            off = error(views, vector)
+            errors.append(np.abs(off))
+            nees.append(off @ np.linalg.solve(vector.covariance, off))
+    direction, rotation = np.rad2deg(np.median(errors, axis=0))
+    assert direction <= 0.8
+    assert rotation <= 0.4
+    assert len(errors) >= 95
+    # Some wrong matches agree by chance and none is told apart: the share inside is not exact.
+    assert np.mean(np.array(nees) < chi2.ppf(0.95, 2)) > 0.85
+
+
+def test_most_right_matches_are_inliers() -> None:
+    recalls = []
+    for seed in range(50):
+        views = two_views(seed, 40, HALF_DEGREE, 0.3)
+        vector = answer(views)
+        if isinstance(vector, HomingVector):
+            recalls.append(np.mean(vector.inliers[views.right]))
+    assert np.mean(recalls) >= 0.99
+
+
+def test_equal_from_equal_seeds_and_arguments_untouched() -> None:
+    views = two_views(3, 40, HALF_DEGREE, 0.3)
+    before = dataclasses.astuple(views.matches)
+    first, second = answer(views), answer(views)
+    assert isinstance(first, HomingVector)
+    assert isinstance(second, HomingVector)
+    assert (first.direction, first.rotation) == (second.direction, second.rotation)
+    for old, new in zip(before, dataclasses.astuple(views.matches), strict=True):
+        np.testing.assert_array_equal(old, new)
+
+
+def test_tilted_cameras_are_estimated() -> None:
+    tilts = (np.deg2rad([2.0, -1.0]), np.deg2rad([-1.5, 1.0]))
+    settings = dataclasses.replace(SETTINGS, tilt_sigma_deg=2.0)
+    level, free = [], []
+    for seed in range(40):
+        views = two_views(seed, 50, np.deg2rad(0.2), tilts=tilts)
+        for found, s in (
+            (level, dataclasses.replace(SETTINGS, tilt_sigma_deg=0.0)),
+            (free, settings),
+        ):
+            vector = answer(views, s)
+            found.append(np.pi if isinstance(vector, Refusal) else abs(error(views, vector)[0]))
+    assert np.rad2deg(np.median(free)) < 0.5
+    assert np.median(free) < 0.3 * np.median(level)
+
+
+def test_matches_by_lot_are_refused() -> None:
+    refused = 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        angles = np.column_stack([rng.uniform(-np.pi, np.pi, 60), rng.uniform(-0.5, 0.6, 60)] * 2)
+        angles[:, 2] = rng.uniform(-np.pi, np.pi, 60)
+        angles[:, 3] = rng.uniform(-0.5, 0.6, 60)
+        found = estimate_homing_vector(make_matches(angles, HALF_DEGREE), SETTINGS, rng)
+        refused += isinstance(found, Refusal)
+    assert refused == 60
+
+
+def test_few_matches_are_refused_with_their_number() -> None:
+    refusal = answer(two_views(0, 5, HALF_DEGREE))
+    assert isinstance(refusal, Refusal)
+    assert refusal.reason is RefusalReason.TOO_FEW_MATCHES
+    assert "5 matches" in refusal.details
+
+
+def test_both_views_from_one_place() -> None:
+    views = two_views(1, 40, np.deg2rad(0.1), leg_m=0.002)
+    refusal = answer(views)
+    assert isinstance(refusal, Refusal)
+    assert refusal.reason is RefusalReason.AT_TARGET
+    assert refusal.rotation == pytest.approx(views.rotation, abs=np.deg2rad(0.2))
+
+
+def test_epipolar_residual_of_truth_is_zero_and_of_unit_variance_under_noise() -> None:
+    exact = two_views(5, 200)
+    there = (np.array([exact.direction]), np.array([exact.rotation]))
+    test = EpipolarTest.of(exact.matches)
+    assert np.max(np.abs(test.coefficients @ _hypothesis(*there))) < 1e-12
+    noisy = [two_views(seed, 100, HALF_DEGREE) for seed in range(40)]
+    residuals = [
+        EpipolarTest.of(v.matches).normalised(np.array([v.direction]), np.array([v.rotation]))
+        for v in noisy
+    ]
+    assert np.std(residuals) == pytest.approx(1.0, abs=0.05)
+
+
+def _hypothesis(direction: FloatArray, rotation: FloatArray) -> FloatArray:
+    between = rotation - direction
+    return np.stack([np.sin(direction), -np.cos(direction), np.sin(between), np.cos(between)])
+
+
+def test_refinement_covariance_is_that_of_monte_carlo() -> None:
+    found = []
+    for seed in range(300):
+        views = two_views(11, 60)
+        rng = np.random.default_rng(seed)
+        m = views.matches
+        angles = np.column_stack([m.bearing_a, m.elevation_a, m.bearing_b, m.elevation_b])
+        noisy = make_matches(
+            angles + rng.normal(0.0, np.deg2rad(0.2), angles.shape), np.deg2rad(0.2)
+        )
+        prior = RefinementPrior(1e-6, 1e-6)
+        refined = HomingRefinement(noisy, prior, 5.0, 0.05).refine(views.direction, views.rotation)
+        found.append(
+            (
+                *(refined.parameters[:2] - [views.direction, views.rotation]),
+                *np.diag(refined.covariance)[:2],
+            )
+        )
+    samples = np.array(found)
+    np.testing.assert_allclose(
+        np.var(samples[:, :2], axis=0), np.median(samples[:, 2:], axis=0), rtol=0.3
+    )
+
+
+def test_triangulation_is_exact() -> None:
+    views = two_views(2, 100)
+    distance = triangulate(views.matches, views.direction, views.rotation)
+    np.testing.assert_allclose(distance, np.hypot(*views.points.T) / views.leg_m, rtol=1e-6)
+
+
+def test_local_map_covariance_is_that_of_monte_carlo() -> None:
+    views = two_views(4, 40)
+    sigma = np.deg2rad(0.05)
+    truth = np.array([views.direction, views.rotation])
+    vector_covariance = np.diag(np.deg2rad([0.1, 0.05]) ** 2)
+    rng = np.random.default_rng(0)
+    drawn = []
+    for _ in range(3000):
+        bearing_a = views.matches.bearing_a + rng.normal(0.0, sigma, 40)
+        bearing_b = views.matches.bearing_b + rng.normal(0.0, sigma, 40)
+        theta, psi = rng.multivariate_normal(truth, vector_covariance)
+        noisy = dataclasses.replace(views.matches, bearing_a=bearing_a, bearing_b=bearing_b)
+        drawn.append(triangulate(noisy, theta, psi))
+    made = _map(views, sigma, vector_covariance)
+    near = triangulable(made, 0.1)
+    assert np.count_nonzero(near) > 20
+    np.testing.assert_allclose(
+        np.std(drawn, axis=0)[near], np.sqrt(made.covariance[near, 0, 0]), rtol=0.15
+    )
+
+
+def _map(views: TwoViews, sigma: float, covariance: FloatArray):  # type: ignore[no-untyped-def]
+    noise = np.full((len(views.matches), 4), sigma)
+    matches: BearingMatches = dataclasses.replace(views.matches, sigma=noise)
+    inliers = np.ones(len(matches), dtype=np.bool_)
+    return make_local_map(
+        HomingVector(views.direction, views.rotation, covariance, inliers, 0), matches
+    )
+
+
+def test_rays_that_diverge_are_not_triangulable() -> None:
+    views = two_views(2, 30)
+    backwards = HomingVector(
+        views.direction + np.pi, views.rotation, np.eye(2) * 1e-8, np.ones(30, dtype=np.bool_), 0
+    )
+    made = make_local_map(backwards, views.matches)
+    assert not np.any(triangulable(made, 0.3))
