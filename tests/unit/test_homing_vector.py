@@ -12,7 +12,13 @@ from fgslam.frontend.omni.epipolar import EpipolarTest
 from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
 from fgslam.frontend.omni.homing_refinement import HomingRefinement, RefinementPrior
 from fgslam.frontend.omni.local_map import make_local_map, triangulable, triangulate
-from fgslam.homing_types import BearingMatches, HomingVector, Refusal, RefusalReason
+from fgslam.homing_types import (
+    BearingMatches,
+    HomingVector,
+    LocalMap,
+    Refusal,
+    RefusalReason,
+)
 from fgslam.planar import wrap
 from fgslam.settings.homing_vector import HomingVectorSettings
 from fgslam.types import FloatArray
@@ -182,7 +188,7 @@ def test_local_map_covariance_is_that_of_monte_carlo() -> None:
     )
 
 
-def _map(views: TwoViews, sigma: float, covariance: FloatArray):  # type: ignore[no-untyped-def]
+def _map(views: TwoViews, sigma: float, covariance: FloatArray) -> LocalMap:
     noise = np.full((len(views.matches), 4), sigma)
     matches: BearingMatches = dataclasses.replace(views.matches, sigma=noise)
     inliers = np.ones(len(matches), dtype=np.bool_)
