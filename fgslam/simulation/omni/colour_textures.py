@@ -64,7 +64,8 @@ def painting(rng: np.random.Generator, side: int) -> Colour:
         if rng.random() < 0.5:
             inside = np.hypot(y - row, x - column) < 0.03 + 0.16 * wide
         else:
-            inside = (np.abs(y - row) < 0.02 + 0.2 * high) & (np.abs(x - column) < 0.02 + 0.2 * wide)
+            tall = np.abs(y - row) < 0.02 + 0.2 * high
+            inside = tall & (np.abs(x - column) < 0.02 + 0.2 * wide)
         image[inside] = level + 6.0 * noise[inside]
     out = ramped(rng, np.asarray(image, dtype=np.float32), 0.75)
     edge = max(side // 24, 2)
