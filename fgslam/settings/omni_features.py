@@ -1,0 +1,197 @@
+"""Settings of the omnidirectional features and of their matching (Goedemé et al. III-A).
+
+Defaults that the paper leaves open were measured on the pairs of ``omni_home``; the tables are in
+``docs/derivations/omni_features.md``.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fgslam.settings.base import STRICT
+
+
+@dataclass(frozen=True, config=STRICT)
+class ColourMomentSettings:
+    """Colour of a patch or segment: eq. 1 as corrected in E-G1."""
+
+    form: Annotated[
+        Literal["ratio", "correlation"],
+        Field(
+            description="`ratio`: mean(PQ) / (mean P mean Q), blind to the gain of each band; "
+            "`correlation`: Pearson's, blind to gain and offset"
+        ),
+    ] = "ratio"
+    patch_sigmas: Annotated[
+        float,
+        Field(gt=0.0, description="half side of a feature's patch, in SIFT scales; 6 is SIFT's"),
+    ] = 6.0
+    mean_floor: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="grey values; means (and deviations) below it count as it, so that the "
+            "noise of dark patches is no colour",
+        ),
+    ] = 8.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class UprightSiftSettings:
+    """Rotation-reduced SIFT (III-A1)."""
+
+    octave_layers: Annotated[int, Field(ge=1, le=8, description="levels an octave; 3 in Lowe")] = 3
+    contrast_threshold: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="OpenCV's contrast threshold (its default is 0.04); low, as dim rooms "
+            "and wide baselines need many weak features",
+        ),
+    ] = 0.015
+    edge_threshold: Annotated[
+        float, Field(gt=1.0, description="ratio of principal curvatures above which edges go")
+    ] = 10.0
+    base_sigma_px: Annotated[
+        float, Field(gt=0.5, le=3.0, description="Gaussian of the first level, doubled image")
+    ] = 1.6
+    max_features: Annotated[
+        int, Field(ge=0, le=1_000_000, description="keep the strongest so many; 0 keeps all")
+    ] = 3000
+    min_elevation_deg: Annotated[
+        float, Field(ge=-90.0, lt=90.0, description="below it: the floor at our feet, the tripod")
+    ] = -60.0
+    max_elevation_deg: Annotated[
+        float, Field(gt=-90.0, le=90.0, description="above it: the ceiling overhead")
+    ] = 60.0
+    view: Annotated[
+        Literal["unwrapped", "raw"],
+        Field(
+            description="of a mirror's or fisheye's image: `raw` describes features along the "
+            "radius where they are, `unwrapped` works on the panorama; panoramas are as they are"
+        ),
+    ] = "unwrapped"
+    max_view_width: Annotated[
+        int, Field(ge=64, le=16384, description="of the unwrapped view, pixels")
+    ] = 2048
+    sigma_px: Annotated[
+        float, Field(gt=0.0, description="position of a feature: this, in pixels of its view")
+    ] = 0.5
+    sigma_scales: Annotated[
+        float, Field(ge=0.0, description="and this many of its scales, added in quadrature")
+    ] = 0.5
+
+
+@dataclass(frozen=True, config=STRICT)
+class ColumnSegmentSettings:
+    """Invariant column segments (III-A2, design B1)."""
+
+    max_width: Annotated[
+        int, Field(ge=64, le=16384, description="of the cylinder, pixels; less for coarser cameras")
+    ] = 1024
+    max_tangent: Annotated[
+        float,
+        Field(gt=0.0, le=10.0, description="of the elevation, up and down, that the cylinder has"),
+    ] = 1.0
+    smoothing_px: Annotated[
+        float, Field(gt=0.0, le=10.0, description="Gaussian before the gradient is taken")
+    ] = 1.2
+    min_gradient: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="of the three bands together, grey values a pixel, at a segment's ends",
+        ),
+    ] = 4.0
+    min_length_px: Annotated[
+        float, Field(ge=2.0, description="shorter segments have no profile to tell them by")
+    ] = 10.0
+    min_contrast: Annotated[
+        float,
+        Field(gt=0.0, description="standard deviation of the luminance along it, grey values"),
+    ] = 4.0
+    min_run_px: Annotated[
+        int, Field(ge=1, description="neighbouring columns that must show a segment")
+    ] = 2
+    max_run_deg: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="wider runs (a table's edge, the joint of wall and ceiling) have no "
+            "bearing of their own and are dropped",
+        ),
+    ] = 4.0
+    run_step_px: Annotated[
+        float, Field(gt=0.0, description="ends of one run shift less than this between columns")
+    ] = 1.5
+    sigma_px: Annotated[
+        float, Field(gt=0.0, description="position of an end, and of a run of one column")
+    ] = 1.0
+    sigma_run: Annotated[
+        float, Field(ge=0.0, description="part of a run's width added to the bearing's deviation")
+    ] = 0.29
+
+
+@dataclass(frozen=True, config=STRICT)
+class OmniMatchingSettings:
+    """Matching of two views' features (III-A)."""
+
+    ratio: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            le=1.0,
+            description="SIFT: nearest over second nearest distance below this; high, as the "
+            "colour filter and the planar gates take the wrong ones (G6)",
+        ),
+    ] = 0.9
+    root: Annotated[
+        bool,
+        Field(description="compare square roots of descriptors (Arandjelovic, Zisserman 2012)"),
+    ] = True
+    max_colour_distance: Annotated[
+        float,
+        Field(gt=0.0, description="Euclidean, of (C_RB, C_RG, C_GB); larger ones are discarded"),
+    ] = 0.15
+    planar_gates: Annotated[
+        bool,
+        Field(
+            description="among candidates, leave out those no planar motion explains: elevations "
+            "of opposite sign (D1), apparent sizes against elevations"
+        ),
+    ] = True
+    horizon_margin_deg: Annotated[
+        float,
+        Field(ge=0.0, description="elevations nearer to the horizon may have either sign"),
+    ] = 3.0
+    max_scale_ratio: Annotated[
+        float,
+        Field(
+            gt=1.0,
+            description="between the ratio of scales and that of the sines of the elevations",
+        ),
+    ] = 2.0
+    column_ratio: Annotated[
+        float, Field(gt=0.0, le=1.0, description="column segments: nearest over second nearest")
+    ] = 0.8
+    max_column_distance: Annotated[
+        float,
+        Field(gt=0.0, description="Mahalanobis, of 11 elements; 4.4 is exceeded by 5 % if normal"),
+    ] = 4.4
+
+
+@dataclass(frozen=True, config=STRICT)
+class OmniFeatureSettings:
+    """All of the omnidirectional features."""
+
+    sift: UprightSiftSettings = UprightSiftSettings()
+    colour: ColourMomentSettings = ColourMomentSettings()
+    columns: ColumnSegmentSettings = ColumnSegmentSettings()
+    matching: OmniMatchingSettings = OmniMatchingSettings()
+    kinds: Annotated[
+        Literal["both", "sift", "columns"],
+        Field(description="which features are sought; the paper uses both kinds together"),
+    ] = "both"
