@@ -165,6 +165,15 @@ class HomingGraphSettings(NamedSettings):
             description="deviation of the weak prior on a landmark's place, in initial distances",
         ),
     ] = 2.0
+    gate_sigmas: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="bearings that miss the landmark, seen from where all of them together "
+            "say the robot is, by more than so many deviations do not enter; where that would be "
+            "most of them, all enter. 0: all do, and the kernel alone deals with wrong ones",
+        ),
+    ] = 4.0
     lag_s: Annotated[
         float, Field(gt=0.0, description="fixed_lag: how long poses stay variables, seconds")
     ] = 1.0

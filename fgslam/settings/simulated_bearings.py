@@ -25,8 +25,8 @@ class SimulatedBearingsSettings:
     ] = "isotropic"
     nearest_m: Annotated[
         float, Field(gt=0.0, description="distance of the nearest points from the way, metres")
-    ] = 1.0
-    farthest_m: Annotated[float, Field(gt=0.0, description="and of the farthest ones")] = 6.0
+    ] = 0.8
+    farthest_m: Annotated[float, Field(gt=0.0, description="and of the farthest ones")] = 2.5
     lowest_m: Annotated[
         float, Field(gt=0.0, description="points are at least so far above or below the camera")
     ] = 0.2

@@ -43,9 +43,13 @@ class HomingGraph:
         """Takes in one image; see the protocol."""
         before = self._motion()
         _, taken = self._features.take(tracked)
+        points = self._points(self._entered())
         self._covariance = None
         self._image += 1
-        self._solver.add(self._problem.image(tracked, taken, before), tracked.time)
+        self._solver.add(self._problem.image(tracked, taken, before, points), tracked.time)
+        collapsed = self._problem.collapsed(self._points(self._entered()))
+        if collapsed:
+            self._solver.move(collapsed, tracked.time)
 
     def estimate(self) -> HomingEstimate:
         """The present state; see the protocol."""
@@ -59,14 +63,13 @@ class HomingGraph:
         covariance = turn @ covariance @ turn.T
         n = len(ids)
         every = np.arange(n)
-        points = [values.atPoint2(landmark_key(row)) for row in rows]
         return HomingEstimate(
             time=self._features.time,
             robot=robot,
             target=target,
             covariance=covariance[:6, :6],
             ids=ids,
-            landmarks=np.array(points, np.float64).reshape(n, 2),
+            landmarks=self._points(rows),
             landmark_covariances=covariance[6:, 6:].reshape(n, 2, n, 2)[every, :, every, :],
         )
 
@@ -75,6 +78,14 @@ class HomingGraph:
         ids = self._features.alive
         ids = ids[np.isin(ids, self._problem.entered)]
         return ids, self._problem.variables(ids).tolist()
+
+    def _entered(self) -> list[int]:
+        numbers: list[int] = self._problem.variables(self._problem.entered).tolist()
+        return numbers
+
+    def _points(self, rows: list[int]) -> FloatArray:
+        points = [self._solver.values.atPoint2(landmark_key(row)) for row in rows]
+        return np.array(points, np.float64).reshape(len(rows), 2)
 
     def _joint(self, rows: list[int]) -> FloatArray:
         """Covariance of robot, target and landmarks, in GTSAM's tangent spaces."""

@@ -14,6 +14,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from fgslam.backend.homing.resection import resected
 from fgslam.factors.bearing import (
     BearingFactors,
     leg_factor,
@@ -24,13 +25,14 @@ from fgslam.factors.bearing import (
     weak_height_prior,
     weak_landmark_prior,
 )
-from fgslam.factors.bearing_residuals import triangulated
+from fgslam.factors.bearing_residuals import bearing, triangulated
 from fgslam.factors.keys import height_key, landmark_key, pose_key, target_key, velocity_key
 from fgslam.homing_types import HomingStart, TrackedBearings
 from fgslam.planar import compose, unit, wrap
-from fgslam.settings.homing_estimators import HomingGraphSettings
+from fgslam.settings.homing_estimators import GraphMotionSettings, HomingGraphSettings
 from fgslam.types import BoolArray, FloatArray, IntArray
 
+_COLLAPSED = 0.1  # of the first distance from the start: gates let no error of ninety percent in
 _LEAST_SIGMA = 1e-3  # radians: of the initialisation's direction and rotation, stated smaller
 
 
@@ -70,6 +72,7 @@ class HomingProblem:
         self._density = np.array([motion.forward, motion.sideways, turning]) ** 2
         self._ids = start.local_map.ids
         self._entered = np.zeros(len(self._ids), np.bool_)
+        self._guesses = np.full((len(self._ids), 2), np.nan)
 
     @property
     def entered(self) -> IntArray:
@@ -79,6 +82,22 @@ class HomingProblem:
     def variables(self, ids: IntArray) -> IntArray:
         """Numbers of the landmark variables of identities (k,)."""
         return np.asarray(np.searchsorted(self._ids, ids))
+
+    def collapsed(self, points: FloatArray) -> dict[int, FloatArray]:
+        """Landmarks that fell upon the start, with their first guesses (2,) by key.
+
+        A long step may carry a landmark with few good bearings across the start, where any
+        bearing is as good as another; from there it does not come back, and its derivatives grow
+        beyond all bounds.
+
+        Args:
+            points: (n, 2) the present landmarks of :attr:`entered`.
+        """
+        rows = np.flatnonzero(self._entered)
+        guesses = self._guesses[rows]
+        nearer = np.linalg.norm(points, axis=1) / np.linalg.norm(guesses, axis=1)
+        fell = np.flatnonzero(~(nearer > _COLLAPSED))
+        return {landmark_key(int(rows[k])): guesses[k] for k in fell}
 
     def first(self) -> NewPart:
         """Start, target and the features that both views triangulate well."""
@@ -105,28 +124,50 @@ class HomingProblem:
             self._enter(new, row, chart.points()[row], float(chart.distance[row]))
         return new
 
-    def image(self, tracked: TrackedBearings, taken: BoolArray, before: Motion) -> NewPart:
+    def image(
+        self, tracked: TrackedBearings, taken: BoolArray, before: Motion, points: FloatArray
+    ) -> NewPart:
         """The robot's next pose with what it sees.
 
         Args:
             tracked: the image.
             taken: (m,) its rows that count.
             before: the robot at the last image.
+            points: (n, 2) the present landmarks of :attr:`entered`.
         """
         new = NewPart()
         image, step = before.image + 1, tracked.time - before.time
-        pose = compose(before.pose, _travelled(before.velocity, step))
+        rows = np.searchsorted(self._ids, tracked.ids)
+        pose, fits = self._resected(tracked, taken & self._entered[rows], before, points)
         new.values.insert(pose_key(image), gtsam.Pose2(*pose))
         new.values.insert(velocity_key(image), before.velocity)
         earlier = (pose_key(before.image), velocity_key(before.image), before.time)
         now = (pose_key(image), velocity_key(image), tracked.time)
         new.graph.add(motion_factor(earlier, now, self._density))
-        rows = np.searchsorted(self._ids, tracked.ids)
-        self._enter_seen(new, rows, tracked, taken, before)
-        for k in np.flatnonzero(taken & self._entered[rows]).tolist():
+        entering = self._enter_seen(new, rows, tracked, taken & ~self._entered[rows], before)
+        for k in np.flatnonzero(fits | entering).tolist():
             self._see(new, pose_key(image), int(rows[k]), tracked, k)
         new.keys |= {pose_key(image), velocity_key(image)}
         return new
+
+    def _resected(
+        self, tracked: TrackedBearings, seen: BoolArray, before: Motion, points: FloatArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """First guess (3,) of the pose, and which bearings (m,) of those ``seen`` fit to it."""
+        step, settings = tracked.time - before.time, self._settings
+        predicted = compose(before.pose, _travelled(before.velocity, step))
+        rows = np.searchsorted(self.entered, tracked.ids[seen])
+        bearings, sigma = tracked.bearing[seen], tracked.sigma_bearing[seen]
+        spread = _drift(settings.motion, step)
+        pose = resected(predicted, spread**-2.0, points[rows], bearings, sigma)
+        if settings.gate_sigmas == 0.0:
+            return pose, seen
+        misses = np.abs(bearing(pose, points[rows], bearings)) > settings.gate_sigmas * sigma
+        if np.count_nonzero(misses) > 0.5 * len(misses):
+            return pose, seen
+        fits = seen.copy()
+        fits[seen] = ~misses
+        return pose, fits
 
     def _see(self, new: NewPart, pose: int, row: int, tracked: TrackedBearings, k: int) -> None:
         landmark = landmark_key(row)
@@ -152,7 +193,7 @@ class HomingProblem:
         settings, matches = self._settings, self._start.matches
         landmark = landmark_key(row)
         new.values.insert(landmark, point)
-        new.keys |= {landmark, pose_key(0), target_key()}
+        new.keys.add(landmark)
         spread = settings.prior_distances * distance
         new.graph.add(weak_landmark_prior(landmark, point, spread))
         from_start, _, from_target, _ = matches.sigma[row].tolist()
@@ -161,7 +202,7 @@ class HomingProblem:
         new.graph.add(self._robust.bearing(target_key(), landmark, at_target, from_target))
         if settings.elevations:
             self._enter_height(new, row, distance)
-        self._entered[row] = True
+        self._entered[row], self._guesses[row] = True, point
 
     def _enter_height(self, new: NewPart, row: int, distance: float) -> None:
         """Its height, with its elevations from start and target."""
@@ -182,17 +223,19 @@ class HomingProblem:
         new: NewPart,
         rows: IntArray,
         tracked: TrackedBearings,
-        taken: BoolArray,
+        candidates: BoolArray,
         before: Motion,
-    ) -> None:
+    ) -> BoolArray:
         """Features that were too uncertain until now and have parallax to the last pose.
 
-        Judged with the bearing of this image from where the robot is expected.
+        Judged with the bearing of this image from where the robot is expected. Answers which
+        (m,) of the candidates entered.
         """
-        waiting = np.flatnonzero(taken & ~self._entered[rows])
+        waiting = np.flatnonzero(candidates)
+        entering = np.zeros(len(candidates), np.bool_)
         reach = float(np.hypot(*before.pose[:2]))
         if len(waiting) == 0 or reach == 0.0:
-            return
+            return entering
         pose = compose(before.pose, _travelled(before.velocity, tracked.time - before.time))
         matches = self._start.matches
         start = matches.bearing_a[rows[waiting]]
@@ -213,6 +256,14 @@ class HomingProblem:
         for k in np.flatnonzero(self._good(legs, spread)).tolist():
             distance = float(length * legs[k])
             self._enter(new, int(rows[waiting[k]]), distance * unit(start[k]), distance)
+            entering[waiting[k]] = True
+        return entering
+
+
+def _drift(motion: GraphMotionSettings, step: float) -> FloatArray:
+    """(3,) how far the robot may be from where it is expected: place in legs, heading."""
+    place = max(motion.forward, motion.sideways) * step**0.5
+    return np.array([place, place, np.deg2rad(motion.turning_deg) * step**0.5])
 
 
 def _travelled(velocity: FloatArray, step: float) -> FloatArray:

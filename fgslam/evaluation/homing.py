@@ -1,0 +1,171 @@
+"""Errors and consistency of homing: home direction and distance, robot, target, home vector.
+
+Truth is in metres and estimates in legs: truth is divided by the true leg. The leg itself is a
+convention, not knowledge: where an estimator holds the target's distance at 1, that is no degree
+of freedom, and its NEES counts direction and rotation alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.evaluation.consistency import Consistency, Nees, judge, nees
+from fgslam.homing_types import HomingEstimate, HomingTruth, home_vector_jacobian
+from fgslam.planar import wrap
+from fgslam.types import FloatArray
+
+DIVERGED_RAD = float(np.deg2rad(30.0))
+"""A home direction further off than this leads away, not home."""
+
+_HELD = 1e-3  # legs: a smaller deviation of the target's distance is a convention
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HomingErrors:
+    """Errors of one homing, image by image (k,), estimate minus truth.
+
+    Attributes:
+        direction: of the target from the robot, radians.
+        rotation: of the target against the robot, radians.
+        distance: to the target, legs; NaN where the estimator knows none.
+        robot, target, joint, home: NEES; without degrees of freedom where there is no covariance.
+            The target is judged as (distance, direction, rotation) from the start, home as the
+            same from the robot.
+    """
+
+    direction: FloatArray
+    rotation: FloatArray
+    distance: FloatArray
+    robot: Nees
+    target: Nees
+    joint: Nees
+    home: Nees
+
+    def last(self) -> HomingErrors:
+        """Those of the last image alone."""
+        parts = [Nees(n.values[-1:], n.dof[-1:]) for n in self._nees()]
+        return HomingErrors(
+            self.direction[-1:], self.rotation[-1:], self.distance[-1:], *parts
+        )
+
+    def _nees(self) -> tuple[Nees, Nees, Nees, Nees]:
+        return self.robot, self.target, self.joint, self.home
+
+
+def homing_errors(estimates: Sequence[HomingEstimate], truth: HomingTruth) -> HomingErrors:
+    """Compares an estimate for each image with the truth.
+
+    Args:
+        estimates: (k) one for each row of ``truth.robots``.
+        truth: of the same homing, in the same start frame, metres.
+
+    Raises:
+        ValueError: there are not as many estimates as true poses.
+    """
+    scale = np.array([1.0 / truth.leg_m, 1.0 / truth.leg_m, 1.0])
+    target = truth.target * scale
+    pairs = zip(estimates, truth.robots * scale, strict=True)
+    rows = [_row(estimate, robot, target) for estimate, robot in pairs]
+    homes, states, home_spreads, spreads = (np.array(part) for part in zip(*rows, strict=True))
+    distance = np.where(np.isfinite(home_spreads[:, 0, 0]), homes[:, 0], np.nan)
+    return HomingErrors(
+        direction=homes[:, 1],
+        rotation=homes[:, 2],
+        distance=distance,
+        robot=nees(states[:, :3], spreads[:, :3, :3]),
+        target=nees(states[:, 3:], spreads[:, 3:, 3:]),
+        joint=nees(states, spreads),
+        home=nees(homes, home_spreads),
+    )
+
+
+def _row(
+    estimate: HomingEstimate, robot: FloatArray, target: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Errors (3,) of home and (6,) of robot and target, and the covariances of both."""
+    home = estimate.home()
+    exact = _home(robot, target)
+    error = np.array([home.distance, home.direction, home.rotation]) - exact
+    error[1:] = wrap(error[1:])
+    polar, spread = _polar_target(estimate)
+    state = np.concatenate([estimate.robot - robot, polar - _home(np.zeros(3), target)])
+    state[[2, 4, 5]] = wrap(state[[2, 4, 5]])
+    if spread[3, 3] < _HELD**2:
+        state[3] = 0.0
+        spread[3, :] = spread[:, 3] = 0.0
+    return error, state, home.covariance, spread
+
+
+def _home(robot: FloatArray, target: FloatArray) -> FloatArray:
+    offset = target[:2] - robot[:2]
+    direction = np.arctan2(offset[1], offset[0]) - robot[2]
+    return np.array([np.hypot(*offset), direction, target[2] - robot[2]])
+
+
+def _polar_target(estimate: HomingEstimate) -> tuple[FloatArray, FloatArray]:
+    """Target (distance, direction, rotation) from the start; joint covariance with the robot."""
+    start = np.zeros(3)
+    change = np.eye(6)
+    change[3:, 3:] = home_vector_jacobian(start, estimate.target)[:, 3:]
+    return _home(start, estimate.target), change @ estimate.covariance @ change.T
+
+
+# --------------------------------------------------------------------------------------------
+# Many trials
+
+
+@dataclass(frozen=True, slots=True)
+class HomingSummary:
+    """What many independent homings say together.
+
+    Attributes:
+        trials: how many.
+        direction_median_deg, direction_p95_deg: of the absolute errors; likewise the others.
+        rotation_median_deg, rotation_p95_deg: of the rotation.
+        distance_median, distance_p95: of the distance left, legs; None where unknown.
+        diverged: trials whose direction is off by more than :data:`DIVERGED_RAD`, or no number.
+        robot, target, joint, home: NEES per degree of freedom with its band; None without.
+    """
+
+    trials: int
+    direction_median_deg: float
+    direction_p95_deg: float
+    rotation_median_deg: float
+    rotation_p95_deg: float
+    distance_median: float | None
+    distance_p95: float | None
+    diverged: int
+    robot: Consistency | None
+    target: Consistency | None
+    joint: Consistency | None
+    home: Consistency | None
+
+
+def summarise_homings(errors: Sequence[HomingErrors]) -> HomingSummary:
+    """Summary over trials, each with its last image.
+
+    Raises:
+        ValueError: there is no trial.
+    """
+    last = [one.last() for one in errors]
+    direction = np.abs(np.concatenate([one.direction for one in last]))
+    rotation = np.abs(np.concatenate([one.rotation for one in last]))
+    distance = np.abs(np.concatenate([one.distance for one in last]))
+    known = distance[np.isfinite(distance)]
+    return HomingSummary(
+        trials=len(last),
+        direction_median_deg=float(np.rad2deg(np.median(direction))),
+        direction_p95_deg=float(np.rad2deg(np.quantile(direction, 0.95))),
+        rotation_median_deg=float(np.rad2deg(np.median(rotation))),
+        rotation_p95_deg=float(np.rad2deg(np.quantile(rotation, 0.95))),
+        distance_median=float(np.median(known)) if len(known) else None,
+        distance_p95=float(np.quantile(known, 0.95)) if len(known) else None,
+        diverged=int(np.count_nonzero(~(direction <= DIVERGED_RAD))),
+        robot=judge([one.robot for one in last]),
+        target=judge([one.target for one in last]),
+        joint=judge([one.joint for one in last]),
+        home=judge([one.home for one in last]),
+    )
