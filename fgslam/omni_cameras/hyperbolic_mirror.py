@@ -6,8 +6,8 @@ image radius is
 
     r = focal * cos(alpha) / (xi - sin(alpha)),
 
-for every alpha below asin(xi): below the horizon and above it. For semi-axes a, b of the hyperboloid
-with c = sqrt(a^2 + b^2) and e = c / a, and a pinhole of focal length f,
+for every alpha below asin(xi): below the horizon and above it. For semi-axes a, b of the
+hyperboloid with c = sqrt(a^2 + b^2) and e = c / a, and a pinhole of focal length f,
 
     xi = 2 e / (1 + e^2),    focal = f (e^2 - 1) / (e^2 + 1).
 """
@@ -62,8 +62,8 @@ class HyperbolicMirror:
         inside = 0.0 <= self.centre_x < self.width and 0.0 <= self.centre_y < self.height
         if not inside:
             raise CalibrationError(
-                f"mirror: centre ({self.centre_x:g}, {self.centre_y:g}) lies outside the picture of "
-                f"{self.width}x{self.height} pixels; mend centre_x and centre_y"
+                f"mirror: centre ({self.centre_x:g}, {self.centre_y:g}) lies outside the picture "
+                f"of {self.width}x{self.height} pixels; mend centre_x and centre_y"
             )
 
     def elevation(self, radius: FloatArray) -> FloatArray:
@@ -126,7 +126,8 @@ def unified_parameters(a: float, b: float, pinhole_focal: float) -> tuple[float,
     """
     if min(a, b, pinhole_focal) <= 0.0:
         raise CalibrationError(
-            f"mirror: semi-axes {a:g} and {b:g}, focal length {pinhole_focal:g}; all must be positive"
+            f"mirror: semi-axes {a:g} and {b:g}, focal length {pinhole_focal:g}; all must be "
+            "positive"
         )
     eccentricity = np.hypot(a, b) / a
     squared = eccentricity**2
@@ -140,7 +141,8 @@ def mirror_seeing(
     """A centred mirror that fills the picture's height and shows elevations up to the given one.
 
     Args:
-        width, height: of the picture, pixels.
+        width: of the picture, pixels.
+        height: likewise.
         xi: the mirror's parameter.
         highest_elevation: at the outer rim, radians; below asin(xi).
         inner_radius: pixels.
