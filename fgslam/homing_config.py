@@ -5,11 +5,10 @@ One model for each task. :func:`load_experiment` reads both worlds and tells the
 
 from __future__ import annotations
 
-import typing
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
@@ -18,6 +17,8 @@ from fgslam.config_reading import Reader, apply_overrides, read_mapping
 from fgslam.errors import ConfigError
 from fgslam.settings.homing_estimators import HomingEstimatorSettings, HomingGraphSettings
 from fgslam.settings.homing_output import HomingOutputSettings
+from fgslam.settings.homing_vector import HomingVectorSettings
+from fgslam.settings.simulated_bearings import SimulatedBearingsSettings
 
 _TAKEN_FOLDERS = ("pictures", "compare", "logs", "runs")
 _GROUPS_OF_KINDS = ("dataset", "estimator")
@@ -44,6 +45,9 @@ ComparedList: TypeAlias = Annotated[
         "under `estimator`"
     ),
 ]
+
+
+_TASK = Field(description="which kind of homing experiment; SLAM has no such key")
 
 
 class HomingExperiment(BaseModel):
@@ -80,12 +84,29 @@ class HomingExperiment(BaseModel):
         return tuple(dict.fromkeys((*([] if live is None else [live]), *others)))
 
 
-TASKS: dict[str, type[HomingExperiment]] = {}
+class HomingTrialsConfig(HomingExperiment):
+    """Simulated homings of bearings alone: estimators against outliers."""
+
+    task: Annotated[Literal["homing_trials"], _TASK]
+    dataset: SimulatedBearingsSettings = SimulatedBearingsSettings()
+    outliers: Annotated[
+        tuple[Annotated[float, Field(ge=0.0, lt=1.0)], ...],
+        Field(
+            min_length=1,
+            description="shares of outliers, each with its own trials: of wrong matches, and half "
+            "each of jumping tracks and of gross bearings; they replace the dataset's own",
+        ),
+    ] = (0.0, 0.1, 0.2, 0.3)
+    trials: Annotated[int, Field(ge=1, description="homings for each share")] = 200
+    homing_vector: HomingVectorSettings = HomingVectorSettings()
+    estimator: LiveHoming = HomingGraphSettings()
+    compare: ComparedList = ()
+
+
+TASKS: dict[str, type[HomingExperiment]] = {
+    "homing_trials": HomingTrialsConfig,
+}
 """The model of each task."""
-
-
-def _task_of(model: type[HomingExperiment]) -> str:
-    return str(typing.get_args(model.model_fields["task"].annotation)[0])
 
 
 # --------------------------------------------------------------------------------------------

@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from fgslam.config import ExperimentConfig
+from fgslam.homing_config import TASKS
 
 Node: TypeAlias = dict[str, Any]
 
 PAGE = Path(__file__).parents[1] / "docs" / "configuration.md"
-_UNWRITTEN = ("kind", "provenance")
+_UNWRITTEN = ("kind", "task", "provenance")
 _INTRODUCTION = """# Configuration
 
 <!-- Made by scripts/make_configuration_docs.py: edit the settings' descriptions, not this page. -->
@@ -27,8 +28,16 @@ the old one. Unknown keys, keys given twice, NaN and infinity are refused. A run
 configuration, every default filled in, to `RUN/config.yaml`; that file is itself a configuration
 and repeats the run.
 
+Experiments of homing have a key `task`; theirs is the [second part](#homing-experiments) of this page.
+
 Keys without a default must be given. Units are metres, seconds and pixels, angles in degrees,
 unless the key's name or meaning says otherwise.
+"""
+
+_HOMING = """## Homing experiments
+
+Each task has its own keys; the groups of keys that they share are described once, below all of
+them.
 """
 
 
@@ -39,7 +48,22 @@ def configuration_page() -> str:
     for name, node in schema["properties"].items():
         if name not in _UNWRITTEN:
             sections += _sections(schema, node, name, 2)
+    sections += _homing()
     return "\n".join(section.rstrip() + "\n" for section in sections)
+
+
+def _homing() -> Iterator[str]:
+    """The keys of each task, then the groups of all of them, each once."""
+    yield _HOMING
+    groups: dict[str, None] = {}
+    for task, model in TASKS.items():
+        schema = model.model_json_schema()
+        told = " ".join(schema.get("description", "").split())
+        yield "\n".join([f"### Task `{task}`", "", told, "", *_table(schema, schema)])
+        for name, node in schema["properties"].items():
+            if name not in _UNWRITTEN:
+                groups |= dict.fromkeys(_sections(schema, node, name, 3))
+    yield from groups
 
 
 def _sections(schema: Node, node: Node, dotted: str, level: int) -> Iterator[str]:

@@ -10,10 +10,15 @@ import yaml
 
 from fgslam.config import ExperimentConfig, load_config, parse_config
 from fgslam.errors import ConfigError
+from fgslam.homing_config import is_homing
 from fgslam.settings.datasets import ConstantVelocitySettings, ImageFolderSettings
 from fgslam.settings.lab import RenderedLabSettings
 
-EXPERIMENTS = sorted((Path(__file__).parents[2] / "experiments").glob("*.yaml"))
+EXPERIMENTS = [
+    path
+    for path in sorted((Path(__file__).parents[2] / "experiments").glob("*.yaml"))
+    if not is_homing(path)
+]
 MINIMAL: dict[str, Any] = {"name": "x", "dataset": {"kind": "image_folder", "path": "there"}}
 LAB: dict[str, Any] = {"name": "x", "dataset": {"kind": "rendered_lab"}}
 

@@ -9,6 +9,7 @@ from types import ModuleType
 import pytest
 
 from fgslam.config import ExperimentConfig
+from fgslam.homing_config import TASKS
 
 ROOT = Path(__file__).parents[2]
 
@@ -38,6 +39,19 @@ def test_every_key_and_kind_is_on_the_page(maker: ModuleType) -> None:
                 assert f"kind `{node['const']}`" in page
             else:
                 assert f"| `{name}` |" in page or f".{name}`" in page, name
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_key_of_every_homing_task_is_on_the_page(maker: ModuleType, task: str) -> None:
+    page = maker.configuration_page()
+    assert f"### Task `{task}`" in page
+    schema = TASKS[task].model_json_schema()
+    for group in (schema, *schema["$defs"].values()):
+        for name, node in group.get("properties", {}).items():
+            if name == "kind":
+                assert f"kind `{node['const']}`" in page
+            elif name not in ("task", "provenance"):
+                assert f"| `{name}` |" in page or f"{name}`" in page, name
 
 
 def test_a_row_holds_range_default_and_meaning(maker: ModuleType) -> None:

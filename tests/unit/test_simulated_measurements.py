@@ -12,7 +12,7 @@ from simulated import assert_same_bits
 
 from fgslam import geometry as g
 from fgslam.backend.landmark_kalman import LandmarkKalman
-from fgslam.config import load_config, make_config
+from fgslam.config import ExperimentConfig, make_config
 from fgslam.datasets.opening import open_measurements
 from fgslam.errors import ConfigError
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
@@ -424,8 +424,9 @@ def test_the_paper_s_drive_is_as_good_as_rendered() -> None:
 SIMULATED = {
     path.stem: config
     for path in sorted((Path(__file__).parents[2] / "experiments").glob("*.yaml"))
-    for config in (load_config(path),)
-    if isinstance(config.dataset, SimulatedMeasurementsSettings)
+    for config in (load_experiment(path),)
+    if isinstance(config, ExperimentConfig)
+    and isinstance(config.dataset, SimulatedMeasurementsSettings)
 }
 
 

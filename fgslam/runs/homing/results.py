@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +43,11 @@ class HomingResult:
     verdict: tuple[str, ...]
     tables: tuple[TextTable, ...] = ()
     remarks: tuple[str, ...] = ()
+
+
+def jobs_of(config: HomingExperiment) -> int:
+    """How many processes at a time."""
+    return config.jobs or os.cpu_count() or 1
 
 
 def begin(
