@@ -28,7 +28,7 @@ the old one. Unknown keys, keys given twice, NaN and infinity are refused. A run
 configuration, every default filled in, to `RUN/config.yaml`; that file is itself a configuration
 and repeats the run.
 
-Experiments of homing have a key `task`; theirs is the [second part](#homing-experiments) of this page.
+Experiments of homing have a key `task`; theirs is the [second part](#homing-experiments).
 
 Keys without a default must be given. Units are metres, seconds and pixels, angles in degrees,
 unless the key's name or meaning says otherwise.
