@@ -101,7 +101,7 @@ class ColourBank:
         total += texels.take(top + x1) * _rounded(right_above)
         total += texels.take(bottom + x0) * _rounded(left_below)
         total += texels.take(bottom + x1) * _rounded(right_below)
-        return total
+        return np.asarray(total)
 
 
 def _rounded(weight: Float32) -> Packed:

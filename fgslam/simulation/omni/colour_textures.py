@@ -50,7 +50,7 @@ def ramped(rng: np.random.Generator, grey: Grey, saturation: float) -> Colour:
     red, blue = (np.interp(level, at, knot) * fade for knot in knots)
     hue = 1.0 + red[:, None] * _TO_RED + blue[:, None] * _TO_BLUE
     chosen = hue[np.clip(grey, 0.0, 255.0).astype(np.int64)]
-    return np.clip(grey[..., None] * chosen, 0.0, 255.0).astype(np.float32)
+    return np.asarray(np.clip(grey[..., None] * chosen, 0.0, 255.0), dtype=np.float32)
 
 
 def painting(rng: np.random.Generator, side: int) -> Colour:

@@ -179,7 +179,7 @@ class MirrorRenderer:
     def _shade_layer(self, layer: Layer, planes: Float32, patch: Int32, rays: _Rays) -> Float32:
         g = planes.take(patch, axis=1)
         d, dc, dr = rays.direction, rays.by_column, rays.by_row
-        distance = 1.0 / np.maximum(_dot(g[8:], d), np.float32(LEAST_INVERSE_DEPTH))
+        distance = np.reciprocal(np.maximum(_dot(g[8:], d), np.float32(LEAST_INVERSE_DEPTH)))
         u, v = _dot(g[:3], d) * distance, _dot(g[4:7], d) * distance
         w_column, w_row = _dot(g[8:], dc), _dot(g[8:], dr)
         width, height = (side.take(patch) * distance for side in layer.size.astype(np.float32).T)
@@ -229,6 +229,24 @@ def visible(
     # A millimetre in four metres short of the point, so that its own surface does not count.
     free = ~scene.caster.blocked(np.asarray(origins), offset, 1.0 - 5e-4)
     return pixels, free & np.isfinite(pixels).all(axis=1)
+
+
+def surface_points(
+    scene: Layer, camera: OmniCamera, pose: FloatArray, pixels: FloatArray
+) -> FloatArray:
+    """(n, 3) points of the scene that pixels (n, 2) show, NaN where they show nothing.
+
+    Exact in double precision but for which surface is hit, which is the ray caster's.
+    """
+    rays = camera.rays(pixels)
+    directions = np.nan_to_num(rays) @ pose[:3, :3].T
+    patch, _ = scene.caster.cast(pose[:3, 3], directions.astype(np.float32))
+    weights = scene.planes(pose, np.eye(3))[8:, np.maximum(patch, 0)]
+    inverse = np.sum(weights.T * np.nan_to_num(rays), axis=1)
+    shown = (patch >= 0) & np.isfinite(rays).all(axis=1)
+    out = np.full((len(pixels), 3), np.nan)
+    out[shown] = pose[:3, 3] + directions[shown] / inverse[shown, None]
+    return out
 
 
 def _pixel_rays(camera: OmniCamera) -> tuple[FloatArray, tuple[FloatArray, FloatArray]]:

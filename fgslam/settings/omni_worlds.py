@@ -1,0 +1,203 @@
+"""Settings of the rendered house: camera, wheelchair, range sensor, disturbances, reference path.
+
+Defaults: the camera is that of Goedemé et al. 2005 (section I: hyperbolic mirror, 320 x 240); the
+wheelchair's limits are those of an indoor electric wheelchair driven slowly; slip and tilt are the
+issue's (2 degrees at most). What the paper leaves open is said to be so in each description.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, TypeAlias
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fgslam.settings.base import STRICT
+
+NonNegative = Annotated[float, Field(ge=0.0)]
+
+
+@dataclass(frozen=True, config=STRICT)
+class HouseMirrorSettings:
+    """A hyperbolic mirror above an upward-looking camera, as the unified sphere model (B7)."""
+
+    kind: Literal["mirror"] = "mirror"
+    width: Annotated[int, Field(ge=64, le=4096, description="image width, pixels")] = 320
+    height: Annotated[int, Field(ge=64, le=4096, description="image height, pixels")] = 240
+    xi: Annotated[
+        float, Field(gt=0.0, lt=1.0, description="eccentricity parameter of the unified model")
+    ] = 0.92
+    top_elevation_deg: Annotated[
+        float,
+        Field(
+            gt=-20.0, lt=60.0, description="at the mirror's rim, which touches the image's border"
+        ),
+    ] = 25.0
+    bottom_elevation_deg: Annotated[
+        float,
+        Field(
+            gt=-89.0, lt=0.0, description="at the inner edge, below which the camera sees itself"
+        ),
+    ] = -65.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class HousePanoramaSettings:
+    """An ideal panoramic camera: columns are bearings, rows elevations."""
+
+    kind: Literal["equirectangular"] = "equirectangular"
+    width: Annotated[int, Field(ge=64, le=8192, description="image width, pixels")] = 1024
+    height: Annotated[int, Field(ge=32, le=4096, description="image height, pixels")] = 512
+
+
+HouseCameraSettings: TypeAlias = Annotated[
+    HouseMirrorSettings | HousePanoramaSettings, Field(discriminator="kind")
+]
+
+
+@dataclass(frozen=True, config=STRICT)
+class WheelchairSettings:
+    """The simulated wheelchair: a unicycle with limits, latency and slip."""
+
+    max_speed_m_s: Annotated[float, Field(gt=0.0, le=3.0, description="limit, forwards")] = 0.5
+    max_turn_deg_s: Annotated[float, Field(gt=0.0, le=180.0, description="limit, either way")] = (
+        45.0
+    )
+    max_acceleration_m_s2: Annotated[float, Field(gt=0.0, le=10.0, description="limit")] = 0.5
+    max_turn_acceleration_deg_s2: Annotated[
+        float, Field(gt=0.0, le=1000.0, description="limit")
+    ] = 120.0
+    latency_s: Annotated[
+        float, Field(ge=0.0, le=2.0, description="from a command to its effect, seconds")
+    ] = 0.1
+    radius_m: Annotated[
+        float, Field(gt=0.05, le=1.0, description="of the disc that must not touch anything")
+    ] = 0.35
+    speed_scale: Annotated[
+        float,
+        Field(ge=0.0, le=0.5, description="relative error of speed, drawn once a drive (sigma)"),
+    ] = 0.03
+    turn_scale: Annotated[
+        float,
+        Field(ge=0.0, le=0.5, description="relative error of turns, drawn once a drive (sigma)"),
+    ] = 0.03
+    pull_deg_m: Annotated[
+        float,
+        Field(ge=0.0, le=30.0, description="turn per metre unasked for, once a drive (sigma)"),
+    ] = 1.0
+    slip_m_sqrt_m: Annotated[
+        float, Field(ge=0.0, le=0.5, description="noise along the way, metres per root metre")
+    ] = 0.02
+    slip_deg_sqrt_m: Annotated[
+        float, Field(ge=0.0, le=45.0, description="noise of heading, degrees per root metre")
+    ] = 1.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class RangeSensorSettings:
+    """Range finders around the wheelchair, like the sonars below the paper's obstacle avoidance."""
+
+    beams: Annotated[int, Field(ge=4, le=720, description="evenly spread, the first ahead")] = 32
+    heights_m: Annotated[
+        tuple[Annotated[float, Field(gt=0.0, le=2.0)], ...],
+        Field(min_length=1, description="a beam sees what stands at any of these heights"),
+    ] = (0.15, 0.45, 0.72, 1.0)
+    max_range_m: Annotated[float, Field(gt=0.1, le=50.0, description="nothing is seen beyond")] = (
+        5.0
+    )
+    noise_m: Annotated[float, Field(ge=0.0, le=0.5, description="sigma of a range, metres")] = 0.02
+
+
+@dataclass(frozen=True, config=STRICT)
+class HouseExposureSettings:
+    """A camera's automatic exposure, over time."""
+
+    gain: Annotated[float, Field(gt=0.05, lt=10.0, description="mean factor of all levels")] = 1.25
+    wave: Annotated[float, Field(ge=0.0, lt=0.9, description="amplitude of the gain's wave")] = 0.0
+    period_s: Annotated[float, Field(gt=0.1, description="of that wave, seconds")] = 20.0
+    offset: Annotated[float, Field(ge=-50.0, le=50.0, description="added grey levels")] = 0.0
+    gamma: Annotated[float, Field(gt=0.2, lt=5.0, description="exponent of brightness")] = 1.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class HouseLightSettings:
+    """The lamps: how bright, how warm, and which."""
+
+    level: Annotated[
+        float, Field(gt=0.0, le=3.0, description="brightness; 0.05 is a dark house")
+    ] = 1.0
+    warmth: Annotated[
+        float, Field(ge=-0.5, le=0.5, description="red up and blue down by this fraction")
+    ] = 0.0
+    evening: Annotated[
+        float,
+        Field(ge=0.0, le=1.0, description="1: every other lamp is off, and shadows fall otherwise"),
+    ] = 0.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class HouseTiltSettings:
+    """Tilt of the camera against the vertical."""
+
+    constant_deg: Annotated[
+        float,
+        Field(ge=0.0, le=10.0, description="size of a tilt that stays; its side is drawn"),
+    ] = 0.0
+    sway_deg: Annotated[
+        float, Field(ge=0.0, le=10.0, description="amplitude of a slow swaying, roll and pitch")
+    ] = 0.0
+    period_s: Annotated[float, Field(gt=0.5, description="of the swaying, seconds")] = 7.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class HousePathSettings:
+    """The reference path, laid by a planner from the seed."""
+
+    legs: Annotated[int, Field(ge=1, le=100, description="targets to reach one after another")] = 10
+    spacing_m: Annotated[
+        float, Field(ge=0.5, le=8.0, description="between a target and the next, metres")
+    ] = 3.0
+    rooms: Annotated[
+        Literal["house", "hall"],
+        Field(
+            description="`house`: through doors from room to room; `hall`: within the largest room"
+        ),
+    ] = "house"
+    clearance_m: Annotated[
+        float,
+        Field(ge=0.3, le=1.0, description="of the straight line from a target to the next, metres"),
+    ] = 0.55
+
+
+@dataclass(frozen=True, config=STRICT)
+class OmniHouseSettings:
+    """A wheelchair with an omnidirectional camera in a furnished house of 20 m x 15 m."""
+
+    kind: Literal["omni_house"] = "omni_house"
+    camera: HouseCameraSettings = HouseMirrorSettings()
+    camera_height_m: Annotated[
+        float, Field(gt=0.2, lt=2.4, description="viewpoint above the floor, metres")
+    ] = 1.2
+    house_seed: Annotated[int, Field(ge=0, description="of textures and furniture")] = 0
+    door_width_m: Annotated[
+        float, Field(ge=0.9, le=2.4, description="of the openings between rooms, metres")
+    ] = 1.6
+    frame_rate_hz: Annotated[
+        float, Field(gt=0.0, le=120.0, description="images a second while driving")
+    ] = 10.0
+    noise_grey: Annotated[
+        float, Field(ge=0.0, le=50.0, description="Gaussian image noise, grey levels")
+    ] = 2.0
+    people: Annotated[int, Field(ge=0, le=8, description="who walk about in the house")] = 0
+    path: HousePathSettings = HousePathSettings()
+    wheelchair: WheelchairSettings = WheelchairSettings()
+    range_sensor: RangeSensorSettings = RangeSensorSettings()
+    exposure: HouseExposureSettings = HouseExposureSettings()
+    light: HouseLightSettings = HouseLightSettings()
+    tilt: HouseTiltSettings = HouseTiltSettings()
+    target_light: Annotated[
+        HouseLightSettings, Field(description="when the target images were taken")
+    ] = HouseLightSettings(level=0.9, warmth=0.04, evening=0.3)
+    target_exposure: Annotated[HouseExposureSettings, Field(description="of the target images")] = (
+        HouseExposureSettings()
+    )
