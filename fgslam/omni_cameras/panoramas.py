@@ -11,14 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.errors import CalibrationError
+from fgslam.omni_cameras.image_bounds import inside, require_size
 from fgslam.types import FloatArray
 
 _HALF_TURN = np.pi
-
-
-def _require_size(what: str, width: int, height: int) -> None:
-    if width < 2 or height < 2:
-        raise CalibrationError(f"{what}: a picture of {width}x{height} pixels; give at least 2x2")
 
 
 def _bearing(columns: FloatArray, width: int) -> FloatArray:
@@ -28,14 +24,6 @@ def _bearing(columns: FloatArray, width: int) -> FloatArray:
 def _column(rays: FloatArray, width: int) -> FloatArray:
     bearing = np.arctan2(rays[:, 1], rays[:, 0])
     return (_HALF_TURN - bearing) * ((width - 1) / (2.0 * _HALF_TURN))
-
-
-def _inside(pixels: FloatArray, width: int, height: int) -> FloatArray:
-    """Pixels (n, 2) with NaN where they lie outside the picture's outermost pixel centres."""
-    c, r = pixels[:, 0], pixels[:, 1]
-    # Half a pixel of margin: a pixel reaches that far around its centre.
-    outside = (c < -0.5) | (c > width - 0.5) | (r < -0.5) | (r > height - 0.5)
-    return np.where(outside[:, None], np.nan, pixels)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +40,7 @@ class Equirectangular:
     bottom_elevation: float = -np.pi / 2
 
     def __post_init__(self) -> None:
-        _require_size("equirectangular panorama", self.width, self.height)
+        require_size("equirectangular panorama", self.width, self.height)
         if not -np.pi / 2 <= self.bottom_elevation < self.top_elevation <= np.pi / 2:
             raise CalibrationError(
                 f"equirectangular panorama: elevations from {self.bottom_elevation:g} to "
@@ -64,7 +52,7 @@ class Equirectangular:
 
     def rays(self, pixels: FloatArray) -> FloatArray:
         """(n, 3) unit rays; see :class:`fgslam.omni_cameras.protocol.OmniCamera`."""
-        pixels = _inside(np.asarray(pixels, dtype=np.float64), self.width, self.height)
+        pixels = inside(np.asarray(pixels, dtype=np.float64), self.width, self.height)
         bearing = _bearing(pixels[:, 0], self.width)
         elevation = self.top_elevation - pixels[:, 1] * self._per_row()
         level = np.cos(elevation)
@@ -77,7 +65,7 @@ class Equirectangular:
         rays = np.asarray(rays, dtype=np.float64)
         elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
         rows = (self.top_elevation - elevation) / self._per_row()
-        return _inside(np.column_stack([_column(rays, self.width), rows]), self.width, self.height)
+        return inside(np.column_stack([_column(rays, self.width), rows]), self.width, self.height)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +83,7 @@ class Cylinder:
     tan_top: float
 
     def __post_init__(self) -> None:
-        _require_size("cylinder", self.width, self.height)
+        require_size("cylinder", self.width, self.height)
         if not -np.inf < self.tan_bottom < self.tan_top < np.inf:
             raise CalibrationError(
                 f"cylinder: tangents of elevation from {self.tan_bottom:g} to {self.tan_top:g}; "
@@ -109,7 +97,7 @@ class Cylinder:
 
     def rays(self, pixels: FloatArray) -> FloatArray:
         """(n, 3) unit rays; see :class:`fgslam.omni_cameras.protocol.OmniCamera`."""
-        pixels = _inside(np.asarray(pixels, dtype=np.float64), self.width, self.height)
+        pixels = inside(np.asarray(pixels, dtype=np.float64), self.width, self.height)
         bearing = _bearing(pixels[:, 0], self.width)
         tangent = self.tangents(pixels[:, 1])
         level = 1.0 / np.sqrt(1.0 + tangent**2)
@@ -122,4 +110,4 @@ class Cylinder:
         with np.errstate(divide="ignore", invalid="ignore"):
             tangent = rays[:, 2] / np.hypot(rays[:, 0], rays[:, 1])
         rows = (self.tan_top - tangent) / per_row
-        return _inside(np.column_stack([_column(rays, self.width), rows]), self.width, self.height)
+        return inside(np.column_stack([_column(rays, self.width), rows]), self.width, self.height)
