@@ -21,6 +21,7 @@ from fgslam.export.homing_report.local_map import (
     local_map_figure,
     upwards,
 )
+from fgslam.export.homing_report.network import Links, network_figure, unfolded
 from fgslam.export.homing_report.page import render
 from fgslam.export.homing_report.plan import catchment_figure, drive_figure
 from fgslam.export.report.traces import Figure, Trace
@@ -142,3 +143,26 @@ def test_nothing_from_outside_is_markup() -> None:
     values = re.search(r'id="report-data">(.*?)</script>', text, re.DOTALL)
     assert values is not None
     assert set(json.loads(values.group(1))["figures"]) >= {"local-map", "drive"}
+
+
+def test_a_chain_unfolds_to_a_line() -> None:
+    places = unfolded(5, [(0, 1), (1, 2), (2, 3), (3, 4)])
+    np.testing.assert_allclose(np.abs(np.diff(places[:, 0])), 1.0, atol=1e-9)
+    np.testing.assert_allclose(places[:, 1], 0.0, atol=1e-6)
+    apart = unfolded(4, [(0, 1), (2, 3)])
+    assert np.linalg.norm(apart[0] - apart[1]) < np.linalg.norm(apart[0] - apart[2])
+    assert unfolded(1, []).shape == (1, 2)
+
+
+def test_links_have_a_switch_for_each_kind_that_there_is() -> None:
+    kinds = [
+        Links("right", 0, ((0, 1), (1, 2)), ("2 deg", "3 deg")),
+        Links("none", 1, (), ()),
+        Links("wrong", 2, ((0, 2),), ("40 deg",), shown=False),
+    ]
+    places = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    figure = network_figure(("k", "Pairs", "What."), places, ("2", "3", "4"), kinds)
+    assert [(s.label, s.on) for s in figure.switches] == [("right (2)", True), ("wrong (1)", False)]
+    marks = [t for t in figure.traces if t["name"] == "wrong" and t["mode"] == "markers"]
+    np.testing.assert_allclose(points(marks[0]), [[0.5, 0.5]])
+    assert figure.traces[-1]["text"] == ["2", "3", "4"]
