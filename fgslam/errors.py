@@ -35,6 +35,10 @@ class MeasurementLogError(FgslamError):
     """A measurement log is truncated, foreign, or of an unknown version."""
 
 
+class StoredMapError(FgslamError):
+    """A path memory or a topological map is truncated, foreign, or of an unknown version."""
+
+
 class OutputError(FgslamError):
     """The run folder cannot be written, or it exists already."""
 

@@ -161,6 +161,9 @@ class RefusalReason(str, Enum):
     AMBIGUOUS = "ambiguous"
     UNCERTAIN = "uncertain"
     AT_TARGET = "at_target"
+    # Of a homing under way
+    LOST = "lost"
+    NO_PROGRESS = "no_progress"
 
 
 @dataclass(frozen=True, slots=True)

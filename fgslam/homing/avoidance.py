@@ -1,0 +1,145 @@
+"""The lower layer that may override the steering: obstacles in a range scan (IV; design G17).
+
+It is kept apart from homing, as in the paper: homing says where home is, this says how to get past
+what stands in the way, and the next image corrects the rest.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from fgslam.homing.command import Drive
+from fgslam.planar import wrap
+from fgslam.settings.homing_behaviour import AvoidanceSettings
+from fgslam.types import FloatArray
+
+_AHEAD = np.deg2rad(45.0)  # farther off than this: turn on the spot
+_BRAKE = 0.5  # part of the speed at which the clear way is driven in a second
+
+
+class RangeScan(NamedTuple):
+    """A planar scan around the robot.
+
+    Attributes:
+        angles: (n,) bearings of the beams, radians.
+        ranges: (n,) metres; infinite, or the sensor's range, where there is nothing. NaN where a
+            beam failed.
+    """
+
+    angles: FloatArray
+    ranges: FloatArray
+
+
+class ObstacleAvoider(Protocol):
+    """Looks at what the steering wants and at the scan, and has the last word."""
+
+    def override(self, wanted: Drive, heading: float, scan: RangeScan) -> Drive:
+        """What is driven in the end.
+
+        Args:
+            wanted: by the steering.
+            heading: direction of home, radians.
+            scan: taken just now.
+        """
+        ...
+
+
+class NoAvoidance:
+    """For robots without a range sensor: the steering is obeyed."""
+
+    def override(self, wanted: Drive, heading: float, scan: RangeScan) -> Drive:
+        """``wanted`` itself."""
+        return wanted
+
+
+class CorridorAvoidance:
+    """Drives along the free corridor that is nearest to home's direction.
+
+    A vector field histogram (Borenstein and Koren 1991) with the robot's width taken in exactly: a
+    direction's clear way is the distance to the first scan point within a corridor of the
+    robot's width, and it is free if that is longer than the look-ahead, which grows with
+    speed. Home's own direction is taken whenever it is free: then nothing is overridden except that
+    the speed is bounded by the clear way.
+    """
+
+    def __init__(self, settings: AvoidanceSettings) -> None:
+        self._settings = settings
+        step = 2.0 * np.pi / settings.directions
+        self._directions: FloatArray = -np.pi + step * np.arange(settings.directions, dtype=float)
+        self._chosen: float | None = None
+
+    def override(self, wanted: Drive, heading: float, scan: RangeScan) -> Drive:
+        """See :class:`ObstacleAvoider`."""
+        if wanted.speed <= 0.0 and self._chosen is None:
+            return wanted  # turning on the spot endangers nobody
+        s = self._settings
+        points = _points(scan)
+        needed = s.look_ahead_m + s.look_ahead_s * max(wanted.speed, 0.0)
+        if clear_ways(np.array([heading]), points, s.half_width_m)[0] >= needed:
+            self._chosen = None
+            return self._slowed(wanted, points)
+        self._chosen = self._choose(heading, points, needed)
+        return self._drive(wanted, self._chosen, points)
+
+    def _choose(self, heading: float, points: FloatArray, needed: float) -> float:
+        """The best free direction; none being free, the one with the longest clear way."""
+        ways = clear_ways(self._directions, points, self._settings.half_width_m)
+        free = ways >= needed
+        if not free.any():
+            return float(self._directions[int(np.argmax(ways))])
+        cost = np.abs(wrap(self._directions - heading))
+        if self._chosen is not None:
+            kept = np.abs(wrap(self._directions - self._chosen))
+            cost = cost + self._settings.keep_weight * kept
+        return float(self._directions[int(np.argmin(np.where(free, cost, np.inf)))])
+
+    def _drive(self, wanted: Drive, direction: float, points: FloatArray) -> Drive:
+        s = self._settings
+        limit = np.deg2rad(s.max_turn_deg_s)
+        rate = float(np.clip(s.gain_per_s * direction, -limit, limit))
+        if abs(direction) > _AHEAD:
+            return Drive(0.0, rate, True)
+        slowed = self._slowed(Drive(wanted.speed, rate, True), points)
+        return Drive(slowed.speed * float(np.cos(direction)), rate, True)
+
+    def _slowed(self, drive: Drive, points: FloatArray) -> Drive:
+        """No faster than the clear way straight ahead allows."""
+        way = clear_ways(np.zeros(1), points, self._settings.half_width_m)[0]
+        most = _BRAKE * max(float(way), 0.0)
+        if drive.speed <= most:
+            return drive
+        return Drive(most, drive.turn_rate, True)
+
+
+def clear_ways(directions: FloatArray, points: FloatArray, half_width: float) -> FloatArray:
+    """(k,) metres that a robot of this half width can drive along each direction (k,).
+
+    Args:
+        directions: radians from the robot's heading.
+        points: (n, 2) obstacles in its axes.
+        half_width: metres; the robot's front is a half circle of this radius.
+
+    Returns:
+        Up to where the robot would touch a point; infinite where there is none in the corridor,
+        0 where a point is inside the robot already and lies ahead.
+    """
+    along = np.cos(directions)[:, None] * points[:, 0] + np.sin(directions)[:, None] * points[:, 1]
+    across = np.cos(directions)[:, None] * points[:, 1] - np.sin(directions)[:, None] * points[:, 0]
+    hit = (along > 0.0) & (np.abs(across) < half_width)
+    front = np.sqrt(np.maximum(half_width**2 - across**2, 0.0))
+    way = np.where(hit, np.maximum(along - front, 0.0), np.inf)
+    return np.asarray(way.min(axis=1, initial=np.inf))
+
+
+def _points(scan: RangeScan) -> FloatArray:
+    """(n, 2) of the beams that hit something."""
+    hit = np.isfinite(scan.ranges)
+    r, a = np.asarray(scan.ranges)[hit], np.asarray(scan.angles)[hit]
+    return np.column_stack([r * np.cos(a), r * np.sin(a)])
+
+
+def make_avoider(settings: AvoidanceSettings) -> ObstacleAvoider:
+    """The avoider that the settings name."""
+    return NoAvoidance() if settings.method == "none" else CorridorAvoidance(settings)

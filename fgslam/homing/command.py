@@ -1,0 +1,66 @@
+"""What a homing tells the wheels with every image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from fgslam.homing_types import Refusal
+from fgslam.types import FloatArray
+
+
+class HomingState(str, Enum):
+    """Where a homing stands; the value is written into files."""
+
+    INITIALISE = "initialise"
+    """Standing: the target is not matched yet."""
+    DRIVE = "drive"
+    CONFIRM = "confirm"
+    """Standing: a new homing vector contradicts the estimate."""
+    BLIND = "blind"
+    """Slowly straight on: there are no tracks, and the target is not matched anew yet."""
+    WAIT = "wait"
+    """Standing: the same, after the longest blind drive."""
+    ARRIVED = "arrived"
+    REFUSED = "refused"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Command:
+    """The interface to what drives the robot (G17).
+
+    Attributes:
+        time: of the image, seconds.
+        state: of the homing.
+        heading: direction of home from the robot's heading, radians; 0 where it is not known.
+        remaining: part of the leg that is left: 1 where it began; its last known value while
+            there is no estimate.
+        rotation: heading of the target minus the present one, radians; NaN while not known.
+        covariance: (3, 3) of (remaining, heading, rotation); NaN while there is no estimate.
+        stop: the robot must stand.
+        reason: one clause: why the state is what it is.
+        target: number of the target image.
+        final: it is the path's last one.
+        refusal: why the homing ended, in state REFUSED.
+    """
+
+    time: float
+    state: HomingState
+    heading: float
+    remaining: float
+    rotation: float
+    covariance: FloatArray
+    stop: bool
+    reason: str
+    target: int = 0
+    final: bool = True
+    refusal: Refusal | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """Speed (m/s) and turning rate (rad/s, counter-clockwise); whether avoidance changed them."""
+
+    speed: float
+    turn_rate: float
+    overridden: bool = False

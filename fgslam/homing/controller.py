@@ -1,0 +1,274 @@
+"""One homing as a state machine: initialise, drive and update, stop (G3, G19; sections II to IV).
+
+The controller knows no metres. Lengths are parts of the leg, the distance to the target where the
+robot set out for it. When the target is matched anew on the way, the new homing's unit is what was
+left then, so that the remaining part goes on from where it was; being a distance to the target, it
+still ends at 0 however wrong that unit is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from fgslam.errors import EstimatorError
+from fgslam.homing.command import Command, HomingState
+from fgslam.homing.eyes import HomingEyes
+from fgslam.homing.underway import EstimatorMaker, Fault, HomingUnderWay
+from fgslam.homing_types import HomingVector, OmniFeatures, Refusal, RefusalReason
+from fgslam.planar import wrap
+from fgslam.settings.homing_behaviour import HomingControlSettings
+from fgslam.types import ByteArray
+
+_PROGRESS = 0.02  # parts of a leg; less is noise of the distance
+
+
+class HomingController:
+    """Brings the robot to one target image.
+
+    Attributes:
+        underway: the homing since the target was last matched; None while it is not.
+        initialisations: how often it was matched so far, 1 when nothing went wrong.
+        remaining: part of the leg that is left, as last known.
+    """
+
+    def __init__(
+        self,
+        eyes: HomingEyes,
+        target: OmniFeatures,
+        make_estimator: EstimatorMaker,
+        settings: HomingControlSettings,
+    ) -> None:
+        self._eyes = eyes
+        self._target = target
+        self._make_estimator = make_estimator
+        self._settings = settings
+        self.underway: HomingUnderWay | None = None
+        self.initialisations = 0
+        self.remaining = 1.0
+        self._time: float | None = None
+        self._ended: Command | None = None
+        self._heading = 0.0
+        self._was_ahead = False
+        self._progress = _Progress(settings.stall_s)
+        self._next_try = -np.inf
+        self._blind_until = -np.inf
+        self._standing_since: float | None = None
+        self._pending: HomingVector | None = None
+
+    def step(self, image: ByteArray, time: float) -> Command:
+        """Takes in one image.
+
+        Args:
+            image: (h, w, 3) uint8.
+            time: seconds; must increase from step to step.
+
+        Raises:
+            EstimatorError: time does not increase; nothing has changed then.
+        """
+        self._take_time(time)
+        if self._ended is not None:
+            return replace(self._ended, time=time)
+        if self.underway is None:
+            return self._seek(image, time, "target not matched yet")
+        return self._go_on(self.underway, image, time)
+
+    def _take_time(self, time: float) -> None:
+        last = self._time
+        if not np.isfinite(time) or (last is not None and time <= last):
+            raise EstimatorError(
+                f"homing: image at {time:.9f} s does not come after "
+                f"{'the start' if last is None else f'{last:.9f} s'}; give images in the order of "
+                "their times"
+            )
+        self._time = time
+
+    # ----------------------------------------------------------------------------------------
+    # Under way
+
+    def _go_on(self, homing: HomingUnderWay, image: ByteArray, time: float) -> Command:
+        fault = homing.update(self._eyes.track(image, time))
+        if fault is not None and not fault.usable:
+            return self._lose(image, time, fault.reason)
+        home = homing.home()
+        self.remaining, self._heading = home.distance, home.direction
+        arrival = self._arrival(homing.unit)
+        if arrival:
+            return self._end(time, HomingState.ARRIVED, arrival)
+        if self._progress.stalled(self.remaining, time):
+            fault = Fault(f"no progress for {self._settings.stall_s:g} s", True)
+            if self._progress.stalls >= self._settings.max_stalls:
+                return self._refuse(time, Refusal(RefusalReason.NO_PROGRESS, fault.reason))
+        if fault is None:
+            return self._drive(homing, time, f"{len(homing.tracked)} tracks")
+        return self._renew(homing, image, time, fault.reason)
+
+    def _arrival(self, unit: float) -> str:
+        """Why the target counts as reached; empty if it does not."""
+        s, behind = self._settings, abs(self._heading) > np.pi / 2
+        if self.remaining <= s.switch_fraction:
+            return f"reached: {self.remaining:.2f} of the leg left"
+        # A renewed homing's own distance counts, too: its unit may be wrong, not its zero.
+        near = min(self.remaining, self.remaining / unit) <= s.pass_fraction
+        if behind and near and self._was_ahead:
+            return f"passed: target behind at {self.remaining:.2f} of the leg"
+        self._was_ahead = self._was_ahead or not behind
+        return ""
+
+    def _renew(self, homing: HomingUnderWay, image: ByteArray, time: float, why: str) -> Command:
+        """The estimate is usable, but weak: match anew while driving on by it."""
+        if time < self._next_try:
+            return self._drive(homing, time, why)
+        answer = self._begin(image, time)
+        if isinstance(answer, Refusal):
+            if answer.reason is RefusalReason.AT_TARGET:
+                return self._end(time, HomingState.ARRIVED, answer.details)
+            return self._drive(homing, time, f"{why}; not matched anew: {answer.details}")
+        vector = answer.start.vector
+        if homing.contradicts(vector):
+            # The old tracks are gone with the new ones' start, and one of both must be wrong.
+            self.underway, self._pending, self._next_try = None, vector, time
+            return self._hold(time, "new homing vector contradicts the estimate")
+        return self._accept(answer, f"matched anew: {why}")
+
+    def _lose(self, image: ByteArray, time: float, why: str) -> Command:
+        """The estimate is not to be believed: match anew at once, or drive blind for a while."""
+        s = self._settings
+        ahead = abs(self._heading) <= np.deg2rad(s.blind_heading_deg)
+        self._blind_until = time + s.blind_s if ahead else -np.inf
+        self.underway, self._next_try = None, time
+        return self._seek(image, time, why)
+
+    # ----------------------------------------------------------------------------------------
+    # Matching the target, for the first time or anew
+
+    def _seek(self, image: ByteArray, time: float, why: str) -> Command:
+        """There is no estimate to drive by: match, or stand (or drive blind) and try again."""
+        if time < self._next_try:
+            return self._hold(time, why)
+        answer = self._begin(image, time)
+        if isinstance(answer, Refusal):
+            return self._refused(time, answer)
+        vector = answer.start.vector
+        if self._confirmed(vector):
+            return self._accept(answer, "target matched")
+        self._pending = vector
+        return self._refused(time, Refusal(RefusalReason.AMBIGUOUS, "homing vectors contradict"))
+
+    def _begin(self, image: ByteArray, time: float) -> HomingUnderWay | Refusal:
+        self._next_try = time + self._settings.retry_s
+        answer = self._eyes.begin(image, self._target, time)
+        if isinstance(answer, Refusal):
+            return answer
+        try:
+            return HomingUnderWay(answer, self._make_estimator, self.remaining, self._settings)
+        except EstimatorError as error:
+            return Refusal(RefusalReason.UNCERTAIN, str(error))
+
+    def _confirmed(self, vector: HomingVector) -> bool:
+        """Whether a new vector is to be believed: nothing was in doubt, or two images agree."""
+        if self._pending is None:
+            return True
+        turn = float(np.abs(wrap(np.array(vector.direction - self._pending.direction))))
+        return bool(turn <= np.deg2rad(self._settings.contradiction_deg))
+
+    def _accept(self, homing: HomingUnderWay, why: str) -> Command:
+        time = homing.start.time
+        if self._standing_since is not None or self.initialisations == 0:
+            self._progress.pause(time)
+        self.underway = homing
+        self._heading = homing.start.vector.direction
+        self._was_ahead = self._was_ahead or abs(self._heading) <= np.pi / 2
+        self._pending = self._standing_since = None
+        self.initialisations += 1
+        return self._drive(homing, time, why)
+
+    def _refused(self, time: float, refusal: Refusal) -> Command:
+        """Stands, or drives blind, until there was nothing but refusals for too long."""
+        if refusal.reason is RefusalReason.AT_TARGET:
+            return self._end(time, HomingState.ARRIVED, refusal.details)
+        command = self._hold(time, refusal.details)
+        since = self._standing_since
+        if since is None or time - since < self._settings.give_up_s:
+            return command
+        if self.initialisations:
+            refusal = Refusal(RefusalReason.LOST, f"lost, then: {refusal.details}")
+        return self._refuse(time, refusal)
+
+    # ----------------------------------------------------------------------------------------
+    # Commands
+
+    def _drive(self, homing: HomingUnderWay, time: float, why: str) -> Command:
+        home = homing.home()
+        return Command(
+            time=time,
+            state=HomingState.DRIVE,
+            heading=home.direction,
+            remaining=home.distance,
+            rotation=home.rotation,
+            covariance=home.covariance,
+            stop=False,
+            reason=why,
+        )
+
+    def _hold(self, time: float, why: str) -> Command:
+        """Without an estimate: blind while that is allowed, then standing."""
+        if self._pending is None and time < self._blind_until:
+            return self._without_estimate(time, HomingState.BLIND, why)
+        if self._standing_since is None:
+            self._standing_since = time
+        state = HomingState.WAIT if self.initialisations else HomingState.INITIALISE
+        if self._pending is not None:
+            state = HomingState.CONFIRM
+        return self._without_estimate(time, state, why)
+
+    def _refuse(self, time: float, refusal: Refusal) -> Command:
+        return self._end(time, HomingState.REFUSED, refusal.details, refusal)
+
+    def _end(
+        self, time: float, state: HomingState, why: str, refusal: Refusal | None = None
+    ) -> Command:
+        self._ended = self._without_estimate(time, state, why, refusal)
+        return self._ended
+
+    def _without_estimate(
+        self, time: float, state: HomingState, why: str, refusal: Refusal | None = None
+    ) -> Command:
+        return Command(
+            time=time,
+            state=state,
+            heading=0.0,
+            remaining=self.remaining,
+            rotation=float("nan"),
+            covariance=np.full((3, 3), np.nan),
+            stop=state is not HomingState.BLIND,
+            reason=why,
+            refusal=refusal,
+        )
+
+
+class _Progress:
+    """Notices a robot that does not come nearer: held up, or driving by a wrong estimate.
+
+    Attributes:
+        stalls: how often it was noticed.
+    """
+
+    def __init__(self, longest_s: float) -> None:
+        self.stalls = 0
+        self._longest = longest_s
+        self._best, self._since = np.inf, 0.0
+
+    def stalled(self, remaining: float, time: float) -> bool:
+        """Whether there was no progress for too long; the clock then starts again."""
+        nearer = remaining < self._best - _PROGRESS
+        late = not nearer and time - self._since > self._longest
+        if nearer or late:
+            self._best, self._since = remaining, time
+        self.stalls += late
+        return late
+
+    def pause(self, time: float) -> None:
+        """The robot stood until now; that is not driving without progress."""
+        self._since = time

@@ -1,0 +1,34 @@
+"""What a homing needs of the camera and the image processing behind it."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from fgslam.homing_types import HomingStart, OmniFeatures, Refusal, TrackedBearings
+from fgslam.types import ByteArray
+
+
+class HomingEyes(Protocol):
+    """Features, matches and tracks of a stream of images (h, w, 3).
+
+    ``begin`` and ``track`` are called with times that never decrease. One image may be given to
+    ``track`` and then, at the same time, to ``begin``: so a homing starts where another one ends.
+    """
+
+    def describe(self, image: ByteArray) -> OmniFeatures:
+        """What is remembered of a path image; changes nothing."""
+        ...
+
+    def begin(self, image: ByteArray, target: OmniFeatures, time: float) -> HomingStart | Refusal:
+        """Matches the image with a target and, unless refused, tracks these features from now on.
+
+        A refusal leaves the tracks that there are alone.
+        """
+        ...
+
+    def track(self, image: ByteArray, time: float) -> TrackedBearings:
+        """The features of the last ``begin`` in a new image; features once lost stay away (G28).
+
+        An image without any of them gives no rows; that is not an error.
+        """
+        ...

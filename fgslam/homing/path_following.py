@@ -1,0 +1,145 @@
+"""Following a path: a chain of homings, one target image after another (G1, G2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+from fgslam.errors import ConfigError
+from fgslam.homing.command import Command, HomingState
+from fgslam.homing.controller import HomingController
+from fgslam.homing.eyes import HomingEyes
+from fgslam.homing.underway import EstimatorMaker
+from fgslam.homing_types import OmniFeatures
+from fgslam.settings.homing_behaviour import HomingControlSettings, PathFollowingSettings
+from fgslam.types import ByteArray
+
+LegResult: TypeAlias = Literal["arrived", "skipped", "refused", "unfinished"]
+
+
+@dataclass(frozen=True, slots=True)
+class LegOutcome:
+    """How one leg ended.
+
+    Attributes:
+        target: number of the target image.
+        result: ``unfinished`` if the drive was ended from outside.
+        began, ended: seconds.
+        initialisations: 1 when nothing went wrong, 0 when the target was never matched.
+        remaining: part of the leg that was left, as far as the robot knew.
+        reason: one clause.
+    """
+
+    target: int
+    result: LegResult
+    began: float
+    ended: float
+    initialisations: int
+    remaining: float
+    reason: str
+
+
+class PathFollower:
+    """Homes to the targets in their order.
+
+    A target that is reached hands over to the next one with the same image, so that the robot
+    does not stop in between. One that ends in a refusal is left out, if the settings allow, and
+    the next one tried from where the robot stands: images are sparse, but often two are in reach.
+
+    Attributes:
+        outcomes: of the legs that ended.
+        controller: of the present leg.
+    """
+
+    def __init__(
+        self,
+        eyes: HomingEyes,
+        path: Sequence[OmniFeatures],
+        make_estimator: EstimatorMaker,
+        control: HomingControlSettings,
+        settings: PathFollowingSettings,
+    ) -> None:
+        """Begins before the first target.
+
+        Raises:
+            ConfigError: the path is empty.
+        """
+        if not path:
+            raise ConfigError("path: no target image; give at least one")
+        self._eyes = eyes
+        self._path = tuple(path)
+        self._make_estimator = make_estimator
+        self._control = control
+        self._settings = settings
+        self._target = 0
+        self._skipped: list[int] = []
+        self._began: float | None = None
+        self._ended: Command | None = None
+        self.outcomes: list[LegOutcome] = []
+        self.controller = self._new_controller()
+
+    @property
+    def finished(self) -> bool:
+        """Whether the last target is reached, or the path given up."""
+        return self._ended is not None
+
+    def step(self, image: ByteArray, time: float) -> Command:
+        """Takes in one image; see :meth:`HomingController.step`."""
+        if self._ended is not None:
+            return replace(self._ended, time=time)
+        if self._began is None:
+            self._began = time
+        command = self._numbered(self.controller.step(image, time))
+        # Each turn ends a leg, so that it ends with the path at the latest.
+        while command.state in (HomingState.ARRIVED, HomingState.REFUSED):
+            if not self._go_on(command):
+                self._ended = command
+                return command
+            command = self._numbered(self.controller.step(image, time))
+        return command
+
+    def interrupt(self, time: float, reason: str) -> None:
+        """Notes the present leg as unfinished: the drive is ended from outside."""
+        if self._ended is None:
+            self._note("unfinished", time, self.controller.remaining, reason)
+
+    def _go_on(self, command: Command) -> bool:
+        """Notes how the leg ended and begins the next one; False at the path's end."""
+        last = self._target + 1 == len(self._path)
+        if command.state is HomingState.ARRIVED:
+            self._note("arrived", command.time, command.remaining, command.reason)
+            self._skipped = []
+        elif last or not self._may_skip():
+            self._note("refused", command.time, command.remaining, command.reason)
+            return False
+        else:
+            self._note("skipped", command.time, command.remaining, command.reason)
+            self._skipped.append(self._target)
+        if last:
+            return False
+        self._target += 1
+        self._began = command.time
+        self.controller = self._new_controller()
+        return True
+
+    def _may_skip(self) -> bool:
+        return self._settings.skip_unmatched and len(self._skipped) < self._settings.max_skips
+
+    def _new_controller(self) -> HomingController:
+        return HomingController(
+            self._eyes, self._path[self._target], self._make_estimator, self._control
+        )
+
+    def _numbered(self, command: Command) -> Command:
+        final = self._target + 1 == len(self._path)
+        return replace(command, target=self._target, final=final)
+
+    def _note(self, result: LegResult, time: float, remaining: float, reason: str) -> None:
+        began = time if self._began is None else self._began
+        self.outcomes.append(
+            LegOutcome(
+                self._target, result, began, time, self.controller.initialisations, remaining,
+                reason,
+            )
+        )  # fmt: skip

@@ -1,0 +1,144 @@
+"""One homing under way, from one matching of the target to the next: estimator, tracks, faults."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from fgslam.backend.homing.protocol import HomingEstimator
+from fgslam.errors import EstimatorError
+from fgslam.homing.soundness import common_turn, target_misfit, tracked_misfit
+from fgslam.homing_types import (
+    HomeVector,
+    HomingStart,
+    HomingVector,
+    TrackedBearings,
+)
+from fgslam.planar import wrap
+from fgslam.settings.homing_behaviour import HomingControlSettings
+
+EstimatorMaker: TypeAlias = Callable[[HomingStart], HomingEstimator]
+
+_FARTHEST = 3.0  # legs; whoever believes to be farther away has diverged
+_TURN_MARGIN = np.deg2rad(20.0)  # what near features and noise make of a common turn
+_KEPT_SHARE = 0.7  # of the tracks; fewer count as weak even where there were few to begin with
+_SIGMAS = 4.0  # between two homing vectors of which one must be wrong
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What is wrong with a homing under way, and whether its estimate may still be driven by."""
+
+    reason: str
+    usable: bool
+
+
+class HomingUnderWay:
+    """An estimator that is fed with tracks, and what tells whether to believe it.
+
+    Attributes:
+        start: what it began with.
+        unit: its leg in parts of the leg where the robot first set out for this target.
+        tracked: the last image's bearings, at first those of the start.
+        estimate: the last state.
+    """
+
+    def __init__(
+        self,
+        start: HomingStart,
+        make_estimator: EstimatorMaker,
+        unit: float,
+        settings: HomingControlSettings,
+    ) -> None:
+        """Makes the estimator.
+
+        Raises:
+            EstimatorError: the start cannot be solved.
+        """
+        self.start, self.unit = start, unit
+        self._settings = settings
+        self._estimator = make_estimator(start)
+        self.estimate = self._estimator.estimate()
+        self.tracked = _seen_at(start)
+
+    def home(self) -> HomeVector:
+        """The steering vector; its distance and covariance in legs where the robot set out."""
+        with np.errstate(invalid="ignore"):  # the direction's variance at the target itself
+            home = self.estimate.home()
+            scale = np.array([self.unit, 1.0, 1.0])
+            covariance = home.covariance * scale[:, None] * scale
+        return HomeVector(self.unit * home.distance, home.direction, home.rotation, covariance)
+
+    def update(self, tracked: TrackedBearings) -> Fault | None:
+        """Takes in one image; what is wrong afterwards, the worst first, or None."""
+        fault = self._unusable(tracked)
+        if fault is not None:
+            return fault
+        try:
+            self._estimator.update(tracked)
+        except EstimatorError as error:
+            return Fault(str(error), False)
+        self.tracked, self.estimate = tracked, self._estimator.estimate()
+        return self._divergence() or self._weakness()
+
+    def _unusable(self, tracked: TrackedBearings) -> Fault | None:
+        """Too little to estimate from, or a picture that was turned rather than the robot."""
+        s = self._settings
+        if len(tracked) < s.fewest_tracks:
+            return Fault(f"{len(tracked)} tracks left", False)
+        step = tracked.time - self.tracked.time
+        turn = common_turn(self.tracked, tracked)
+        limit = np.deg2rad(s.max_turn_deg_s) * step + _TURN_MARGIN
+        if abs(turn) > limit:
+            degrees = np.rad2deg(turn)
+            return Fault(f"image turned by {degrees:.0f} deg within {step:.2f} s", False)
+        return None
+
+    def _divergence(self) -> Fault | None:
+        distance = self.estimate.home().distance
+        if not distance <= _FARTHEST:
+            return Fault(f"estimate diverged: {distance:.1f} legs to go", False)
+        for name, misfit in (
+            ("tracks", tracked_misfit(self.estimate, self.tracked)),
+            ("target's bearings", target_misfit(self.estimate, self.start)),
+        ):
+            if misfit > np.deg2rad(self._settings.max_residual_deg):
+                degrees = np.rad2deg(misfit)
+                return Fault(f"estimate diverged: {name} misfit by {degrees:.1f} deg", False)
+        return None
+
+    def _weakness(self) -> Fault | None:
+        s, count = self._settings, len(self.tracked)
+        if count < min(s.min_tracks, _KEPT_SHARE * len(self.start.matches)):
+            return Fault(f"{count} tracks left", True)
+        home = self.home()
+        with np.errstate(invalid="ignore"):
+            across = float(home.distance * np.sqrt(home.covariance[1, 1]))
+        if np.isfinite(across) and across > s.max_across:
+            return Fault(f"target uncertain by {across:.2f} legs across", True)
+        return None
+
+    def contradicts(self, vector: HomingVector) -> bool:
+        """Whether a new homing vector from the present place cannot be true if the estimate is."""
+        home = self.home()
+        turns = [vector.direction - home.direction, vector.rotation - home.rotation]
+        variance = np.diag(vector.covariance) + np.nan_to_num(np.diag(home.covariance)[1:])
+        limit = np.deg2rad(self._settings.contradiction_deg)
+        allowed = np.maximum(limit, _SIGMAS * np.sqrt(variance))
+        return bool((np.abs(wrap(np.array(turns))) > allowed).any())
+
+
+def _seen_at(start: HomingStart) -> TrackedBearings:
+    """The start's own image as if it had been tracked."""
+    seen = start.matches
+    return TrackedBearings(
+        time=start.time,
+        ids=start.local_map.ids,
+        bearing=seen.bearing_a,
+        sigma_bearing=seen.sigma[:, 0],
+        elevation=seen.elevation_a,
+        sigma_elevation=seen.sigma[:, 1],
+    )

@@ -1,0 +1,307 @@
+"""Settings of the behaviour: homing, steering, avoidance, path following, maps, localisation.
+
+Where the paper leaves a number open, `docs/homing.md` says where the default comes from. *Legs* are
+distances from start to target: the scale of images is not known.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fgslam.settings.base import STRICT
+
+
+@dataclass(frozen=True, config=STRICT)
+class HomingControlSettings:
+    """When a target is reached, when matching begins anew, and when to stop (G3, G19)."""
+
+    switch_fraction: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            lt=0.5,
+            description="part of the leg that may be left when the target counts as reached",
+        ),
+    ] = 0.07
+    pass_fraction: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            lt=1.0,
+            description="a target nearer than this part of the leg that has fallen behind the "
+            "robot counts as reached: passed by",
+        ),
+    ] = 0.25
+    min_tracks: Annotated[
+        int, Field(ge=3, description="with fewer tracks than this, the target is matched anew")
+    ] = 10
+    fewest_tracks: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="with fewer than this the estimate is not believed any more (D8: a third "
+            "view needs three bearings)",
+        ),
+    ] = 4
+    max_across: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="deviation of the target's place across the way, in parts of the leg, "
+            "beyond which the target is matched anew",
+        ),
+    ] = 0.1
+    max_residual_deg: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="median difference of the bearings from the estimate's prediction beyond "
+            "which the estimate counts as diverged",
+        ),
+    ] = 5.0
+    max_turn_deg_s: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="an image turned faster than this against the last one is not believed",
+        ),
+    ] = 120.0
+    retry_s: Annotated[
+        float, Field(ge=0.0, description="between two attempts to match the target anew")
+    ] = 0.5
+    blind_s: Annotated[
+        float,
+        Field(ge=0.0, description="longest drive straight on, at reduced speed, without tracks"),
+    ] = 1.0
+    blind_heading_deg: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            le=90.0,
+            description="without tracks the robot drives on only if home was so nearly ahead",
+        ),
+    ] = 20.0
+    give_up_s: Annotated[
+        float, Field(ge=0.0, description="refusals for so long, standing, end the homing")
+    ] = 3.0
+    contradiction_deg: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="a new homing vector that differs by more from a sound estimate (and by "
+            "more than four deviations) must be confirmed by another image",
+        ),
+    ] = 30.0
+    stall_s: Annotated[
+        float,
+        Field(gt=0.0, description="without progress for so long, the target is matched anew"),
+    ] = 15.0
+    max_stalls: Annotated[
+        int, Field(ge=1, description="so many times without progress end the homing")
+    ] = 3
+
+
+@dataclass(frozen=True, config=STRICT)
+class SteeringSettings:
+    """From the direction of home to speed and turning rate of a wheelchair."""
+
+    max_speed_mps: Annotated[float, Field(gt=0.0, description="on the open way")] = 0.4
+    max_turn_deg_s: Annotated[float, Field(gt=0.0, description="largest turning rate")] = 40.0
+    gain_per_s: Annotated[
+        float, Field(gt=0.0, description="turning rate over the direction of home")
+    ] = 1.2
+    acceleration_mps2: Annotated[float, Field(gt=0.0, description="largest change of speed")] = 0.5
+    turn_acceleration_deg_s2: Annotated[
+        float, Field(gt=0.0, description="largest change of the turning rate")
+    ] = 120.0
+    turn_in_place_deg: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            le=180.0,
+            description="home farther off than this: turn without driving, until it is within "
+            "half of it",
+        ),
+    ] = 60.0
+    slow_fraction: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            le=1.0,
+            description="part of the leg that is left from which on the robot slows down",
+        ),
+    ] = 0.3
+    least_share: Annotated[
+        float,
+        Field(gt=0.0, le=1.0, description="of the speed, at the last target"),
+    ] = 0.25
+    passing_share: Annotated[
+        float,
+        Field(gt=0.0, le=1.0, description="of the speed, at targets on the way"),
+    ] = 0.6
+    blind_share: Annotated[
+        float, Field(gt=0.0, le=1.0, description="of the speed, without tracks")
+    ] = 0.4
+
+
+@dataclass(frozen=True, config=STRICT)
+class AvoidanceSettings:
+    """A range scan overrides the steering (IV; design G17)."""
+
+    method: Annotated[
+        Literal["corridors", "none"],
+        Field(description="`corridors`: the free direction nearest to home; `none`: no sensor"),
+    ] = "corridors"
+    half_width_m: Annotated[
+        float,
+        Field(gt=0.0, description="of the corridor that the robot needs: its radius and a margin"),
+    ] = 0.42
+    look_ahead_m: Annotated[
+        float, Field(gt=0.0, description="length of the corridor that must be free, from standing")
+    ] = 0.6
+    look_ahead_s: Annotated[
+        float, Field(ge=0.0, description="what comes on top at speed, in seconds of driving")
+    ] = 1.5
+    directions: Annotated[
+        int, Field(ge=8, le=720, description="corridors that are looked at, all around")
+    ] = 72
+    keep_weight: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="weight of staying with the last choice, against turning towards home",
+        ),
+    ] = 0.5
+    max_turn_deg_s: Annotated[
+        float, Field(gt=0.0, description="largest turning rate of an override")
+    ] = 40.0
+    gain_per_s: Annotated[
+        float, Field(gt=0.0, description="turning rate over the chosen direction")
+    ] = 2.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class PathFollowingSettings:
+    """A path is a chain of homings (G1)."""
+
+    skip_unmatched: Annotated[
+        bool,
+        Field(description="a target that is refused is skipped if the one after it can be matched"),
+    ] = True
+    max_skips: Annotated[
+        int, Field(ge=0, description="targets left out one after another, at most")
+    ] = 1
+
+
+@dataclass(frozen=True, config=STRICT)
+class ClosedLoopSettings:
+    """The loop of camera, homing, steering and drive."""
+
+    images_per_s: Annotated[float, Field(gt=0.0, description="images, and commands, a second")] = (
+        10.0
+    )
+    longest_s: Annotated[float, Field(gt=0.0, description="a drive that takes longer is ended")] = (
+        900.0
+    )
+
+
+@dataclass(frozen=True, config=STRICT)
+class HomingBehaviourSettings:
+    """All that the robot does between image and wheels."""
+
+    control: HomingControlSettings = HomingControlSettings()
+    steering: SteeringSettings = SteeringSettings()
+    avoidance: AvoidanceSettings = AvoidanceSettings()
+    path: PathFollowingSettings = PathFollowingSettings()
+    loop: ClosedLoopSettings = ClosedLoopSettings()
+
+
+# --------------------------------------------------------------------------------------------
+# Maps
+
+
+@dataclass(frozen=True, config=STRICT)
+class RetrievalSettings:
+    """Which images are worth a homing, by visual words of their descriptors."""
+
+    words: Annotated[int, Field(ge=2, description="in the vocabulary, k-means of descriptors")] = (
+        400
+    )
+    sample: Annotated[
+        int, Field(ge=2, description="descriptors that the vocabulary is made of, at most")
+    ] = 10_000
+    iterations: Annotated[int, Field(ge=1, description="of k-means")] = 6
+
+
+@dataclass(frozen=True, config=STRICT)
+class TopologicalMapSettings:
+    """Edges where homing succeeds, and what makes an edge believed (G34)."""
+
+    candidates: Annotated[
+        int,
+        Field(
+            ge=0,
+            description="images that each one is tried against, the most alike first; 0: all pairs",
+        ),
+    ] = 0
+    retrieval: RetrievalSettings = RetrievalSettings()
+    min_support: Annotated[int, Field(ge=3, description="inliers of an edge, in either answer")] = (
+        12
+    )
+    lone_support: Annotated[
+        int,
+        Field(
+            ge=3,
+            description="inliers of an edge that no third image confirms, unless its images follow "
+            "each other in an ordered set",
+        ),
+    ] = 40
+    mutual_deg: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="largest difference between the answers there and back, beyond three "
+            "deviations",
+        ),
+    ] = 5.0
+    loop_deg: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="largest sum of the rotations around a triangle, and largest misfit of its "
+            "directions, beyond three deviations",
+        ),
+    ] = 6.0
+    heading_deg: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="largest misfit of an edge's rotation with all others' together",
+        ),
+    ] = 15.0
+    doubling_support: Annotated[
+        float,
+        Field(gt=0.0, description="inliers at which an edge costs twice what many inliers cost"),
+    ] = 25.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class LocalisationSettings:
+    """Bayesian localisation over a map's nodes (G34)."""
+
+    candidates: Annotated[
+        int, Field(ge=0, description="nodes that an image is matched with; 0: all")
+    ] = 10
+    stay: Annotated[
+        float, Field(ge=0.0, le=1.0, description="chance to be still at the node of the last image")
+    ] = 0.5
+    leap: Annotated[
+        float,
+        Field(gt=0.0, le=1.0, description="chance to be anywhere at all: carried off, or wrong"),
+    ] = 0.02
+    background: Annotated[
+        float, Field(gt=0.0, description="inliers that a wrong place may get, on average")
+    ] = 4.0
