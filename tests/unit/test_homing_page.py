@@ -166,3 +166,5 @@ def test_links_have_a_switch_for_each_kind_that_there_is() -> None:
     marks = [t for t in figure.traces if t["name"] == "wrong" and t["mode"] == "markers"]
     np.testing.assert_allclose(points(marks[0]), [[0.5, 0.5]])
     assert figure.traces[-1]["text"] == ["2", "3", "4"]
+    hostile = network_figure(("k", "Pairs", "What."), places, ("<b>", "3", "4"), kinds)
+    assert hostile.traces[-1]["text"][0] == "&lt;b&gt;"

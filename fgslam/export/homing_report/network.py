@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
-from fgslam.export.report.traces import Figure, Owner, Switch, Trace, joined, trace
+from fgslam.export.report.traces import Figure, Owner, Switch, Trace, joined, plain_texts, trace
 from fgslam.types import FloatArray
 
 _TOLD = "%{text}<extra></extra>"
@@ -56,7 +56,7 @@ def network_figure(
         {"x": places[:, 0], "y": places[:, 1]},
         mode="markers+text",
         marker={"symbol": "square", "size": 9},
-        text=list(names),
+        text=plain_texts(names),
         textposition="top center",
         hovertemplate=_TOLD,
     )
@@ -108,7 +108,7 @@ def _lines(kind: Links, places: FloatArray, key: str) -> list[Trace]:
         {"x": middle[:, 0], "y": middle[:, 1]},
         mode="markers",
         marker={"size": 4},
-        text=list(kind.told),
+        text=plain_texts(kind.told),
         hovertemplate=_TOLD,
     )
     return [line, told]

@@ -8,7 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.export.report.traces import Figure, Owner, Switch, Trace, joined, thinned, trace
+from fgslam.export.report.traces import (
+    Figure,
+    Owner,
+    Switch,
+    Trace,
+    joined,
+    plain_texts,
+    thinned,
+    trace,
+)
 from fgslam.types import BoolArray, FloatArray, IntArray
 
 MAX_MOMENTS = 80
@@ -83,7 +92,7 @@ def catchment_figure(
                     {"x": -offsets[which, 1], "y": offsets[which, 0]},
                     mode="markers",
                     marker={"symbol": symbol, "size": 9},
-                    text=texts,
+                    text=plain_texts(texts),
                     hovertemplate="%{text}<br>%{y:.2f} m ahead, %{x:.2f} m right<extra></extra>",
                 )
             )

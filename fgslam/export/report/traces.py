@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -105,6 +105,11 @@ def trace(owner: Owner, axes: Mapping[str, FloatArray], **more: Any) -> Trace:
         **{axis: packed(values) for axis, values in axes.items()},
         **more,
     }
+
+
+def plain_texts(texts: Iterable[str]) -> list[str]:
+    """Texts as Plotly shall show them: it reads a little HTML, which they are not."""
+    return [html.escape(text) for text in texts]
 
 
 def packed(values: FloatArray) -> dict[str, str]:
