@@ -47,9 +47,7 @@ class HomingErrors:
     def last(self) -> HomingErrors:
         """Those of the last image alone."""
         parts = [Nees(n.values[-1:], n.dof[-1:]) for n in self._nees()]
-        return HomingErrors(
-            self.direction[-1:], self.rotation[-1:], self.distance[-1:], *parts
-        )
+        return HomingErrors(self.direction[-1:], self.rotation[-1:], self.distance[-1:], *parts)
 
     def _nees(self) -> tuple[Nees, Nees, Nees, Nees]:
         return self.robot, self.target, self.joint, self.home

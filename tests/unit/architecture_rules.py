@@ -26,6 +26,7 @@ BASE = frozenset(
         "planar",
         "omni_cameras",
         "homing_types",
+        "bearing_log",
     }
 )
 STAGES = frozenset({"datasets", "simulation", "frontend", "factors", "evaluation", "export"})
@@ -44,6 +45,7 @@ FOUNDATION_ALLOWS: dict[str, frozenset[str]] = {
     "planar": frozenset({"types"}),
     "omni_cameras": frozenset({"types", "errors", "planar"}),
     "homing_types": frozenset({"types", "planar"}),
+    "bearing_log": frozenset({"types", "errors", "homing_types", "measurement_log"}),
     "measurement_log": frozenset({"types", "errors", "geometry"}),
     "recordings": frozenset({"types", "errors", "geometry", "measurement_log"}),
 }

@@ -136,7 +136,7 @@ class HomingProblem:
             points: (n, 2) the present landmarks of :attr:`entered`.
         """
         new = NewPart()
-        image, step = before.image + 1, tracked.time - before.time
+        image = before.image + 1
         rows = np.searchsorted(self._ids, tracked.ids)
         pose, fits = self._resected(tracked, taken & self._entered[rows], before, points)
         new.values.insert(pose_key(image), gtsam.Pose2(*pose))
