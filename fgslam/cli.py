@@ -191,10 +191,18 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     from fgslam.errors import ConfigError
     from fgslam.runs.baseline import read_baseline
     from fgslam.runs.choosing import Choice
+    from fgslam.runs.homing.compare import all_homing
 
-    expected = None if check_baseline is None else read_baseline(check_baseline)
     names = None if estimators is None else tuple(estimators.split(","))
     choice, existing = Choice(names, tuple(overrides or ())), _existing(overwrite)
+    if all_homing(runs):
+        if any(given is not None for given in (trials, seed, write_baseline, check_baseline)):
+            raise ConfigError(
+                "--trials, --seed and baselines are not for homing runs; set `trials` and `seed` "
+                "in the experiment"
+            )
+        return _compare_homing(runs, choice, out, existing, jobs)
+    expected = None if check_baseline is None else read_baseline(check_baseline)
     if trials is None and seed is not None:
         raise ConfigError("--seed means nothing without --trials; give both or none")
     if trials is None:
@@ -208,6 +216,22 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     regression = expected is not None and _check_baseline(expected, results)
     if status or regression:
         raise typer.Exit(status or EXIT_FAULT)
+    return None
+
+
+def _compare_homing(
+    runs: list[Path], choice: Choice, out: Path | None, existing: ExistingFolder, jobs: int
+) -> None:
+    from fgslam.console import progress_bar
+    from fgslam.homing_console import show_homing
+    from fgslam.runs.homing.compare import compare_homing_runs
+
+    with _stop_flag() as stopped, progress_bar() as progress:
+        results = compare_homing_runs(runs, choice, out, existing, jobs, progress, stopped)
+    for result in results:
+        show_homing(result)
+    if any(result.status == "interrupted" for result in results):
+        raise typer.Exit(EXIT_INTERRUPTED)
 
 
 def _existing(overwrite: bool) -> ExistingFolder:

@@ -39,6 +39,7 @@ _RESULT_FILES = (
     "reference_pairs.csv",
     "links.csv",
     "localisation.csv",
+    "estimates.csv",
     "routes.csv",
     "map.npz",
     "path_memory.npz",

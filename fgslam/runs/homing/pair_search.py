@@ -39,9 +39,7 @@ class PairSearch:
 
 def pairs_of(count: int, *, both_ways: bool) -> list[tuple[int, int]]:
     """Pairs (a, b) of views, a before b; both ways also (b, a)."""
-    return [
-        (a, b) for a in range(count) for b in range(count) if a < b or (both_ways and a != b)
-    ]
+    return [(a, b) for a in range(count) for b in range(count) if a < b or (both_ways and a != b)]
 
 
 def pair_generator(seed: int, a: int, b: int) -> np.random.Generator:

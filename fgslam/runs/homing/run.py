@@ -6,8 +6,9 @@ from pathlib import Path
 
 from fgslam.errors import ConfigError, OutputError
 from fgslam.export.atomic import ExistingFolder, is_run_folder
-from fgslam.homing_config import HomingExperiment
+from fgslam.homing_config import HomingExperiment, HomingTrialsConfig
 from fgslam.runs.homing.results import HomingResult, Progress, Stopped
+from fgslam.runs.homing.trials import run_homing_trials
 from fgslam.runs.threads import one_blas_thread
 
 
@@ -38,4 +39,7 @@ def run_homing(
         )
     if existing == "refuse" and is_run_folder(folder):  # now, not after minutes of work
         raise OutputError(f"{folder} holds a run already; choose another --out, or add --overwrite")
-    raise AssertionError(f"task {config.task} has no module")
+    match config:
+        case HomingTrialsConfig():
+            return run_homing_trials(config, folder, existing, progress, stopped)
+    raise ConfigError(f"task {config.task}: cannot be run yet")

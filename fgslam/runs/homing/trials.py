@@ -1,0 +1,157 @@
+"""Task `homing_trials`: simulated homings of bearings, many estimators on the same ones."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.bearing_log import BearingLog
+from fgslam.evaluation.homing import HomingErrors, homing_errors
+from fgslam.export.atomic import ExistingFolder
+from fgslam.homing_config import HomingTrialsConfig
+from fgslam.homing_types import Refusal
+from fgslam.runs.homing.logs import save_bearing_logs
+from fgslam.runs.homing.replay import replay_homing
+from fgslam.runs.homing.results import HomingResult, Progress, Stopped, begin, jobs_of
+from fgslam.runs.homing.starting import start_from_matches
+from fgslam.runs.homing.trial_results import finish_trials
+from fgslam.runs.processes import WorkerEnded, run_apart
+from fgslam.settings.simulated_bearings import with_outliers
+from fgslam.simulation.bearings import simulate_homing
+from fgslam.types import FloatArray
+
+_BLOCK = 20  # trials a process: starting one takes as long as some trials
+
+
+@dataclass(frozen=True, slots=True)
+class TrialBlock:
+    """Some trials for one process.
+
+    Attributes:
+        config: the experiment.
+        share: number of the share of outliers.
+        first, count: which trials.
+    """
+
+    config: HomingTrialsConfig
+    share: int
+    first: int
+    count: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TriedEstimator:
+    """What one estimator made of one trial.
+
+    Attributes:
+        errors: image by image; None where it gave no estimate.
+        update_ms: (k,) time of each update.
+        failure: why it ended early, else empty.
+    """
+
+    errors: HomingErrors | None
+    update_ms: FloatArray
+    failure: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HomingTrial:
+    """One simulated homing.
+
+    Attributes:
+        share: part of outliers.
+        trial: its number.
+        refused: why there was no homing vector; empty where there was one.
+        inliers, wrong_inliers: matches that support the vector; wrong ones among them.
+        tried: by title of the estimator.
+        log: of the bearings, where it is to be kept.
+    """
+
+    share: float
+    trial: int
+    refused: str
+    inliers: int
+    wrong_inliers: int
+    tried: dict[str, TriedEstimator]
+    log: BearingLog | None = None
+
+
+def run_homing_trials(
+    config: HomingTrialsConfig,
+    folder: Path,
+    existing: ExistingFolder,
+    progress: Progress,
+    stopped: Stopped,
+) -> HomingResult:
+    """Runs all trials; stopped early, those finished count."""
+    begin(config, folder, existing, {"dataset": {"name": "simulated bearings"}})
+    trials, failures = _perform_all(_blocks(config), jobs_of(config), progress, stopped)
+    logs = {trial_name(trial): trial.log for trial in trials if trial.log is not None}
+    save_bearing_logs(folder, logs)
+    done = len(trials) == config.trials * len(config.outliers)
+    return finish_trials(config, folder, "finished" if done else "interrupted", trials, failures)
+
+
+def trial_name(trial: HomingTrial) -> str:
+    """Of a trial's log: share of outliers in percent, and number."""
+    return f"outliers_{100.0 * trial.share:02.0f}_trial_{trial.trial:04d}"
+
+
+def perform_block(block: TrialBlock) -> list[HomingTrial]:
+    """Some trials, one after the other."""
+    numbers = range(block.first, block.first + block.count)
+    return [perform_trial(block.config, block.share, trial) for trial in numbers]
+
+
+def perform_trial(config: HomingTrialsConfig, share: int, trial: int) -> HomingTrial:
+    """One trial; its noise depends on the seed, the share's number and its own number alone."""
+    rng = np.random.default_rng((config.seed, share, trial))
+    part = config.outliers[share]
+    simulated = simulate_homing(with_outliers(config.dataset, part), rng)
+    begun = start_from_matches(simulated.time, simulated.matches, config.homing_vector, rng)
+    if isinstance(begun, Refusal):
+        return HomingTrial(part, trial, begun.reason.value, 0, 0, {})
+    start, rows = begun
+    tracks, truth = simulated.followed(rows)
+    tried = {}
+    for settings in config.estimators:
+        replayed = replay_homing(start, tracks, settings)
+        errors = None
+        if replayed.estimates:
+            seen = dataclasses.replace(truth, robots=truth.robots[: len(replayed.estimates)])
+            errors = homing_errors(replayed.estimates, seen)
+        tried[settings.title] = TriedEstimator(errors, replayed.update_ms, replayed.failure)
+    wrong = int(np.count_nonzero(~simulated.correct[rows]))
+    log = BearingLog(start, list(tracks), truth) if trial < config.output.logs else None
+    return HomingTrial(part, trial, "", len(rows), wrong, tried, log)
+
+
+def _blocks(config: HomingTrialsConfig) -> list[TrialBlock]:
+    return [
+        TrialBlock(config, share, first, min(_BLOCK, config.trials - first))
+        for first in range(0, config.trials, _BLOCK)
+        for share in range(len(config.outliers))
+    ]
+
+
+def _perform_all(
+    blocks: Sequence[TrialBlock], jobs: int, progress: Progress, stopped: Callable[[], bool]
+) -> tuple[list[HomingTrial], list[str]]:
+    """Finished trials in order, and a line for each block that ended without a result."""
+    trials: list[HomingTrial] = []
+    failures: list[str] = []
+    total = sum(block.count for block in blocks)
+    progress("trials", 0, total)
+    for _, result in run_apart(perform_block, blocks, jobs, stopped, single_threaded=True):
+        if isinstance(result, WorkerEnded):
+            block = result.argument
+            last = block.first + block.count - 1
+            failures.append(f"trials {block.first} to {last}, share {block.share}: {result.why}")
+        else:
+            trials += result
+        progress("trials", len(trials), total)
+    return sorted(trials, key=lambda trial: (trial.share, trial.trial)), sorted(failures)
