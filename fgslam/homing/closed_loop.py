@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Protocol
 
@@ -15,7 +15,7 @@ from fgslam.homing.path_following import PathFollower
 from fgslam.homing.record import STAGES, DriveRecord, HomingLog
 from fgslam.homing.steering import Steering
 from fgslam.homing.underway import HomingUnderWay
-from fgslam.homing_types import HomingEstimate, TrackedBearings
+from fgslam.homing_types import HomingEstimate
 from fgslam.settings.homing_behaviour import ClosedLoopSettings
 from fgslam.types import ByteArray, FloatArray
 
@@ -121,29 +121,6 @@ class _Clock:
         self._last = now
 
 
-@dataclass(slots=True, eq=False)
-class _OpenLog:
-    """A homing's log while it grows."""
-
-    target: int
-    homing: HomingUnderWay
-    first_step: int
-    tracks: list[TrackedBearings] = field(default_factory=list)
-    steps: list[int] = field(default_factory=list)
-
-    def closed(self) -> HomingLog:
-        homing = self.homing
-        return HomingLog(
-            target=self.target,
-            start=homing.start,
-            tracks=tuple(self.tracks),
-            estimate=homing.estimate,
-            unit=homing.unit,
-            steps=np.array(self.steps, dtype=np.int64),
-            first_step=self.first_step,
-        )
-
-
 class _Recorder:
     """Gathers rows, and closes them into a record."""
 
@@ -154,7 +131,7 @@ class _Recorder:
         self._rows: list[int] = []
         self._estimates: list[HomingEstimate | None] = []
         self._laps: list[list[float]] = []
-        self._logs: list[_OpenLog] = []
+        self._logs: list[tuple[int, HomingUnderWay, int]] = []
 
     def note(
         self,
@@ -173,15 +150,21 @@ class _Recorder:
         self._commands.append(command)
 
     def _log(self, command: Command, homing: HomingUnderWay) -> int:
-        step = len(self._commands)
-        if not self._logs or self._logs[-1].homing is not homing:
-            self._logs.append(_OpenLog(command.target, homing, step))
-        log = self._logs[-1]
-        # The first step is the start's own image, which the estimator was not told again.
-        if homing.tracked.time > homing.start.time:
-            log.tracks.append(homing.tracked)
-            log.steps.append(step)
+        if not self._logs or self._logs[-1][1] is not homing:
+            self._logs.append((command.target, homing, len(self._commands)))
         return len(self._logs) - 1
+
+    def _closed(self, target: int, homing: HomingUnderWay, first_step: int) -> HomingLog:
+        times = np.array([c.time for c in self._commands])
+        return HomingLog(
+            target=target,
+            start=homing.start,
+            tracks=tuple(homing.history),
+            estimate=homing.estimate,
+            unit=homing.unit,
+            first_step=first_step,
+            steps=np.searchsorted(times, [t.time for t in homing.history]),
+        )
 
     def record(
         self, end: FloatArray, follower: PathFollower, targets: FloatArray | None
@@ -209,7 +192,7 @@ class _Recorder:
             robot=np.array([unknown if e is None else e.robot for e in known]),
             aim=np.array([unknown if e is None else e.target for e in known]),
             joint=np.array([blank if e is None else e.covariance for e in known]),
-            homings=tuple(log.closed() for log in self._logs),
+            homings=tuple(self._closed(*log) for log in self._logs),
             legs=tuple(follower.outcomes),
             seconds={name: laps[:, i] for i, name in enumerate(STAGES)},
             finished=follower.finished,

@@ -1,4 +1,4 @@
-"""What a drive leaves behind: arrays and short texts, ready for files and figures (Figs 4 and 6)."""
+"""What a drive leaves behind: arrays and short texts for files and figures (Figs 4 and 6)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from fgslam.homing_types import HomingEstimate, HomingStart, TrackedBearings
 from fgslam.types import BoolArray, FloatArray, IntArray
 
 STAGES = ("image", "homing", "steering", "drive")
-"""What a step's seconds are split into: camera; eyes, estimator and command; steering and avoidance;
-the world's own motion."""
+"""What a step's seconds are split into: camera; eyes, estimator and command; steering and
+avoidance; the world's own motion."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,8 +23,8 @@ class HomingLog:
         tracks: what it was told afterwards, image by image.
         estimate: its last state.
         unit: length of its leg in parts of the leg where the robot set out for the target.
-        steps: (k,) rows of the drive's record at which the images of ``tracks`` were taken.
-        first_step: row at which it started.
+        first_step: row of the drive's record at which it started.
+        steps: (k,) rows at which the images of ``tracks`` were taken.
     """
 
     target: int
@@ -32,8 +32,8 @@ class HomingLog:
     tracks: tuple[TrackedBearings, ...]
     estimate: HomingEstimate
     unit: float
-    steps: IntArray
     first_step: int
+    steps: IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -43,6 +43,7 @@ class HomingUnderWay:
         start: what it began with.
         unit: its leg in parts of the leg where the robot first set out for this target.
         tracked: the last image's bearings, at first those of the start.
+        history: all images that the estimator was told.
         estimate: the last state.
     """
 
@@ -63,6 +64,7 @@ class HomingUnderWay:
         self._estimator = make_estimator(start)
         self.estimate = self._estimator.estimate()
         self.tracked = _seen_at(start)
+        self.history: list[TrackedBearings] = []
 
     def home(self) -> HomeVector:
         """The steering vector; its distance and covariance in legs where the robot set out."""
@@ -82,6 +84,7 @@ class HomingUnderWay:
         except EstimatorError as error:
             return Fault(str(error), False)
         self.tracked, self.estimate = tracked, self._estimator.estimate()
+        self.history.append(tracked)
         return self._divergence() or self._weakness()
 
     def _unusable(self, tracked: TrackedBearings) -> Fault | None:
