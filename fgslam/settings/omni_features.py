@@ -79,10 +79,10 @@ class UprightSiftSettings:
     ] = 2048
     sigma_px: Annotated[
         float, Field(gt=0.0, description="position of a feature: this, in pixels of its view")
-    ] = 0.5
+    ] = 1.2
     sigma_scales: Annotated[
         float, Field(ge=0.0, description="and this many of its scales, added in quadrature")
-    ] = 0.5
+    ] = 0.27
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -91,7 +91,7 @@ class ColumnSegmentSettings:
 
     max_width: Annotated[
         int, Field(ge=64, le=16384, description="of the cylinder, pixels; less for coarser cameras")
-    ] = 1024
+    ] = 2048
     max_tangent: Annotated[
         float,
         Field(gt=0.0, le=10.0, description="of the elevation, up and down, that the cylinder has"),
@@ -108,7 +108,10 @@ class ColumnSegmentSettings:
     ] = 4.0
     min_length_px: Annotated[
         float, Field(ge=2.0, description="shorter segments have no profile to tell them by")
-    ] = 10.0
+    ] = 8.0
+    min_length_tangent: Annotated[
+        float, Field(ge=0.0, description="nor have those that appear smaller, in tangents")
+    ] = 0.05
     min_contrast: Annotated[
         float,
         Field(gt=0.0, description="standard deviation of the luminance along it, grey values"),
@@ -123,16 +126,16 @@ class ColumnSegmentSettings:
             description="wider runs (a table's edge, the joint of wall and ceiling) have no "
             "bearing of their own and are dropped",
         ),
-    ] = 4.0
+    ] = 8.0
     run_step_px: Annotated[
         float, Field(gt=0.0, description="ends of one run shift less than this between columns")
     ] = 1.5
     sigma_px: Annotated[
         float, Field(gt=0.0, description="position of an end, and of a run of one column")
-    ] = 1.0
+    ] = 1.8
     sigma_run: Annotated[
         float, Field(ge=0.0, description="part of a run's width added to the bearing's deviation")
-    ] = 0.29
+    ] = 0.15
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -147,7 +150,7 @@ class OmniMatchingSettings:
             description="SIFT: nearest over second nearest distance below this; high, as the "
             "colour filter and the planar gates take the wrong ones (G6)",
         ),
-    ] = 0.9
+    ] = 0.8
     root: Annotated[
         bool,
         Field(description="compare square roots of descriptors (Arandjelovic, Zisserman 2012)"),
@@ -155,7 +158,7 @@ class OmniMatchingSettings:
     max_colour_distance: Annotated[
         float,
         Field(gt=0.0, description="Euclidean, of (C_RB, C_RG, C_GB); larger ones are discarded"),
-    ] = 0.15
+    ] = 0.2
     planar_gates: Annotated[
         bool,
         Field(

@@ -10,23 +10,28 @@ divides zero by zero, for a centralised band integrates to zero. Two readings ma
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from fgslam.settings.omni_features import ColourMomentSettings
 from fgslam.types import FloatArray, Image, IntArray
+
+Float32Image: TypeAlias = npt.NDArray[np.float32]
 
 PAIRS = ((0, 2), (0, 1), (1, 2))
 """R and B, R and G, G and B: the order of the paper and of all colour descriptors here."""
 
 
-def moment_images(image: Image, with_squares: bool) -> list[FloatArray]:
+def moment_images(image: Image, with_squares: bool) -> list[Float32Image]:
     """Bands of an image (h, w, 3), products of their :data:`PAIRS`, on demand their squares.
 
     Returns:
         6 or 9 float32 images (h, w); products of two bytes are exact.
     """
-    bands = [np.ascontiguousarray(band, dtype=np.float32) for band in cv2.split(image)]
+    bands: list[Float32Image] = [band.astype(np.float32) for band in cv2.split(image)]
     products = [bands[p] * bands[q] for p, q in PAIRS]
     squares = [band * band for band in bands] if with_squares else []
     return [*bands, *products, *squares]

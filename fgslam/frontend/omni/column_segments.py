@@ -20,14 +20,17 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from fgslam.frontend.omni.colour_moments import colour_from_means, moment_images
-from fgslam.frontend.omni.sift import wrapping_period
+from fgslam.frontend.omni.sift import inner_part, wrapping_period
 from fgslam.homing_types import ColumnSegments
 from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.settings.omni_features import ColourMomentSettings, ColumnSegmentSettings
-from fgslam.types import FloatArray, Image, IntArray
+from fgslam.types import BoolArray, FloatArray, Image, IntArray
 
 PROFILE_SAMPLES = 32
 COEFFICIENTS = 7
+
+_RIM_SIGMAS = 3.0
+"""Of the smoothing: so far the end of the picture reaches into it."""
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -58,13 +61,22 @@ class ColumnSegmentFinder:
     """Finds invariant column segments in cylindrical views of one geometry."""
 
     def __init__(
-        self, view: OmniCamera, settings: ColumnSegmentSettings, colour: ColourMomentSettings
+        self,
+        view: OmniCamera,
+        settings: ColumnSegmentSettings,
+        colour: ColourMomentSettings,
+        seen: BoolArray | None = None,
     ) -> None:
-        """Takes the view's camera: vertical columns, rows proportional to tan(elevation)."""
+        """Takes the view's camera: vertical columns, rows proportional to tan(elevation).
+
+        ``seen`` (height, width) tells where the view has a picture; None for everywhere.
+        """
         self._settings, self._colour = settings, colour
         self._width, self._height = view.width, view.height
         self._period = wrapping_period(view) or view.width
         self._bearings, (self._tangent_0, self._tangent_step) = _axes(view)
+        rim = int(np.ceil(_RIM_SIGMAS * settings.smoothing_px))
+        self._blind = None if seen is None else inner_part(seen, rim)[:, : self._period] == 0
         self._dct = dct_rows() / np.sqrt(PROFILE_SAMPLES)
 
     def extract(self, image: Image) -> ColumnSegments:
@@ -89,7 +101,11 @@ class ColumnSegmentFinder:
         column, row = np.nonzero(np.ascontiguousarray(peak.T))
         at = row + _summit(before[row, column], middle[row, column], after[row, column]) + 1.0
         length = np.diff(at)
-        pair = (np.diff(column) == 0) & (length >= self._settings.min_length_px)
+        shortest = max(
+            self._settings.min_length_px,
+            self._settings.min_length_tangent / abs(self._tangent_step),
+        )
+        pair = (np.diff(column) == 0) & (length >= shortest)
         return _Raw(column[:-1][pair], at[:-1][pair], at[1:][pair])
 
     def _gradient(self, image: Image) -> Float32Array:
@@ -102,7 +118,10 @@ class ColumnSegmentFinder:
         )
         slope = np.zeros_like(smooth)
         slope[1:-1] = 0.5 * (smooth[2:] - smooth[:-2])
-        return np.asarray(np.einsum("rcb,rcb->rc", slope, slope), np.float32)
+        squared = np.einsum("rcb,rcb->rc", slope, slope)
+        if self._blind is not None:
+            squared[self._blind] = 0.0
+        return np.asarray(squared, np.float32)
 
     def _representatives(self, raw: _Raw) -> tuple[IntArray, IntArray]:
         """Rows of the middle segment of every run that is kept, and the runs' widths in pixels.
@@ -150,7 +169,7 @@ class ColumnSegmentFinder:
         crosses = np.zeros((runs, 2), np.bool_)
         crosses[labels[column == 0], 0] = True
         crosses[labels[column == self._period - 1], 1] = True
-        over = crosses.all(axis=1)[labels] & (column < self._period // 2)
+        over = np.all(crosses, axis=1)[labels] & (column < self._period // 2)
         return np.asarray(column + self._period * over, np.int64)
 
     def _described(
@@ -180,7 +199,8 @@ class _ColumnSums:
 
     def __init__(self, image: Image, colour: ColourMomentSettings) -> None:
         parts = moment_images(image, colour.form == "correlation")
-        luminance = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        luminance: Float32Array = grey.astype(np.float32)
         self._colours = len(parts)
         self._stride = image.shape[1]
         self._tables = [_summed_down(part) for part in [*parts, luminance, luminance * luminance]]
@@ -211,14 +231,14 @@ class _ColumnSums:
         return np.asarray(np.diff(total, axis=1) / np.diff(rows, axis=1))
 
 
-def _summed_down(part: FloatArray) -> FloatArray:
+def _summed_down(part: Float32Array) -> FloatArray:
     """((h + 1) * w,) sums of the rows above each row, flat."""
     out = np.zeros((part.shape[0] + 1, part.shape[1]))
     np.cumsum(part, axis=0, out=out[1:])
     return out.ravel()
 
 
-def _summit(before: FloatArray, middle: FloatArray, after: FloatArray) -> FloatArray:
+def _summit(before: Float32Array, middle: Float32Array, after: Float32Array) -> FloatArray:
     """Offset in (-0.5, 0.5] of the top of the parabola through three values around a maximum."""
     bend = before + after - 2.0 * middle
     return np.asarray(0.5 * (before - after) / np.minimum(bend, -1e-9), np.float64)

@@ -1,4 +1,4 @@
-"""All features of one omnidirectional image: what is kept of a path image (Goedemé et al. III-A)."""
+"""Both kinds of features of one image: all that is kept of a path image (Goedemé III-A)."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ class _View:
     def __init__(self, source: OmniCamera, target: OmniCamera) -> None:
         self.camera = target
         self._maps = unwrap_maps(source, target)
+        seen = self._maps[0] > -1.0
+        self.seen = None if seen.all() else seen
         self._wraps = wrapping_period(source) is not None
 
     def of(self, image: Image) -> Image:
@@ -38,13 +40,14 @@ class OmniFeatureExtractor:
         resolution = pixels_a_radian(camera)
         self._sift_view = self._view_for_sift(settings, resolution)
         described = self._sift_view.camera if self._sift_view else camera
-        self._sift = UprightSift(described, settings.sift, settings.colour)
+        seen = self._sift_view.seen if self._sift_view else None
+        self._sift = UprightSift(described, settings.sift, settings.colour, seen)
         columns = settings.columns
-        width = min(columns.max_width, int(round(2.0 * np.pi * resolution)))
-        height = int(round(2.0 * columns.max_tangent * width / (2.0 * np.pi))) + 1
+        width = min(columns.max_width, round(2.0 * np.pi * resolution))
+        height = round(2.0 * columns.max_tangent * width / (2.0 * np.pi)) + 1
         cylinder = Cylinder(width, height, -columns.max_tangent, columns.max_tangent)
         self._cylinder = _View(camera, cylinder)
-        self._columns = ColumnSegmentFinder(cylinder, columns, settings.colour)
+        self._columns = ColumnSegmentFinder(cylinder, columns, settings.colour, self._cylinder.seen)
 
     def extract(self, image: Image) -> OmniFeatures:
         """Features of an image (height, width, 3) in R, G, B.
@@ -80,9 +83,9 @@ class OmniFeatureExtractor:
     def _view_for_sift(self, settings: OmniFeatureSettings, resolution: float) -> _View | None:
         if wrapping_period(self._camera) is not None or settings.sift.view == "raw":
             return None
-        width = min(settings.sift.max_view_width, int(round(2.0 * np.pi * resolution)))
+        width = min(settings.sift.max_view_width, round(2.0 * np.pi * resolution))
         limits = np.deg2rad([settings.sift.max_elevation_deg, settings.sift.min_elevation_deg])
-        height = int(round((limits[0] - limits[1]) * width / (2.0 * np.pi))) + 1
+        height = round((limits[0] - limits[1]) * width / (2.0 * np.pi)) + 1
         view = Equirectangular(width, height, float(limits[0]), float(limits[1]))
         return _View(self._camera, view)
 

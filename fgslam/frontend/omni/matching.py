@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from fgslam.frontend.omni.column_whitening import WHITENING
+from fgslam.frontend.omni.column_whitening import whitened
 from fgslam.homing_types import (
     BearingMatches,
     ColumnSegments,
@@ -24,7 +24,7 @@ from fgslam.homing_types import (
     UprightFeatures,
 )
 from fgslam.settings.omni_features import OmniMatchingSettings
-from fgslam.types import BoolArray, ByteArray, FloatArray, IntArray
+from fgslam.types import ByteArray, FloatArray, IntArray
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -92,7 +92,7 @@ def _comparable(descriptors: ByteArray, root: bool) -> Float32Array:
     if not root:
         return values
     total = np.maximum(values.sum(axis=1, keepdims=True), 1.0)
-    return np.sqrt(values / total)
+    return np.asarray(np.sqrt(values / total), np.float32)
 
 
 def _forbid_impossible(
@@ -166,7 +166,7 @@ def match_columns(
     none = np.zeros(0, np.int64)
     if len(a) < 2 or len(b) < 2:
         return _column_matches(a, b, none, none, np.zeros(0))
-    i, j, distance, ratio = nearest_segments(a.descriptors @ WHITENING, b.descriptors @ WHITENING)
+    i, j, distance, ratio = nearest_segments(whitened(a.descriptors), whitened(b.descriptors))
     keep = (ratio < settings.column_ratio) & (distance < settings.max_column_distance)
     return _column_matches(a, b, i[keep], j[keep], 1.0 - ratio[keep])
 
@@ -232,15 +232,4 @@ def consistent_tangents(a: FloatArray, b: FloatArray) -> tuple[FloatArray, Float
 
 
 def _far_end(tangents: FloatArray) -> IntArray:
-    return np.argmax(np.abs(tangents), axis=1)
-
-
-__all__ = [
-    "BoolArray",
-    "consistent_tangents",
-    "joined",
-    "match_columns",
-    "match_features",
-    "match_sift",
-    "nearest_segments",
-]
+    return np.asarray(np.argmax(np.abs(tangents), axis=1), np.int64)

@@ -24,6 +24,9 @@ from fgslam.types import BoolArray, ByteArray, FloatArray, Image, IntArray
 _STEP = 1e-3
 """Radians of elevation over which directions in the image are taken."""
 
+_RIM_PX = 6
+"""So near to where the picture ends, its end is what would be found."""
+
 _MARGIN_PART = 16
 """A panorama is continued over its seam by its width over this."""
 
@@ -40,7 +43,7 @@ def wrapping_period(camera: OmniCamera) -> int | None:
     if not np.all(np.isfinite(rays)):
         return None
     steps = wrap(np.diff(np.arctan2(rays[:, 1], rays[:, 0])))
-    period = int(round(2.0 * np.pi / max(float(np.abs(steps).mean()), 1e-9)))
+    period = round(2.0 * np.pi / max(float(np.abs(steps).mean()), 1e-9))
     even = np.ptp(steps) < 1e-6 and np.ptp(rays[:, 2]) < 1e-6
     return period if even and period in (camera.width - 1, camera.width) else None
 
@@ -57,20 +60,40 @@ def up_in_image(camera: OmniCamera, pixels: FloatArray) -> FloatArray:
     up = np.column_stack([-rays[:, 2:] * outward, level])
     moved = [camera.pixels(rays + sign * _STEP * up) for sign in (1.0, -1.0)]
     offsets = [(moved[0] - pixels) / _STEP, (pixels - moved[1]) / _STEP]
-    offsets = [np.where(np.abs(o) * _STEP < camera.width / 2, o, 0.0) for o in offsets]
-    known = [np.isfinite(o).all(axis=1)[:, None] for o in offsets]
+    offsets = [np.where(np.abs(o) * _STEP > camera.width / 2, 0.0, o) for o in offsets]
+    known = [np.all(np.isfinite(o), axis=1, keepdims=True) for o in offsets]
     both = 0.5 * (offsets[0] + offsets[1])
     one = np.where(known[0], offsets[0], offsets[1])
     return np.asarray(np.where(known[0] & known[1], both, one))
+
+
+def inner_part(seen: BoolArray, rim_px: int) -> ByteArray:
+    """255 where all pixels within ``rim_px`` are seen, else 0; OpenCV's kind of mask."""
+    mask = np.asarray(255 * seen, np.uint8)
+    if not rim_px:
+        return mask
+    box = np.ones((2 * rim_px + 1, 2 * rim_px + 1), np.uint8)
+    return np.asarray(cv2.erode(mask, box), np.uint8)
 
 
 class UprightSift:
     """Finds upright colour SIFT features in the images of one camera."""
 
     def __init__(
-        self, camera: OmniCamera, settings: UprightSiftSettings, colour: ColourMomentSettings
+        self,
+        camera: OmniCamera,
+        settings: UprightSiftSettings,
+        colour: ColourMomentSettings,
+        seen: BoolArray | None = None,
     ) -> None:
-        """Prepares detector, mask and the continuation over the seam."""
+        """Prepares detector, mask and the continuation over the seam.
+
+        Args:
+            camera: of the images, or of the view that they are unwrapped to.
+            settings: of the detector.
+            colour: of the colour moments.
+            seen: (height, width) where an unwrapped view has a picture; None for everywhere.
+        """
         self._camera, self._settings, self._colour = camera, settings, colour
         self._sift = cv2.SIFT.create(
             0,
@@ -82,7 +105,7 @@ class UprightSift:
             True,
         )
         self._period = wrapping_period(camera)
-        self._mask = self._seen_mask()
+        self._mask = self._seen_mask(seen)
         rows = np.flatnonzero(self._mask.any(axis=1))
         self._rows = (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, 0)
 
@@ -91,14 +114,14 @@ class UprightSift:
         if self._rows[1] - self._rows[0] < 2:
             return empty_features()
         colour, mask, offset = self._working_image(image)
-        grey = cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY)
+        grey = np.asarray(cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), np.uint8)
         keypoints = self._sift.detect(grey, mask)
         table, octaves = _distinct(keypoints)
         keep = self._chosen(table[:, :2] + offset, table)
         table, octaves = table[keep], octaves[keep]
         pixels = self._unwrapped(table[:, :2] + offset)
         up = up_in_image(self._camera, pixels)
-        seen = np.isfinite(up).all(axis=1)
+        seen = np.all(np.isfinite(up), axis=1)
         table, octaves, pixels, up = table[seen], octaves[seen], pixels[seen], up[seen]
         if not len(table):
             return empty_features()
@@ -106,14 +129,19 @@ class UprightSift:
         colours = PatchColours(colour, self._colour).around(table[:, :2], table[:, 2])
         return self._measured(pixels, table[:, 2], up, descriptors, colours)
 
-    def _seen_mask(self) -> ByteArray:
+    def _seen_mask(self, given: BoolArray | None) -> ByteArray:
         camera, settings = self._camera, self._settings
         columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         rays = camera.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
         low, high = np.sin(np.deg2rad([settings.min_elevation_deg, settings.max_elevation_deg]))
         with np.errstate(invalid="ignore"):
             seen = (rays[:, 2] >= low) & (rays[:, 2] <= high)
-        return np.asarray(255 * seen.reshape(camera.height, camera.width), np.uint8)
+        seen = seen.reshape(camera.height, camera.width)
+        if given is not None:
+            seen = seen & given
+        # A panorama goes on beyond the rows that are asked for; a mirror's image ends at its rim.
+        whole = self._period is not None and given is None
+        return inner_part(seen, 0 if whole else _RIM_PX)
 
     def _working_image(self, image: Image) -> tuple[Image, ByteArray | None, FloatArray]:
         """The rows in use, continued over the seam; the mask; what to add to get the image's."""
@@ -122,7 +150,8 @@ class UprightSift:
             return image[first:last], self._mask[first:last], np.array([0.0, first])
         margin = max(self._period // _MARGIN_PART // 16, 1) * 16
         columns = np.arange(-margin, self._period + margin) % self._period
-        return image[first:last][:, columns], None, np.array([-margin, first], dtype=np.float64)
+        offset = np.array([-margin, first], dtype=np.float64)
+        return image[first:last][:, columns], self._mask[first:last][:, columns], offset
 
     def _chosen(self, pixels: FloatArray, table: FloatArray) -> IntArray:
         """Rows of the key points to keep: each feature once, the strongest first."""
