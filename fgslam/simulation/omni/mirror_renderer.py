@@ -28,6 +28,7 @@ _EDGE_SAMPLES = ((-0.25, -0.375), (0.375, -0.25), (0.25, 0.375), (-0.375, 0.25))
 # Colour difference over an edge, summed over channels, from which on it is worth smoothing.
 _EDGE_CONTRAST = 24.0
 _NOTHING = np.int32(-1)
+_TILT_MARGIN = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +85,8 @@ class MirrorRenderer:
         self._valid = np.flatnonzero(np.isfinite(self._exact[:, 0]))
         picked = (self._exact, *steps)
         self._rays = _Rays(*(np.ascontiguousarray(a[self._valid].T, np.float32) for a in picked))
-        self._bearing = np.arctan2(self._rays.direction[1], self._rays.direction[0])
+        level = self._rays.direction[:2]
+        self._level = level / np.maximum(np.linalg.norm(level, axis=0), np.float32(1e-9))
         self._pairs = _neighbours(self._valid, self._shape)
 
     @property
@@ -104,17 +106,15 @@ class MirrorRenderer:
         """
         layers = [(scene, pose), *((b.layer, np.linalg.inv(b.wTo) @ pose) for b in bodies)]
         planes = [layer.planes(seen, np.eye(3)).astype(np.float32) for layer, seen in layers]
-        hits = self._cast(layers, bodies, self._rays, self._bearing)
+        hits = self._cast(layers, bodies, self._rays, self._level)
         levels = self._shade(layers, planes, hits, self._rays)
         border = self._borders(hits, levels)
         if len(border):
-            bearing = self._bearing[border]
+            level = self._level[:, border]
             total = np.zeros((3, len(border)), dtype=np.float32)
             for column, row in _EDGE_SAMPLES:
                 rays = self._rays.shifted(border, column, row)
-                total += self._shade(
-                    layers, planes, self._cast(layers, bodies, rays, bearing), rays
-                )
+                total += self._shade(layers, planes, self._cast(layers, bodies, rays, level), rays)
             levels[:, border] = total * np.float32(1.0 / len(_EDGE_SAMPLES))
         return levels
 
@@ -129,7 +129,7 @@ class MirrorRenderer:
 
         Exact in double precision but for which surface is hit, which is the ray caster's.
         """
-        hits = self._cast([(scene, pose)], (), self._rays, self._bearing)
+        hits = self._cast([(scene, pose)], (), self._rays, self._level)
         weights = scene.planes(pose, np.eye(3))[8:, np.maximum(hits.patch, 0)]
         inverse = np.sum(weights.T * self._exact[self._valid], axis=1)
         out = np.full(self._shape[0] * self._shape[1], np.nan)
@@ -142,13 +142,13 @@ class MirrorRenderer:
         layers: Sequence[tuple[Layer, FloatArray]],
         bodies: Sequence[Body],
         rays: _Rays,
-        bearing: Float32,
+        level: Float32,
     ) -> _Hits:
         scene, pose = layers[0]
         patch, distance = scene.caster.cast(pose[:3, 3], _turned(pose, rays.direction))
         layer = np.where(patch >= 0, np.int32(0), _NOTHING)
         for k, body in enumerate(bodies, start=1):
-            chosen = _towards(body, pose, bearing)
+            chosen = _towards(body, pose, level, distance)
             if len(chosen) == 0:
                 continue
             other, seen = layers[k]
@@ -166,7 +166,7 @@ class MirrorRenderer:
         hits: _Hits,
         rays: _Rays,
     ) -> Float32:
-        if len(layers) == 1 and bool((hits.layer == 0).all()):
+        if bool((hits.layer == 0).all()):
             return self._shade_layer(layers[0][0], planes[0], hits.patch, rays)
         levels = np.zeros((3, len(hits.layer)), dtype=np.float32)
         for k, (layer, _) in enumerate(layers):
@@ -281,18 +281,22 @@ def _turned(pose: FloatArray, directions: Float32) -> Float32:
     return np.asarray((pose[:3, :3].astype(np.float32) @ directions).T)
 
 
-def _towards(body: Body, pose: FloatArray, bearing: Float32) -> IntArray:
-    """Rays that may meet a body, by their bearing; a small tilt of the camera is allowed for."""
+def _towards(body: Body, pose: FloatArray, level: Float32, distance: Float32) -> IntArray:
+    """Rays that may meet a body: by their bearing, and as nothing nearer is before it.
+
+    ``level`` (2, n) are the rays' horizontal unit directions in the camera's axes. The camera's
+    tilt, a few degrees, is allowed for by a margin.
+    """
     offset = (body.wTo[:3, 3] - pose[:3, 3])[:2]
     far = float(np.hypot(*offset))
     if far <= body.radius + 0.1:
-        return np.arange(len(bearing))
+        return np.arange(len(distance))
     forward = float(np.arctan2(pose[1, 0], pose[0, 0]))
     middle = float(np.arctan2(offset[1], offset[0])) - forward
-    half = np.arcsin(body.radius / far) + 0.1
-    turn, full = np.float32(np.pi - middle), np.float32(2.0 * np.pi)
-    away = np.abs((bearing + turn) % full - np.float32(np.pi))
-    return np.flatnonzero(away < half)
+    half = np.arcsin(body.radius / far) + _TILT_MARGIN
+    x, y, least = np.array([np.cos(middle), np.sin(middle), np.cos(half)], dtype=np.float32)
+    nearest = np.float32(far - body.radius)
+    return np.flatnonzero((level[0] * x + level[1] * y > least) & (distance > nearest))
 
 
 def _dot(a: Float32, b: Float32) -> Float32:

@@ -33,7 +33,7 @@ from fgslam.types import BoolArray, FloatArray, Image
 
 # Coarser than in the lab: the mirror's pixels are wider.
 _LIGHT_SPACING_M = 0.2
-_PEOPLE_STEPS, _PEOPLE_STEP_M, _PEOPLE_CLEARANCE_M = 14, 1.0, 0.4
+_PEOPLE_STEPS, _PEOPLE_STEP_M, _PEOPLE_CLEARANCE_M = 16, 0.7, 0.45
 # Nearer than this to an obstacle's coarse distance, contact is decided exactly; metres.
 _CONTACT_M = 0.06
 
@@ -205,19 +205,15 @@ class OmniWorld:
         return np.random.default_rng([self._seed, 100 + stream])
 
     def _people_routes(self) -> list[FloatArray]:
-        """One route for each person, in the rooms that the reference path goes through."""
-        count = self.settings.people
-        if count == 0:
-            return []
+        """A walk for each person between places of the reference path, so that they are met."""
         planner = PathPlanner(self.model.space, _PEOPLE_CLEARANCE_M)
-        rng, poses = self._rng(6), self.reference_poses
-        starts = rng.permutation(len(poses))[:count]
-        return [
-            planner.reference_path(
-                _PEOPLE_STEP_M, _PEOPLE_STEPS, rng, start=poses[starts[k % len(starts)], :2]
-            )[:, :2]
-            for k in range(count)
-        ]
+        rng, places = self._rng(6), self.reference_poses[:, :2]
+        routes = []
+        for _ in range(self.settings.people):
+            tour = [*rng.permutation(places), *rng.permutation(places)]
+            route = planner.walk(tour, _PEOPLE_STEP_M, _PEOPLE_STEPS, rng)
+            routes.append(places if route is None else route)
+        return routes
 
     def _touches(self, place: FloatArray) -> bool:
         radius = self.settings.wheelchair.radius_m

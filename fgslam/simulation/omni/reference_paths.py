@@ -46,7 +46,6 @@ class PathPlanner:
         legs: int,
         rng: np.random.Generator,
         within: str | None = None,
-        start: FloatArray | None = None,
     ) -> FloatArray:
         """(legs + 1, 3) poses, start first, each headed to the next one.
 
@@ -55,17 +54,13 @@ class PathPlanner:
             legs: number of targets after the start.
             rng: chooses the tour and the targets.
             within: name of the room to stay in; None tours the house.
-            start: (2,) free place to begin at; None draws one.
 
         Raises:
             DatasetError: no such path is found.
         """
         for _ in range(_STARTS):
             tour = self._tour(rng, within)
-            if start is not None:
-                tour[0] = start
-            search = _Search(self._space, self._grid, tour, spacing, self._clearance)
-            points = search.run(legs, rng, None if within is None else _room(within))
+            points = self._searched(tour, spacing, legs, rng, within)
             if points is not None:
                 return _with_headings(points)
         where = "the house" if within is None else f"the {within}"
@@ -73,6 +68,26 @@ class PathPlanner:
             f"no path of {legs} legs of {spacing} m with {self._clearance} m of clearance is found "
             f"in {where}; lower path.spacing_m, path.legs or path.clearance_m"
         )
+
+    def walk(
+        self, places: Sequence[FloatArray], spacing: float, steps: int, rng: np.random.Generator
+    ) -> FloatArray | None:
+        """(steps + 1, 2) places of a walk from the first of some free places (2,) by the others.
+
+        None where no such walk is found; whether it gets to the last place depends on ``steps``.
+        """
+        return self._searched(places, spacing, steps, rng, None)
+
+    def _searched(
+        self,
+        tour: Sequence[FloatArray],
+        spacing: float,
+        legs: int,
+        rng: np.random.Generator,
+        within: str | None,
+    ) -> FloatArray | None:
+        search = _Search(self._space, self._grid, tour, spacing, self._clearance)
+        return search.run(legs, rng, None if within is None else _room(within))
 
     def _tour(self, rng: np.random.Generator, within: str | None) -> list[FloatArray]:
         """Places to head for in turn; the first is the start."""

@@ -1,0 +1,301 @@
+"""The house's parts: wheelchair, range finders, free floor, reference paths, people, camera."""
+
+import numpy as np
+import pytest
+
+from fgslam.errors import CalibrationError, DatasetError
+from fgslam.planar import between, wrap
+from fgslam.settings.omni_worlds import (
+    HouseExposureSettings,
+    HouseMirrorSettings,
+    HouseTiltSettings,
+    RangeSensorSettings,
+    WheelchairSettings,
+)
+from fgslam.simulation.omni.disturbances import CameraTilt, camera_pose, exposed, noisy
+from fgslam.simulation.omni.floor_plan import DEPTH, WIDTH, room_at
+from fgslam.simulation.omni.floor_space import FloorSpace
+from fgslam.simulation.omni.house import House, build_house
+from fgslam.simulation.omni.house_camera import make_house_camera
+from fgslam.simulation.omni.people import Walker
+from fgslam.simulation.omni.range_scan import RangeSensor
+from fgslam.simulation.omni.reference_paths import PathPlanner
+from fgslam.simulation.omni.wheelchair import Wheelchair
+from fgslam.simulation.patches import PatchArrays, Surface, Thing, box, stack
+from fgslam.simulation.raycaster import RayCaster
+from fgslam.types import FloatArray
+
+EXACT = WheelchairSettings(
+    speed_scale=0.0, turn_scale=0.0, pull_deg_m=0.0, slip_m_sqrt_m=0.0, slip_deg_sqrt_m=0.0
+)
+
+
+def rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+# --------------------------------------------------------------------------------------------
+# Wheelchair
+
+
+def test_speed_follows_command_after_the_latency_and_within_limits() -> None:
+    chair = Wheelchair(EXACT, np.zeros(3), rng())
+    chair.command(9.0, -9.0)
+    speeds, turns = [], []
+    for _ in range(200):
+        chair.advance(0.01)
+        speeds.append(chair.speed)
+        turns.append(chair.turn_rate)
+    waiting = round(EXACT.latency_s / 0.01)
+    assert np.array_equal(speeds[:waiting], np.zeros(waiting))
+    assert speeds[waiting] == pytest.approx(EXACT.max_acceleration_m_s2 * 0.01)
+    assert np.diff(speeds).max() <= EXACT.max_acceleration_m_s2 * 0.01 + 1e-12
+    assert max(speeds) == pytest.approx(EXACT.max_speed_m_s)
+    assert min(turns) == pytest.approx(-np.deg2rad(EXACT.max_turn_deg_s))
+    limit = np.deg2rad(EXACT.max_turn_acceleration_deg_s2) * 0.01
+    assert np.abs(np.diff(turns)).max() <= limit + 1e-12
+
+
+def test_without_slip_it_drives_the_circle_of_its_command() -> None:
+    chair = Wheelchair(EXACT, np.array([1.0, 2.0, 0.4]), rng())
+    chair.command(0.3, 0.2)
+    chair.advance(5.0)
+    first = chair.pose.copy()
+    chair.advance(4.0)
+    step = between(first, chair.pose)
+    expected = 1.5 * np.array([np.sin(0.8), 1.0 - np.cos(0.8)])
+    np.testing.assert_allclose(step[:2], expected, atol=1e-5)
+    assert step[2] == pytest.approx(0.8)
+
+
+def test_slip_has_the_stated_size() -> None:
+    """End points of 200 drives of 2 m scatter as the settings say."""
+    settings = WheelchairSettings(
+        speed_scale=0.03, turn_scale=0.0, pull_deg_m=1.0, slip_m_sqrt_m=0.02, slip_deg_sqrt_m=1.0,
+        latency_s=0.0, max_acceleration_m_s2=10.0,
+    )  # fmt: skip
+    ends = []
+    for seed in range(200):
+        chair = Wheelchair(settings, np.zeros(3), rng(seed))
+        chair.command(0.5, 0.0)
+        chair.advance(4.0)
+        ends.append(chair.pose)
+    heading = np.array(ends)[:, 2]
+    way = np.linalg.norm(np.array(ends)[:, :2], axis=1)
+    expected = np.deg2rad(np.hypot(2.0 * 1.0, 1.0 * np.sqrt(2.0)))
+    # The standard error of a deviation from 200 samples is 5 %.
+    assert heading.std() == pytest.approx(expected, rel=0.16)
+    assert way.std() == pytest.approx(np.hypot(2.0 * 0.03, 0.02 * np.sqrt(2.0)), rel=0.16)
+    assert abs(heading.mean()) < 4 * expected / 14
+
+
+def test_a_wall_stops_it_but_lets_it_turn_and_back_out() -> None:
+    chair = Wheelchair(EXACT, np.zeros(3), rng(), lambda place: bool(place[0] > 0.5))
+    chair.command(0.5, 0.0)
+    chair.advance(4.0)
+    assert chair.collided
+    assert 0.48 < chair.pose[0] <= 0.5
+    assert chair.collisions == 1
+    chair.command(-0.3, 0.3)
+    # Until the command takes effect it still pushes against the wall.
+    chair.advance(0.2)
+    chair.advance(1.8)
+    assert not chair.collided
+    assert chair.pose[0] < 0.3
+    assert chair.pose[2] > 0.3
+
+
+@pytest.mark.parametrize("speed", [np.nan, np.inf])
+def test_commands_are_finite_and_time_goes_forwards(speed: float) -> None:
+    chair = Wheelchair(EXACT, np.zeros(3), rng())
+    with pytest.raises(ValueError, match="not finite"):
+        chair.command(speed, 0.0)
+    with pytest.raises(ValueError, match="forwards"):
+        chair.advance(0.0)
+
+
+# --------------------------------------------------------------------------------------------
+# House, free floor, paths
+
+
+@pytest.fixture(scope="module")
+def house() -> House:
+    return build_house(rng(0), 1.6)
+
+
+@pytest.fixture(scope="module")
+def patches(house: House) -> PatchArrays:
+    return stack(house.things)
+
+
+@pytest.fixture(scope="module")
+def space(patches: PatchArrays) -> FloorSpace:
+    return FloorSpace(patches, np.zeros(2), np.array([WIDTH, DEPTH]))
+
+
+def textures(patches: PatchArrays) -> list[str]:
+    return [surface.texture for surface in patches.surfaces]
+
+
+def test_house_is_the_seeds(house: House, patches: PatchArrays) -> None:
+    again = stack(build_house(rng(0), 1.6).things)
+    np.testing.assert_array_equal(again.corner, patches.corner)
+    assert textures(again) == textures(patches)
+    other = stack(build_house(rng(1), 1.6).things)
+    assert textures(other) != textures(patches)
+
+
+def test_some_picture_hangs_in_every_room(house: House) -> None:
+    for name in ("painting_0", "poster_0"):
+        rooms = {
+            thing.name.split("_")[0]
+            for thing in house.things
+            if "picture" in thing.name and thing.patches[0].surface.texture == name
+        }
+        assert len(rooms) >= 5
+
+
+def test_all_furniture_stands_in_its_room(house: House) -> None:
+    low, high = np.array([0.0, 0.0, 0.0]), np.array([WIDTH, DEPTH, 2.7])
+    for thing in house.things:
+        for patch in thing.patches:
+            corners = patch.corner + np.array(
+                [0 * patch.edge_u, patch.edge_u, patch.edge_v, patch.edge_u + patch.edge_v]
+            )
+            assert (corners > low - 0.1).all(), thing.name
+            assert (corners < high + 0.1).all(), thing.name
+
+
+def test_clearance_is_the_distance_to_a_box() -> None:
+    things = [Thing("box", tuple(box((1.0, 1.0, 0.0), (2.0, 2.0, 0.8), Surface("any"))))]
+    high = [Thing("lintel", tuple(box((0.0, 0.0, 2.1), (3.0, 3.0, 2.4), Surface("any"))))]
+    space = FloorSpace(stack(things + high), np.zeros(2), np.array([3.0, 3.0]))
+    points = np.array([[0.5, 1.5], [2.4, 2.3], [1.5, 0.9]])
+    np.testing.assert_allclose(space.clearance(points), [0.5, 0.5, 0.1], atol=1e-12)
+    assert space.line_is_free(
+        np.array([0.4, 0.4]), np.array([[0.4, 2.6], [2.6, 2.6]]), 0.3
+    ).tolist() == [
+        True,
+        False,
+    ]
+
+
+@pytest.mark.parametrize("within", [None, "hall"])
+@pytest.mark.parametrize("spacing", [2.0, 3.0, 4.0])
+def test_reference_path_is_drivable(space: FloorSpace, spacing: float, within: str | None) -> None:
+    planner = PathPlanner(space, 0.55)
+    rooms = set()
+    for seed in range(5):
+        poses = planner.reference_path(spacing, 10, rng(seed), within)
+        assert poses.shape == (11, 3)
+        step = np.diff(poses[:, :2], axis=0)
+        np.testing.assert_allclose(np.linalg.norm(step, axis=1), spacing)
+        heading = np.arctan2(step[:, 1], step[:, 0])
+        np.testing.assert_allclose(wrap(heading - poses[:-1, 2]), 0.0, atol=1e-12)
+        part = np.linspace(0.0, 1.0, 25)[:, None]
+        for start, move in zip(poses[:-1, :2], step, strict=True):
+            assert space.clearance(start + part * move).min() > 0.52
+        names = {room.name for x, y, _ in poses if (room := room_at(x, y))}
+        assert within is None or names == {within}
+        rooms |= names
+    np.testing.assert_array_equal(poses, planner.reference_path(spacing, 10, rng(4), within))
+    assert within is not None or len(rooms) >= 4
+
+
+def test_impossible_path_is_told(space: FloorSpace) -> None:
+    with pytest.raises(DatasetError, match=r"no path of 60 legs of 8\.0 m .* in the hall; lower"):
+        PathPlanner(space, 0.9).reference_path(8.0, 60, rng(), "hall")
+
+
+# --------------------------------------------------------------------------------------------
+# Range finders, people, camera
+
+
+def make_sensor(noise: float, patches: PatchArrays) -> RangeSensor:
+    return RangeSensor(RangeSensorSettings(beams=32, noise_m=noise), RayCaster(patches))
+
+
+def test_scan_agrees_with_the_floors_outlines(patches: PatchArrays, space: FloorSpace) -> None:
+    """No beam ends before the nearest obstacle; the nearest beam ends close to it."""
+    sensor = make_sensor(0.0, patches)
+    for pose in PathPlanner(space, 0.55).reference_path(2.0, 4, rng(3)):
+        angles, ranges = sensor.scan(pose, np.empty((0, 3)), rng())
+        clearance = space.clearance(pose[None, :2])[0]
+        assert ranges.min() > clearance - 1e-5
+        ends = pose[:2] + ranges[:, None] * np.column_stack(
+            [np.cos(angles + pose[2]), np.sin(angles + pose[2])]
+        )
+        hit = ranges < 5.0
+        assert np.median(space.clearance(ends[hit])) < 0.02
+
+
+def test_scan_sees_people_with_noise_and_nothing_beyond_its_range(patches: PatchArrays) -> None:
+    sensor = make_sensor(0.02, patches)
+    pose = np.array([10.0, 8.7, 0.0])
+    disc = np.array([[11.5, 8.7, 0.3]])
+    ahead = [sensor.scan(pose, disc, rng(seed))[1][0] for seed in range(300)]
+    assert np.mean(ahead) == pytest.approx(1.2, abs=0.005)
+    assert np.std(ahead) == pytest.approx(0.02, rel=0.2)
+    angles, ranges = sensor.scan(pose, np.empty((0, 3)), rng())
+    assert angles[0] == 0.0
+    assert ranges[0] == 5.0
+
+
+def test_walker_goes_to_and_fro_and_waits_for_the_robot() -> None:
+    route = np.array([[0.0, 0.0], [4.0, 0.0]])
+    walker = Walker(route, 0.0)
+    far = np.array([50.0, 50.0])
+    places = []
+    for _ in range(140):
+        walker.advance(0.1, far)
+        places.append(walker.stance().x)
+    assert max(places) == pytest.approx(4.0, abs=0.1)
+    assert min(places[60:]) == pytest.approx(0.0, abs=0.1)
+    assert np.abs(np.diff(places)).max() <= 0.08 + 1e-9
+    meeting = Walker(route, 1.0)
+    for _ in range(10):
+        meeting.advance(0.1, np.array([2.0, 0.0]))
+    assert meeting.stance().x == pytest.approx(1.0, abs=0.05)
+    for _ in range(20):
+        meeting.advance(0.1, np.array([2.0, 0.0]))
+    assert meeting.stance().x < 0.6
+
+
+def test_tilt_is_bounded_and_leans_the_camera() -> None:
+    tilt = CameraTilt(HouseTiltSettings(constant_deg=2.0, sway_deg=0.0), rng(1))
+    angles = np.rad2deg(tilt.angles(3.0))
+    assert np.linalg.norm(angles) == pytest.approx(2.0)
+    sway = CameraTilt(HouseTiltSettings(sway_deg=1.5), rng(1))
+    seen = np.rad2deg([sway.angles(t) for t in np.linspace(0, 60, 600)])
+    np.testing.assert_allclose(np.abs(seen).max(axis=0), 1.5, atol=0.01)
+    pitched = camera_pose(np.array([1.0, 2.0, 0.5]), 1.2, np.array([0.0, 0.1]))
+    # Pitch about the left axis is nose down.
+    np.testing.assert_allclose(pitched[2, 0], -np.sin(0.1))
+    np.testing.assert_allclose(pitched[:3, 3], [1.0, 2.0, 1.2])
+    rolled: FloatArray = camera_pose(np.zeros(3), 1.2, np.array([0.1, 0.0]))
+    np.testing.assert_allclose(rolled[2, 1], np.sin(0.1))
+
+
+def test_exposure_and_noise() -> None:
+    levels = np.full((3, 20_000), 100.0, np.float32)
+    settings = HouseExposureSettings(gain=1.2, wave=0.25, period_s=8.0, offset=3.0)
+    np.testing.assert_allclose(exposed(levels, settings, 2.0), 100 * 1.2 * 1.25 + 3, rtol=1e-5)
+    bright = exposed(levels, HouseExposureSettings(gain=1.0, gamma=0.5), 0.0)
+    np.testing.assert_allclose(bright, 255 * np.sqrt(100 / 255), rtol=1e-5)
+    seen = noisy(levels, 2.0, (1, 2, 3))
+    assert seen.std() == pytest.approx(2.0, rel=0.03)
+    np.testing.assert_array_equal(seen, noisy(levels, 2.0, (1, 2, 3)))
+    assert not np.array_equal(seen, noisy(levels, 2.0, (1, 2, 4)))
+    np.testing.assert_array_equal(levels, np.full((3, 20_000), 100.0, np.float32))
+
+
+def test_mirror_shows_the_elevations_asked_for() -> None:
+    camera = make_house_camera(HouseMirrorSettings(top_elevation_deg=20.0))
+    rays = camera.rays(
+        np.indices((camera.height, camera.width)).reshape(2, -1)[::-1].T.astype(float)
+    )
+    elevation = np.rad2deg(np.arcsin(rays[np.isfinite(rays[:, 0]), 2]))
+    assert elevation.max() == pytest.approx(20.0, abs=0.5)
+    assert elevation.min() == pytest.approx(-65.0, abs=3.0)
+    with pytest.raises(CalibrationError, match="does not show"):
+        make_house_camera(HouseMirrorSettings(xi=0.5, top_elevation_deg=40.0))
