@@ -46,6 +46,15 @@ def read_grey_image(path: Path) -> Image:
     Raises:
         FrameError: the file is absent, incomplete or no image.
     """
+    return _decoded(path, cv2.IMREAD_GRAYSCALE)
+
+
+def read_colour_image(path: Path) -> Image:
+    """The image (height, width, 3) in red, green, blue, uint8; else as :func:`read_grey_image`."""
+    return np.asarray(cv2.cvtColor(_decoded(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def _decoded(path: Path, mode: int) -> Image:
     try:
         data = path.read_bytes()
     except OSError as cause:
@@ -54,7 +63,7 @@ def read_grey_image(path: Path) -> Image:
             "out with dataset.start/stop/stride"
         ) from cause
     _require_complete(path, data)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), mode) if data else None
     if image is None:
         raise FrameError(f"image {path} is not an image that can be decoded; restore the file")
     return np.ascontiguousarray(image, np.uint8)

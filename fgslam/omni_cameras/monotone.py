@@ -1,4 +1,4 @@
-"""Exact inverse of a smooth monotone function: a table for the start, Newton's method for the end."""
+"""Exact inverse of a smooth monotone function: started from a table, ended by Newton's method."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class MonotoneInverse:
         self._starts = knots if rising else knots[::-1]
 
     def __call__(self, wanted: FloatArray) -> FloatArray:
-        """x (n,) of values (n,); NaN where the function does not take them in the interval."""
+        """Arguments (n,) of values (n,); NaN where the function does not take them."""
         wanted = np.asarray(wanted, dtype=np.float64)
         slack = 1e-12 * (1.0 + np.abs(self._values[[0, -1]]).max())
         seen = (wanted >= self._values[0] - slack) & (wanted <= self._values[-1] + slack)

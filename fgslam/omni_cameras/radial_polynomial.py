@@ -57,7 +57,8 @@ class RadialPolynomial(RadialCamera):
     def _value_and_slope(self, radius: FloatArray) -> tuple[FloatArray, FloatArray]:
         slope = polynomial.polyder(np.array(self.coefficients))
         per_pixel = 2.0 / (self.outer_radius - self.inner_radius)
-        return self.elevation(radius), per_pixel * polynomial.polyval(self._scaled(radius), slope)
+        slopes = per_pixel * polynomial.polyval(self._scaled(radius), slope)
+        return self.elevation(radius), np.asarray(slopes)
 
 
 def _scaled(radius: FloatArray, inner: float, outer: float) -> FloatArray:

@@ -1,0 +1,173 @@
+"""Cameras from settings: models, calibration files, and what a recording keeps beside itself."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.datasets.tables import read_lines
+from fgslam.errors import CalibrationError
+from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
+from fgslam.omni_cameras.ocamcalib import read_ocamcalib
+from fgslam.omni_cameras.panoramas import Equirectangular
+from fgslam.omni_cameras.protocol import OmniCamera
+from fgslam.omni_cameras.radial import MirrorFrame
+from fgslam.omni_cameras.radial_polynomial import RadialPolynomial, fit_radial_polynomial
+from fgslam.settings.omni_cameras import (
+    BloggieSettings,
+    EquirectangularSettings,
+    HyperbolicMirrorSettings,
+    MirrorMountSettings,
+    OCamCalibSettings,
+    OmniCameraSettings,
+    RadialPolynomialSettings,
+)
+
+Size = tuple[int, int]
+
+
+def make_camera(
+    settings: OmniCameraSettings, image_size: Size, folder: Path | None = None
+) -> OmniCamera:
+    """The camera that the settings describe, for pictures of a size (width, height).
+
+    Args:
+        settings: one kind of camera.
+        image_size: width and height of the pictures.
+        folder: of the recording; calibration files are looked for there first.
+
+    Raises:
+        CalibrationError: the values are impossible, a file is missing or malformed, or the
+            pictures have another size than was calibrated.
+    """
+    match settings:
+        case EquirectangularSettings():
+            limits = np.deg2rad([settings.top_elevation_deg, settings.bottom_elevation_deg])
+            return Equirectangular(*image_size, float(limits[0]), float(limits[1]))
+        case HyperbolicMirrorSettings():
+            return _hyperbolic(settings, image_size)
+        case OCamCalibSettings():
+            calibration = read_ocamcalib(_find(settings.file, folder))
+            ahead = math.radians(settings.ahead_deg)
+            return calibration.camera(image_size, settings.ring_px, ahead, settings.clockwise)
+        case RadialPolynomialSettings():
+            _require_size("radial_polynomial", settings.size, image_size)
+            frame = _frame(settings, image_size, settings.centre)
+            coefficients = tuple(np.deg2rad(settings.coefficients_deg).tolist())
+            return RadialPolynomial(frame, *settings.ring_px, coefficients=coefficients)
+        case BloggieSettings():
+            return _bloggie(settings, _find(settings.file, folder), image_size)
+
+
+def _frame(
+    mount: MirrorMountSettings, size: Size, centre: tuple[float, float] | None
+) -> MirrorFrame:
+    middle = ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0)
+    return MirrorFrame(*size, centre or middle, math.radians(mount.ahead_deg), mount.clockwise)
+
+
+def _hyperbolic(settings: HyperbolicMirrorSettings, size: Size) -> HyperbolicMirror:
+    _require_size("mirror", settings.size, size)
+    frame = _frame(settings, size, settings.centre)
+    lowest = math.radians(settings.inner_elevation_deg)
+    highest = math.radians(settings.outer_elevation_deg)
+    if not lowest < highest or not math.sin(highest) < settings.xi:
+        raise CalibrationError(
+            f"camera: inner_elevation_deg {settings.inner_elevation_deg:g} and outer_elevation_deg "
+            f"{settings.outer_elevation_deg:g} must rise, and stay below arcsin(xi) = "
+            f"{math.degrees(math.asin(settings.xi)):.1f}"
+        )
+    scales = {a: math.cos(a) / (settings.xi - math.sin(a)) for a in (lowest, highest)}
+    column, row = frame.centre
+    border = min(column, row, size[0] - 1 - column, size[1] - 1 - row)
+    outer, focal = settings.outer_radius_px, settings.focal_px
+    if outer is None:
+        outer = border if focal is None else focal * scales[highest]
+    focal = focal or outer / scales[highest]
+    inner = settings.inner_radius_px
+    inner = focal * scales[lowest] if inner is None else inner
+    return HyperbolicMirror(frame, inner, outer, xi=settings.xi, focal_px=focal)
+
+
+def _require_size(kind: str, calibrated: Size | None, size: Size) -> None:
+    if calibrated is not None and calibrated != size:
+        raise CalibrationError(
+            f"camera ({kind}) is calibrated for {calibrated[0]}x{calibrated[1]} pixels, but the "
+            f"pictures have {size[0]}x{size[1]}; give the calibration at this size"
+        )
+
+
+def _find(file: str, folder: Path | None) -> Path:
+    beside = None if folder is None else folder / file
+    if beside is not None and beside.is_file():
+        return beside
+    if not Path(file).is_file():
+        also = "" if beside is None else f", nor {beside}"
+        raise CalibrationError(
+            f"camera.file: there is no calibration {file}{also}; put it beside the pictures, or "
+            "give its path"
+        )
+    return Path(file)
+
+
+# --------------------------------------------------------------------------------------------
+# Sony Bloggie with its 360 degree accessory
+
+# Radius (0 at the inner, 1 at the outer rim) over the panorama's height (0 above), as measured on a
+# grid by Golan Levin (BloggieUnwarp, 2010): 0.1850 y^2 + 0.8184 y - 0.0028.
+_LEVIN = (-0.0028, 0.8184, 0.1850)
+_BLOGGIE_KEYS = (
+    "INPUT_WIDTH",
+    "INPUT_HEIGHT",
+    "OPTICAL_CENTER_X",
+    "OPTICAL_CENTER_Y",
+    "MAX_R_PERCENT",
+    "MIN_R_PERCENT",
+    "ANGLE_SHIFT",
+)
+
+
+def _bloggie(settings: BloggieSettings, path: Path, size: Size) -> RadialPolynomial:
+    """The camera of a settings file of BloggieUnwarp: the panorama's middle is ahead."""
+    values = _bloggie_values(path)
+    width, height = values["INPUT_WIDTH"], values["INPUT_HEIGHT"]
+    if (width, height) != size:
+        raise CalibrationError(
+            f"{path} is for pictures of {width:g}x{height:g} pixels, but these have "
+            f"{size[0]}x{size[1]}; give their own settings"
+        )
+    # Half a pixel: that tool counts from the corner, here the first pixel's centre is 0.
+    centre = (
+        width * values["OPTICAL_CENTER_X"] - 0.5,
+        height * values["OPTICAL_CENTER_Y"] - 0.5,
+    )
+    inner = 0.5 * height * values["MIN_R_PERCENT"]
+    outer = 0.5 * height * values["MAX_R_PERCENT"]
+    frame = MirrorFrame(*size, centre, math.radians(values["ANGLE_SHIFT"] - 180.0))
+    down = np.linspace(0.0, 1.0, 50)
+    fraction = np.clip(np.polynomial.polynomial.polyval(down, np.array(_LEVIN)), 0.0, 1.0)
+    elevation = np.radians(settings.view_deg) * (settings.above_horizon - down)
+    samples = (inner + fraction * (outer - inner), elevation)
+    return fit_radial_polynomial(frame, (inner, outer), samples).camera
+
+
+def _bloggie_values(path: Path) -> dict[str, float]:
+    values: dict[str, float] = {}
+    for line, text in read_lines(path, CalibrationError):
+        key, _, word = (part.strip() for part in text.partition(","))
+        if key not in _BLOGGIE_KEYS:
+            continue
+        try:
+            values[key] = float(word)
+        except ValueError:
+            values[key] = math.nan
+        if not math.isfinite(values[key]):
+            raise CalibrationError(
+                f"{path}, line {line}: {key} is {word!r}, not a finite number; correct it"
+            )
+    absent = [key for key in _BLOGGIE_KEYS if key not in values]
+    if absent:
+        raise CalibrationError(f"{path} lacks {', '.join(absent)}; add `{absent[0]}, value`")
+    return values

@@ -1,0 +1,67 @@
+"""Settings of recordings of an omnidirectional camera, a tagged union over ``kind``."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, TypeAlias
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fgslam.settings.base import STRICT
+from fgslam.settings.datasets import RecordingSettings
+from fgslam.settings.omni_cameras import (
+    BloggieSettings,
+    EquirectangularSettings,
+    HyperbolicMirrorSettings,
+    OmniCameraSettings,
+)
+
+
+@dataclass(frozen=True, config=STRICT)
+class PanoramasSettings(RecordingSettings):
+    """A folder of panoramas, with or without ``poses.csv`` (docs/datasets/panoramas.md)."""
+
+    kind: Literal["panoramas"] = "panoramas"
+    camera: EquirectangularSettings = EquirectangularSettings()
+    width: Annotated[
+        int | None,
+        Field(
+            ge=64,
+            le=16384,
+            description="pictures are reduced to this width, and their height with it; null: as "
+            "they are",
+        ),
+    ] = None
+
+
+@dataclass(frozen=True, config=STRICT)
+class OmniPathSettings(RecordingSettings):
+    """A folder of a mirror camera's pictures along a path (docs/datasets/mirror_images.md)."""
+
+    kind: Literal["omni_path"] = "omni_path"
+    camera: OmniCameraSettings = HyperbolicMirrorSettings()
+    pattern: Annotated[
+        str,
+        Field(
+            min_length=1,
+            pattern=r"^[^/\\]+$",
+            description="names of the pictures, with * and ?; in order of the numbers in them",
+        ),
+    ] = "*"
+
+
+@dataclass(frozen=True, config=STRICT)
+class OmniVideoSettings(RecordingSettings):
+    """A mirror camera's video file; ``path`` is the file (docs/datasets/mirror_images.md)."""
+
+    kind: Literal["omni_video"] = "omni_video"
+    camera: OmniCameraSettings = BloggieSettings()
+    frame_rate_hz: Annotated[
+        float | None,
+        Field(gt=0.0, le=1000.0, description="frames a second; null: as the file says"),
+    ] = None
+
+
+OmniDatasetSettings: TypeAlias = Annotated[
+    PanoramasSettings | OmniPathSettings | OmniVideoSettings, Field(discriminator="kind")
+]
