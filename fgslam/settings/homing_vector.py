@@ -52,17 +52,18 @@ class HomingVectorSettings:
         float,
         Field(
             gt=0.0,
-            description="expected number of equally supported vectors if all matches were wrong",
+            description="expected number of equally likely vectors if all matches were wrong; so "
+            "small because wrong matches have common causes (measured on `omni_home`)",
         ),
-    ] = 1e-4
-    rival_sigmas: Annotated[
+    ] = 1e-9
+    rival_log_odds: Annotated[
         float,
         Field(
             ge=0.0,
-            description="sign test over the matches that support only one of two different "
-            "solutions; below it the answer is ambiguous",
+            description="the answer must be this much likelier (natural log) than any different "
+            "solution; else it is ambiguous",
         ),
-    ] = 1.0
+    ] = 15.0
     rival_angle_deg: Annotated[
         float, Field(gt=0.0, description="solutions closer than this are one and the same")
     ] = 15.0

@@ -11,10 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import binom
 
 from fgslam.frontend.omni.epipolar import EpipolarTest
 from fgslam.frontend.omni.homing_refinement import HomingRefinement, Refined, RefinementPrior
+from fgslam.frontend.omni.match_odds import gain, log_likelihood_ratio, right_probability
 from fgslam.frontend.omni.two_point import TwoPointSamples, solve_two_point
 from fgslam.homing_types import BearingMatches, HomingVector, Refusal, RefusalReason
 from fgslam.planar import wrap
@@ -24,7 +24,11 @@ from fgslam.types import BoolArray, FloatArray, IntArray
 _BATCH = 50  # samples between two looks at the confidence
 _MAX_LOG_RATIO_SIGMA = 0.7  # of ln rho: matches near the horizon support, but are not sampled
 _SHUFFLES = 10  # times the matches are paired wrongly to learn what chance supports
-_REFINED = 3  # different hypotheses that are refined, the best supported first
+_REFINED = 8  # different hypotheses that are refined, the best supported first
+_ALIKE = np.deg2rad(5.0)  # hypotheses closer than this lead to the same refined solution, mostly
+_SAME = np.deg2rad(0.2)  # refined solutions closer than this are one
+_TEMPER = 2.0  # residuals have common causes: so many of them count as one, see `covariance`
+_CHANCE = 0.05  # that a wrong match agrees with a hypothesis, while searching; later it is measured
 _CELL = np.deg2rad(2.0)  # matches within one cell in both views are one witness
 
 
@@ -49,8 +53,7 @@ def estimate_homing_vector(
         return Refusal(
             RefusalReason.TOO_FEW_INLIERS, "no pair of matches agrees on any homing vector"
         )
-    refined = [search.refined(c) for c in candidates]
-    refined.sort(key=lambda r: -search.witnesses(r.inliers))
+    refined = search.refined(candidates)
     best = refined[0]
     at_target = search.turn_at_target(best)
     if at_target is not None:
@@ -61,14 +64,13 @@ def estimate_homing_vector(
         return refusal
     theta, psi = (float(v) for v in best.parameters[:2])
     support = max((search.witnesses(r.inliers) for r in rivals), default=0)
-    return HomingVector(theta, psi, best.covariance[:2, :2], best.inliers, support)
+    return HomingVector(theta, psi, search.covariance(refined), best.inliers, support)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
     direction: float
     rotation: float
-    support: int
 
 
 class _Search:
@@ -91,6 +93,7 @@ class _Search:
         )
         self._cells = _cells(matches)
         self._tilt = tilt
+        self._right = right_probability(matches)
 
     # ----------------------------------------------------------------------------------------
     # Sampling
@@ -101,20 +104,22 @@ class _Search:
         if len(eligible) < 2:
             return []
         found: list[FloatArray] = []
-        drawn, best = 0, 0
+        drawn, best = 0, 0.0
         while drawn < self._settings.samples and drawn < self._needed(best):
             count = min(_BATCH, self._settings.samples - drawn)
-            pairs = eligible[_distinct_pairs(len(eligible), count, self._rng)]
+            pairs = eligible[_distinct_pairs(self._right[eligible], count, self._rng)]
             solutions = self._hypotheses(pairs, log_ratio, sigma_log)
             drawn += count
             if solutions.shape[1]:
                 found.append(solutions)
-                best = max(best, int(np.max(solutions[2])))
+                best = max(best, float(np.max(solutions[2])))
         return self._different(np.hstack(found)) if found else []
 
-    def _needed(self, support: int) -> float:
-        """Samples until one of two inliers was drawn with the wanted confidence."""
-        share = support / len(self._matches)
+    def _needed(self, share: float) -> float:
+        """Samples until one of two inliers was drawn with the wanted confidence.
+
+        ``share`` is that of the inliers, each counted as often as it is drawn.
+        """
         if share <= 0.0:
             return np.inf
         if share >= 1.0:
@@ -124,7 +129,7 @@ class _Search:
     def _hypotheses(
         self, pairs: IntArray, log_ratio: FloatArray, sigma_log: FloatArray
     ) -> FloatArray:
-        """(4, c) direction, rotation, number of inliers and their squared residuals' sum."""
+        """(4, c) direction, rotation, share of the inliers, and score, see :meth:`_score`."""
         m = self._matches
         bearing_sigma = np.sqrt(0.5 * (m.sigma[:, 0] ** 2 + m.sigma[:, 2] ** 2))
         solved = solve_two_point(
@@ -140,35 +145,60 @@ class _Search:
         inliers, residuals = self._test.inliers(
             direction, rotation, self._settings.inlier_sigmas, self._least_parallax
         )
-        misfit = np.sum(np.where(inliers, residuals**2, 0.0), axis=0)
-        return np.stack([direction, rotation, np.sum(inliers, axis=0), misfit])
+        share = self._right @ inliers / np.sum(self._right)
+        return np.stack([direction, rotation, share, self._score(inliers, residuals)])
+
+    def _score(self, inliers: BoolArray, residuals: FloatArray) -> FloatArray:
+        """(c,) log-likelihoods of hypotheses, up to a constant, of (n, c) residuals."""
+        gains = gain(residuals, self._settings.inlier_sigmas, _CHANCE)
+        odds = (self._right / (1.0 - self._right))[:, None]
+        return np.asarray(np.sum(np.where(inliers, np.log1p(odds * gains), 0.0), axis=0))
 
     def _different(self, hypotheses: FloatArray) -> list[_Candidate]:
         """The best of each group of like hypotheses."""
-        # Support decides; among equals the better fit.
-        order = np.lexsort((hypotheses[3], -hypotheses[2]))
+        ordered = hypotheses[:, np.argsort(-hypotheses[3], kind="stable")]
         chosen: list[_Candidate] = []
-        limit = np.deg2rad(self._settings.rival_angle_deg)
-        ordered = hypotheses[:, order]
         open_ = np.ones(ordered.shape[1], dtype=np.bool_)
         while len(chosen) < _REFINED and np.any(open_):
             k = int(np.argmax(open_))
-            theta, psi, support, _ = ordered[:, k]
-            chosen.append(_Candidate(float(theta), float(psi), int(support)))
-            open_ &= _angle_apart(ordered[:2], ordered[:2, k : k + 1]) > limit
+            chosen.append(_Candidate(float(ordered[0, k]), float(ordered[1, k])))
+            open_ &= _angle_apart(ordered[:2], ordered[:2, k : k + 1]) > _ALIKE
         return chosen
 
     # ----------------------------------------------------------------------------------------
     # Refining and judging
 
-    def refined(self, candidate: _Candidate) -> Refined:
-        """The candidate after least squares."""
-        return self._refinement.refine(candidate.direction, candidate.rotation)
+    def refined(self, candidates: list[_Candidate]) -> list[Refined]:
+        """The candidates after least squares, the best score first, each solution once."""
+        found = [self._refinement.refine(c.direction, c.rotation) for c in candidates]
+        found.sort(key=lambda r: -self._score_of(r))
+        out: list[Refined] = []
+        for solution in found:
+            if all(_apart(solution, known) > _SAME for known in out):
+                out.append(solution)
+        return out
+
+    def _score_of(self, solution: Refined) -> float:
+        return float(self._score(solution.inliers[:, None], solution.residuals[:, None])[0])
+
+    def covariance(self, refined: list[Refined]) -> FloatArray:
+        """(2, 2) of the best solution, widened by those near it that fit nearly as well.
+
+        Features all on one side leave a valley with several minima. Each solution within the
+        rivals' angle weighs by its likelihood, tempered since residuals have common causes.
+        """
+        best = refined[0]
+        near = [r for r in refined if not self.differ(r, best)]
+        lost = np.array([self._score_of(best) - self._score_of(r) for r in near])
+        weights = np.exp(-lost / _TEMPER)
+        offsets = wrap(np.array([r.parameters[:2] for r in near]) - best.parameters[:2])
+        spread = np.array([r.covariance[:2, :2] for r in near])
+        spread = spread + offsets[:, :, None] * offsets[:, None, :]
+        return np.asarray(np.tensordot(weights / np.sum(weights), spread, axes=1))
 
     def differ(self, one: Refined, other: Refined) -> bool:
         """Whether two solutions are not one and the same."""
-        apart = _angle_apart(one.parameters[:2, None], other.parameters[:2, None])[0]
-        return bool(apart > np.deg2rad(self._settings.rival_angle_deg))
+        return _apart(one, other) > float(np.deg2rad(self._settings.rival_angle_deg))
 
     def witnesses(self, which: BoolArray) -> int:
         """Number of inliers that are independent of each other."""
@@ -191,11 +221,7 @@ class _Search:
         )
 
     def _undecided(self, best: Refined, rival: Refined) -> bool:
-        """Sign test over the witnesses that support only one of two solutions."""
-        only_best = self.witnesses(best.inliers & ~rival.inliers)
-        only_rival = self.witnesses(rival.inliers & ~best.inliers)
-        needed = self._settings.rival_sigmas * np.sqrt(only_best + only_rival)
-        return bool(only_best - only_rival <= needed)
+        return self._score_of(best) - self._score_of(rival) < self._settings.rival_log_odds
 
     def refusal(self, best: Refined, rivals: list[Refined]) -> Refusal | None:
         """Why the best solution is no answer, or None."""
@@ -215,9 +241,8 @@ class _Search:
             )
         elif undecided := [r for r in rivals if self._undecided(best, r)]:
             reason = RefusalReason.AMBIGUOUS
-            text = (
-                f"{support} inliers, {self.witnesses(undecided[0].inliers)} for a different solution"
-            )
+            other = self.witnesses(undecided[0].inliers)
+            text = f"{support} inliers, {other} for a different solution"
         elif (sigma := float(np.sqrt(best.covariance[0, 0]))) > np.deg2rad(
             s.max_direction_sigma_deg
         ):
@@ -230,27 +255,44 @@ class _Search:
     def _log_false_alarms(self, best: Refined) -> float:
         """Log of the number of equally supported hypotheses expected if all matches were wrong.
 
-        What a wrong match's chance is to support this hypothesis is read off wrong matches: the
-        same features paired by lot (an *a contrario* test, Moisan and Stival 2004).
+        How often a wrong match agrees with this hypothesis is read off wrong matches: the same
+        features paired by lot (an *a contrario* test, Moisan and Stival 2004).
         """
-        n = len(self._matches)
-        total, support = len(np.unique(self._cells)), self.witnesses(best.inliers)
+        n, sigmas = len(self._matches), self._settings.inlier_sigmas
         shuffled = np.concatenate([self._rng.permutation(n) for _ in range(_SHUFFLES)])
-        pairs = _repaired(self._matches, shuffled)
-        good, _ = EpipolarTest.of(pairs, self._tilt).inliers(
-            best.parameters[:1], best.parameters[1:2],
-            self._settings.inlier_sigmas, self._least_parallax,
-        )  # fmt: skip
+        wrong = EpipolarTest.of(_repaired(self._matches, shuffled), self._tilt)
+        good, _ = wrong.inliers(
+            best.parameters[:1], best.parameters[1:2], sigmas, self._least_parallax
+        )
         chance = (np.count_nonzero(good) + 1.0) / (len(good) + 2.0)
-        tests = np.log(float(total * (total - 1)))  # two solutions for each pair
-        return float(tests + binom.logsf(support - 1, total, chance))
+        gains = np.where(best.inliers, gain(best.residuals, sigmas, chance), 0.0)
+        witnesses = _one_a_cell(gains, self._cells)
+        tests = np.log(float(n * (n - 1)))  # two solutions for each pair
+        return tests - log_likelihood_ratio(gains[witnesses], self._right[witnesses])
 
 
-def _distinct_pairs(n: int, count: int, rng: np.random.Generator) -> IntArray:
-    """(count, 2) of two different numbers below n each."""
-    first = rng.integers(0, n, count)
-    second = (first + rng.integers(1, n, count)) % n
-    return np.column_stack([first, second])
+def _one_a_cell(gains: FloatArray, cells: IntArray) -> IntArray:
+    """(m,) of each cell the match that agrees best: the others say the same again."""
+    order = np.lexsort((-gains, cells))
+    first = np.ones(len(order), dtype=np.bool_)
+    first[1:] = cells[order][1:] != cells[order][:-1]
+    return np.asarray(order[first], dtype=np.int64)
+
+
+def _distinct_pairs(weights: FloatArray, count: int, rng: np.random.Generator) -> IntArray:
+    """(count, 2) of two different indices, drawn in proportion to weights (n,), n at least 2."""
+    n, ends = len(weights), np.cumsum(weights)
+    first = np.searchsorted(ends, rng.uniform(0.0, ends[-1], count), side="right")
+    # The second is drawn from what is left when the first one's interval is cut out.
+    rest = rng.uniform(0.0, 1.0, count) * (ends[-1] - weights[first])
+    rest = np.where(rest < ends[first] - weights[first], rest, rest + weights[first])
+    second = np.searchsorted(ends, rest, side="right")
+    return np.minimum(np.column_stack([first, second]), n - 1)
+
+
+def _apart(one: Refined, other: Refined) -> float:
+    """Larger of the differences in direction and rotation."""
+    return float(_angle_apart(one.parameters[:2, None], other.parameters[:2, None])[0])
 
 
 def _angle_apart(one: FloatArray, other: FloatArray) -> FloatArray:
