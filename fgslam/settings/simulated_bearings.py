@@ -15,7 +15,10 @@ from fgslam.settings.base import STRICT
 class SimulatedBearingsSettings:
     """A room of points, a start, a target, and a robot that drives from one towards the other."""
 
-    features: Annotated[int, Field(ge=3, description="points that both views see")] = 30
+    features: Annotated[
+        int,
+        Field(ge=3, description="points that are matched rightly; wrong matches come on top"),
+    ] = 30
     surrounding: Annotated[
         Literal["isotropic", "anisotropic"],
         Field(
@@ -75,8 +78,8 @@ class SimulatedBearingsSettings:
         Field(
             ge=0.0,
             lt=1.0,
-            description="part of the matches between start and target whose target end belongs to "
-            "another one of them",
+            description="part of all matches between start and target that is wrong: the target "
+            "end belongs to another point",
         ),
     ] = 0.0
     jumping_tracks: Annotated[
@@ -98,7 +101,7 @@ class SimulatedBearingsSettings:
     ] = 0.0
     lost_per_s: Annotated[
         float, Field(ge=0.0, description="part of the tracks that get lost in a second")
-    ] = 0.05
+    ] = 0.02
 
 
 def with_outliers(settings: SimulatedBearingsSettings, part: float) -> SimulatedBearingsSettings:

@@ -65,11 +65,11 @@ def simulate_homing(
     """
     _require_room(settings)
     target = _target(settings, rng)
-    points = _points(settings, target, 2 * settings.features, rng)
-    points, decoys = np.split(points, 2)
-    heights = rng.uniform(settings.lowest_m, settings.highest_m, settings.features)
-    heights *= rng.choice([-1.0, 1.0], settings.features)
-    matches, correct = _matches(settings, target, (points, heights), rng)
+    wrong = round(settings.features * settings.wrong_matches / (1.0 - settings.wrong_matches))
+    n = settings.features + wrong
+    points, decoys = np.split(_points(settings, target, 2 * n, rng), 2)
+    heights = rng.uniform(settings.lowest_m, settings.highest_m, n) * rng.choice([-1.0, 1.0], n)
+    matches, correct = _matches(settings, target, (points, heights), wrong, rng)
     robots = _drive(settings, target, rng)
     tracks = _Tracks(settings, points, decoys, heights, rng).images(robots)
     landmarks = np.where(correct[:, None], points, np.nan)
@@ -115,15 +115,14 @@ def _matches(
     settings: SimulatedBearingsSettings,
     target: FloatArray,
     world: tuple[FloatArray, FloatArray],
+    wrong: int,
     rng: np.random.Generator,
 ) -> tuple[BearingMatches, BoolArray]:
     points, heights = world
     n = len(points)
     end = np.arange(n)
-    wrong = np.sort(rng.permutation(n)[: round(settings.wrong_matches * n)])
-    if len(wrong) == 1:
-        end[wrong] = (wrong + 1) % n
-    end[wrong] = np.roll(end[wrong], 1)
+    swapped = np.sort(rng.permutation(n)[:wrong])
+    end[swapped] = np.roll(swapped, 1) if wrong > 1 else (swapped + 1) % n
     seen_a = _seen(settings, np.zeros(3), points, heights, rng)
     seen_b = _seen(settings, target, points, heights, rng)[:, end]
     sigma = np.deg2rad([settings.bearing_sigma_deg, settings.elevation_sigma_deg] * 2)

@@ -82,7 +82,7 @@ def initial_state(start: HomingStart, settings: HomingEkfSettings) -> FilterStat
     make = _joint_covariance if settings.target == "joint" else _independent_covariance
     covariance[4:, 4:] = make(start, kept, settings.exact_bearings)
     covariance[3, 3] = settings.motion.initial_speed**2
-    state = FilterState(chart.ids[kept], mean, covariance)
+    state = FilterState(chart.ids[kept], mean, 0.5 * (covariance + covariance.T))
     return _with_one_distance(state, settings) if settings.gauge == "one_distance" else state
 
 

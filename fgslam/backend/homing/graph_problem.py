@@ -33,6 +33,8 @@ from fgslam.settings.homing_estimators import GraphMotionSettings, HomingGraphSe
 from fgslam.types import BoolArray, FloatArray, IntArray
 
 _COLLAPSED = 0.1  # of the first distance from the start: gates let no error of ninety percent in
+_CONFIRMED, _SAME_SIGMAS = 3, 1.0  # agreements in a row before a waiting feature enters
+_JUMPED = 4  # misses in a row after which a track follows something else
 _LEAST_SIGMA = 1e-3  # radians: of the initialisation's direction and rotation, stated smaller
 
 
@@ -73,6 +75,9 @@ class HomingProblem:
         self._ids = start.local_map.ids
         self._entered = np.zeros(len(self._ids), np.bool_)
         self._guesses = np.full((len(self._ids), 2), np.nan)
+        self._sighted = np.full((len(self._ids), 2), np.nan)  # distance and deviation, when waiting
+        self._agreed = np.zeros(len(self._ids), np.int64)
+        self._missed = np.zeros(len(self._ids), np.int64)
 
     @property
     def entered(self) -> IntArray:
@@ -165,8 +170,12 @@ class HomingProblem:
         misses = np.abs(bearing(pose, points[rows], bearings)) > settings.gate_sigmas * sigma
         if np.count_nonzero(misses) > 0.5 * len(misses):
             return pose, seen
+        numbers = np.searchsorted(self._ids, tracked.ids[seen])
+        self._missed[numbers] = np.where(
+            misses | (self._missed[numbers] >= _JUMPED), self._missed[numbers] + 1, 0
+        )
         fits = seen.copy()
-        fits[seen] = ~misses
+        fits[seen] = ~misses & (self._missed[numbers] == 0)
         return pose, fits
 
     def _see(self, new: NewPart, pose: int, row: int, tracked: TrackedBearings, k: int) -> None:
@@ -253,11 +262,25 @@ class HomingProblem:
             ]
         )
         spread = np.sqrt((by**2 * variance).sum(axis=1))
-        for k in np.flatnonzero(self._good(legs, spread)).tolist():
+        self._compare(rows[waiting], length * legs, length * spread)
+        confirmed = self._good(legs, spread) & (self._agreed[rows[waiting]] >= _CONFIRMED)
+        for k in np.flatnonzero(confirmed).tolist():
             distance = float(length * legs[k])
             self._enter(new, int(rows[waiting[k]]), distance * unit(start[k]), distance)
             entering[waiting[k]] = True
         return entering
+
+
+    def _compare(self, rows: IntArray, distance: FloatArray, spread: FloatArray) -> None:
+        """Counts how often in a row a waiting feature was seen at one distance, within its noise.
+
+        A single wrong bearing makes a large parallax, and would pass for a good triangulation.
+        """
+        last = self._sighted[rows]
+        with np.errstate(invalid="ignore"):
+            same = np.abs(distance - last[:, 0]) <= _SAME_SIGMAS * np.hypot(spread, last[:, 1])
+        self._agreed[rows] = np.where(same, self._agreed[rows] + 1, 0)
+        self._sighted[rows] = np.column_stack([distance, spread])
 
 
 def _drift(motion: GraphMotionSettings, step: float) -> FloatArray:

@@ -1,0 +1,43 @@
+"""Simulated homings from matches to tracks, through the real initialisation step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
+from fgslam.frontend.omni.local_map import make_local_map
+from fgslam.homing_types import HomingStart, HomingTruth, HomingVector, TrackedBearings
+from fgslam.settings.homing_vector import HomingVectorSettings
+from fgslam.settings.simulated_bearings import SimulatedBearingsSettings
+from fgslam.simulation.bearings import simulate_homing
+from fgslam.types import BoolArray
+
+LEVEL = HomingVectorSettings(tilt_sigma_deg=0.0, height_sigma=0.0, max_direction_sigma_deg=15.0)
+"""The simulated camera neither tilts nor rises; sparse rooms are to be answered, too."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What an estimator is given, and the truth; ``correct`` of the matches that were kept."""
+
+    start: HomingStart
+    tracks: tuple[TrackedBearings, ...]
+    truth: HomingTruth
+    correct: BoolArray
+
+
+def trial(seed: int, settings: SimulatedBearingsSettings | None = None) -> Trial:
+    """One homing of a seed."""
+    simulated = simulate_homing(
+        settings or SimulatedBearingsSettings(), np.random.default_rng([seed, 1])
+    )
+    vector = estimate_homing_vector(simulated.matches, LEVEL, np.random.default_rng([seed, 2]))
+    assert isinstance(vector, HomingVector), vector
+    distance = make_local_map(vector, simulated.matches).distance
+    rows = np.flatnonzero(vector.inliers & np.isfinite(distance) & (distance > 0.0))
+    matches = simulated.matches.taken(rows)
+    start = HomingStart(simulated.time, vector, make_local_map(vector, matches), matches)
+    tracks, truth = simulated.followed(rows)
+    return Trial(start, tracks, truth, simulated.correct[rows])
