@@ -1,0 +1,195 @@
+"""Which links to believe: a false one, between places that look alike, contradicts its neighbours.
+
+Around a triangle of images the rotations add up to zero, and the direction from the first to the
+third lies between the directions of the two steps. Links that break more triangles than they
+keep go first, the worst one first, as one false link spoils every triangle it is in. Then each
+link's rotation is held against all others' together (rotation averaging).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+
+import numpy as np
+
+from fgslam.homing.linking import Link, Pair
+from fgslam.planar import wrap
+from fgslam.settings.homing_behaviour import TopologicalMapSettings
+from fgslam.types import FloatArray
+
+_SIGMAS = 3.0
+_ROUNDS = 10  # of the rotation averaging's reweighting
+_HUBER = np.deg2rad(5.0)  # residual from which on a link's rotation counts less
+
+
+class LinkChecks:
+    """All links of a map under examination."""
+
+    def __init__(self, count: int, links: Iterable[Link], settings: TopologicalMapSettings) -> None:
+        """Takes links between ``count`` images, one a pair."""
+        self._count = count
+        self._settings = settings
+        self._links = {(link.a, link.b): link for link in links}
+        self._verdicts = self._judge_triangles()
+
+    def believed(self, *, ordered: bool) -> tuple[list[Link], dict[Pair, str]]:
+        """Links that pass every check, by pair, and why the others do not.
+
+        Args:
+            ordered: images follow each other on a way; neighbours in it need no third witness. It
+                is no proof: their link must still not contradict others.
+        """
+        rejected: dict[Pair, str] = {}
+        self._drop_contradicted(rejected)
+        self._drop_lone(rejected, ordered=ordered)
+        self._drop_turned(rejected)
+        return [self._links[pair] for pair in sorted(self._links)], rejected
+
+    # ----------------------------------------------------------------------------------------
+    # Triangles
+
+    def _judge_triangles(self) -> dict[tuple[int, int, int], bool]:
+        neighbours: list[set[int]] = [set() for _ in range(self._count)]
+        for a, b in self._links:
+            neighbours[a].add(b)
+            neighbours[b].add(a)
+        return {
+            (a, b, c): self._holds(a, b, c)
+            for a, b in self._links
+            for c in sorted(neighbours[a] & neighbours[b])
+            if c > b
+        }
+
+    def _holds(self, a: int, b: int, c: int) -> bool:
+        ab, bc, ac = self._links[a, b], self._links[b, c], self._links[a, c]
+        limit = np.deg2rad(self._settings.loop_deg)
+        turn = abs(float(wrap(np.array(ab.rotation + bc.rotation - ac.rotation))))
+        if turn > max(limit, _SIGMAS * np.sqrt(_variance(1, ab, bc, ac))):
+            return False
+        misfit = between_misfit(ab.direction, ab.rotation + bc.direction, ac.direction)
+        allowed = max(limit, _SIGMAS * np.sqrt(_variance(0, ab, bc, ac)))
+        # Without a direction (one place) there is nothing to contradict.
+        return not misfit > allowed
+
+    def votes(self) -> dict[Pair, tuple[int, int]]:
+        """Triangles that each link keeps, and that it breaks."""
+        out = dict.fromkeys(self._links, (0, 0))
+        for triangle, holds in self._verdicts.items():
+            for pair in itertools.combinations(triangle, 2):
+                good, bad = out[pair]
+                out[pair] = (good + holds, bad + (not holds))
+        return out
+
+    def _drop_contradicted(self, rejected: dict[Pair, str]) -> None:
+        while True:
+            votes = self.votes()
+            suspects = [p for p, (good, bad) in votes.items() if bad and bad >= good]
+            if not suspects:
+                return
+            worst = max(
+                suspects,
+                key=lambda p: (votes[p][1] - votes[p][0], -self._links[p].support, p),
+            )
+            good, bad = votes[worst]
+            self._drop(worst, f"breaks {bad} of {good + bad} triangles", rejected)
+
+    def _drop_lone(self, rejected: dict[Pair, str], *, ordered: bool) -> None:
+        for pair, (good, _) in self.votes().items():
+            support = self._links[pair].support
+            follows = ordered and pair[1] == pair[0] + 1
+            if good == 0 and not follows and support < self._settings.lone_support:
+                text = f"no third image confirms it, and {support} inliers are too few alone"
+                self._drop(pair, text, rejected)
+
+    def _drop(self, pair: Pair, why: str, rejected: dict[Pair, str]) -> None:
+        del self._links[pair]
+        rejected[pair] = why
+        self._verdicts = {
+            triangle: holds
+            for triangle, holds in self._verdicts.items()
+            if not set(pair) <= set(triangle)
+        }
+
+    # ----------------------------------------------------------------------------------------
+    # Headings
+
+    def _drop_turned(self, rejected: dict[Pair, str]) -> None:
+        limit = np.deg2rad(self._settings.heading_deg)
+        while self._links:
+            pairs = list(self._links)
+            rotations = np.array([self._links[p].rotation for p in pairs])
+            supports = np.array([self._links[p].support for p in pairs], dtype=np.float64)
+            residual = np.abs(heading_residuals(self._count, pairs, rotations, supports))
+            worst = int(np.argmax(residual))
+            if residual[worst] <= limit:
+                return
+            degrees = np.rad2deg(residual[worst])
+            self._drop(pairs[worst], f"{degrees:.0f} deg off all other rotations", rejected)
+
+
+def between_misfit(first: float, second: float, whole: float) -> float:
+    """By how much a triangle's long side leaves the cone of its two steps, radians.
+
+    Args:
+        first: direction of the first step.
+        second: of the second step, in the same axes.
+        whole: of both together.
+    """
+    turn, reached = wrap(np.array([second - first, whole - first]))
+    if turn < 0.0:
+        turn, reached = -turn, -reached
+    # Steps in opposite directions leave any direction between them, to one side or the other.
+    return float(max(0.0, -reached, reached - turn)) if np.isfinite(turn + reached) else 0.0
+
+
+def _variance(row: int, *links: Link) -> float:
+    return float(np.nansum([link.covariance[row, row] for link in links]))
+
+
+def heading_residuals(
+    count: int, pairs: list[Pair], rotations: FloatArray, weights: FloatArray
+) -> FloatArray:
+    """(m,) rotations minus what the best headings of all images together say, radians.
+
+    Headings start from a spanning tree of the strongest links, then iteratively reweighted least
+    squares (Huber) on wrapped residuals.
+
+    Args:
+        count: of images.
+        pairs: m links (a, b).
+        rotations: (m,) heading of b minus that of a.
+        weights: (m,) of the links, positive.
+    """
+    headings = _tree_headings(count, pairs, rotations, weights)
+    ends = np.array(pairs)
+    rows = np.arange(len(pairs))
+    design = np.zeros((len(pairs), count))
+    design[rows, ends[:, 0]], design[rows, ends[:, 1]] = -1.0, 1.0
+
+    def residuals() -> FloatArray:
+        return wrap(rotations - (headings[ends[:, 1]] - headings[ends[:, 0]]))
+
+    for _ in range(_ROUNDS):
+        left = residuals()
+        huber = np.minimum(1.0, _HUBER / np.maximum(np.abs(left), 1e-12))
+        root = np.sqrt(weights * huber)
+        step = np.linalg.lstsq(design * root[:, None], root * left, rcond=None)[0]
+        headings = headings + step
+    return residuals()
+
+
+def _tree_headings(
+    count: int, pairs: list[Pair], rotations: FloatArray, weights: FloatArray
+) -> FloatArray:
+    """(count,) headings along a maximum spanning forest (Prim's order, by Kruskal's sets)."""
+    group = np.arange(count)
+    headings = np.zeros(count)
+    for k in np.argsort(-weights, kind="stable"):
+        a, b = pairs[k]
+        if group[a] == group[b]:
+            continue
+        moved = group == group[b]
+        headings[moved] += headings[a] + rotations[k] - headings[b]
+        group[moved] = group[a]
+    return headings

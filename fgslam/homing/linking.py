@@ -1,0 +1,121 @@
+"""Links between images: homings there and back that agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from fgslam.homing_types import HomingVector, OmniFeatures, Refusal, RefusalReason
+from fgslam.planar import wrap
+from fgslam.settings.homing_behaviour import TopologicalMapSettings
+from fgslam.types import FloatArray
+
+Answer: TypeAlias = HomingVector | Refusal
+Linker: TypeAlias = Callable[[OmniFeatures, OmniFeatures], Answer]
+"""The homing vector from the first image's place to the second's."""
+Pair: TypeAlias = tuple[int, int]
+
+_SIGMAS = 3.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Link:
+    """A homing from one image to another that was answered in both directions alike.
+
+    Attributes:
+        a, b: numbers of the images.
+        direction: of b as seen from a, radians; NaN where both were taken at one place.
+        rotation: heading of b minus that of a.
+        back: direction of a as seen from b.
+        covariance: (2, 2) of (direction, rotation).
+        back_covariance: the same of the way back.
+        support: inliers, of the answer that has fewer.
+    """
+
+    a: int
+    b: int
+    direction: float
+    rotation: float
+    back: float
+    covariance: FloatArray
+    back_covariance: FloatArray
+    support: int
+
+    def reversed(self) -> Link:
+        """The way back."""
+        return Link(
+            self.b, self.a, self.back, -self.rotation, self.direction, self.back_covariance,
+            self.covariance, self.support,
+        )  # fmt: skip
+
+
+def link_pair(
+    pair: Pair, there: Answer, back: Answer, settings: TopologicalMapSettings
+) -> Link | str:
+    """The link of two answers, or why there is none.
+
+    Both directions must be answered with enough inliers, and one motion must explain both:
+    the rotations are opposite, and back points where there came from:
+    theta_ba = theta_ab + pi - psi_ab.
+    """
+    if isinstance(there, Refusal) and isinstance(back, Refusal):
+        return _same_place(pair, there, back, settings)
+    if isinstance(there, Refusal):
+        return f"refused in one direction: {there.details}"
+    if isinstance(back, Refusal):
+        return f"refused in one direction: {back.details}"
+    support = min(there.support, back.support)
+    if support < settings.min_support:
+        return f"{support} inliers, of {settings.min_support} needed"
+    gap = np.array(
+        [
+            there.rotation + back.rotation,
+            there.direction + np.pi - there.rotation - back.direction,
+        ]
+    )
+    apart = float(np.max(np.abs(wrap(gap))))
+    variance = float(np.max(np.diag(there.covariance) + np.diag(back.covariance)))
+    if apart > max(np.deg2rad(settings.mutual_deg), _SIGMAS * np.sqrt(variance)):
+        return f"there and back disagree by {np.rad2deg(apart):.1f} deg"
+    return Link(
+        *pair, there.direction, there.rotation, back.direction, there.covariance,
+        back.covariance, support,
+    )  # fmt: skip
+
+
+def _same_place(
+    pair: Pair, there: Refusal, back: Refusal, settings: TopologicalMapSettings
+) -> Link | str:
+    """Images from one place are linked, too: by a turn without a direction."""
+    if RefusalReason.AT_TARGET not in (there.reason, back.reason):
+        return there.details
+    if there.rotation is None or back.rotation is None:
+        return "taken at one place as seen from one of them only"
+    apart = abs(float(wrap(np.array(there.rotation + back.rotation))))
+    if apart > np.deg2rad(settings.mutual_deg):
+        return f"there and back disagree by {np.rad2deg(apart):.1f} deg"
+    nowhere = np.full((2, 2), np.nan)
+    nowhere[1, 1] = np.deg2rad(settings.mutual_deg / _SIGMAS) ** 2
+    return Link(
+        *pair, float("nan"), there.rotation, float("nan"), nowhere, nowhere, settings.min_support,
+    )  # fmt: skip
+
+
+def link_pairs(
+    answers: Mapping[Pair, Answer], settings: TopologicalMapSettings
+) -> tuple[list[Link], dict[Pair, str]]:
+    """Links of all pairs a < b that were answered in both directions, and why others are none."""
+    links: list[Link] = []
+    refused: dict[Pair, str] = {}
+    for a, b in sorted(answers):
+        if a >= b or (b, a) not in answers:
+            continue
+        made = link_pair((a, b), answers[a, b], answers[b, a], settings)
+        if isinstance(made, str):
+            refused[a, b] = made
+        else:
+            links.append(made)
+    return links, refused

@@ -1,0 +1,259 @@
+"""Topological map: images as nodes, homings that succeed as edges (I; design G34)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from fgslam.errors import StoredMapError
+from fgslam.homing.feature_file import (
+    load_archive,
+    pack_features,
+    require_array,
+    save_archive,
+    unpack_features,
+)
+from fgslam.homing.link_checks import LinkChecks
+from fgslam.homing.linking import Answer, Link, Linker, Pair, link_pairs
+from fgslam.homing.path_memory import PathMemory, read_names
+from fgslam.homing.retrieval import VisualWords, candidate_pairs
+from fgslam.homing_types import OmniFeatures
+from fgslam.settings.homing_behaviour import TopologicalMapSettings
+from fgslam.types import FloatArray, IntArray, StateArrays
+
+FORMAT = "fgslam topological map"
+VERSION = 1
+_SIGMA_OF_ONE = np.deg2rad(5.0)  # direction's deviation that costs as much as a leg by itself
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TopologicalMap:
+    """Nodes and edges.
+
+    Attributes:
+        images: features of the nodes.
+        names: of the nodes, for people.
+        links: believed, ascending by their pair (a < b).
+        costs: (m,) of the links: 1 for a leg of many inliers and a sure direction, more otherwise.
+        rejected: pairs that were answered, but not believed, and why; not saved.
+    """
+
+    images: tuple[OmniFeatures, ...]
+    names: tuple[str, ...]
+    links: tuple[Link, ...]
+    costs: FloatArray
+    rejected: Mapping[Pair, str]
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def graph(self) -> csr_matrix:
+        """(n, n) symmetric matrix of costs."""
+        return _graph(len(self), self.links, self.costs)
+
+    def components(self) -> tuple[IntArray, ...]:
+        """Node numbers of the connected parts, the largest first."""
+        _, label = connected_components(self.graph(), directed=False)
+        parts = [np.flatnonzero(label == k) for k in range(int(label.max(initial=-1)) + 1)]
+        return tuple(sorted(parts, key=lambda part: (-len(part), int(part[0]))))
+
+    def neighbours(self, node: int) -> IntArray:
+        """Nodes that are linked with one, ascending."""
+        ends = [link.b if link.a == node else link.a for link in self.links]
+        mine = [node in (link.a, link.b) for link in self.links]
+        return np.sort(np.array(ends, dtype=np.int64)[np.array(mine, dtype=np.bool_)])
+
+    def route(self, start: int, goal: int) -> tuple[int, ...]:
+        """The cheapest way's nodes, both ends included.
+
+        Raises:
+            StoredMapError: there is no such node, or no way.
+        """
+        for node in (start, goal):
+            if not 0 <= node < len(self):
+                raise StoredMapError(
+                    f"map: no node {node}; its {len(self)} nodes are numbered from 0"
+                )
+        cost, before = dijkstra(self.graph(), False, start, return_predecessors=True)
+        if not np.isfinite(cost[goal]):
+            raise StoredMapError(
+                f"map: no way from {self.names[start]} to {self.names[goal]}; they lie in "
+                "different parts of the map, take more images in between"
+            )
+        way = [goal]
+        while way[-1] != start:
+            way.append(int(before[way[-1]]))
+        return tuple(reversed(way))
+
+    def path(self, nodes: Sequence[int]) -> PathMemory:
+        """The target images of a route, ready to be followed."""
+        return PathMemory.of([self.images[k] for k in nodes], [self.names[k] for k in nodes])
+
+    def save(self, path: Path) -> float:
+        """Writes the map atomically.
+
+        Returns:
+            Kilobytes (of 1000 bytes) an image.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        arrays = pack_features(self.images) | _link_arrays(self.links, self.costs)
+        size = save_archive(path, FORMAT, VERSION, {"names": list(self.names)}, arrays)
+        return size / 1000.0 / max(len(self), 1)
+
+    @staticmethod
+    def load(path: Path) -> TopologicalMap:
+        """Reads a map; pixel positions of features are NaN, and nothing is known as rejected.
+
+        Raises:
+            StoredMapError: the file is missing, truncated, damaged, foreign or of another version.
+        """
+        header, arrays = load_archive(path, FORMAT, VERSION)
+        images = unpack_features(arrays, str(path))
+        names = read_names(header, len(images), str(path))
+        links, costs = _read_links(arrays, len(images), str(path))
+        return TopologicalMap(images, names, links, costs, {})
+
+
+# --------------------------------------------------------------------------------------------
+# Building
+
+
+def build_map(
+    images: Sequence[OmniFeatures],
+    linker: Linker,
+    settings: TopologicalMapSettings,
+    rng: np.random.Generator,
+    *,
+    ordered: bool = False,
+    names: Sequence[str] | None = None,
+) -> TopologicalMap:
+    """Tries every candidate pair both ways, and keeps the links that are believed.
+
+    Args:
+        images: features of the nodes.
+        linker: homing vector from one image to another.
+        settings: candidates and checks.
+        rng: for the visual words, which choose the candidates.
+        ordered: the images follow each other on a way.
+        names: of the images; numbered if absent.
+    """
+    pairs = map_candidates(images, settings, rng, ordered=ordered)
+    answers: dict[Pair, Answer] = {}
+    for a, b in pairs:
+        answers[a, b] = linker(images[a], images[b])
+        answers[b, a] = linker(images[b], images[a])
+    return map_of_answers(images, answers, settings, ordered=ordered, names=names)
+
+
+def map_candidates(
+    images: Sequence[OmniFeatures],
+    settings: TopologicalMapSettings,
+    rng: np.random.Generator,
+    *,
+    ordered: bool,
+) -> list[Pair]:
+    """Pairs a < b that are worth a homing; of an ordered set neighbours always."""
+    n = len(images)
+    if settings.candidates == 0 or settings.candidates >= n - 1:
+        likenesses = np.zeros((n, n))
+    else:
+        likenesses = VisualWords(images, settings.retrieval, rng).likenesses()
+    pairs = {(int(a), int(b)) for a, b in candidate_pairs(likenesses, settings.candidates)}
+    if ordered:
+        pairs |= {(k, k + 1) for k in range(n - 1)}
+    return sorted(pairs)
+
+
+def map_of_answers(
+    images: Sequence[OmniFeatures],
+    answers: Mapping[Pair, Answer],
+    settings: TopologicalMapSettings,
+    *,
+    ordered: bool = False,
+    names: Sequence[str] | None = None,
+) -> TopologicalMap:
+    """The map of homings that were searched elsewhere, in processes say.
+
+    Args:
+        images: features of the nodes.
+        answers: of pairs (from, to), both ways; pairs with one way only are passed over.
+        settings: checks.
+        ordered: as in :func:`build_map`.
+        names: likewise.
+    """
+    memory = PathMemory.of(images, names)
+    links, refused = link_pairs(answers, settings)
+    believed, rejected = LinkChecks(len(images), links, settings).believed(ordered=ordered)
+    costs = np.array([link_cost(link, settings) for link in believed])
+    return TopologicalMap(memory.images, memory.names, tuple(believed), costs, refused | rejected)
+
+
+def link_cost(link: Link, settings: TopologicalMapSettings) -> float:
+    """One for a leg, more where few inliers or an unsure direction make it risky.
+
+    So a route prefers a few safe legs to many, and two safe ones to one that is not.
+    """
+    variance = np.nan_to_num(max(link.covariance[0, 0], link.back_covariance[0, 0]))
+    weak = settings.doubling_support / max(link.support, 1)
+    return float(1.0 + weak + variance / _SIGMA_OF_ONE**2)
+
+
+def _graph(count: int, links: Sequence[Link], costs: FloatArray) -> csr_matrix:
+    ends = np.array([(link.a, link.b) for link in links], dtype=np.int64).reshape(-1, 2)
+    both = np.vstack([ends, ends[:, ::-1]])
+    weights = np.concatenate([costs, costs])
+    return coo_matrix((weights, (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
+
+
+# --------------------------------------------------------------------------------------------
+# Links in files
+
+
+def _link_arrays(links: Sequence[Link], costs: FloatArray) -> StateArrays:
+    m = len(links)
+    angles = [(link.direction, link.rotation, link.back) for link in links]
+    covariances = [(link.covariance, link.back_covariance) for link in links]
+    return {
+        "link_ends": np.array([(k.a, k.b) for k in links], dtype=np.int64).reshape(m, 2),
+        "link_angles": np.array(angles, dtype=np.float64).reshape(m, 3),
+        "link_covariances": np.array(covariances, dtype=np.float64).reshape(m, 2, 2, 2),
+        "link_support": np.array([k.support for k in links], dtype=np.int64),
+        "link_cost": np.asarray(costs, dtype=np.float64).reshape(m),
+    }
+
+
+def _read_links(
+    arrays: Mapping[str, Any], count: int, where: str
+) -> tuple[tuple[Link, ...], FloatArray]:
+    given = arrays.get("link_support")
+    m = len(given) if isinstance(given, np.ndarray) and given.ndim == 1 else 0
+    support = require_array(arrays, "link_support", "i", (m,), where)
+    ends = require_array(arrays, "link_ends", "i", (m, 2), where)
+    angles = require_array(arrays, "link_angles", "f", (m, 3), where)
+    covariances = require_array(arrays, "link_covariances", "f", (m, 2, 2, 2), where)
+    costs = require_array(arrays, "link_cost", "f", (m,), where)
+    ascending = m == 0 or bool((ends[:, 0] < ends[:, 1]).all())
+    if not ascending or ((ends < 0) | (ends >= count)).any() or not (costs > 0.0).all():
+        raise StoredMapError(f"{where}: array link_ends or link_cost is damaged; build it again")
+    links = tuple(
+        Link(
+            a=int(ends[k, 0]),
+            b=int(ends[k, 1]),
+            direction=float(angles[k, 0]),
+            rotation=float(angles[k, 1]),
+            back=float(angles[k, 2]),
+            covariance=covariances[k, 0],
+            back_covariance=covariances[k, 1],
+            support=int(support[k]),
+        )
+        for k in range(m)
+    )
+    return links, np.array(costs)
