@@ -115,7 +115,7 @@ def _slopes(profiles: Float32) -> Float32:
 
     Taken over a pixel each way: a quarter pixel would amplify the interpolation's facets.
     """
-    reach = int(round(1.0 / _STEP_PX))
+    reach = round(1.0 / _STEP_PX)
     out = np.zeros_like(profiles)
     out[:, reach:-reach] = (profiles[:, 2 * reach :] - profiles[:, : -2 * reach]) / 2.0
     return np.nan_to_num(out, copy=False)
