@@ -32,7 +32,7 @@ class HouseMirrorSettings:
         Field(
             gt=-20.0, lt=60.0, description="at the mirror's rim, which touches the image's border"
         ),
-    ] = 25.0
+    ] = 15.0
     bottom_elevation_deg: Annotated[
         float,
         Field(

@@ -109,11 +109,11 @@ class OmniWorld:
         self.wheelchair = Wheelchair(self.settings.wheelchair, pose, self._rng(3), self._touches)
         self._scan_rng = self._rng(4)
 
-    def drive(self, speed: float, turn_rate: float, seconds: float) -> None:
-        """Commands (m/s, rad/s) and lets time pass for everybody."""
+    def drive(self, speed: float, turn_rate: float, dt: float) -> None:
+        """Commands (m/s, rad/s) and lets ``dt`` seconds pass for everybody."""
         self.wheelchair.command(speed, turn_rate)
-        self.wheelchair.advance(seconds)
-        self._people.advance(seconds, self.wheelchair.pose[:2])
+        self.wheelchair.advance(dt)
+        self._people.advance(dt, self.wheelchair.pose[:2])
 
     @property
     def time(self) -> float:
