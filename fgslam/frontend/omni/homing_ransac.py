@@ -14,7 +14,12 @@ import numpy as np
 
 from fgslam.frontend.omni.epipolar import EpipolarTest
 from fgslam.frontend.omni.homing_refinement import HomingRefinement, Refined, RefinementPrior
-from fgslam.frontend.omni.match_odds import gain, log_likelihood_ratio, right_probability
+from fgslam.frontend.omni.match_odds import (
+    COMMON_CHANCE,
+    gain,
+    log_likelihood_ratio,
+    right_probability,
+)
 from fgslam.frontend.omni.two_point import TwoPointSamples, solve_two_point
 from fgslam.homing_types import BearingMatches, HomingVector, Refusal, RefusalReason
 from fgslam.planar import wrap
@@ -28,7 +33,6 @@ _REFINED = 8  # different hypotheses that are refined, the best supported first
 _ALIKE = np.deg2rad(5.0)  # hypotheses closer than this lead to the same refined solution, mostly
 _SAME = np.deg2rad(0.2)  # refined solutions closer than this are one
 _TEMPER = 2.0  # residuals have common causes: so many of them count as one, see `covariance`
-_CHANCE = 0.05  # that a wrong match agrees with a hypothesis, while searching; later it is measured
 _CELL = np.deg2rad(2.0)  # matches within one cell in both views are one witness
 
 
@@ -150,7 +154,7 @@ class _Search:
 
     def _score(self, inliers: BoolArray, residuals: FloatArray) -> FloatArray:
         """(c,) log-likelihoods of hypotheses, up to a constant, of (n, c) residuals."""
-        gains = gain(residuals, self._settings.inlier_sigmas, _CHANCE)
+        gains = gain(residuals, self._settings.inlier_sigmas, COMMON_CHANCE)
         odds = (self._right / (1.0 - self._right))[:, None]
         return np.asarray(np.sum(np.where(inliers, np.log1p(odds * gains), 0.0), axis=0))
 
@@ -267,7 +271,7 @@ class _Search:
         chance = (np.count_nonzero(good) + 1.0) / (len(good) + 2.0)
         gains = np.where(best.inliers, gain(best.residuals, sigmas, chance), 0.0)
         witnesses = _one_a_cell(gains, self._cells)
-        tests = np.log(float(n * (n - 1)))  # two solutions for each pair
+        tests = float(np.log(n * (n - 1.0)))  # two solutions for each pair
         return tests - log_likelihood_ratio(gains[witnesses], self._right[witnesses])
 
 
@@ -287,7 +291,7 @@ def _distinct_pairs(weights: FloatArray, count: int, rng: np.random.Generator) -
     rest = rng.uniform(0.0, 1.0, count) * (ends[-1] - weights[first])
     rest = np.where(rest < ends[first] - weights[first], rest, rest + weights[first])
     second = np.searchsorted(ends, rest, side="right")
-    return np.minimum(np.column_stack([first, second]), n - 1)
+    return np.asarray(np.minimum(np.column_stack([first, second]), n - 1), dtype=np.int64)
 
 
 def _apart(one: Refined, other: Refined) -> float:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.frontend.omni.epipolar import EpipolarTest, ray_derivatives, unit_rays
+from fgslam.frontend.omni.match_odds import COMMON_CHANCE, gain, right_probability
 from fgslam.homing_types import BearingMatches
 from fgslam.planar import rotation as planar_rotation
 from fgslam.planar import wrap
@@ -81,6 +82,8 @@ class HomingRefinement:
         self._noisy = np.concatenate(noisy)
         self._test = EpipolarTest.of(matches)
         self._prior = prior.information()
+        right = right_probability(matches)
+        self._odds = right / (1.0 - right)
         self._sigmas = inlier_sigmas
         self._least_parallax = least_parallax
 
@@ -104,16 +107,19 @@ class HomingRefinement:
     def _finished(self, parameters: FloatArray) -> Refined:
         residuals, jacobian = self._linearised(parameters)
         inliers = self._inliers(parameters, residuals)
-        weights = inliers.astype(np.float64)
+        weights = self._weights(parameters, residuals)
         information = (jacobian * weights[:, None]).T @ jacobian + np.diag(self._prior)
         spread = _MAD_TO_SIGMA * float(np.median(np.abs(residuals[inliers]))) if any(inliers) else 1
         covariance = np.linalg.pinv(information) * max(1.0, spread) ** 2
         return Refined(parameters, np.asarray(covariance, dtype=np.float64), residuals, inliers)
 
-    def _weights(self, parameters: FloatArray, residuals: FloatArray, widened: float) -> FloatArray:
-        """(n,) Cauchy weights of the inliers: those near the border count little."""
+    def _weights(
+        self, parameters: FloatArray, residuals: FloatArray, widened: float = 1.0
+    ) -> FloatArray:
+        """(n,) probability that each match is right, given how it fits."""
         inliers = self._inliers(parameters, residuals, widened)
-        return inliers / (1.0 + (residuals / (2.0 * widened)) ** 2)
+        likely = self._odds * gain(residuals / widened, self._sigmas, COMMON_CHANCE)
+        return inliers * likely / (1.0 + likely)
 
     def _inliers(
         self, parameters: FloatArray, residuals: FloatArray, widened: float = 1.0

@@ -22,6 +22,8 @@ column matches in bins of quality: SIFT 0.1 at 0.05, 0.4 at 0.22, 0.7 at 0.35, 0
 """
 _LEAST, _MOST = 0.02, 0.95
 _SCATTER = 1.2  # of right matches' residuals over their stated noise, measured on the same pairs
+COMMON_CHANCE = 0.05
+"""That a wrong match agrees with a hypothesis, while searching; an answer's own is measured."""
 _SHARES = np.array([1.0, 0.5, 0.25, 0.1])
 """Scenes differ in how many of their matches survive; p is taken times each of these, evenly."""
 
