@@ -18,6 +18,8 @@ from fgslam.errors import ConfigError
 from fgslam.settings.homing_estimators import HomingEstimatorSettings, HomingGraphSettings
 from fgslam.settings.homing_output import HomingOutputSettings
 from fgslam.settings.homing_vector import HomingVectorSettings
+from fgslam.settings.omni_datasets import OmniDatasetSettings
+from fgslam.settings.omni_features import OmniFeatureSettings
 from fgslam.settings.simulated_bearings import SimulatedBearingsSettings
 
 _TAKEN_FOLDERS = ("pictures", "compare", "logs", "runs")
@@ -84,6 +86,21 @@ class HomingExperiment(BaseModel):
         return tuple(dict.fromkeys((*([] if live is None else [live]), *others)))
 
 
+class HomingPairsConfig(HomingExperiment):
+    """The homing vector between every two views of a recording."""
+
+    task: Annotated[Literal["homing_pairs"], _TASK]
+    dataset: OmniDatasetSettings
+    features: OmniFeatureSettings = OmniFeatureSettings()
+    homing_vector: HomingVectorSettings = HomingVectorSettings()
+    both_ways: Annotated[
+        bool, Field(description="each pair in both directions; else from the earlier view only")
+    ] = False
+    reference: Annotated[
+        bool, Field(description="plain SIFT and two-point RANSAC beside it, for comparison")
+    ] = True
+
+
 class HomingTrialsConfig(HomingExperiment):
     """Simulated homings of bearings alone: estimators against outliers."""
 
@@ -104,6 +121,7 @@ class HomingTrialsConfig(HomingExperiment):
 
 
 TASKS: dict[str, type[HomingExperiment]] = {
+    "homing_pairs": HomingPairsConfig,
     "homing_trials": HomingTrialsConfig,
 }
 """The model of each task."""

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from fgslam.export.metrics import JsonValue
 from fgslam.export.tables import Cell, write_csv
-from fgslam.homing_types import HomingVector, Refusal
+from fgslam.homing_types import HomingVector, Refusal, RefusalReason
 from fgslam.planar import wrap
 from fgslam.types import BoolArray, FloatArray
 
@@ -84,6 +84,14 @@ class PairErrors:
     def worst(self) -> FloatArray:
         """(n,) larger of both errors' sizes."""
         return np.asarray(np.maximum(np.abs(self.direction), np.abs(self.rotation)))
+
+
+def with_support(answer: PairAnswer, inliers: int) -> PairAnswer:
+    """The same, refused where fewer inliers support it."""
+    if not answer.answered or answer.inliers >= inliers:
+        return answer
+    why = Refusal(RefusalReason.TOO_FEW_INLIERS, f"{answer.inliers} inliers of {inliers} needed")
+    return PairAnswer(answer.a, answer.b, why, answer.matches)
 
 
 def true_pair(wTa: FloatArray, wTb: FloatArray) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,13 @@ from fgslam.runs.homing.results import Progress, Stopped
 from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.settings.homing_vector import HomingVectorSettings
 from fgslam.settings.omni_features import OmniMatchingSettings
+
+PLAIN_MATCHING = OmniMatchingSettings(
+    ratio=0.8, root=False, max_colour_distance=1e9, planar_gates=False
+)
+"""Lowe's ratio test alone."""
+PLAIN_INLIERS = 25
+"""A plain answer counts from here on (issue 4, 5.3)."""
 
 _BLOCKS_A_JOB = 4  # so that progress moves, and no process waits long for the last one
 
@@ -37,6 +45,18 @@ class PairSearch:
     seed: int
 
 
+def never_refusing(settings: HomingVectorSettings) -> HomingVectorSettings:
+    """RANSAC's answer whatever speaks against it, but for the number of its inliers."""
+    return dataclasses.replace(
+        settings,
+        min_inliers=PLAIN_INLIERS,
+        max_false_alarms=1e300,
+        rival_log_odds=0.0,
+        max_direction_sigma_deg=180.0,
+        at_target_parallax_deg=0.0,
+    )
+
+
 def pairs_of(count: int, *, both_ways: bool) -> list[tuple[int, int]]:
     """Pairs (a, b) of views, a before b; both ways also (b, a)."""
     return [(a, b) for a in range(count) for b in range(count) if a < b or (both_ways and a != b)]
@@ -56,20 +76,20 @@ def answer_pair(search: PairSearch, a: int, b: int) -> tuple[PairAnswer, Bearing
 
 
 def answer_pairs(
-    search: PairSearch, jobs: int, progress: Progress, stopped: Stopped
+    search: PairSearch, jobs: int, progress: Progress, stopped: Stopped, what: str = "pairs"
 ) -> tuple[list[PairAnswer], list[str]]:
     """All pairs in their order (stopped early, those that are done), and what went wrong."""
     pairs = search.pairs
     blocks = [search_of(search, part) for part in _parts(pairs, _BLOCKS_A_JOB * jobs)]
     answers: list[PairAnswer] = []
     failures: list[str] = []
-    progress("pairs", 0, len(pairs))
+    progress(what, 0, len(pairs))
     for _, result in run_apart(_perform, blocks, jobs, stopped, single_threaded=True):
         if isinstance(result, WorkerEnded):
             failures.append(f"{len(result.argument.pairs)} pairs: {result.why}")
         else:
             answers += result
-        progress("pairs", len(answers), len(pairs))
+        progress(what, len(answers), len(pairs))
     place = {pair: k for k, pair in enumerate(pairs)}
     return sorted(answers, key=lambda answer: place[answer.a, answer.b]), failures
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from fgslam.errors import ConfigError, OutputError
 from fgslam.export.atomic import ExistingFolder, is_run_folder
-from fgslam.homing_config import HomingExperiment, HomingTrialsConfig
+from fgslam.homing_config import HomingExperiment, HomingPairsConfig, HomingTrialsConfig
+from fgslam.runs.homing.pairs import run_homing_pairs
 from fgslam.runs.homing.results import HomingResult, Progress, Stopped
 from fgslam.runs.homing.trials import run_homing_trials
 from fgslam.runs.threads import one_blas_thread
@@ -40,6 +41,8 @@ def run_homing(
     if existing == "refuse" and is_run_folder(folder):  # now, not after minutes of work
         raise OutputError(f"{folder} holds a run already; choose another --out, or add --overwrite")
     match config:
+        case HomingPairsConfig():
+            return run_homing_pairs(config, folder, existing, progress, stopped)
         case HomingTrialsConfig():
             return run_homing_trials(config, folder, existing, progress, stopped)
     raise ConfigError(f"task {config.task}: cannot be run yet")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,11 +15,9 @@ from fgslam.export.homing_report.curves import sorted_errors
 from fgslam.export.metrics import JsonValue, UpdateTime
 from fgslam.export.report.traces import Figure
 from fgslam.export.tables import Cell, write_csv
+from fgslam.homing_config import HomingTrialsConfig
 from fgslam.runs.homing.results import HomingResult, Status, write_document, write_page
-
-if TYPE_CHECKING:
-    from fgslam.homing_config import HomingTrialsConfig
-    from fgslam.runs.homing.trials import HomingTrial
+from fgslam.runs.homing.trial_data import HomingTrial
 
 TRIALS_FILE = "trials.csv"
 TIMING_FILE = "trials_timing.csv"

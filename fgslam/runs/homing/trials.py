@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.bearing_log import BearingLog
-from fgslam.evaluation.homing import HomingErrors, homing_errors
+from fgslam.evaluation.homing import homing_errors
 from fgslam.export.atomic import ExistingFolder
 from fgslam.homing_config import HomingTrialsConfig
 from fgslam.homing_types import Refusal
@@ -18,11 +18,11 @@ from fgslam.runs.homing.logs import save_bearing_logs
 from fgslam.runs.homing.replay import replay_homing
 from fgslam.runs.homing.results import HomingResult, Progress, Stopped, begin, jobs_of
 from fgslam.runs.homing.starting import start_from_matches
+from fgslam.runs.homing.trial_data import HomingTrial, TriedEstimator
 from fgslam.runs.homing.trial_results import finish_trials
 from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.settings.simulated_bearings import with_outliers
 from fgslam.simulation.bearings import simulate_homing
-from fgslam.types import FloatArray
 
 _BLOCK = 20  # trials a process: starting one takes as long as some trials
 
@@ -41,43 +41,6 @@ class TrialBlock:
     share: int
     first: int
     count: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TriedEstimator:
-    """What one estimator made of one trial.
-
-    Attributes:
-        errors: image by image; None where it gave no estimate.
-        update_ms: (k,) time of each update.
-        failure: why it ended early, else empty.
-    """
-
-    errors: HomingErrors | None
-    update_ms: FloatArray
-    failure: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HomingTrial:
-    """One simulated homing.
-
-    Attributes:
-        share: part of outliers.
-        trial: its number.
-        refused: why there was no homing vector; empty where there was one.
-        inliers, wrong_inliers: matches that support the vector; wrong ones among them.
-        tried: by title of the estimator.
-        log: of the bearings, where it is to be kept.
-    """
-
-    share: float
-    trial: int
-    refused: str
-    inliers: int
-    wrong_inliers: int
-    tried: dict[str, TriedEstimator]
-    log: BearingLog | None = None
 
 
 def run_homing_trials(
