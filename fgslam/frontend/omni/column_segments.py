@@ -209,9 +209,8 @@ class _ColumnSums:
         self, column: IntArray, top: FloatArray, bottom: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """(n, 6 or 9) means of the colour products, (n,) deviation of the luminance."""
-        # A pixel's area reaches half a pixel around its centre.
-        upper = np.floor(top + 1.0).astype(np.int64)
-        lower = np.floor(bottom + 0.5).astype(np.int64) + 1
+        # The rows whose centres lie within; ``lower`` is the first beyond.
+        upper, lower = (np.floor(end).astype(np.int64) + 1 for end in (top, bottom))
         count = (lower - upper).astype(np.float64)
         start, end = upper * self._stride + column, lower * self._stride + column
         means = np.column_stack([(t[end] - t[start]) / count for t in self._tables])

@@ -29,6 +29,10 @@ from fgslam.types import ByteArray, FloatArray, IntArray
 Float32Array = npt.NDArray[np.float32]
 
 
+_ROUNDING = 1e-6
+"""Of squared distances of unit vectors in float32, some times over."""
+
+
 def match_features(
     a: OmniFeatures, b: OmniFeatures, settings: OmniMatchingSettings
 ) -> BearingMatches:
@@ -132,7 +136,8 @@ def _mutual_nearest(squared: Float32Array) -> tuple[IntArray, IntArray, FloatArr
     squared[every, j] = np.inf
     second = squared.min(axis=1).astype(np.float64)
     keep = mutual & np.isfinite(best)
-    best, second = np.maximum(best[keep], 0.0), np.maximum(second[keep], 1e-12)
+    # Equal descriptors differ by rounding; two equal ones in a row are rivals all the same.
+    best, second = (np.maximum(d[keep], 0.0) + _ROUNDING for d in (best, second))
     return every[keep], j[keep], np.minimum(np.sqrt(best / second), 1.0)
 
 

@@ -12,6 +12,7 @@ from collections.abc import Sequence as Many
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from fgslam.frontend.omni.colour_moments import PatchColours
 from fgslam.homing_types import UprightFeatures
@@ -26,6 +27,12 @@ _STEP = 1e-3
 
 _RIM_PX = 6
 """So near to where the picture ends, its end is what would be found."""
+
+_SEAM_PX = 6.0
+"""Copies of one feature lie no further apart."""
+
+_SAME_SIZE = 0.15
+"""Difference of the logarithms of scales below which two features at one place are one."""
 
 _MARGIN_PART = 16
 """A panorama is continued over its seam by its width over this."""
@@ -156,16 +163,14 @@ class UprightSift:
     def _chosen(self, pixels: FloatArray, table: FloatArray) -> IntArray:
         """Rows of the key points to keep: each feature once, the strongest first."""
         order = np.argsort(-table[:, 3], kind="stable")
-        if self._period is not None:
-            order = order[_once_around(pixels[order], table[order, 2], self._period)]
+        order = order[_once(pixels[order], table[order, 2], self._period)]
         limit = self._settings.max_features
         return order[:limit] if limit else order
 
     def _unwrapped(self, pixels: FloatArray) -> FloatArray:
         if self._period is None:
             return pixels
-        columns = (pixels[:, 0] + 0.5) % self._period - 0.5
-        return np.column_stack([np.maximum(columns, 0.0), pixels[:, 1]])
+        return np.column_stack([pixels[:, 0] % self._period, pixels[:, 1]])
 
     def _describe(
         self, grey: Image, table: FloatArray, octaves: IntArray, up: FloatArray
@@ -213,25 +218,30 @@ def _distinct(keypoints: Many[cv2.KeyPoint]) -> tuple[FloatArray, IntArray]:
     return table[:, :4], table[:, 4].astype(np.int64)
 
 
-def _once_around(pixels: FloatArray, scale: FloatArray, period: int) -> BoolArray:
-    """Which of the features of a continued panorama to keep, so that none is there twice.
+def _once(pixels: FloatArray, scale: FloatArray, period: int | None) -> BoolArray:
+    """Which features (strongest first) to keep, so that none is there twice.
 
-    The pyramid's phase differs on both sides, so a copy may lie a fraction of its scale away; near
-    the seam, copies are therefore told by distance.
+    OpenCV finds some extrema from two neighbouring levels, and a continued panorama shows what is
+    near the seam on both sides, a fraction of its scale apart as the pyramid's phase differs. Two
+    such copies would be each other's rivals in the ratio test.
     """
-    columns = pixels[:, 0]
-    reach = np.maximum(1.0, scale)
-    keep = (columns >= -0.5) & (columns < period - 0.5)
-    near_seam = (np.abs(columns + 0.5) < reach) | (np.abs(columns - period + 0.5) < reach)
-    taken: list[int] = []
-    for row in np.flatnonzero(near_seam):
-        gap = (columns[taken] - columns[row] + period / 2.0) % period - period / 2.0
-        apart = np.hypot(gap, pixels[taken, 1] - pixels[row, 1]) > reach[row]
-        ratio = np.abs(np.log(scale[taken] / scale[row]))
-        keep[row] = bool(np.all(apart | (ratio > 0.2)))
-        if keep[row]:
-            taken.append(int(row))
-    return np.asarray(keep, np.bool_)
+    keep = np.ones(len(pixels), np.bool_)
+    places, box = pixels, None
+    if period is not None:
+        keep &= (pixels[:, 0] >= -_SEAM_PX) & (pixels[:, 0] < period + _SEAM_PX)
+        places, box = np.column_stack([pixels[:, 0] % period, pixels[:, 1]]), [period, 0.0]
+    rows = np.flatnonzero(keep)
+    if not len(rows):
+        return keep
+    pairs = rows[cKDTree(places[rows], boxsize=box).query_pairs(_SEAM_PX, output_type="ndarray")]
+    first, second = pairs.min(axis=1), pairs.max(axis=1)
+    gap = np.abs(places[first] - places[second])
+    if period is not None:
+        gap[:, 0] = np.minimum(gap[:, 0], period - gap[:, 0])
+    near = np.hypot(gap[:, 0], gap[:, 1]) < np.maximum(0.5, 0.25 * scale[first])
+    alike = np.abs(np.log(scale[first] / scale[second])) < _SAME_SIZE
+    keep[second[near & alike]] = False
+    return keep
 
 
 def empty_features() -> UprightFeatures:
