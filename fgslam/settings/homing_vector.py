@@ -69,7 +69,18 @@ class HomingVectorSettings:
     ] = 15.0
     max_direction_sigma_deg: Annotated[
         float, Field(gt=0.0, description="less certain directions are refused")
-    ] = 5.0
+    ] = 4.0
+    direction_floor_deg: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="added to the direction's sigma in quadrature: what the images themselves "
+            "cannot tell, such as panoramas stitched from several viewpoints, or an inexact reference",
+        ),
+    ] = 0.0
+    rotation_floor_deg: Annotated[float, Field(ge=0.0, description="likewise for the rotation")] = (
+        0.0
+    )
     at_target_parallax_deg: Annotated[
         float,
         Field(

@@ -63,12 +63,14 @@ def estimate_homing_vector(
     if at_target is not None:
         return at_target
     rivals = [r for r in refined[1:] if search.differ(r, best)]
-    refusal = search.refusal(best, rivals)
+    covariance = search.covariance(refined)
+    refusal = search.refusal(best, rivals, float(np.sqrt(covariance[0, 0])))
     if refusal is not None:
         return refusal
     theta, psi = (float(v) for v in best.parameters[:2])
     support = max((search.witnesses(r.inliers) for r in rivals), default=0)
-    return HomingVector(theta, psi, search.covariance(refined), best.inliers, support)
+    floor = np.deg2rad([settings.direction_floor_deg, settings.rotation_floor_deg])
+    return HomingVector(theta, psi, covariance + np.diag(floor**2), best.inliers, support)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,7 +229,9 @@ class _Search:
     def _undecided(self, best: Refined, rival: Refined) -> bool:
         return self._score_of(best) - self._score_of(rival) < self._settings.rival_log_odds
 
-    def refusal(self, best: Refined, rivals: list[Refined]) -> Refusal | None:
+    def refusal(
+        self, best: Refined, rivals: list[Refined], direction_sigma: float
+    ) -> Refusal | None:
         """Why the best solution is no answer, or None."""
         s = self._settings
         support = self.witnesses(best.inliers)
@@ -247,11 +251,9 @@ class _Search:
             reason = RefusalReason.AMBIGUOUS
             other = self.witnesses(undecided[0].inliers)
             text = f"{support} inliers, {other} for a different solution"
-        elif (sigma := float(np.sqrt(best.covariance[0, 0]))) > np.deg2rad(
-            s.max_direction_sigma_deg
-        ):
+        elif direction_sigma > np.deg2rad(s.max_direction_sigma_deg):
             reason = RefusalReason.UNCERTAIN
-            text = f"direction is uncertain by {np.rad2deg(sigma):.1f} deg"
+            text = f"direction is uncertain by {np.rad2deg(direction_sigma):.1f} deg"
         else:
             return None
         return Refusal(reason, text)
