@@ -1,0 +1,88 @@
+"""Covariance of bearing and elevation against closed forms and Monte Carlo."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fgslam.omni_cameras.bearing_measurement import angles_of, measure
+from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
+from fgslam.omni_cameras.panoramas import Cylinder, Equirectangular
+from fgslam.omni_cameras.protocol import OmniCamera
+from fgslam.omni_cameras.radial import MirrorFrame
+from fgslam.planar import wrap
+
+MIRROR = HyperbolicMirror.with_view((640, 480), 0.92, (np.radians(-70), np.radians(25)))
+
+
+def test_a_panoramas_covariance_is_its_pixel_size() -> None:
+    camera = Equirectangular(1025, 513)
+    pixels = np.array([[100.0, 100.0], [512.0, 256.0], [1000.3, 400.7]])
+    bearing, elevation, covariance = measure(camera, pixels, 0.5)
+    np.testing.assert_allclose(bearing, np.pi - pixels[:, 0] * 2 * np.pi / 1024, atol=1e-12)
+    np.testing.assert_allclose(elevation, np.pi / 2 - pixels[:, 1] * np.pi / 512, atol=1e-12)
+    pixel = np.array([2 * np.pi / 1024, np.pi / 512])
+    expected = np.broadcast_to(np.diag((0.5 * pixel) ** 2), (3, 2, 2))
+    np.testing.assert_allclose(covariance, expected, rtol=1e-9, atol=1e-15)
+
+
+def test_a_mirrors_covariance_is_its_radial_slope() -> None:
+    """Across the radius a pixel is 1 / r; along it the slope of elevation over radius."""
+    frame = MIRROR.frame
+    radius = np.array([30.0, 90.0, 150.0, 230.0])
+    bearing = np.array([0.2, 1.7, -2.0, 3.0])
+    _, _, covariance = measure(MIRROR, frame.pixels(radius, bearing), np.array([0.3, 1, 2, 0.5]))
+    slope = (MIRROR.elevation(radius + 1e-4) - MIRROR.elevation(radius - 1e-4)) / 2e-4
+    sigma = np.array([0.3, 1.0, 2.0, 0.5])
+    np.testing.assert_allclose(np.sqrt(covariance[:, 0, 0]), sigma / radius, rtol=1e-5)
+    np.testing.assert_allclose(np.sqrt(covariance[:, 1, 1]), sigma * slope, rtol=1e-5)
+    np.testing.assert_allclose(covariance[:, 0, 1], 0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        MIRROR,
+        Cylinder(640, 200, -1.0, 0.6),
+        HyperbolicMirror(
+            MirrorFrame(640, 480, (320.0, 240.0), affine=(0.8, 0.1, -0.05)),
+            20.0,
+            200.0,
+            xi=0.9,
+            focal_px=90.0,
+        ),
+    ],
+)
+def test_monte_carlo(camera: OmniCamera) -> None:
+    rng = np.random.default_rng(4)
+    sigma = 0.4
+    pixel = camera.pixels(np.array([[1.0, -0.6, -0.3]]))
+    bearing, elevation, covariance = measure(camera, pixel, sigma)
+    noisy = pixel + rng.normal(0.0, sigma, (40_000, 2))
+    b, e = angles_of(camera.rays(noisy))
+    sample = np.cov(np.stack([wrap(b - bearing), e - elevation]))
+    scale = np.sqrt(np.outer(np.diag(covariance[0]), np.diag(covariance[0])))
+    # Standard error of a sample variance: 0.7 %.
+    np.testing.assert_allclose(sample / scale, covariance[0] / scale, atol=0.03)
+
+
+def test_outside_and_at_the_border() -> None:
+    ring = MIRROR.outer_radius
+    at = MIRROR.frame.pixels(np.array([ring - 1e-6, ring + 5.0]), np.array([0.5, 0.5]))
+    bearing, _, covariance = measure(MIRROR, at, 1.0)
+    assert np.isfinite(bearing).tolist() == [True, False]
+    assert np.isfinite(covariance).all(axis=(1, 2)).tolist() == [True, False]
+    _, _, within = measure(MIRROR, MIRROR.frame.pixels(np.array([ring - 1.0]), np.array([0.5])), 1.0)
+    np.testing.assert_allclose(covariance[0], within[0], rtol=0.05, atol=1e-7)
+
+
+def test_no_pixels() -> None:
+    bearing, elevation, covariance = measure(MIRROR, np.empty((0, 2)), 1.0)
+    assert bearing.shape == elevation.shape == (0,)
+    assert covariance.shape == (0, 2, 2)
+
+
+def test_the_seam_behind_the_robot_is_no_jump() -> None:
+    camera = Equirectangular(1025, 513)
+    _, _, covariance = measure(camera, np.array([[0.0, 256.0], [1024.0, 256.0]]), 1.0)
+    np.testing.assert_allclose(covariance[:, 0, 0], (2 * np.pi / 1024) ** 2, rtol=1e-9)
