@@ -289,15 +289,3 @@ def drive_path(
     driver = Driver(Steering(behaviour.steering), avoider or NoAvoidance())
     follower = make_follower(setting, behaviour, estimator)
     return follow(setting.world, follower, driver, behaviour.loop, setting.targets)
-
-
-def passes(record: DriveRecord) -> FloatArray:
-    """(m,) how near the robot came to each target while it was aimed at, or just after."""
-    way = np.vstack([record.truth[:, :2], record.end[:2]])
-    near = np.full(len(record.targets), np.inf)
-    for k, target in enumerate(record.targets):
-        aimed = np.flatnonzero(record.target == k)
-        if len(aimed):
-            upto = min(int(aimed[-1]) + 20, len(way))
-            near[k] = np.min(np.hypot(*(way[aimed[0] : upto] - target[:2]).T))
-    return near

@@ -1,0 +1,81 @@
+"""How well a drive kept to its path: distances to targets, and whether errors build up (G2, G32)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student_t
+
+from fgslam.homing.record import DriveRecord
+from fgslam.types import FloatArray, IntArray
+
+
+def pass_distances(record: DriveRecord) -> FloatArray:
+    """(m,) metres to each target where the robot was nearest, on its leg or on the next one.
+
+    Infinite for targets that were never aimed at. The next leg counts, as the robot turns away
+    from a target shortly before it is there.
+    """
+    way = np.vstack([record.truth[:, :2], record.end[:2]])
+    aimed = np.append(record.target, record.target[-1:])
+    out = np.full(len(record.targets), np.inf)
+    for k, target in enumerate(record.targets):
+        near = way[np.isin(aimed, (k, k + 1))]
+        if k in aimed:
+            out[k] = np.min(np.hypot(*(near - target[:2]).T))
+    return out
+
+
+def cross_track(record: DriveRecord) -> FloatArray:
+    """(m,) root mean square distance (metres) from the straight line of each leg.
+
+    The line runs from the target before (for the first, from where the robot stood) to the leg's
+    target; NaN for legs that were not driven.
+    """
+    ends = np.vstack([record.truth[0, :2], record.targets[:, :2]])
+    out = np.full(len(record.targets), np.nan)
+    for k in range(len(record.targets)):
+        rows = record.target == k
+        if rows.any():
+            offsets = record.truth[rows, :2] - ends[k]
+            along = (ends[k + 1] - ends[k]) / np.hypot(*(ends[k + 1] - ends[k]))
+            across = offsets[:, 1] * along[0] - offsets[:, 0] * along[1]
+            out[k] = np.sqrt(np.mean(across**2))
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Slope:
+    """A straight line's slope with its confidence interval.
+
+    Attributes:
+        value: of the least squares line, units of the values a leg.
+        low, high: 95 % confidence interval (Student's t).
+    """
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def flat(self) -> bool:
+        """Whether zero lies within the interval."""
+        return self.low <= 0.0 <= self.high
+
+
+def slope_by_leg(legs: IntArray, values: FloatArray) -> Slope:
+    """Whether values (n,), one a leg and run, grow with the leg's number (n,).
+
+    Values that are not finite are left out; with fewer than three there is no interval: NaN.
+    """
+    kept = np.isfinite(values)
+    x, y = np.asarray(legs, dtype=np.float64)[kept], np.asarray(values)[kept]
+    spread = float(np.sum((x - x.mean()) ** 2)) if len(x) else 0.0
+    if len(x) < 3 or spread == 0.0:
+        return Slope(float("nan"), float("nan"), float("nan"))
+    slope = float(np.sum((x - x.mean()) * (y - y.mean())) / spread)
+    residuals = y - y.mean() - slope * (x - x.mean())
+    sigma = float(np.sqrt(np.sum(residuals**2) / (len(x) - 2) / spread))
+    reach = float(student_t.ppf(0.975, len(x) - 2)) * sigma
+    return Slope(slope, slope - reach, slope + reach)

@@ -1,0 +1,439 @@
+"""The state machine of one homing, on scripted eyes and on a world of landmarks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.errors import EstimatorError
+from fgslam.homing.command import Command, HomingState
+from fgslam.homing.controller import HomingController
+from fgslam.homing_types import (
+    HomingEstimate,
+    HomingStart,
+    HomingVector,
+    LocalMap,
+    OmniFeatures,
+    Refusal,
+    RefusalReason,
+    TrackedBearings,
+)
+from fgslam.planar import bearings, unit, wrap
+from fgslam.settings.homing_behaviour import HomingControlSettings
+from fgslam.settings.homing_estimators import HomingEkfSettings, HomingGraphSettings
+from fgslam.types import ByteArray, FloatArray
+from tests.homing import make_matches
+from tests.landmark_world import DARK, Setting, winding_path
+
+SETTINGS = HomingControlSettings()
+POINTS = 3.0 * unit(np.linspace(-3.0, 3.0, 20)) * np.linspace(0.6, 1.4, 20)[:, None]
+"""(20, 2) landmarks around start and target, legs."""
+
+
+def vector_to(direction: float, rotation: float = 0.0) -> HomingVector:
+    """A homing vector of 20 inliers and a degree."""
+    covariance = np.eye(2) * np.deg2rad(1.0) ** 2
+    return HomingVector(direction, rotation, covariance, np.ones(20, dtype=np.bool_), 0)
+
+
+def start_at(time: float, vector: HomingVector) -> HomingStart:
+    """A start whose local map is exact."""
+    target = np.array([*unit(np.array(vector.direction)), vector.rotation])
+    angles = np.zeros((20, 4))
+    angles[:, 0] = np.arctan2(POINTS[:, 1], POINTS[:, 0])
+    angles[:, 2] = bearings(target, POINTS)
+    distance = np.hypot(*POINTS.T)
+    covariance = np.tile(np.eye(2) * 1e-6, (20, 1, 1))
+    local_map = LocalMap(np.arange(20), angles[:, 0], distance, covariance)
+    return HomingStart(time, vector, local_map, make_matches(angles, 0.01))
+
+
+class OracleEstimator:
+    """Believes what it is told: ``robot`` is set from outside."""
+
+    kind = "oracle"
+
+    def __init__(self, start: HomingStart) -> None:
+        self.time, self.robot, self.sigma = start.time, np.zeros(3), 1e-3
+        self.target = np.array([*unit(np.array(start.vector.direction)), start.vector.rotation])
+
+    def update(self, tracked: TrackedBearings) -> None:
+        """Takes in nothing."""
+        self.time = tracked.time
+
+    def estimate(self) -> HomingEstimate:
+        """As told; the map is exact."""
+        covariance = np.eye(6) * self.sigma**2
+        many = np.tile(np.eye(2) * 1e-6, (20, 1, 1))
+        return HomingEstimate(
+            self.time, self.robot, self.target, covariance, np.arange(20), POINTS, many
+        )
+
+
+@dataclass
+class ScriptedEyes:
+    """Answers to ``begin`` from a list, the last one repeated; tracks of a robot that one sets."""
+
+    answers: list[HomingVector | Refusal]
+    robot: FloatArray = field(default_factory=lambda: np.zeros(3))
+    tracks: int = 20
+    turned: float = 0.0
+    begun: list[float] = field(default_factory=list)
+
+    def describe(self, image: ByteArray) -> OmniFeatures:
+        """Never asked."""
+        raise AssertionError
+
+    def begin(self, image: ByteArray, target: OmniFeatures, time: float) -> HomingStart | Refusal:
+        """The next answer."""
+        self.begun.append(time)
+        answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
+        return answer if isinstance(answer, Refusal) else start_at(time, answer)
+
+    def track(self, image: ByteArray, time: float) -> TrackedBearings:
+        """Exact bearings."""
+        seen = wrap(bearings(self.robot, POINTS) + self.turned)[: self.tracks]
+        n = len(seen)
+        nan = np.full(n, np.nan)
+        return TrackedBearings(time, np.arange(n), seen, np.full(n, 0.01), nan, nan)
+
+
+@dataclass
+class Bench:
+    """A controller with scripted eyes and an estimator that one can set."""
+
+    eyes: ScriptedEyes
+    settings: HomingControlSettings = SETTINGS
+    estimators: list[OracleEstimator] = field(default_factory=list)
+    time: float = -0.1
+
+    def __post_init__(self) -> None:
+        """Makes the controller."""
+        target = OmniFeatures(None, None)  # type: ignore[arg-type]  # scripted eyes do not look
+        self.controller = HomingController(self.eyes, target, self._make, self.settings)
+
+    def _make(self, start: HomingStart) -> OracleEstimator:
+        self.estimators.append(OracleEstimator(start))
+        return self.estimators[-1]
+
+    def at(self, x: float, y: float = 0.0, psi: float = 0.0) -> None:
+        """Puts the robot, truth and belief alike, into the start frame."""
+        self.eyes.robot = np.array([x, y, psi])
+        self.estimators[-1].robot = self.eyes.robot
+
+    def step(self, dt: float = 0.1) -> Command:
+        """One image later."""
+        self.time += dt
+        return self.controller.step(DARK, self.time)
+
+
+def bench(*answers: HomingVector | Refusal, **changes: float) -> Bench:
+    """With these answers to ``begin``."""
+    return Bench(ScriptedEyes(list(answers)), replace(SETTINGS, **changes))  # type: ignore[arg-type]
+
+
+FEW = Refusal(RefusalReason.TOO_FEW_MATCHES, "2 matches, of 8 needed")
+
+
+def test_first_image_is_matched_and_driven_by() -> None:
+    """Heading, rotation and remaining part are the vector's; nothing is tracked yet."""
+    command = bench(vector_to(0.3, -0.2)).step()
+    assert command.state is HomingState.DRIVE
+    assert command.heading == pytest.approx(0.3)
+    assert command.rotation == pytest.approx(-0.2)
+    assert command.remaining == pytest.approx(1.0)
+    assert not command.stop
+
+
+def test_reached_and_stays_reached() -> None:
+    """Less than the switch fraction left: stop; later images change nothing but the time."""
+    b = bench(vector_to(0.0))
+    b.step()
+    b.at(1.0 - 1.01 * SETTINGS.switch_fraction)
+    assert b.step().state is HomingState.DRIVE
+    b.at(1.0 - 0.99 * SETTINGS.switch_fraction)
+    arrived = b.step()
+    assert arrived.state is HomingState.ARRIVED
+    assert arrived.stop
+    later = b.step()
+    assert (later.state, later.time) == (HomingState.ARRIVED, b.time)
+    assert len(b.eyes.begun) == 1
+
+
+def test_passed_target_counts_as_reached_only_when_near() -> None:
+    """Behind and near: passed. Behind and far, or behind from the beginning: not."""
+    b = bench(vector_to(0.0))
+    b.step()
+    b.at(0.9, 0.15)
+    assert b.step().state is HomingState.DRIVE
+    b.at(1.02, 0.15)
+    passed = b.step()
+    assert passed.state is HomingState.ARRIVED
+    assert "passed" in passed.reason
+    far = bench(vector_to(0.0))
+    far.step()
+    far.at(1.3, 0.3)
+    assert far.step().state is HomingState.DRIVE
+    behind = bench(vector_to(np.pi))
+    behind.step()
+    behind.at(-0.8, 0.0)  # driving backwards: home was never ahead
+    assert behind.step().state is HomingState.DRIVE
+
+
+def test_one_place_is_arrival() -> None:
+    """Start and target coincide: there is no way to drive, and no refusal either."""
+    here = Refusal(RefusalReason.AT_TARGET, "median parallax 0.1 deg", 0.4)
+    command = bench(here).step()
+    assert command.state is HomingState.ARRIVED
+    assert command.refusal is None
+
+
+def test_refused_target_is_tried_for_a_while_and_then_given_up() -> None:
+    """Standing all the time, one attempt a retry period, the refusal handed on."""
+    b = bench(FEW)
+    commands = [b.step() for _ in range(40)]
+    assert {c.state for c in commands[:30]} == {HomingState.INITIALISE}
+    assert all(c.stop for c in commands)
+    assert commands[-1].state is HomingState.REFUSED
+    assert commands[-1].refusal is FEW
+    assert np.all(np.diff(b.eyes.begun) > SETTINGS.retry_s - 0.01)
+    assert commands[0].reason == FEW.details
+
+
+def test_refusal_that_heals_is_driven_by() -> None:
+    """People walk on; the next attempt succeeds."""
+    b = bench(FEW, FEW, vector_to(0.1))
+    states = [b.step().state for _ in range(12)]
+    assert states[0] is HomingState.INITIALISE
+    assert states[-1] is HomingState.DRIVE
+
+
+def test_few_tracks_match_anew_while_driving_on() -> None:
+    """With too few tracks the target is matched anew; refused, the old estimate still serves."""
+    b = bench(vector_to(0.0), FEW, vector_to(0.05))
+    b.step()
+    b.at(0.4)
+    b.step()
+    b.eyes.tracks = SETTINGS.min_tracks - 1
+    refused = b.step(SETTINGS.retry_s)
+    assert refused.state is HomingState.DRIVE
+    assert FEW.details in refused.reason
+    assert refused.remaining == pytest.approx(0.6)
+    renewed = [b.step() for _ in range(6)]
+    assert b.controller.initialisations == 2
+    assert any("matched anew" in c.reason for c in renewed)
+    assert all(c.state is HomingState.DRIVE for c in renewed)
+    assert len(b.eyes.begun) == 3
+
+
+def test_remaining_goes_on_in_the_old_unit() -> None:
+    """Matched anew at 60 % of the way: the new homing's leg counts 0.4, with its covariance."""
+    b = bench(vector_to(0.0), vector_to(0.0))
+    b.step()
+    b.at(0.6)
+    b.step()
+    b.eyes.tracks = 9
+    assert b.step(SETTINGS.retry_s).remaining == pytest.approx(0.4)
+    b.eyes.tracks = 20
+    b.at(0.5)  # half of the new leg
+    command = b.step()
+    assert command.remaining == pytest.approx(0.2)
+    sigma = b.estimators[-1].sigma
+    # Target and robot are both uncertain by sigma legs, and a leg is 0.4 of the first one.
+    assert np.sqrt(command.covariance[0, 0]) == pytest.approx(0.4 * np.sqrt(2.0) * sigma)
+
+
+def test_uncertain_estimate_is_matched_anew() -> None:
+    """Deviation across the way beyond the bound."""
+    b = bench(vector_to(0.0))
+    b.step()
+    b.step()
+    b.estimators[-1].sigma = SETTINGS.max_across
+    command = b.step(SETTINGS.retry_s)
+    assert "uncertain" in command.reason
+    assert b.controller.initialisations == 2
+
+
+def test_diverged_estimate_is_not_driven_by() -> None:
+    """Belief and bearings part: matched anew at once, whatever the estimator's covariance says."""
+    b = bench(vector_to(0.0), FEW)
+    b.step()
+    b.at(0.2)
+    b.step()
+    b.estimators[-1].robot = np.array([0.2, 0.5, 0.3])
+    command = b.step()
+    assert command.state is HomingState.BLIND
+    assert command.reason == FEW.details
+    assert len(b.eyes.begun) == 2
+
+
+def test_all_tracks_lost_in_one_frame_heals_in_the_same() -> None:
+    """One dark image, and the next is matched: no step without a command to drive."""
+    b = bench(vector_to(0.0))
+    b.step()
+    b.at(0.3)
+    b.step()
+    b.eyes.tracks = 0
+    command = b.step()
+    assert command.state is HomingState.DRIVE
+    assert b.controller.initialisations == 2
+    assert command.remaining == pytest.approx(0.7)
+
+
+def test_blind_is_short_then_stands_then_refuses() -> None:
+    """Lost and not healing: straight on for a second at most, then standing, then the end."""
+    b = bench(vector_to(0.0), FEW)
+    b.step()
+    b.step()
+    b.eyes.tracks = 0
+    commands = [b.step() for _ in range(60)]
+    states = [c.state for c in commands]
+    blind = states.count(HomingState.BLIND)
+    assert 0 < blind <= round(SETTINGS.blind_s / 0.1) + 1
+    assert states[:blind] == [HomingState.BLIND] * blind
+    assert all(not c.stop and c.heading == 0.0 for c in commands[:blind])
+    assert states[blind] is HomingState.WAIT
+    assert states[-1] is HomingState.REFUSED
+    assert commands[-1].refusal is not None
+    assert commands[-1].refusal.reason is RefusalReason.LOST
+
+
+def test_blind_only_where_home_was_ahead() -> None:
+    """Turning towards home when the tracks were lost: straight on would lead astray."""
+    b = bench(vector_to(1.0), FEW)
+    b.step()
+    b.step()
+    b.eyes.tracks = 0
+    assert b.step().state is HomingState.WAIT
+
+
+def test_image_that_flips_is_not_believed() -> None:
+    """The picture turned by 180 degrees between two images: no wheelchair did that."""
+    b = bench(vector_to(0.0))
+    b.step()
+    b.step()
+    b.eyes.turned = np.pi
+    b.eyes.answers = [FEW]
+    b.step()
+    assert b.controller.underway is None
+    b.eyes.turned = 0.0
+    b.eyes.answers = [vector_to(np.pi)]
+    healed = [b.step() for _ in range(6)][-1]
+    assert healed.state is HomingState.DRIVE
+    assert b.controller.initialisations == 2
+
+
+def test_flip_is_named() -> None:
+    """The reason tells what was seen."""
+    b = bench(vector_to(0.0))
+    b.step()
+    underway = b.controller.underway
+    assert underway is not None
+    b.eyes.turned = np.pi
+    fault = underway.update(b.eyes.track(DARK, 0.1))
+    assert fault is not None
+    assert not fault.usable
+    assert "turned by" in fault.reason
+    assert "180 deg within 0.10 s" in fault.reason
+
+
+def test_fast_turn_is_no_flip() -> None:
+    """A robot may turn at its limit, a second between images."""
+    b = bench(vector_to(0.0))
+    b.step()
+    for k in range(1, 4):
+        b.at(0.0, 0.0, np.deg2rad(40.0) * k)
+        assert b.step(1.0).state is HomingState.DRIVE
+    assert b.controller.initialisations == 1
+
+
+def test_contradicting_vector_is_confirmed_before_it_is_driven_by() -> None:
+    """A sound estimate against a new vector: stand, look again; two that agree win."""
+    b = bench(vector_to(0.0), vector_to(2.0), vector_to(2.1))
+    b.step()
+    b.step()
+    b.eyes.tracks = 9
+    doubt = b.step(SETTINGS.retry_s)
+    assert doubt.state is HomingState.CONFIRM
+    assert doubt.stop
+    b.eyes.tracks = 20
+    b.eyes.robot = np.zeros(3)
+    confirmed = b.step()
+    assert confirmed.state is HomingState.DRIVE
+    assert confirmed.heading == pytest.approx(2.1)
+
+
+def test_vectors_that_keep_contradicting_end_the_homing() -> None:
+    """Never a confident wrong vector: no two images agree, so there is no answer."""
+    answers = [vector_to(0.0)] + [vector_to(2.0 * (-1.0) ** k) for k in range(60)]
+    b = bench(*answers)
+    b.step()
+    b.step()
+    b.eyes.tracks = 9
+    commands = [b.step(SETTINGS.retry_s) for _ in range(12)]
+    assert all(c.stop for c in commands)
+    assert commands[-1].state is HomingState.REFUSED
+
+
+def test_no_progress_is_noticed() -> None:
+    """Held up for good: matched anew a few times, then given up with the reason."""
+    b = bench(vector_to(0.0), stall_s=1.0)
+    commands = [b.step() for _ in range(60)]
+    assert commands[-1].state is HomingState.REFUSED
+    assert commands[-1].refusal is not None
+    assert commands[-1].refusal.reason is RefusalReason.NO_PROGRESS
+    assert b.controller.initialisations == SETTINGS.max_stalls
+
+
+@pytest.mark.parametrize("time", [0.0, -1.0, float("nan"), float("inf")])
+def test_time_must_run_forward(time: float) -> None:
+    """One clear line, and the homing goes on as if nothing had been said."""
+    b = bench(vector_to(0.0))
+    b.step()
+    with pytest.raises(EstimatorError, match="give images in the order of their times"):
+        b.controller.step(DARK, time)
+    assert len(b.eyes.begun) == 1
+    assert b.step().state is HomingState.DRIVE
+
+
+def real_controller(
+    setting: Setting, kind: HomingEkfSettings | HomingGraphSettings
+) -> HomingController:
+    """On the world's first target with the program's own estimator."""
+    return HomingController(
+        setting.eyes, setting.path()[0], lambda start: make_homing_estimator(start, kind), SETTINGS
+    )
+
+
+@pytest.mark.parametrize("kind", [HomingEkfSettings(), HomingGraphSettings()])
+def test_real_estimators_survive_a_dark_second(
+    kind: HomingEkfSettings | HomingGraphSettings,
+) -> None:
+    """All tracks lost in one frame, light again after a second; the robot's pose is frozen."""
+    setting = winding_path(3, 1, 2.0)
+    setting.eyes.dark = lambda t: 0.95 < t < 1.95
+    controller = real_controller(setting, kind)
+    states = []
+    for k in range(40):
+        command = controller.step(DARK, 0.1 * k)
+        states.append(command.state)
+        if not command.stop:
+            setting.world.drive(0.2, float(np.clip(command.heading, -0.5, 0.5)), 0.1)
+    assert HomingState.BLIND in states
+    assert states[-1] is HomingState.DRIVE
+    truth = setting.targets[0][:2] - setting.world.true_pose[:2]
+    expected = wrap(np.arctan2(truth[1], truth[0]) - setting.world.true_pose[2])
+    assert abs(wrap(command.heading - expected)) < np.deg2rad(5.0)
+
+
+def test_dark_from_the_beginning_is_refused() -> None:
+    """The refusal's own reason is kept."""
+    setting = winding_path(3, 1, 2.0)
+    setting.eyes.dark = lambda _: True
+    controller = real_controller(setting, HomingEkfSettings())
+    commands = [controller.step(DARK, 0.1 * k) for k in range(40)]
+    assert commands[-1].refusal is not None
+    assert commands[-1].refusal.reason is RefusalReason.TOO_DARK
