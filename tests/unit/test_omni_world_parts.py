@@ -105,6 +105,14 @@ def test_a_wall_stops_it_but_lets_it_turn_and_back_out() -> None:
     assert chair.pose[2] > 0.3
 
 
+def test_steps_of_any_length_add_up() -> None:
+    """Fifteen frames a second are no whole number of the integration's steps."""
+    chair = Wheelchair(EXACT, np.zeros(3), rng())
+    for _ in range(150):
+        chair.advance(1.0 / 15.0)
+    assert chair.time == pytest.approx(10.0, abs=0.0051)
+
+
 @pytest.mark.parametrize("speed", [np.nan, np.inf])
 def test_commands_are_finite_and_time_goes_forwards(speed: float) -> None:
     chair = Wheelchair(EXACT, np.zeros(3), rng())

@@ -105,9 +105,10 @@ class OmniWorld:
     # ---------------------------------------------------------------------------- acting
 
     def put(self, pose: FloatArray) -> None:
-        """Puts the wheelchair elsewhere (3,), standing still, as a new drive at time 0."""
+        """Puts the wheelchair elsewhere (3,), standing still: all begins anew at time 0."""
         self.wheelchair = Wheelchair(self.settings.wheelchair, pose, self._rng(3), self._touches)
         self._scan_rng = self._rng(4)
+        self._people.restart()
 
     def drive(self, speed: float, turn_rate: float, dt: float) -> None:
         """Commands (m/s, rad/s) and lets ``dt`` seconds pass for everybody."""
@@ -206,6 +207,8 @@ class OmniWorld:
 
     def _people_routes(self) -> list[FloatArray]:
         """A walk for each person between places of the reference path, so that they are met."""
+        if self.settings.people == 0:
+            return []
         planner = PathPlanner(self.model.space, _PEOPLE_CLEARANCE_M)
         rng, places = self._rng(6), self.reference_poses[:, :2]
         routes = []

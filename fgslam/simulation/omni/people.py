@@ -71,10 +71,15 @@ class People:
 
     def __init__(self, routes: Sequence[FloatArray], rng: np.random.Generator, bank: ColourBank):
         """One person on each route (n, 2), starting somewhere on it."""
-        self._walkers = [Walker(route, float(rng.uniform(0.0, 100.0))) for route in routes]
+        self._starts = [(route, float(rng.uniform(0.0, 100.0))) for route in routes]
         self._shirts = [int(k) for k in rng.integers(0, SHIRTS, len(routes))]
         self._bank = bank
         self._layers: dict[tuple[int, int], Layer] = {}
+        self.restart()
+
+    def restart(self) -> None:
+        """Everybody is again where the first walk began."""
+        self._walkers = [Walker(route, start) for route, start in self._starts]
 
     def advance(self, seconds: float, robot: FloatArray) -> None:
         """Everybody walks on."""

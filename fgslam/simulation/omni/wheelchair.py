@@ -47,7 +47,7 @@ class Wheelchair:
         self._pull = np.deg2rad(settings.pull_deg_m) * drawn[2]
         self._pending: deque[tuple[float, float, float]] = deque()
         self._aim = (0.0, 0.0)
-        self._steps = 0
+        self._steps, self._asked = 0, 0.0
 
     def command(self, speed: float, turn_rate: float) -> None:
         """Asks for a speed (m/s) and turn rate (rad/s); it takes effect after the latency.
@@ -64,7 +64,7 @@ class Wheelchair:
         self._pending.append((self.time + s.latency_s, limited, turn))
 
     def advance(self, seconds: float) -> None:
-        """Moves on by a multiple of a hundredth of a second (rounded, at least one).
+        """Moves on, in steps of a hundredth of a second; what is left over is made up for later.
 
         Raises:
             ValueError: the time does not go forwards.
@@ -72,7 +72,8 @@ class Wheelchair:
         if not seconds > 0.0:
             raise ValueError(f"time must go forwards, got a step of {seconds} s")
         touched = False
-        for _ in range(max(round(seconds / _STEP_S), 1)):
+        self._asked += seconds
+        for _ in range(round(self._asked / _STEP_S) - self._steps):
             touched |= self._step()
         self.collisions += int(touched and not self.collided)
         self.collided = touched
