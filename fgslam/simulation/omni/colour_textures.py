@@ -27,7 +27,6 @@ from fgslam.simulation.textures import Grey
 Colour = npt.NDArray[np.float32]
 
 PAINTINGS, SHIRTS = 16, 4
-COLOUR_PHOTOGRAPHS = ("astronaut", "coffee", "chelsea", "rocket", "stereo_motorcycle")
 
 # Two directions in (red, green, blue) that leave the brightness 0.299 R + 0.587 G + 0.114 B alone.
 _TO_RED = np.array([1.0, -0.299 / 0.587, 0.0])
