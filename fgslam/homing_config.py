@@ -15,6 +15,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from fgslam.config import ExperimentConfig, make_config
 from fgslam.config_reading import Reader, apply_overrides, read_mapping
 from fgslam.errors import ConfigError
+from fgslam.settings.homing_behaviour import LocalisationSettings, TopologicalMapSettings
 from fgslam.settings.homing_estimators import HomingEstimatorSettings, HomingGraphSettings
 from fgslam.settings.homing_output import HomingOutputSettings
 from fgslam.settings.homing_vector import HomingVectorSettings
@@ -40,6 +41,9 @@ def _with_default_kind(value: Any) -> Any:
 
 ComparedHoming: TypeAlias = Annotated[HomingEstimatorSettings, BeforeValidator(_as_settings)]
 LiveHoming: TypeAlias = Annotated[HomingEstimatorSettings, BeforeValidator(_with_default_kind)]
+ViewName: TypeAlias = Annotated[
+    str, BeforeValidator(lambda value: str(value) if isinstance(value, int) else value)
+]
 ComparedList: TypeAlias = Annotated[
     tuple[ComparedHoming, ...],
     Field(
@@ -101,6 +105,33 @@ class HomingPairsConfig(HomingExperiment):
     ] = True
 
 
+class TopologicalMapConfig(HomingExperiment):
+    """A topological map of a recording's views, routes on it, and localisation."""
+
+    task: Annotated[Literal["topological_map"], _TASK]
+    dataset: OmniDatasetSettings
+    features: OmniFeatureSettings = OmniFeatureSettings()
+    homing_vector: HomingVectorSettings = HomingVectorSettings()
+    map: TopologicalMapSettings = TopologicalMapSettings()
+    localisation: LocalisationSettings = LocalisationSettings()
+    ordered: Annotated[bool, Field(description="views follow each other on a way")] = False
+    routes: Annotated[
+        tuple[Annotated[tuple[ViewName, ...], Field(min_length=2)], ...],
+        Field(
+            description="ways to seek on the map, by the views' numbers: start and goal, or all "
+            "nodes of a chain whose links shall be there"
+        ),
+    ] = ()
+    held_out_every: Annotated[
+        int | None,
+        Field(
+            ge=2,
+            description="localisation is tried with every so many views, on a map of the others; "
+            "null: not tried",
+        ),
+    ] = None
+
+
 class HomingTrialsConfig(HomingExperiment):
     """Simulated homings of bearings alone: estimators against outliers."""
 
@@ -122,6 +153,7 @@ class HomingTrialsConfig(HomingExperiment):
 
 TASKS: dict[str, type[HomingExperiment]] = {
     "homing_pairs": HomingPairsConfig,
+    "topological_map": TopologicalMapConfig,
     "homing_trials": HomingTrialsConfig,
 }
 """The model of each task."""

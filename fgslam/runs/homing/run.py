@@ -6,7 +6,13 @@ from pathlib import Path
 
 from fgslam.errors import ConfigError, OutputError
 from fgslam.export.atomic import ExistingFolder, is_run_folder
-from fgslam.homing_config import HomingExperiment, HomingPairsConfig, HomingTrialsConfig
+from fgslam.homing_config import (
+    HomingExperiment,
+    HomingPairsConfig,
+    HomingTrialsConfig,
+    TopologicalMapConfig,
+)
+from fgslam.runs.homing.mapping import run_topological_map
 from fgslam.runs.homing.pairs import run_homing_pairs
 from fgslam.runs.homing.results import HomingResult, Progress, Stopped
 from fgslam.runs.homing.trials import run_homing_trials
@@ -43,6 +49,8 @@ def run_homing(
     match config:
         case HomingPairsConfig():
             return run_homing_pairs(config, folder, existing, progress, stopped)
+        case TopologicalMapConfig():
+            return run_topological_map(config, folder, existing, progress, stopped)
         case HomingTrialsConfig():
             return run_homing_trials(config, folder, existing, progress, stopped)
     raise ConfigError(f"task {config.task}: cannot be run yet")
