@@ -130,7 +130,9 @@ def _read_places(path: Path) -> list[_Place]:
             )
         places = [_place(path, reader.line_num, row) for row in reader]
     except csv.Error as cause:
-        raise DatasetError(f"{path}, line {reader.line_num}: {cause}; correct the line") from cause
+        raise DatasetError(
+            f"{path}, line {reader.reader.line_num}: {cause}; correct the line"
+        ) from cause
     if not places:
         raise DatasetError(f"{path} lists no panorama; add rows, or remove the file")
     _require_different(path, places)

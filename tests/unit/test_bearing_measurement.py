@@ -72,7 +72,8 @@ def test_outside_and_at_the_border() -> None:
     bearing, _, covariance = measure(MIRROR, at, 1.0)
     assert np.isfinite(bearing).tolist() == [True, False]
     assert np.isfinite(covariance).all(axis=(1, 2)).tolist() == [True, False]
-    _, _, within = measure(MIRROR, MIRROR.frame.pixels(np.array([ring - 1.0]), np.array([0.5])), 1.0)
+    near = MIRROR.frame.pixels(np.array([ring - 1.0]), np.array([0.5]))
+    _, _, within = measure(MIRROR, near, 1.0)
     np.testing.assert_allclose(covariance[0], within[0], rtol=0.05, atol=1e-7)
 
 

@@ -85,7 +85,7 @@ def test_rays_follow_the_toolboxs_definition(calibration: OCamCalibration) -> No
 def test_an_uncropped_picture_has_its_centre_further_right(calibration: OCamCalibration) -> None:
     cropped, whole = calibration.camera(), calibration.camera((1920, 1080))
     pixels = np.array([[900.0, 300.0], [300.0, 800.0]])
-    np.testing.assert_array_equal(cropped.rays(pixels), whole.rays(pixels + [300.0, 0.0]))
+    np.testing.assert_array_equal(cropped.rays(pixels), whole.rays(pixels + np.array([300.0, 0.0])))
     with pytest.raises(CalibrationError, match=r"1300x1080 \(or 1920x1080 uncropped\).*640x480"):
         calibration.camera((640, 480))
 
@@ -128,7 +128,7 @@ def test_malformed_files_name_the_line(tmp_path: Path, content: str, told: str) 
 
 
 def test_unreadable_files(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match="cannot read calibration .*No such file"):
+    with pytest.raises(CalibrationError, match=r"cannot read calibration .*No such file"):
         read_ocamcalib(tmp_path / "absent.txt")
     (tmp_path / "binary.txt").write_bytes(b"\xff\xfe\x00\x81")
     with pytest.raises(CalibrationError, match="it is not text"):

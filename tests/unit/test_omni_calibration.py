@@ -1,4 +1,4 @@
-"""Calibration from rendered pictures: rings at known elevations, the mirror's circle, straightness."""
+"""Calibration from rendered pictures: rings, the mirror's circle, straight edges."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def sampled_rays(camera: OmniCamera) -> FloatArray:
     grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
     pixels = grid.reshape(-1, 2).astype(np.float64)
     thirds = np.array([-1.0, 0.0, 1.0]) / 3.0
-    return np.stack([camera.rays(pixels + [a, b]) for a in thirds for b in thirds])
+    return np.stack([camera.rays(pixels + np.array([a, b])) for a in thirds for b in thirds])
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def test_the_mirrors_circle_and_a_mirror_off_its_place(rays: FloatArray) -> None
     away, circle = mirror_offset(MIRROR, shifted)
     assert away == pytest.approx(5.0, abs=0.4)
     np.testing.assert_allclose(circle.centre, np.add(FRAME.centre, (-4, 3)), atol=0.3)
-    with pytest.raises(CalibrationError, match="320x240 pixels, the camera is .* 640x480"):
+    with pytest.raises(CalibrationError, match=r"320x240 pixels, the camera is .* 640x480"):
         mirror_offset(MIRROR, picture[::2, ::2])
 
 

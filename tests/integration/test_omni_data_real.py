@@ -1,0 +1,167 @@
+"""Readers and calibrations on real panoramas and mirror images (`shared/data`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from fgslam.datasets.images import read_colour_image
+from fgslam.datasets.omni_opening import open_omni
+from fgslam.datasets.omni_recording import OmniRecording
+from fgslam.frontend.omni.calibration import find_mirror_circle, mirror_offset
+from fgslam.frontend.omni.straightness import upright_edges
+from fgslam.omni_cameras.ocamcalib import OCamCamera
+from fgslam.omni_cameras.panoramas import Cylinder, Equirectangular
+from fgslam.omni_cameras.radial import RadialCamera
+from fgslam.omni_cameras.unwrapping import unwrap_maps
+from fgslam.settings.omni_cameras import OCamCalibSettings
+from fgslam.settings.omni_datasets import OmniPathSettings, OmniVideoSettings, PanoramasSettings
+from fgslam.types import FloatArray, Image
+
+pytestmark = pytest.mark.data
+
+BOARD = (6, 9)
+
+
+def present(root: Path, name: str) -> Path:
+    if not (root / name).exists():
+        pytest.skip(f"no {name} in {root}: this test needs it")
+    return root / name
+
+
+# --------------------------------------------------------------------------------------------
+# Panoramas
+
+
+def test_omni_home(shared_data: Path) -> None:
+    folder = present(shared_data, "omni_home")
+    recording = open_omni(PanoramasSettings(path=str(folder), width=1024))
+    assert recording.ids.tolist() == list(range(2, 18))
+    assert recording.camera == Equirectangular(1024, 512)
+    assert recording.notes == ()
+    assert recording.rooms is not None
+    assert recording.rooms.count("living room") == 4
+    assert recording.poses is not None
+    np.testing.assert_allclose(
+        recording.poses[0], [-0.0041, -0.1195, np.radians(-90.535)], atol=1e-12
+    )
+    assert recording.image(15).shape == (512, 1024, 3)
+    full = open_omni(PanoramasSettings(path=str(folder)))
+    difference = full.image(3).mean(axis=(0, 1)) - recording.image(3).mean(axis=(0, 1))
+    assert np.abs(difference).max() < 1.0
+
+
+def test_omni_corridors(shared_data: Path) -> None:
+    folder = present(shared_data, "omni_corridors")
+    recording = open_omni(PanoramasSettings(path=str(folder), stride=20))
+    assert recording.ids.tolist() == [1, 21, 41]
+    assert recording.poses is None
+    assert recording.image(2).shape == (1024, 2048, 3)
+
+
+# --------------------------------------------------------------------------------------------
+# Mirror images
+
+
+def test_the_mirror_video(shared_data: Path) -> None:
+    video = present(shared_data, "omni_mirror/bloggie_walk.mp4")
+    recording = open_omni(OmniVideoSettings(path=str(video)))
+    assert len(recording) == 391
+    assert recording.timestamps[390] == pytest.approx(390 / 29.97, abs=1e-3)
+    camera = recording.camera
+    assert isinstance(camera, RadialCamera)
+    away, circle = mirror_offset(camera, recording.image(0))
+    assert away < 1.5
+    assert circle.radius == pytest.approx(camera.outer_radius, abs=1.5)
+    assert circle.support > 0.7
+    # The accessory sits loosely: later in the film the whole picture has moved.
+    later, _ = mirror_offset(camera, recording.image(390))
+    assert later < 8.0
+
+
+def ocamcalib(shared_data: Path) -> OmniRecording:
+    folder = present(shared_data, "omni_mirror")
+    camera = OCamCalibSettings(file="omniunwarp_calib_results.txt")
+    return open_omni(
+        OmniPathSettings(path=str(folder), pattern="omniunwarp_example.jpg", camera=camera)
+    )
+
+
+def unwrapped(recording: OmniRecording, view: Cylinder) -> Image:
+    maps = unwrap_maps(recording.camera, view)
+    return np.asarray(cv2.remap(recording.image(0), *maps, cv2.INTER_LINEAR))
+
+
+VIEW = Cylinder(2400, 530, float(np.tan(np.radians(-40.4))), float(np.tan(np.radians(27.0))))
+
+
+def test_the_ocamcalib_picture_unwraps_straight(shared_data: Path) -> None:
+    """Bows of long upright edges, and their lean once the camera's own tilt is taken off."""
+    recording = ocamcalib(shared_data)
+    assert isinstance(recording.camera, OCamCamera)
+    # Calibrated without the 300 columns at the left, pictured with them.
+    assert recording.camera.frame.centre == pytest.approx((974.318875, 545.872616))
+    edges = upright_edges(unwrapped(recording, VIEW), 100)
+    assert len(edges) >= 25
+    assert np.median(edges.bow) < 0.7  # pixels of 2400, on edges of 100 to 300 rows
+    bearing = np.pi - edges.column * 2.0 * np.pi / (VIEW.width - 1)
+    tilt, left = without_tilt(bearing, edges.lean)
+    assert np.degrees(np.hypot(*tilt)) < 3.5
+    assert np.degrees(np.median(np.abs(left))) < 1.0
+
+
+def without_tilt(bearing: FloatArray, lean: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Tilt (2,) in radians and what remains of the leans (n,): a trimmed fit."""
+    design = np.column_stack([np.cos(bearing), np.sin(bearing)])
+    kept = np.ones(len(lean), np.bool_)
+    for _ in range(10):
+        tilt = np.linalg.lstsq(design[kept], lean[kept], rcond=None)[0]
+        left = lean - design @ tilt
+        kept = np.abs(left) < max(3.0 * 1.4826 * float(np.median(np.abs(left))), 1e-3)
+    return tilt, left
+
+
+def test_a_chessboard_in_the_mirror_is_a_plane(shared_data: Path) -> None:
+    """Its corners' rays, over 34 degrees of elevation, map to a grid by one homography."""
+    recording = ocamcalib(shared_data)
+    board = unwrapped(recording, VIEW)[:, 220:530]
+    found, corners = cv2.findChessboardCornersSB(
+        cv2.resize(cv2.cvtColor(board, cv2.COLOR_RGB2GRAY), None, fx=2, fy=2),
+        BOARD,
+        flags=cv2.CALIB_CB_EXHAUSTIVE,
+    )
+    assert found
+    pixels = recording.camera.pixels(
+        VIEW.rays((corners.reshape(-1, 2).astype(np.float64) + 0.5) / 2.0 - 0.5 + [220.0, 0.0])
+    )
+    right = plane_error(recording.camera.rays(pixels))
+    assert np.degrees(right) < 0.06
+    # A calibration of another place in the picture is noticed.
+    wrong = recording.camera.rays(pixels + np.array([30.0, 0.0]))
+    assert plane_error(wrong) > 1.3 * right
+
+
+def plane_error(rays: FloatArray) -> float:
+    """Root mean square angle by which rays of a board's corners miss a plane grid, radians."""
+    middle = rays.mean(axis=0) / np.linalg.norm(rays.mean(axis=0))
+    across = np.cross([0.0, 0.0, 1.0], middle)
+    across /= np.linalg.norm(across)
+    down = np.cross(middle, across)
+    image = np.column_stack([rays @ across, rays @ down]) / (rays @ middle)[:, None]
+    grid = np.array([[i, j] for j in range(BOARD[1]) for i in range(BOARD[0])], np.float64)
+    homography, _ = cv2.findHomography(grid, image)
+    mapped = np.column_stack([grid, np.ones(len(grid))]) @ homography.T
+    away = mapped[:, :2] / mapped[:, 2:] - image
+    return float(np.sqrt((away**2).sum(axis=1).mean()))
+
+
+@pytest.mark.parametrize("name", ["kit_pair_left.png", "hypercat_1280x1024_01.jpg"])
+def test_mirror_circles_of_real_pictures(shared_data: Path, name: str) -> None:
+    image = read_colour_image(present(shared_data, f"omni_mirror/{name}"))
+    circle = find_mirror_circle(image)
+    middle = np.array([image.shape[1], image.shape[0]]) / 2.0
+    assert np.hypot(*(circle.centre - middle)) < 60.0
+    assert circle.radius == pytest.approx(max(image.shape) / 2.0, rel=0.1)
