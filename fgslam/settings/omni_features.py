@@ -179,7 +179,7 @@ class OmniMatchingSettings:
     ] = 2.0
     column_ratio: Annotated[
         float, Field(gt=0.0, le=1.0, description="column segments: nearest over second nearest")
-    ] = 0.8
+    ] = 0.7
     max_column_distance: Annotated[
         float,
         Field(gt=0.0, description="Mahalanobis, of 11 elements; 4.4 is exceeded by 5 % if normal"),
