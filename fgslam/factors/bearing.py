@@ -17,6 +17,7 @@ from fgslam.factors.bearing_residuals import (
     direction_and_turn,
     elevation,
     elevation_jacobians,
+    elevation_pair,
 )
 from fgslam.factors.noise import KernelName, Whitening
 from fgslam.planar import rotation
@@ -57,6 +58,34 @@ class BearingFactors:
             return elevation(place, point, tall, value)
 
         return gtsam.CustomFactor(self._model(sigma), keys, error)
+
+    def elevation_pair(
+        self,
+        target: int,
+        landmark: int,
+        measured: FloatArray,
+        sigmas: FloatArray,
+        first: FloatArray,
+    ) -> Any:
+        """Elevations (2,) of a landmark from start and target without its height; radians.
+
+        Their deviations (2,) are brought together at first guesses of target and landmark, (5,).
+        """
+        _, _, _, by_elevations = elevation_pair(first[:3], first[3:], measured)
+        sigma = float(np.linalg.norm(by_elevations * sigmas))
+
+        def error(_: Any, values: Any, jacobians: list[FloatArray] | None) -> FloatArray:
+            at = values.atPose2(target)
+            place = np.array([at.x(), at.y(), at.theta()])
+            residual, by_pose, by_point, _ = elevation_pair(
+                place, values.atPoint2(landmark), measured
+            )
+            if jacobians is not None:
+                jacobians[0] = (by_pose @ tangent_to_pose(place))[None]
+                jacobians[1] = by_point[None]
+            return np.array([residual])
+
+        return gtsam.CustomFactor(self._model(sigma), [target, landmark], error)
 
     def _model(self, sigma: float) -> Any:
         return self._whitening.model(np.array([[sigma**2]]))

@@ -71,6 +71,32 @@ def elevation_jacobians(
     return np.column_stack([-by_point, np.zeros(len(points))]), by_point, distance / squared
 
 
+def elevation_pair(
+    target: FloatArray, point: FloatArray, elevations: FloatArray
+) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+    """Elevation from the target of a landmark whose height the one from the start gives (G12).
+
+    The height d tan(alpha) is put in, d the distance from the start: the two elevations' factors
+    with the height eliminated, to first order.
+
+    Args:
+        target: (3,) pose; the start is the origin.
+        point: (2,) landmark.
+        elevations: (2,) measured from start and target, radians.
+
+    Returns:
+        Residual, radians; its derivatives by target (3,), point (2,) and both elevations (2,).
+    """
+    pose, tangent = np.asarray(target), np.tan(elevations[0])
+    distance = np.hypot(*point)
+    height = np.array([distance * tangent])
+    by_pose, by_point, by_height = elevation_jacobians(pose, point[None], height)
+    residual = elevation(pose, point[None], height, elevations[1:])[0]
+    raised = by_height[0] * tangent / distance * point
+    by_elevations = np.array([by_height[0] * distance * (1.0 + tangent**2), -1.0])
+    return float(residual), by_pose[0], by_point[0] + raised, by_elevations
+
+
 def direction_and_turn(
     target: FloatArray, direction: float, turn: float
 ) -> tuple[FloatArray, FloatArray]:

@@ -142,13 +142,14 @@ class HomingGraphSettings(NamedSettings):
     ] = "isam2"
     kernel: KernelSettings = KernelSettings("cauchy", 2.0)
     elevations: Annotated[
-        bool,
+        Literal["none", "two_views", "all"],
         Field(
-            description="elevations are used too, with a height for each landmark; the "
-            "initialisation's direction and rotation, which were found with those of the first "
-            "two views, are then left out"
+            description="`two_views`: those from start and target, a factor for each landmark, in "
+            "place of the direction and rotation that the initialisation found with them: nothing "
+            "counts twice. `none`: direction and rotation as a prior instead. `all`: those of the "
+            "images on the way, too, with a height for each landmark (twice as slow)"
         ),
-    ] = False
+    ] = "two_views"
     max_relative_distance_sigma: Annotated[
         float,
         Field(

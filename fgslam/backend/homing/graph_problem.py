@@ -25,7 +25,12 @@ from fgslam.factors.bearing import (
     weak_height_prior,
     weak_landmark_prior,
 )
-from fgslam.factors.bearing_residuals import bearing, triangulated
+from fgslam.factors.bearing_residuals import (
+    bearing,
+    bearing_jacobians,
+    polar_points,
+    triangulated,
+)
 from fgslam.factors.keys import height_key, landmark_key, pose_key, target_key, velocity_key
 from fgslam.homing_types import HomingStart, TrackedBearings
 from fgslam.planar import compose, unit, wrap
@@ -35,6 +40,8 @@ from fgslam.types import BoolArray, FloatArray, IntArray
 _COLLAPSED = 0.1  # of the first distance from the start: gates let no error of ninety percent in
 _CONFIRMED, _SAME_SIGMAS = 3, 1.0  # agreements in a row before a waiting feature enters
 _JUMPED = 4  # misses in a row after which a track follows something else
+_WIDER = 10.0  # deviations of the initialisation's answer where its elevations enter themselves
+_SEEN_SIGMAS = 3.0  # of the target's bearing against the place where a feature is to enter
 _LEAST_SIGMA = 1e-3  # radians: of the initialisation's direction and rotation, stated smaller
 
 
@@ -67,7 +74,6 @@ class HomingProblem:
     def __init__(self, start: HomingStart, settings: HomingGraphSettings) -> None:
         """Nothing is in the graph yet; see :meth:`first`."""
         self._start, self._settings = start, settings
-        self._plain = BearingFactors()
         self._robust = BearingFactors(settings.kernel.name, settings.kernel.width)
         motion = settings.motion
         turning = float(np.deg2rad(motion.turning_deg))
@@ -117,11 +123,10 @@ class HomingProblem:
         new.graph.add(start_prior(pose_key(0)))
         new.graph.add(velocity_prior(velocity_key(0), np.zeros(3), sigmas))
         new.graph.add(leg_factor(pose_key(0), target_key()))
-        if not self._settings.elevations:
-            covariance = vector.covariance + _LEAST_SIGMA**2 * np.eye(2)
-            new.graph.add(
-                vector_factor(target_key(), vector.direction, vector.rotation, covariance)
-            )
+        wider = 1.0 if self._settings.elevations == "none" else _WIDER
+        covariance = 0.5 * wider**2 * (vector.covariance + vector.covariance.T)
+        covariance = covariance + _LEAST_SIGMA**2 * np.eye(2)
+        new.graph.add(vector_factor(target_key(), vector.direction, vector.rotation, covariance))
         chart = start.local_map
         spread = np.sqrt(chart.covariance[:, 0, 0])
         good = self._good(chart.distance, spread)
@@ -183,7 +188,7 @@ class HomingProblem:
         new.keys.add(landmark)
         sigma = float(tracked.sigma_bearing[k])
         new.graph.add(self._robust.bearing(pose, landmark, float(tracked.bearing[k]), sigma))
-        if self._settings.elevations and np.isfinite(tracked.elevation[k]):
+        if self._settings.elevations == "all" and np.isfinite(tracked.elevation[k]):
             new.keys.add(height_key(row))
             measured, sigma = float(tracked.elevation[k]), float(tracked.sigma_elevation[k])
             new.graph.add(self._robust.elevation(pose, landmark, height_key(row), measured, sigma))
@@ -207,11 +212,22 @@ class HomingProblem:
         new.graph.add(weak_landmark_prior(landmark, point, spread))
         from_start, _, from_target, _ = matches.sigma[row].tolist()
         at_start, at_target = float(matches.bearing_a[row]), float(matches.bearing_b[row])
-        new.graph.add(self._plain.bearing(pose_key(0), landmark, at_start, from_start))
+        new.graph.add(self._robust.bearing(pose_key(0), landmark, at_start, from_start))
         new.graph.add(self._robust.bearing(target_key(), landmark, at_target, from_target))
-        if settings.elevations:
+        if settings.elevations == "all":
             self._enter_height(new, row, distance)
+        elif settings.elevations == "two_views" and np.isfinite(self._elevations(row)).all():
+            vector = self._start.vector
+            at = unit(np.array(vector.direction))
+            both = self._elevations(row)
+            first = np.array([*at, vector.rotation, *point])
+            sigmas = matches.sigma[row, [1, 3]]
+            new.graph.add(self._robust.elevation_pair(target_key(), landmark, both, sigmas, first))
         self._entered[row], self._guesses[row] = True, point
+
+    def _elevations(self, row: int) -> FloatArray:
+        matches = self._start.matches
+        return np.array([matches.elevation_a[row], matches.elevation_b[row]])
 
     def _enter_height(self, new: NewPart, row: int, distance: float) -> None:
         """Its height, with its elevations from start and target."""
@@ -222,7 +238,7 @@ class HomingProblem:
         new.values.insert(height, tall)
         new.keys.add(height)
         new.graph.add(weak_height_prior(height, tall, self._settings.prior_distances * distance))
-        new.graph.add(self._plain.elevation(pose_key(0), landmark, height, up, sigma))
+        new.graph.add(self._robust.elevation(pose_key(0), landmark, height, up, sigma))
         new.graph.add(
             self._robust.elevation(target_key(), landmark, height, up_target, sigma_target)
         )
@@ -264,12 +280,31 @@ class HomingProblem:
         spread = np.sqrt((by**2 * variance).sum(axis=1))
         self._compare(rows[waiting], length * legs, length * spread)
         confirmed = self._good(legs, spread) & (self._agreed[rows[waiting]] >= _CONFIRMED)
+        confirmed &= self._seen_by_target(rows[waiting], length * legs, length * spread)
         for k in np.flatnonzero(confirmed).tolist():
             distance = float(length * legs[k])
             self._enter(new, int(rows[waiting[k]]), distance * unit(start[k]), distance)
             entering[waiting[k]] = True
         return entering
 
+    def _seen_by_target(
+        self, rows: IntArray, distance: FloatArray, spread: FloatArray
+    ) -> BoolArray:
+        """Whether the target saw them where they would be, as far as both are known.
+
+        A track that jumped while its feature waited triangulates something else.
+        """
+        vector, matches = self._start.vector, self._start.matches
+        target = np.append(unit(np.array(vector.direction)), vector.rotation)
+        polar = np.column_stack([distance, matches.bearing_a[rows]])
+        points = polar_points(polar)
+        miss = bearing(target, points, matches.bearing_b[rows])
+        by_pose, by_point = bearing_jacobians(target, points)
+        along = np.einsum("ij,ij->i", by_point, unit(polar[:, 1])) * spread
+        turned = np.column_stack([by_pose[:, :2] @ [-target[1], target[0]], by_pose[:, 2]])
+        variance = np.einsum("ni,ij,nj->n", turned, vector.covariance, turned)
+        variance = variance + along**2 + matches.sigma[rows, 2] ** 2 + matches.sigma[rows, 0] ** 2
+        return np.asarray(miss**2 <= _SEEN_SIGMAS**2 * variance)
 
     def _compare(self, rows: IntArray, distance: FloatArray, spread: FloatArray) -> None:
         """Counts how often in a row a waiting feature was seen at one distance, within its noise.
