@@ -75,7 +75,7 @@ class HomingVectorSettings:
         Field(
             ge=0.0,
             description="added to the direction's sigma in quadrature: what the images themselves "
-            "cannot tell, such as panoramas stitched from several viewpoints, or an inexact reference",
+            "cannot tell: panoramas stitched from several viewpoints, an inexact reference",
         ),
     ] = 0.0
     rotation_floor_deg: Annotated[float, Field(ge=0.0, description="likewise for the rotation")] = (

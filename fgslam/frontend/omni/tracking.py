@@ -1,0 +1,168 @@
+"""Tracking of features from image to image: KLT on a steady view (Goedemé et al. IV-A, G21-G23).
+
+Eq. 2's matrix is summed over the window (E-G8). A point is lost for good when it cannot be tracked
+back to where it came from, when its window no longer looks like the one before, or when it leaves
+the view.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from fgslam.errors import EstimatorError
+from fgslam.frontend.omni.steady_view import SteadyImage, SteadyView
+from fgslam.homing_types import TrackedBearings
+from fgslam.omni_cameras.protocol import OmniCamera
+from fgslam.settings.omni_tracking import OmniTrackingSettings
+from fgslam.types import BoolArray, FloatArray, Image, IntArray
+
+Float32 = npt.NDArray[np.float32]
+
+_MAX_TURN = np.deg2rad(60.0)  # between two images; 40 deg/s of a wheelchair seen 5 times a second
+_CORRELATED = np.arange(-4.0, 5.0)  # window of the look-alike check, pixels
+
+
+class BearingTracker:
+    """Tracks points of one camera's images and tells their bearings."""
+
+    def __init__(self, camera: OmniCamera, settings: OmniTrackingSettings) -> None:
+        self._settings = settings
+        self.steady = SteadyView(
+            camera, settings.max_view_width, settings.window_px, settings.pyramid_levels
+        )
+        self._last: SteadyImage | None = None
+        self._places: FloatArray = np.empty((0, 2))
+        self._ids: IntArray = np.empty(0, dtype=np.int64)
+        self._time = -np.inf
+
+    @property
+    def view(self) -> OmniCamera:
+        """The camera whose pixels the tracked points are."""
+        return self.steady.view
+
+    def start(self, image: Image, time: float, ids: IntArray, pixels: FloatArray) -> None:
+        """Tracks these points from now on, instead of any before.
+
+        Args:
+            image: (h, w, 3) that they are seen in.
+            time: seconds.
+            ids: (n,) ascending.
+            pixels: (n, 2) in the view.
+        """
+        self._last = self.steady.make(image, None, 0.0)
+        self._places = self.steady.to_steady(pixels, self._last)
+        self._ids, self._time = ids.copy(), time
+
+    def add(self, ids: IntArray, pixels: FloatArray) -> None:
+        """Tracks these points of the last image, too; identities above those before."""
+        if self._last is None:
+            raise EstimatorError("no image was tracked yet: start before adding points")
+        places = self.steady.to_steady(pixels, self._last)
+        self._places = np.vstack([self._places, places])
+        self._ids = np.concatenate([self._ids, ids])
+
+    def track(self, image: Image, time: float) -> TrackedBearings:
+        """Finds the points in the next image; those not found are forgotten.
+
+        Raises:
+            EstimatorError: tracking was not started, or time does not increase.
+            FrameError: the image is not the camera's.
+        """
+        if self._last is None:
+            raise EstimatorError("no image was tracked yet: start before tracking")
+        if not time > self._time:
+            raise EstimatorError(
+                f"an image at {time:.9f} s follows one at {self._time:.9f} s; give images in order"
+            )
+        turn = _MAX_TURN * self.steady.period / (2.0 * np.pi)
+        now = self.steady.make(image, self._last, turn)
+        if len(self._ids):
+            places, kept = self._follow(self._last, now)
+            self._places, self._ids = self._centred(places[kept]), self._ids[kept]
+        self._last, self._time = now, time
+        return self._bearings(time)
+
+    def pixels(self) -> FloatArray:
+        """(n, 2) where the points are in the view of the last image."""
+        if self._last is None:
+            return np.empty((0, 2))
+        return self.steady.from_steady(self._places, self._last)
+
+    def _centred(self, places: FloatArray) -> FloatArray:
+        """Places between the margins; who crossed the seam goes on at the other end."""
+        margin, period = self.steady.margin, self.steady.period
+        return np.column_stack([(places[:, 0] - margin) % period + margin, places[:, 1]])
+
+    def _follow(self, before: SteadyImage, now: SteadyImage) -> tuple[FloatArray, BoolArray]:
+        """(n, 2) places in the new view, and (n,) whether they are to be trusted."""
+        s = self._settings
+        origin = self._places.astype(np.float32)
+        window = (s.window_px, s.window_px)
+        kinds = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT
+        criteria = (kinds, s.iterations, s.precision_px)
+        start = np.empty_like(origin)  # not read without the flag
+        found, good, _ = cv2.calcOpticalFlowPyrLK(
+            before.grey, now.grey, origin, start, None, None,
+            window, s.pyramid_levels, criteria, 0, s.min_eigenvalue,
+        )  # fmt: skip
+        # The way back starts at its end, so that the finest level alone does: it costs a third.
+        back, good_back, _ = cv2.calcOpticalFlowPyrLK(
+            now.grey, before.grey, found, origin.copy(), None, None,
+            window, 0, criteria, cv2.OPTFLOW_USE_INITIAL_FLOW, s.min_eigenvalue,
+        )  # fmt: skip
+        ends = np.asarray(found, np.float32)
+        missed = np.hypot(*(np.asarray(back, np.float32) - origin).T)
+        kept = np.asarray((good[:, 0] == 1) & (good_back[:, 0] == 1) & (missed <= s.max_back_px))
+        kept &= self._inside(ends)
+        kept &= _correlation(before.grey, now.grey, origin, ends) >= s.min_correlation
+        return ends.astype(np.float64), kept
+
+    def _inside(self, places: Float32) -> BoolArray:
+        """(n,) whether a point's window lies mostly in the view; rows have no continuation."""
+        rim, rows = self._settings.window_px / 4.0, self.steady.view.height
+        good = (places[:, 1] >= rim) & (places[:, 1] <= rows - 1 - rim)
+        columns = 2 * self.steady.margin + self.steady.period
+        return np.asarray(good & (places[:, 0] >= 0.0) & (places[:, 0] <= columns - 1.0))
+
+    def _bearings(self, time: float) -> TrackedBearings:
+        view = self.steady.view
+        pixels = self.pixels()
+        a_column = 2.0 * np.pi / self.steady.period
+        a_row = (view.top_elevation - view.bottom_elevation) / (view.height - 1)
+        sigma = self._settings.sigma_px * np.ones(len(pixels))
+        return TrackedBearings(
+            time=time,
+            ids=self._ids.copy(),
+            bearing=np.pi - pixels[:, 0] * a_column,
+            sigma_bearing=sigma * a_column,
+            elevation=view.top_elevation - pixels[:, 1] * a_row,
+            sigma_elevation=sigma * a_row,
+        )
+
+
+def _correlation(
+    before: Image, now: Image, origin: Float32, found: Float32
+) -> npt.NDArray[np.float64]:
+    """(n,) normalised correlation of small windows around points (n, 2) of two views.
+
+    Blind to gain and offset: exposure may change from image to image.
+    """
+    one, other = (_windows(image, at) for image, at in ((before, origin), (now, found)))
+    return np.asarray(np.sum(one * other, axis=1), dtype=np.float64)
+
+
+def _windows(image: Image, centres: Float32) -> Float32:
+    """(n, k * k) windows around centres, bilinear, zero mean and unit length."""
+    across = (centres[:, :1] + _CORRELATED[None, :]).astype(np.float32)
+    down = (centres[:, 1:] + _CORRELATED[None, :]).astype(np.float32)
+    k, n = len(_CORRELATED), len(centres)
+    columns = np.broadcast_to(across[:, None, :], (n, k, k)).reshape(n, k * k)
+    rows = np.broadcast_to(down[:, :, None], (n, k, k)).reshape(n, k * k)
+    grey = cv2.remap(
+        image, np.ascontiguousarray(columns), np.ascontiguousarray(rows), cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    ).astype(np.float32)  # fmt: skip
+    grey -= grey.mean(axis=1, keepdims=True)
+    return np.asarray(grey / np.maximum(np.linalg.norm(grey, axis=1, keepdims=True), 1e-3))

@@ -1,0 +1,115 @@
+"""The eyes of a robot with one omnidirectional camera: features, homing vector, tracking."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgslam.frontend.omni.features import OmniFeatureExtractor
+from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
+from fgslam.frontend.omni.local_map import make_local_map, triangulable
+from fgslam.frontend.omni.matching import match_features
+from fgslam.frontend.omni.trackable import move_to_trackable
+from fgslam.frontend.omni.tracking import BearingTracker
+from fgslam.homing_types import (
+    BearingMatches,
+    HomingStart,
+    HomingVector,
+    OmniFeatures,
+    Refusal,
+    RefusalReason,
+    TrackedBearings,
+)
+from fgslam.omni_cameras.protocol import OmniCamera
+from fgslam.settings.homing_vector import HomingVectorSettings
+from fgslam.settings.omni_features import OmniFeatureSettings, OmniMatchingSettings
+from fgslam.settings.omni_tracking import OmniTrackingSettings
+from fgslam.types import ByteArray
+
+_DARK = 8.0  # mean grey value of what the camera sees
+_MAX_RELATIVE_SIGMA = 1.0  # of a distance; whoever knows less of a feature waits for parallax
+
+
+@dataclass(frozen=True, slots=True)
+class EyesSettings:
+    """What every stage of the front-end is set to."""
+
+    features: OmniFeatureSettings
+    matching: OmniMatchingSettings
+    homing_vector: HomingVectorSettings
+    tracking: OmniTrackingSettings
+
+
+class ImageEyes:
+    """Homing's front-end for one camera; see :class:`fgslam.homing.eyes.HomingEyes`."""
+
+    def __init__(
+        self, camera: OmniCamera, settings: EyesSettings, rng: np.random.Generator
+    ) -> None:
+        """``rng`` chooses RANSAC's samples."""
+        self._settings = settings
+        self._rng = rng
+        self._extractor = OmniFeatureExtractor(camera, settings.features)
+        self._tracker = BearingTracker(camera, settings.tracking)
+
+    def describe(self, image: ByteArray) -> OmniFeatures:
+        """Features of a path image. Raises FrameError where the image is not the camera's."""
+        return self._extractor.extract(image)
+
+    def begin(self, image: ByteArray, target: OmniFeatures, time: float) -> HomingStart | Refusal:
+        """The initialisation step (section III); unless refused, its features are tracked now."""
+        present = self.describe(image)
+        refusal = _unusable(image, present)
+        if refusal is not None:
+            return refusal
+        s = self._settings
+        matches = match_features(present, target, s.matching)
+        vector = estimate_homing_vector(matches, s.homing_vector, self._rng)
+        if isinstance(vector, Refusal):
+            return vector
+        return self._started(image, time, vector, matches, (present, target))
+
+    def track(self, image: ByteArray, time: float) -> TrackedBearings:
+        """The features in the next image. Raises as :meth:`BearingTracker.track`."""
+        return self._tracker.track(image, time)
+
+    def _started(
+        self,
+        image: ByteArray,
+        time: float,
+        vector: HomingVector,
+        matches: BearingMatches,
+        features: tuple[OmniFeatures, OmniFeatures],
+    ) -> HomingStart | Refusal:
+        """Trackable points of the inliers, triangulated; those in front are tracked from now on."""
+        steady = self._tracker.steady
+        _, pixels, points = move_to_trackable(
+            steady.grey(image),
+            steady.view,
+            matches.taken(vector.inliers),
+            features,
+            self._settings.tracking,
+        )
+        known = triangulable(make_local_map(vector, points), _MAX_RELATIVE_SIGMA)
+        points, pixels = points.taken(known), pixels[known]
+        least = self._settings.homing_vector.min_inliers
+        if len(points) < least:
+            return Refusal(
+                RefusalReason.TOO_FEW_INLIERS,
+                f"{len(points)} of {vector.support} inliers can be tracked, of {least} needed",
+            )
+        vector = replace(vector, inliers=np.ones(len(points), dtype=np.bool_))
+        local_map = make_local_map(vector, points)
+        self._tracker.start(image, time, local_map.ids, pixels)
+        return HomingStart(time, vector, local_map, points)
+
+
+def _unusable(image: ByteArray, present: OmniFeatures) -> Refusal | None:
+    lit = image[np.any(image > 0, axis=2)]
+    brightness = float(np.mean(lit)) if len(lit) else 0.0
+    if brightness < _DARK:
+        return Refusal(RefusalReason.TOO_DARK, f"mean grey value {brightness:.1f} of 255")
+    if not len(present.sift) and not len(present.columns):
+        return Refusal(RefusalReason.NO_FEATURES, "nothing to recognise in the present image")
+    return None
