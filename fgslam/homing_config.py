@@ -15,12 +15,18 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from fgslam.config import ExperimentConfig, make_config
 from fgslam.config_reading import Reader, apply_overrides, read_mapping
 from fgslam.errors import ConfigError
-from fgslam.settings.homing_behaviour import LocalisationSettings, TopologicalMapSettings
+from fgslam.settings.homing_behaviour import (
+    HomingBehaviourSettings,
+    LocalisationSettings,
+    TopologicalMapSettings,
+)
 from fgslam.settings.homing_estimators import HomingEstimatorSettings, HomingGraphSettings
 from fgslam.settings.homing_output import HomingOutputSettings
 from fgslam.settings.homing_vector import HomingVectorSettings
 from fgslam.settings.omni_datasets import OmniDatasetSettings
 from fgslam.settings.omni_features import OmniFeatureSettings
+from fgslam.settings.omni_tracking import OmniTrackingSettings
+from fgslam.settings.omni_worlds import OmniHouseSettings
 from fgslam.settings.simulated_bearings import SimulatedBearingsSettings
 
 _TAKEN_FOLDERS = ("pictures", "compare", "logs", "runs")
@@ -151,10 +157,47 @@ class HomingTrialsConfig(HomingExperiment):
     compare: ComparedList = ()
 
 
+class DrivingConfig(HomingExperiment):
+    """Closed loop in a rendered house: what homing and path following share."""
+
+    dataset: OmniHouseSettings = OmniHouseSettings()
+    features: OmniFeatureSettings = OmniFeatureSettings()
+    homing_vector: HomingVectorSettings = HomingVectorSettings()
+    tracking: OmniTrackingSettings = OmniTrackingSettings()
+    behaviour: HomingBehaviourSettings = HomingBehaviourSettings()
+    estimator: LiveHoming = HomingGraphSettings()
+    compare: ComparedList = ()
+    trials: Annotated[
+        int, Field(ge=1, description="drives, each with a seed of its own: path, noise, people")
+    ] = 1
+    start_offset_m: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="the robot starts up to so far from the path's start, turned at random: "
+            "from where homing succeeds (G36)",
+        ),
+    ] = 0.0
+
+
+class HomingConfig(DrivingConfig):
+    """One homing in closed loop: the path's first leg alone."""
+
+    task: Annotated[Literal["homing"], _TASK]
+
+
+class PathFollowingConfig(DrivingConfig):
+    """A path of many target images, followed in closed loop."""
+
+    task: Annotated[Literal["path_following"], _TASK]
+
+
 TASKS: dict[str, type[HomingExperiment]] = {
     "homing_pairs": HomingPairsConfig,
     "topological_map": TopologicalMapConfig,
     "homing_trials": HomingTrialsConfig,
+    "homing": HomingConfig,
+    "path_following": PathFollowingConfig,
 }
 """The model of each task."""
 

@@ -40,6 +40,9 @@ from fgslam.settings.homing_estimators import HomingEstimatorSettings
 DEFAULT_FOLDER = "compare"
 COMPARISON_FILE = "comparison.csv"
 ESTIMATES_FILE = "estimates.csv"
+_LEFT = 0.199
+"""Judged where a fifth of the leg is left, as simulated homings end there: nearer to the target its
+direction means less and less."""
 _ESTIMATE_COLUMNS = (
     "log",
     "estimator",
@@ -140,7 +143,8 @@ def _finish(
     }
     rows, numbers = [], {}
     for title, by_log in replays.items():
-        row, values = _judged(by_log, errors[title])
+        judged = {name: _errors(one, logs[name], _LEFT) for name, one in by_log.items()}
+        row, values = _judged(by_log, judged)
         rows.append((title, row))
         numbers[title] = values
     with_truth = sum(log.truth is not None for log in logs.values())
@@ -158,11 +162,16 @@ def _finish(
     return result
 
 
-def _errors(replayed: ReplayedHoming, log: BearingLog) -> HomingErrors | None:
+def _errors(replayed: ReplayedHoming, log: BearingLog, left: float = 0.0) -> HomingErrors | None:
+    """Errors of all images up to the last one with so much of the leg left; None without truth."""
     if log.truth is None or not replayed.estimates:
         return None
-    seen = dataclasses.replace(log.truth, robots=log.truth.robots[: len(replayed.estimates)])
-    return homing_errors(replayed.estimates, seen)
+    robots = log.truth.robots[: len(replayed.estimates)]
+    away = np.hypot(*(log.truth.target[:2] - robots[:, :2]).T) / log.truth.leg_m
+    far = np.flatnonzero(away >= left)
+    count = int(far[-1]) + 1 if len(far) else 1
+    seen = dataclasses.replace(log.truth, robots=robots[:count])
+    return homing_errors(replayed.estimates[:count], seen)
 
 
 def _judged(

@@ -7,11 +7,15 @@ from pathlib import Path
 from fgslam.errors import ConfigError, OutputError
 from fgslam.export.atomic import ExistingFolder, is_run_folder
 from fgslam.homing_config import (
+    HomingConfig,
     HomingExperiment,
     HomingPairsConfig,
     HomingTrialsConfig,
+    PathFollowingConfig,
     TopologicalMapConfig,
 )
+from fgslam.runs.homing.driving import run_driving, with_one_leg
+from fgslam.runs.homing.house import open_house_drive
 from fgslam.runs.homing.mapping import run_topological_map
 from fgslam.runs.homing.pairs import run_homing_pairs
 from fgslam.runs.homing.results import HomingResult, Progress, Stopped
@@ -53,4 +57,9 @@ def run_homing(
             return run_topological_map(config, folder, existing, progress, stopped)
         case HomingTrialsConfig():
             return run_homing_trials(config, folder, existing, progress, stopped)
-    raise ConfigError(f"task {config.task}: cannot be run yet")
+        case HomingConfig():
+            one = with_one_leg(config)
+            return run_driving(one, folder, existing, progress, stopped, open_house_drive)
+        case PathFollowingConfig():
+            return run_driving(config, folder, existing, progress, stopped, open_house_drive)
+    raise ConfigError(f"task {config.task}: cannot be run")

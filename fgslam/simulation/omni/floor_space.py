@@ -39,6 +39,11 @@ class FloorSpace:
         blocked[i, j] = True
         self.clearances = ndimage.distance_transform_edt(~blocked) * _CELL
 
+    @property
+    def outlines(self) -> FloatArray:
+        """(n, 2, 2) edges of all obstacles, from above: ends, then x and y in metres."""
+        return np.stack([self._start, self._end], axis=1)
+
     def clearance(self, points: FloatArray) -> FloatArray:
         """(n,) exact distance in metres of points (n, 2) to the nearest obstacle.
 

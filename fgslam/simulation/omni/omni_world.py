@@ -187,6 +187,11 @@ class OmniWorld:
         """(n,) metres from places (n, 2) to the nearest obstacle of the house."""
         return self.model.space.clearance(points)
 
+    @property
+    def outlines(self) -> tuple[FloatArray, ...]:
+        """Lines (2, 2) of walls and furniture from above, metres."""
+        return tuple(self.model.space.outlines)
+
     def seen(self, pose: FloatArray, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Pixels (n, 2) of points (n, 3) from an untilted pose (3,), and whether they show."""
         return visible(self.model.layer, self.camera, self._untilted(pose), points)

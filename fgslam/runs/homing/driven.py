@@ -1,0 +1,28 @@
+"""What one drive gave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fgslam.homing.path_memory import PathMemory
+from fgslam.homing.record import DriveRecord
+from fgslam.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrivenSeed:
+    """One drive.
+
+    Attributes:
+        seed: of world and chance.
+        record: of the drive.
+        memory: the path as it is remembered.
+        outlines: of the world.
+        leg_m: true length of the first leg as driven: start to target.
+    """
+
+    seed: int
+    record: DriveRecord
+    memory: PathMemory
+    outlines: tuple[FloatArray, ...]
+    leg_m: float
