@@ -2,8 +2,8 @@
 
 Features that are recognised from afar are rarely the points that are tracked best. Near each one
 the point is chosen whose gradient matrix (eq. 2, summed over the window, E-G8) has the largest
-smaller eigenvalue. In the target image that point was not looked for: it lies where the feature's own
-frame puts it, as if its surroundings were a plane seen alike from both places.
+smaller eigenvalue. In the target image that point was not looked for: it lies where the own
+frame of the feature puts it, as if its surroundings were a plane seen alike from both places.
 """
 
 from __future__ import annotations
