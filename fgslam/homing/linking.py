@@ -59,14 +59,13 @@ def link_pair(
 
     Both directions must be answered with enough inliers, and one motion must explain both:
     the rotations are opposite, and back points where there came from:
-    theta_ba = theta_ab + pi - psi_ab.
+    theta_ba = theta_ab + pi - psi_ab. Where one direction cannot decide between two solutions, the
+    other may, with more inliers.
     """
     if isinstance(there, Refusal) and isinstance(back, Refusal):
         return _same_place(pair, there, back, settings)
-    if isinstance(there, Refusal):
-        return f"refused in one direction: {there.details}"
-    if isinstance(back, Refusal):
-        return f"refused in one direction: {back.details}"
+    if isinstance(there, Refusal) or isinstance(back, Refusal):
+        return _one_way(pair, there, back, settings)
     support = min(there.support, back.support)
     if support < settings.min_support:
         return f"{support} inliers, of {settings.min_support} needed"
@@ -84,6 +83,41 @@ def link_pair(
         *pair, there.direction, there.rotation, back.direction, there.covariance,
         back.covariance, support,
     )  # fmt: skip
+
+
+def _one_way(
+    pair: Pair, there: Answer, back: Answer, settings: TopologicalMapSettings
+) -> Link | str:
+    """One direction is answered, the other cannot decide: what holds there holds back.
+
+    Which of the two solutions (design D3) the few decisive features support may hang on the draw;
+    that is no contradiction. Any other refusal is, as both answers come from the same views.
+    """
+    answer, other = (back, there) if isinstance(there, Refusal) else (there, back)
+    if isinstance(answer, Refusal) or not isinstance(other, Refusal):
+        raise TypeError("one direction must be answered, the other refused")
+    if other.reason is not RefusalReason.AMBIGUOUS:
+        return f"refused in one direction: {other.details}"
+    if answer.support < settings.one_way_support:
+        return (
+            f"{answer.support} inliers one way, of {settings.one_way_support} needed; "
+            f"back: {other.details}"
+        )
+    opposite = _opposite(answer)
+    ahead, behind = (opposite, answer) if answer is back else (answer, opposite)
+    return Link(
+        *pair, ahead.direction, ahead.rotation, behind.direction, ahead.covariance,
+        behind.covariance, answer.support,
+    )  # fmt: skip
+
+
+def _opposite(vector: HomingVector) -> HomingVector:
+    """The way back, of the same motion."""
+    back = float(wrap(np.array(vector.direction + np.pi - vector.rotation)))
+    # (theta + pi - psi, -psi) of (theta, psi)
+    jacobian = np.array([[1.0, -1.0], [0.0, -1.0]])
+    covariance = jacobian @ vector.covariance @ jacobian.T
+    return HomingVector(back, -vector.rotation, covariance, vector.inliers, vector.rival_support)
 
 
 def _same_place(

@@ -251,6 +251,14 @@ class TopologicalMapSettings:
     min_support: Annotated[int, Field(ge=3, description="inliers of an edge, in either answer")] = (
         12
     )
+    one_way_support: Annotated[
+        int,
+        Field(
+            ge=3,
+            description="inliers of an edge that is answered in one direction and ambiguous in the "
+            "other",
+        ),
+    ] = 25
     lone_support: Annotated[
         int,
         Field(
