@@ -73,13 +73,13 @@ def test_the_mirror_video(shared_data: Path) -> None:
     assert recording.timestamps[390] == pytest.approx(390 / 29.97, abs=1e-3)
     camera = recording.camera
     assert isinstance(camera, RadialCamera)
-    away, circle = mirror_offset(camera, recording.image(0))
+    away, circle = mirror_offset(camera, recording.image(0), np.random.default_rng(0))
     assert away < 1.5
     assert circle.radius == pytest.approx(camera.outer_radius, abs=1.5)
     assert circle.support > 0.7
-    # The accessory sits loosely: later in the film the whole picture has moved.
-    later, _ = mirror_offset(camera, recording.image(390))
-    assert later < 8.0
+    # Thirteen seconds later the loose accessory has not moved in the picture.
+    later, _ = mirror_offset(camera, recording.image(390), np.random.default_rng(0))
+    assert later < 1.5
 
 
 def ocamcalib(shared_data: Path) -> OmniRecording:
@@ -161,7 +161,7 @@ def plane_error(rays: FloatArray) -> float:
 @pytest.mark.parametrize("name", ["kit_pair_left.png", "hypercat_1280x1024_01.jpg"])
 def test_mirror_circles_of_real_pictures(shared_data: Path, name: str) -> None:
     image = read_colour_image(present(shared_data, f"omni_mirror/{name}"))
-    circle = find_mirror_circle(image)
+    circle = find_mirror_circle(image, np.random.default_rng(0))
     middle = np.array([image.shape[1], image.shape[0]]) / 2.0
     assert np.hypot(*(circle.centre - middle)) < 60.0
     assert circle.radius == pytest.approx(max(image.shape) / 2.0, rel=0.1)

@@ -61,25 +61,25 @@ def test_the_mirrors_circle_and_a_mirror_off_its_place(rays: FloatArray) -> None
     bearing = np.arctan2(rays[..., 1], rays[..., 0])
     wall = 120.0 + 60.0 * np.sign(np.sin(9.0 * bearing)) * np.sign(rays[..., 2] + 0.2)
     picture = rendered(MIRROR, wall)
-    circle = find_mirror_circle(picture)
+    circle = find_mirror_circle(picture, np.random.default_rng(0))
     np.testing.assert_allclose(circle.centre, FRAME.centre, atol=0.3)
     assert circle.radius == pytest.approx(232.0, abs=0.5)
     assert circle.support > 0.8
-    away, _ = mirror_offset(MIRROR, picture)
+    away, _ = mirror_offset(MIRROR, picture, np.random.default_rng(0))
     assert away < 0.3
     shifted = np.roll(picture, (3, -4), axis=(0, 1))
-    away, circle = mirror_offset(MIRROR, shifted)
+    away, circle = mirror_offset(MIRROR, shifted, np.random.default_rng(0))
     assert away == pytest.approx(5.0, abs=0.4)
     np.testing.assert_allclose(circle.centre, np.add(FRAME.centre, (-4, 3)), atol=0.3)
     with pytest.raises(CalibrationError, match=r"320x240 pixels, the camera is .* 640x480"):
-        mirror_offset(MIRROR, picture[::2, ::2])
+        mirror_offset(MIRROR, picture[::2, ::2], np.random.default_rng(0))
 
 
 def test_no_circle_in_a_picture_without_a_mirror() -> None:
     noise = np.random.default_rng(1).integers(0, 255, (120, 160), dtype=np.uint8)
     for picture in (np.zeros((120, 160), np.uint8), np.full((120, 160), 90, np.uint8), noise):
         with pytest.raises(CalibrationError, match="no mirror's circle"):
-            find_mirror_circle(picture)
+            find_mirror_circle(picture, np.random.default_rng(0))
 
 
 def test_upright_edges_stay_upright_unless_the_centre_is_wrong(rays: FloatArray) -> None:

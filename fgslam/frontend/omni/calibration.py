@@ -26,6 +26,7 @@ _CIRCLE_TOLERANCE = 0.01  # of the radius: what counts as on the circle while se
 _LEAST_CONTRAST = 4.0  # grey levels a pixel after smoothing: 4 sigma at 2 grey levels of noise
 _REFINEMENTS = 5
 _MARGIN_PX = 3.0
+_NEAR = 0.05  # of the radius: the Bloggie's holder ends 13 % further out than its mirror
 _MIN_SUPPORT = 0.35
 
 
@@ -47,14 +48,17 @@ class MirrorCircle:
 
 
 def find_mirror_circle(
-    image: Image, near: tuple[tuple[float, float], float] | None = None
+    image: Image,
+    rng: np.random.Generator,
+    near: tuple[tuple[float, float], float] | None = None,
 ) -> MirrorCircle:
     """Finds the circle on which the mirror's bright picture ends toward the dark around it.
 
     Args:
         image: (height, width) or (height, width, 3).
+        rng: of the search among the edges.
         near: centre and radius that it should have, to choose between the concentric edges of a
-            mirror and its holder: edges more than a tenth of the radius off are left out. None:
+            mirror and its holder: edges more than a twentieth of the radius off are left out. None:
             the circle with the most support, around a centre within the middle half of the picture.
 
     Raises:
@@ -63,18 +67,25 @@ def find_mirror_circle(
     grey = _grey(image)
     height, width = grey.shape
     centre = near[0] if near else ((width - 1) / 2.0, (height - 1) / 2.0)
-    limits = (0.9 * near[1], 1.1 * near[1]) if near else (0.2 * min(grey.shape), 0.75 * width)
+    limits = _near_limits(near[1]) if near else (0.2 * min(grey.shape), 0.75 * width)
     edges = _falling_edges(grey, centre, limits)
-    circle = _search_circle(edges, np.array(centre), limits, grey.shape)
-    if circle is None:
+    seed = _search_circle(edges, np.array(centre), limits, 0.25 * min(grey.shape), rng)
+    circle = None if seed is None else _refined(grey, seed)
+    if circle is None or not limits[0] < circle.radius < limits[1]:
         raise CalibrationError(
             "no mirror's circle is found in the picture: it must be brighter inside than outside, "
             f"on at least {_MIN_SUPPORT:.0%} of its circumference"
         )
-    return _refined(grey, circle)
+    return circle
 
 
-def mirror_offset(camera: RadialCamera, image: Image) -> tuple[float, MirrorCircle]:
+def _near_limits(radius: float) -> tuple[float, float]:
+    return (1.0 - _NEAR) * radius, (1.0 + _NEAR) * radius
+
+
+def mirror_offset(
+    camera: RadialCamera, image: Image, rng: np.random.Generator
+) -> tuple[float, MirrorCircle]:
     """How far the mirror lies from where the camera has it, in pixels, and the circle found.
 
     Raises:
@@ -85,7 +96,7 @@ def mirror_offset(camera: RadialCamera, image: Image) -> tuple[float, MirrorCirc
             f"the picture has {image.shape[1]}x{image.shape[0]} pixels, the camera is calibrated "
             f"for {camera.width}x{camera.height}; give the calibration at this size"
         )
-    circle = find_mirror_circle(image, (camera.frame.centre, camera.outer_radius))
+    circle = find_mirror_circle(image, rng, (camera.frame.centre, camera.outer_radius))
     away = np.subtract(circle.centre, camera.frame.centre)
     return float(np.hypot(*away)), circle
 
@@ -165,15 +176,17 @@ def _search_circle(
     points: FloatArray,
     around: FloatArray,
     limits: tuple[float, float],
-    shape: tuple[int, ...],
+    reach: float,
+    rng: np.random.Generator,
 ) -> tuple[FloatArray, float] | None:
-    """Circle through three points with the most others on it, seen all around (RANSAC)."""
+    """Circle through three points with the most others on it, seen all around (RANSAC).
+
+    Its centre lies within ``reach`` of ``around``.
+    """
     if len(points) < 30:
         return None
-    rng = np.random.default_rng(0)
     triples = points[rng.integers(0, len(points), (_CIRCLE_TRIALS, 3))]
     centres, radii = _circles(triples)
-    reach = 0.25 * min(shape)
     good = (radii > limits[0]) & (radii < limits[1])
     good &= np.hypot(*(centres - around).T) < reach
     best, most = None, _MIN_SUPPORT
