@@ -1,0 +1,399 @@
+"""Maps of homings: links that agree, false ones that do not, routes, localisation."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fgslam.errors import StoredMapError
+from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
+from fgslam.homing.link_checks import LinkChecks, between_misfit, heading_residuals
+from fgslam.homing.linking import Answer, Link, link_pair
+from fgslam.homing.localisation import Localiser
+from fgslam.homing.retrieval import VisualWords, candidate_pairs
+from fgslam.homing.topological_map import TopologicalMap, build_map, map_of_answers
+from fgslam.homing_types import HomingVector, OmniFeatures, Refusal, RefusalReason
+from fgslam.planar import between, wrap
+from fgslam.settings.homing_behaviour import (
+    LocalisationSettings,
+    RetrievalSettings,
+    TopologicalMapSettings,
+)
+from fgslam.settings.homing_vector import HomingVectorSettings
+from fgslam.types import FloatArray
+from tests.landmark_world import landmark_features, match_landmarks, numbers
+
+SETTINGS = TopologicalMapSettings()
+NONE = Refusal(RefusalReason.TOO_FEW_MATCHES, "3 matches, of 8 needed")
+
+
+def vector(direction: float, rotation: float, support: int = 60) -> HomingVector:
+    """With a deviation of a degree."""
+    covariance = np.eye(2) * np.deg2rad(1.0) ** 2
+    return HomingVector(direction, rotation, covariance, np.ones(support, dtype=np.bool_), 0)
+
+
+def true_vector(one: FloatArray, other: FloatArray, support: int = 60) -> HomingVector:
+    """From one pose to another."""
+    way = between(one, other)
+    return vector(float(np.arctan2(way[1], way[0])), float(way[2]), support)
+
+
+def true_link(poses: FloatArray, a: int, b: int, support: int = 60) -> Link:
+    """As both directions' answers make it."""
+    there, back = true_vector(poses[a], poses[b], support), true_vector(poses[b], poses[a], support)
+    link = link_pair((a, b), there, back, SETTINGS)
+    assert isinstance(link, Link)
+    return link
+
+
+def turned(link: Link, rotation: float = 0.0, direction: float = 0.0) -> Link:
+    """The same, wrong by so much, there and back alike, as of a place that looks like another."""
+    return Link(
+        link.a, link.b, link.direction + direction, link.rotation + rotation,
+        link.back + direction - rotation, link.covariance, link.back_covariance, link.support,
+    )  # fmt: skip
+
+
+def random_poses(seed: int, count: int) -> FloatArray:
+    """In a hall of 10 m."""
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform(0, 10, (count, 2)), rng.uniform(-np.pi, np.pi, count)])
+
+
+# --------------------------------------------------------------------------------------------
+# Links
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_there_and_back_agree_for_true_answers(seed: int) -> None:
+    """Any two poses; the way back of the way back is the link itself."""
+    link = true_link(random_poses(seed, 2), 0, 1)
+    again = link.reversed().reversed()
+    assert (again.direction, again.rotation, again.back) == (
+        link.direction, link.rotation, link.back,
+    )  # fmt: skip
+    assert link.reversed().direction == link.back
+
+
+def test_answers_that_disagree_are_no_link() -> None:
+    """Rotation not opposite; direction not where one came from; a refusal; few inliers."""
+    a, b = random_poses(1, 2)
+    there, back = true_vector(a, b), true_vector(b, a)
+    assert isinstance(link_pair((0, 1), there, back, SETTINGS), Link)
+    off = np.deg2rad(SETTINGS.mutual_deg + 1.0)
+    for wrong in (
+        vector(back.direction, back.rotation + off),
+        vector(back.direction + off, back.rotation),
+    ):
+        assert "disagree" in str(link_pair((0, 1), there, wrong, SETTINGS))
+    assert "3 matches" in str(link_pair((0, 1), there, NONE, SETTINGS))
+    assert "3 matches" in str(link_pair((0, 1), NONE, NONE, SETTINGS))
+    few = true_vector(b, a, SETTINGS.min_support - 1)
+    assert "inliers" in str(link_pair((0, 1), there, few, SETTINGS))
+
+
+def test_ambiguous_in_one_direction_is_decided_by_the_other() -> None:
+    """With enough inliers, and the same link whichever direction it was."""
+    a, b = random_poses(2, 2)
+    there, back = true_vector(a, b), true_vector(b, a)
+    unsure = Refusal(RefusalReason.AMBIGUOUS, "30 inliers, 29 for a different solution")
+    one, other = (link_pair((0, 1), *pair, SETTINGS) for pair in ((there, unsure), (unsure, back)))
+    assert isinstance(one, Link)
+    assert isinstance(other, Link)
+    gap = [one.direction - other.direction, one.rotation - other.rotation, one.back - other.back]
+    assert np.abs(wrap(np.array(gap))).max() < 1e-12
+    few = true_vector(a, b, SETTINGS.one_way_support - 1)
+    assert "one way" in str(link_pair((0, 1), few, unsure, SETTINGS))
+
+
+def test_one_place_is_linked_by_its_turn() -> None:
+    """No direction, but a rotation that both must tell alike."""
+    here = Refusal(RefusalReason.AT_TARGET, "parallax 0.1 deg", 0.7)
+    back = Refusal(RefusalReason.AT_TARGET, "parallax 0.1 deg", -0.7)
+    link = link_pair((0, 1), here, back, SETTINGS)
+    assert isinstance(link, Link)
+    assert np.isnan(link.direction)
+    assert link.rotation == pytest.approx(0.7)
+    assert "disagree" in str(link_pair((0, 1), here, here, SETTINGS))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_true_triangles_hold(seed: int) -> None:
+    """The long side lies between the steps; rotations add up to zero."""
+    poses = random_poses(seed, 3)
+    ab, bc, ac = (true_link(poses, *pair) for pair in ((0, 1), (1, 2), (0, 2)))
+    assert abs(wrap(np.array(ab.rotation + bc.rotation - ac.rotation))) < 1e-12
+    assert between_misfit(ab.direction, ab.rotation + bc.direction, ac.direction) < 1e-12
+    assert between_misfit(0.0, 1.0, -0.2) == pytest.approx(0.2)
+    assert between_misfit(0.0, 1.0, 1.3) == pytest.approx(0.3)
+    assert between_misfit(1.0, 0.0, 0.5) == 0.0
+
+
+def all_links(poses: FloatArray, reach: float = 5.0) -> list[Link]:
+    """Of all poses within reach of each other."""
+    pairs = itertools.combinations(range(len(poses)), 2)
+    return [
+        true_link(poses, a, b) for a, b in pairs if np.hypot(*(poses[a, :2] - poses[b, :2])) < reach
+    ]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_false_links_are_found_and_true_ones_kept(seed: int) -> None:
+    """A tenth of the links is turned or points elsewhere: all of them go, and nothing else."""
+    rng = np.random.default_rng(seed)
+    links = all_links(random_poses(seed, 16))
+    wrong = set(rng.permutation(len(links))[: len(links) // 10].tolist())
+    spoiled = [
+        turned(link, *rng.uniform(0.6, 2.5, 2) * rng.choice([-1, 1], 2)) if k in wrong else link
+        for k, link in enumerate(links)
+    ]
+    believed, rejected = LinkChecks(16, spoiled, SETTINGS).believed(ordered=False)
+    false = {(links[k].a, links[k].b) for k in wrong}
+    assert false == set(rejected)
+    assert len(believed) == len(links) - len(false)
+
+
+def test_long_link_between_lookalikes_needs_a_witness() -> None:
+    """A chain of places in order, and a link from one end to the other that nothing confirms."""
+    poses = np.column_stack([np.arange(8.0), np.zeros(8), np.zeros(8)])
+    chain = [true_link(poses, k, k + 1, 20) for k in range(7)]
+    long = turned(true_link(poses, 1, 6, SETTINGS.lone_support - 1), 0.0, 1.0)
+    believed, rejected = LinkChecks(8, [*chain, long], SETTINGS).believed(ordered=True)
+    assert [(k.a, k.b) for k in believed] == [(k, k + 1) for k in range(7)]
+    assert "no third image" in rejected[1, 6]
+    unordered, _ = LinkChecks(8, chain, SETTINGS).believed(ordered=False)
+    assert unordered == []  # order is the only witness there was
+
+
+def test_strong_lone_link_that_is_turned_breaks_a_loop() -> None:
+    """Enough inliers to stand alone, but its rotation is not that of the way around."""
+    angle = np.arange(10) * 2.0 * np.pi / 10.0
+    poses = np.column_stack([4.0 * np.cos(angle), 4.0 * np.sin(angle), angle])
+    ring = [true_link(poses, *sorted((k, (k + 1) % 10)), 80) for k in range(10)]
+    across = turned(true_link(poses, 2, 7, 60), np.deg2rad(90.0))
+    believed, rejected = LinkChecks(10, [*ring, across], SETTINGS).believed(ordered=True)
+    assert set(rejected) == {(2, 7)}
+    assert "off all other rotations" in rejected[2, 7]
+    assert len(believed) == 10
+
+
+def test_headings_fit_true_rotations_across_the_wrap() -> None:
+    """Residuals vanish although rotations pass 180 degrees; one wrong one keeps its own error."""
+    poses = random_poses(3, 12)
+    links = all_links(poses, 20.0)
+    pairs = [(k.a, k.b) for k in links]
+    rotations = np.array([k.rotation for k in links])
+    weights = np.ones(len(links))
+    assert np.abs(heading_residuals(12, pairs, rotations, weights)).max() < 1e-9
+    rotations[5] += 1.0
+    residuals = heading_residuals(12, pairs, rotations, weights)
+    assert np.argmax(np.abs(residuals)) == 5
+    assert residuals[5] == pytest.approx(1.0, abs=0.05)
+
+
+# --------------------------------------------------------------------------------------------
+# Maps over a world of landmarks
+
+
+PLACES = 16
+SIGMA = np.deg2rad(0.4)
+
+
+def hall_points() -> FloatArray:
+    """(n, 3) landmarks around a round way of 2.7 m radius."""
+    rng = np.random.default_rng(1)
+    ring, radius = rng.uniform(-np.pi, np.pi, 250), rng.uniform(0.7, 5.0, 250)
+    return np.column_stack(
+        [radius * np.cos(ring), radius * np.sin(ring), rng.uniform(0.3, 1.2, 250)]
+    )
+
+
+def hall() -> tuple[FloatArray, list[OmniFeatures]]:
+    """A round of places a metre apart that see 2.5 m far; the last is beside the first."""
+    angle = np.arange(PLACES) * 2.0 * np.pi / PLACES
+    poses = np.column_stack([2.7 * np.cos(angle), 2.7 * np.sin(angle), angle + np.pi / 2])
+    rng, points = np.random.default_rng(1), hall_points()
+    return poses, [landmark_features(points, pose, 2.5, SIGMA, rng) for pose in poses]
+
+
+def link_by_landmarks(a: OmniFeatures, b: OmniFeatures) -> Answer:
+    """The program's homing vector from matches by identity, a tenth of them wrong."""
+    rng = np.random.default_rng(len(a.sift) * 1000 + len(b.sift))
+    matches, _ = match_landmarks(a, b, 0.1, rng)
+    return estimate_homing_vector(matches, HomingVectorSettings(), rng)
+
+
+@pytest.fixture(scope="module")
+def built() -> tuple[FloatArray, TopologicalMap]:
+    """The hall's map, from candidates by retrieval."""
+    poses, images = hall()
+    settings = TopologicalMapSettings(candidates=5, retrieval=RetrievalSettings(words=100))
+    rng = np.random.default_rng(0)
+    return poses, build_map(images, link_by_landmarks, settings, rng, ordered=True)
+
+
+def hops(a: int, b: int) -> int:
+    """Steps between two places of the round."""
+    return min((a - b) % PLACES, (b - a) % PLACES)
+
+
+def test_map_is_one_and_true(built: tuple[FloatArray, TopologicalMap]) -> None:
+    """Every link is near its truth, none is long, and the round is closed."""
+    poses, topology = built
+    assert [len(c) for c in topology.components()] == [PLACES]
+    for link in topology.links:
+        truth = true_vector(poses[link.a], poses[link.b])
+        assert abs(wrap(np.array(link.direction - truth.direction))) < np.deg2rad(10.0)
+        assert abs(wrap(np.array(link.rotation - truth.rotation))) < np.deg2rad(5.0)
+        assert hops(link.a, link.b) <= 4
+    assert any(hops(link.a, link.b) < link.b - link.a for link in topology.links)
+    assert np.all(topology.costs > 1.0)
+
+
+def test_route_takes_the_short_way_round(built: tuple[FloatArray, TopologicalMap]) -> None:
+    """From place 2 to place 14 back over the start, not forward through half the round."""
+    topology = built[1]
+    way = topology.route(2, 14)
+    assert (way[0], way[-1]) == (2, 14)
+    assert all(hops(k, 0) <= 2 for k in way)
+    assert topology.route(5, 5) == (5,)
+    memory = topology.path(way)
+    assert memory.names == tuple(str(k) for k in way)
+    for one, other in itertools.pairwise(way):
+        assert other in topology.neighbours(one)
+
+
+def test_routes_that_are_none_are_told() -> None:
+    """Another part of the map; a node that is none."""
+    _, images = hall()
+    poses = hall()[0]
+    answers: dict[tuple[int, int], Answer] = {
+        pair: true_vector(poses[pair[0]], poses[pair[1]])
+        for pair in ((0, 1), (1, 0), (2, 3), (3, 2), (4, 5))
+    }
+    topology = map_of_answers(images[:6], answers, SETTINGS)
+    assert [len(c) for c in topology.components()] == [2, 2, 1, 1]
+    with pytest.raises(StoredMapError, match="no way from 0 to 3"):
+        topology.route(0, 3)
+    for node in (-1, 6):
+        with pytest.raises(StoredMapError, match=f"no node {node}"):
+            topology.route(0, node)
+
+
+def test_map_survives_its_file(built: tuple[FloatArray, TopologicalMap], tmp_path: Path) -> None:
+    """Links to the bit; damage is refused."""
+    topology = built[1]
+    path = tmp_path / "map.npz"
+    kilobytes = topology.save(path)
+    assert kilobytes == pytest.approx(path.stat().st_size / (1000.0 * PLACES))
+    again = TopologicalMap.load(path)
+    assert again.names == topology.names
+    assert np.array_equal(again.costs, topology.costs)
+    for one, other in zip(again.links, topology.links, strict=True):
+        assert (one.a, one.b, one.direction, one.rotation, one.back, one.support) == (
+            other.a, other.b, other.direction, other.rotation, other.back, other.support,
+        )  # fmt: skip
+        assert np.array_equal(one.covariance, other.covariance)
+    assert again.route(2, 14) == topology.route(2, 14)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(StoredMapError, match="truncated"):
+        TopologicalMap.load(path)
+    path.write_bytes(whole)
+    with np.load(path) as file:
+        arrays = dict(file)
+    arrays["link_ends"] = arrays["link_ends"] + PLACES - 2
+    np.savez(path, **arrays)
+    with pytest.raises(StoredMapError, match="link_ends"):
+        TopologicalMap.load(path)
+
+
+def test_candidates_by_retrieval_are_the_near_ones() -> None:
+    """Places that share landmarks look alike, and hardly any true neighbour is passed over."""
+    _, images = hall()
+    words = VisualWords(images, RetrievalSettings(words=100), np.random.default_rng(0))
+    likeness = words.likenesses()
+    assert np.allclose(likeness, likeness.T)
+    assert np.allclose(np.diag(likeness), 1.0)
+    pairs = candidate_pairs(likeness, 5)
+    near = {p for p in itertools.combinations(range(PLACES), 2) if hops(*p) <= 2}
+    found = {(int(a), int(b)) for a, b in pairs}
+    assert len(near & found) >= 0.95 * len(near)
+    assert len(found) < PLACES * (PLACES - 1) / 3
+    assert len(candidate_pairs(likeness, 0)) == PLACES * (PLACES - 1) / 2
+
+
+def test_images_without_features_are_like_none() -> None:
+    """Empty images, and a set of nothing else."""
+    _, images = hall()
+    empty = landmark_features(np.empty((0, 3)), np.zeros(3), 1.0, 0.01, np.random.default_rng(0))
+    words = VisualWords([*images[:5], empty], RetrievalSettings(), np.random.default_rng(0))
+    assert np.all(words.likeness(empty) == 0.0)
+    nothing = VisualWords([empty, empty], RetrievalSettings(), np.random.default_rng(0))
+    assert nothing.likenesses().tolist() == [[0.0, 0.0], [0.0, 0.0]]
+    topology = build_map(
+        [empty, empty], link_by_landmarks, SETTINGS, np.random.default_rng(0), ordered=True
+    )
+    assert topology.links == ()
+
+
+# --------------------------------------------------------------------------------------------
+# Localisation
+
+
+def localiser(topology: TopologicalMap, settings: LocalisationSettings) -> Localiser:
+    """With a vocabulary of the map's own images."""
+    words = VisualWords(topology.images, RetrievalSettings(words=100), np.random.default_rng(0))
+    return Localiser(topology, words, link_by_landmarks, settings)
+
+
+def views_at(places: Iterable[float]) -> list[OmniFeatures]:
+    """Images between the hall's places, by number of place, taken another time."""
+    rng, points = np.random.default_rng(2), hall_points()
+    angles = np.array(list(places)) * 2.0 * np.pi / PLACES
+    poses = [np.array([2.6 * np.cos(t), 2.6 * np.sin(t), t]) for t in angles]
+    return [landmark_features(points, pose, 2.5, SIGMA, rng) for pose in poses]
+
+
+def test_localisation_converges_from_unknown(built: tuple[FloatArray, TopologicalMap]) -> None:
+    """Uniform at first; after a few images of a drive the nearest place leads clearly."""
+    topology = built[1]
+    here = localiser(topology, LocalisationSettings(candidates=8))
+    assert here.belief == pytest.approx(np.full(PLACES, 1.0 / PLACES))
+    for view, place in zip(views_at([7.2, 8.1, 9.0, 10.2]), (7, 8, 9, 10), strict=True):
+        belief = here.update(view)
+        assert belief.sum() == pytest.approx(1.0)
+        assert hops(here.best()[0], place) <= 1
+    near = sum(belief[k] for k in range(PLACES) if hops(k, 10) <= 2)
+    assert near > 0.8
+
+
+def test_carried_off_robot_finds_itself_again(built: tuple[FloatArray, TopologicalMap]) -> None:
+    """A leap to the other side of the hall, against a belief that is sure of itself."""
+    here = localiser(built[1], LocalisationSettings(candidates=6))
+    for view in views_at([3.0, 3.1, 2.9]):
+        here.update(view)
+    assert hops(here.best()[0], 3) <= 1
+    for view in views_at([11.0, 11.1, 10.9]):
+        here.update(view)
+    assert hops(here.best()[0], 11) <= 1
+
+
+def test_image_that_matches_nothing_leaves_belief_near_where_it_was(
+    built: tuple[FloatArray, TopologicalMap],
+) -> None:
+    """A dark image spreads the belief along edges; it is no evidence for any place."""
+    here = localiser(built[1], LocalisationSettings(candidates=6))
+    for view in views_at([5.0, 5.1]):
+        here.update(view)
+    dark = landmark_features(np.empty((0, 3)), np.zeros(3), 1.0, 0.01, np.random.default_rng(0))
+    before = here.belief
+    after = here.update(dark)
+    assert after.max() < before.max()
+    assert hops(here.best()[0], 5) <= 1
+    assert numbers(dark).size == 0
