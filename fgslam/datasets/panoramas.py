@@ -26,7 +26,7 @@ from fgslam.datasets.stereo_files import require_folder
 from fgslam.errors import DatasetError, FrameError
 from fgslam.planar import wrap
 from fgslam.settings.omni_datasets import PanoramasSettings
-from fgslam.types import FloatArray, Image
+from fgslam.types import FloatArray, Image, IntArray
 
 POSES_FILE = "poses.csv"
 _PICTURES = "panos"
@@ -194,7 +194,7 @@ def _listed(root: Path, places: list[_Place]) -> list[Path]:
     return paths
 
 
-def _ids(places: list[_Place]) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+def _ids(places: list[_Place]) -> IntArray:
     return np.array([p.id for p in places], dtype=np.int64)
 
 

@@ -12,6 +12,7 @@ import pytest
 from fgslam.datasets.omni_camera_files import make_camera
 from fgslam.datasets.omni_opening import open_omni
 from fgslam.datasets.omni_recording import OmniRecording, ids_of
+from fgslam.datasets.omni_video import VideoFrames
 from fgslam.datasets.panorama_reduction import PanoramaReduction
 from fgslam.errors import CalibrationError, DatasetError, FrameError
 from fgslam.omni_cameras.bearing_measurement import angles_of
@@ -271,6 +272,14 @@ def test_bad_videos(film: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"start is 50 but .* frames 0 to 11"):
         open_omni(OmniVideoSettings(path=str(film), start=50))
     (tmp_path / "film.avi").write_bytes(film.read_bytes())
+    (tmp_path / "half.avi").write_bytes(film.read_bytes()[: film.stat().st_size // 2])
+    with pytest.raises(DatasetError, match="cannot be opened as a video"):
+        open_omni(OmniVideoSettings(path=str(tmp_path / "half.avi")))
+    # What a container that promises more frames than it holds leads to.
+    frames = VideoFrames(film)
+    frames.load(3)
+    with pytest.raises(FrameError, match=r"walk\.avi ends after 12 frames, frame 15"):
+        frames.load(15)
     with pytest.raises(CalibrationError, match=r"there is no calibration bloggie_settings\.txt"):
         open_omni(OmniVideoSettings(path=str(tmp_path / "film.avi")))
 
