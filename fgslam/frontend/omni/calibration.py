@@ -23,7 +23,7 @@ _STEP_PX = 0.25
 _BLUR_PX = 1.0
 _CIRCLE_TRIALS = 500
 _CIRCLE_TOLERANCE = 0.01  # of the radius: what counts as on the circle while searching
-_LEAST_CONTRAST = 4.0  # grey levels a pixel after smoothing: 4 sigma at 2 grey levels of noise
+_LEAST_CONTRAST = 4.0  # grey levels a pixel; 2 grey levels of noise leave 0.35 after smoothing
 _REFINEMENTS = 5
 _MARGIN_PX = 3.0
 _NEAR = 0.05  # of the radius: the Bloggie's holder ends 13 % further out than its mirror
@@ -71,12 +71,16 @@ def find_mirror_circle(
     edges = _falling_edges(grey, centre, limits)
     seed = _search_circle(edges, np.array(centre), limits, 0.25 * min(grey.shape), rng)
     circle = None if seed is None else _refined(grey, seed)
-    if circle is None or not limits[0] < circle.radius < limits[1]:
+    if circle is None or not _credible(circle, limits):
         raise CalibrationError(
             "no mirror's circle is found in the picture: it must be brighter inside than outside, "
             f"on at least {_MIN_SUPPORT:.0%} of its circumference"
         )
     return circle
+
+
+def _credible(circle: MirrorCircle, limits: tuple[float, float]) -> bool:
+    return limits[0] < circle.radius < limits[1] and circle.support >= _MIN_SUPPORT
 
 
 def _near_limits(radius: float) -> tuple[float, float]:

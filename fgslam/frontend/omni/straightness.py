@@ -19,7 +19,7 @@ from fgslam.types import FloatArray, Image
 Float32 = npt.NDArray[np.float32]
 
 _BLUR_PX = 1.5
-_LEAST_SLOPE = 1.5  # grey levels a pixel: 4 sigma of 2 grey levels of noise after the blur
+_LEAST_SLOPE = 1.5  # grey levels a pixel; 2 grey levels of noise leave 0.16 after the blur
 _MAX_LEAN = 0.2  # columns a row: steeper than 79 degrees
 
 
