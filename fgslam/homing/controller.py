@@ -91,7 +91,7 @@ class HomingController:
         fault = homing.update(self._eyes.track(image, time))
         if fault is not None and not fault.usable:
             return self._lose(image, time, fault.reason)
-        home = homing.home()
+        home = homing.home
         self.remaining, self._heading = home.distance, home.direction
         arrival = self._arrival(homing.unit)
         if arrival:
@@ -200,7 +200,7 @@ class HomingController:
     # Commands
 
     def _drive(self, homing: HomingUnderWay, time: float, why: str) -> Command:
-        home = homing.home()
+        home = homing.home
         return Command(
             time=time,
             state=HomingState.DRIVE,

@@ -45,6 +45,7 @@ class HomingUnderWay:
         tracked: the last image's bearings, at first those of the start.
         history: all images that the estimator was told.
         estimate: the last state.
+        home: its steering vector, with distance and covariance in legs where the robot set out.
     """
 
     def __init__(
@@ -63,11 +64,11 @@ class HomingUnderWay:
         self._settings = settings
         self._estimator = make_estimator(start)
         self.estimate = self._estimator.estimate()
+        self.home = self._home()
         self.tracked = _seen_at(start)
         self.history: list[TrackedBearings] = []
 
-    def home(self) -> HomeVector:
-        """The steering vector; its distance and covariance in legs where the robot set out."""
+    def _home(self) -> HomeVector:
         with np.errstate(invalid="ignore"):  # the direction's variance at the target itself
             home = self.estimate.home()
             scale = np.array([self.unit, 1.0, 1.0])
@@ -85,6 +86,7 @@ class HomingUnderWay:
             return Fault(str(error), False)
         self.tracked, self.estimate = tracked, self._estimator.estimate()
         self.history.append(tracked)
+        self.home = self._home()
         return self._divergence() or self._weakness()
 
     def _unusable(self, tracked: TrackedBearings) -> Fault | None:
@@ -101,7 +103,7 @@ class HomingUnderWay:
         return None
 
     def _divergence(self) -> Fault | None:
-        distance = self.estimate.home().distance
+        distance = self.home.distance / self.unit
         if not distance <= _FARTHEST:
             return Fault(f"estimate diverged: {distance:.1f} legs to go", False)
         for name, misfit in (
@@ -117,7 +119,7 @@ class HomingUnderWay:
         s, count = self._settings, len(self.tracked)
         if count < min(s.min_tracks, _KEPT_SHARE * len(self.start.matches)):
             return Fault(f"{count} tracks left", True)
-        home = self.home()
+        home = self.home
         with np.errstate(invalid="ignore"):
             across = float(home.distance * np.sqrt(home.covariance[1, 1]))
         if np.isfinite(across) and across > s.max_across:
@@ -126,7 +128,7 @@ class HomingUnderWay:
 
     def contradicts(self, vector: HomingVector) -> bool:
         """Whether a new homing vector from the present place cannot be true if the estimate is."""
-        home = self.home()
+        home = self.home
         turns = [vector.direction - home.direction, vector.rotation - home.rotation]
         variance = np.diag(vector.covariance) + np.nan_to_num(np.diag(home.covariance)[1:])
         limit = np.deg2rad(self._settings.contradiction_deg)
