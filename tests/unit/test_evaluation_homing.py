@@ -95,9 +95,7 @@ def test_consistent_estimates_are_found_consistent_and_divergence_is_counted() -
         assert judged.verdict == "consistent"
     turned = exact[:3] + np.array([0.0, 0.0, 1.0])
     over = [
-        homing_errors(
-            [estimate(exact[:3] + np.array([0.0, 0.0, 1.0]), exact[3:], covariance)], one
-        ),
+        homing_errors([estimate(turned, exact[3:], covariance)], one),
         *runs[:9],
     ]
     assert summarise_homings(over).diverged == 1
