@@ -1,0 +1,114 @@
+"""Closed-loop runs on a light world of landmarks: files, numbers, logs that replay."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from landmark_world import drive_path, winding_path
+
+from fgslam.evaluation.homing import homing_errors
+from fgslam.homing.drive_scores import pass_distances
+from fgslam.homing.path_memory import PathMemory
+from fgslam.homing.record import DriveRecord
+from fgslam.homing_config import PathFollowingConfig, parse_homing
+from fgslam.runs.homing.drive_files import bearing_log
+from fgslam.runs.homing.drive_results import drive_numbers, finish_drives
+from fgslam.runs.homing.driven import DrivenSeed
+from fgslam.runs.homing.driving import _displaced, with_one_leg
+from fgslam.runs.homing.logs import load_bearing_logs
+from fgslam.runs.homing.replay import replay_homing
+from fgslam.runs.homing.results import begin
+
+EKF = {"kind": "homing_ekf"}
+
+
+def configuration(**more: Any) -> PathFollowingConfig:
+    values = {"task": "path_following", "name": "x", "estimator": EKF, "trials": 1, **more}
+    return cast(PathFollowingConfig, parse_homing(values, "test"))
+
+
+@pytest.fixture(scope="module")
+def record() -> DriveRecord:
+    return drive_path(winding_path(4, 2, 2.0))
+
+
+def driven(record: DriveRecord, seed: int = 4) -> DrivenSeed:
+    memory = PathMemory.of(winding_path(4, 2, 2.0).path())
+    return DrivenSeed(seed, record, memory, (np.array([[0.0, 0.0], [1.0, 0.0]]),), 2.0)
+
+
+def test_a_homing_s_log_is_in_its_start_frame(record: DriveRecord) -> None:
+    log = bearing_log(record, record.homings[0])
+    assert log.truth is not None
+    assert len(log.truth.robots) == len(log.images)
+    start = record.truth[record.homings[0].first_step]
+    away = np.hypot(*(record.targets[0, :2] - start[:2]))
+    assert log.truth.leg_m == pytest.approx(away)
+    # What the robot did last, it did towards the target.
+    left = np.hypot(*(log.truth.target[:2] - log.truth.robots[-1, :2]))
+    assert left < 0.2 * away
+
+
+def test_a_replayed_log_tells_the_true_way_home(record: DriveRecord) -> None:
+    log = bearing_log(record, record.homings[0])
+    replayed = replay_homing(log.start, log.images, configuration().estimator)
+    assert replayed.failure == ""
+    assert log.truth is not None
+    errors = homing_errors(replayed.estimates, log.truth)
+    half = len(log.images) // 2
+    assert np.rad2deg(np.median(np.abs(errors.direction[:half]))) < 3.0
+
+
+def test_files_and_numbers_of_drives(record: DriveRecord, tmp_path: Path) -> None:
+    config = configuration(output={"logs": 1})
+    begin(config, tmp_path, "refuse", {})
+    result = finish_drives(config, tmp_path, "finished", [driven(record)], [])
+    assert "1 of 1 drives arrive" in result.verdict[0]
+    with (tmp_path / "legs.csv").open(encoding="utf-8") as lines:
+        legs = list(csv.DictReader(lines))
+    assert [(leg["seed"], leg["leg"], leg["result"]) for leg in legs] == [
+        ("4", "1", "arrived"),
+        ("4", "2", "arrived"),
+    ]
+    told = [float(leg["pass_distance_m"]) for leg in legs]
+    np.testing.assert_allclose(told, pass_distances(record), rtol=1e-9)
+    for name in ("commands.csv", "trajectory.csv"):
+        assert len((tmp_path / name).read_text(encoding="utf-8").splitlines()) == len(record) + 1
+    assert len(load_bearing_logs(tmp_path)) == sum(bool(h.tracks) for h in record.homings)
+    assert len(PathMemory.load(tmp_path / "path_memory.npz")) == 2
+
+
+def test_numbers_of_no_drive_at_all_are_null() -> None:
+    numbers = drive_numbers([])
+    assert numbers["drives"] == 0
+    assert numbers["arrival_rate"] is None
+    assert numbers["cross_track_slope"]["flat"] is None  # type: ignore[call-overload,index]
+
+
+def test_arrival_counts_the_last_target(record: DriveRecord) -> None:
+    numbers = drive_numbers([record, record])
+    assert numbers["arrived"] == 2
+    assert numbers["targets_aimed_at"] == 4
+    assert numbers["legs"] == {"arrived": 4}
+
+
+def test_one_homing_is_a_path_of_one_leg() -> None:
+    assert with_one_leg(configuration()).dataset.path.legs == 1
+
+
+def test_displaced_starts_stay_near_and_free() -> None:
+    def clearance(points: np.ndarray) -> np.ndarray:
+        return np.where(points[:, 0] > 0.3, 0.0, 1.0)
+
+    world = SimpleNamespace(true_pose=np.zeros(3), clearance=clearance)
+    places = np.array(
+        [_displaced(cast(Any, world), 1.0, np.random.default_rng(k)) for k in range(50)]
+    )
+    assert (np.hypot(*places[:, :2].T) <= 1.0).all()
+    assert (places[:, 0] <= 0.3).all()
+    assert np.ptp(places[:, 2]) > 3.0
