@@ -138,6 +138,18 @@ class TopologicalMapConfig(HomingExperiment):
     ] = None
 
 
+class OmniVideoConfig(HomingExperiment):
+    """Points tracked through a recording of a mirror camera."""
+
+    task: Annotated[Literal["omni_video"], _TASK]
+    dataset: OmniDatasetSettings
+    tracking: OmniTrackingSettings = OmniTrackingSettings()
+    least_points: Annotated[
+        int, Field(ge=1, description="with fewer points left, new ones are added")
+    ] = 110
+    most_points: Annotated[int, Field(ge=1, description="up to so many")] = 160
+
+
 class HomingTrialsConfig(HomingExperiment):
     """Simulated homings of bearings alone: estimators against outliers."""
 
@@ -195,6 +207,7 @@ class PathFollowingConfig(DrivingConfig):
 TASKS: dict[str, type[HomingExperiment]] = {
     "homing_pairs": HomingPairsConfig,
     "topological_map": TopologicalMapConfig,
+    "omni_video": OmniVideoConfig,
     "homing_trials": HomingTrialsConfig,
     "homing": HomingConfig,
     "path_following": PathFollowingConfig,

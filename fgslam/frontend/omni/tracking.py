@@ -84,6 +84,10 @@ class BearingTracker:
         self._last, self._time = now, time
         return self._bearings(time)
 
+    def bearings(self) -> TrackedBearings:
+        """The points as the last image shows them."""
+        return self._bearings(self._time)
+
     def pixels(self) -> FloatArray:
         """(n, 2) where the points are in the view of the last image."""
         if self._last is None:

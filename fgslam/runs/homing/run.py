@@ -11,6 +11,7 @@ from fgslam.homing_config import (
     HomingExperiment,
     HomingPairsConfig,
     HomingTrialsConfig,
+    OmniVideoConfig,
     PathFollowingConfig,
     TopologicalMapConfig,
 )
@@ -20,6 +21,7 @@ from fgslam.runs.homing.mapping import run_topological_map
 from fgslam.runs.homing.pairs import run_homing_pairs
 from fgslam.runs.homing.results import HomingResult, Progress, Stopped
 from fgslam.runs.homing.trials import run_homing_trials
+from fgslam.runs.homing.video import run_omni_video
 from fgslam.runs.threads import one_blas_thread
 
 
@@ -55,6 +57,8 @@ def run_homing(
             return run_homing_pairs(config, folder, existing, progress, stopped)
         case TopologicalMapConfig():
             return run_topological_map(config, folder, existing, progress, stopped)
+        case OmniVideoConfig():
+            return run_omni_video(config, folder, existing, progress, stopped)
         case HomingTrialsConfig():
             return run_homing_trials(config, folder, existing, progress, stopped)
         case HomingConfig():
