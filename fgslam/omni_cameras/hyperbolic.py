@@ -67,18 +67,22 @@ class HyperbolicMirror(RadialCamera):
         elevations: tuple[float, float],
         ahead: float = AHEAD_IS_UP,
         clockwise: bool = True,
+        margin_px: float = 0.0,
     ) -> HyperbolicMirror:
         """A mirror amid a picture (width, height), whose rim touches the nearest border.
 
-        ``elevations`` in radians are those at the inner and at the outer rim.
+        ``elevations`` in radians are those at the inner and at the outer rim; ``margin_px`` is left
+        free around the rim.
         """
         lowest, highest = elevations
-        if not -np.pi / 2 <= lowest < highest < np.arcsin(min(max(xi, 0.0), 1.0)):
+        limit = np.arcsin(min(max(xi, 0.0), 1.0))
+        if not -np.pi / 2 <= lowest < highest < limit:
             raise CalibrationError(
-                f"hyperbolic mirror: elevations from {lowest:g} to {highest:g} rad; they must "
-                f"rise, and stay below arcsin(xi), xi = {xi:g}"
+                f"hyperbolic mirror: elevations from {np.degrees(lowest):g} to "
+                f"{np.degrees(highest):g} degrees; they must rise from -90 or more, and stay "
+                f"below arcsin(xi) = {np.degrees(limit):.1f}"
             )
-        outer = (min(size) - 1) / 2.0
+        outer = (min(size) - 1) / 2.0 - margin_px
         focal_px = outer * (xi - np.sin(highest)) / np.cos(highest)
         inner = focal_px * np.cos(lowest) / (xi - np.sin(lowest))
         centre = ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0)

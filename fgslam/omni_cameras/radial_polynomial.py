@@ -39,7 +39,8 @@ class RadialPolynomial(RadialCamera):
             turn = inverse.knots[int(np.argmin(np.abs(inverse.slopes)))]
             raise CalibrationError(
                 f"radial polynomial: elevation turns back near radius {turn:.1f} px, so a pixel "
-                "would have two radii; fit a lower degree, correct the samples, or take more near the rims"
+                "would have two radii; fit a lower degree, correct the samples, or take more near "
+                "the rims"
             )
         object.__setattr__(self, "_inverse", inverse)
 

@@ -14,7 +14,7 @@ from fgslam.frontend.omni.matching import match_features, match_sift
 from fgslam.frontend.omni.plain_sift import match_plain, plain_sift
 from fgslam.frontend.omni.sift import up_in_image, wrapping_period
 from fgslam.homing_types import FeatureKind, OmniFeatures, UprightFeatures
-from fgslam.omni_cameras.hyperbolic_mirror import mirror_seeing
+from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
 from fgslam.omni_cameras.panoramas import Cylinder, Equirectangular
 from fgslam.omni_cameras.unwrapping import unwrap_maps
 from fgslam.planar import wrap
@@ -26,7 +26,7 @@ from fgslam.settings.omni_features import (
 from fgslam.types import Image
 
 PANORAMA = Equirectangular(513, 257)
-MIRROR = mirror_seeing(400, 400, 0.96, np.deg2rad(30.0), 40.0)
+MIRROR = HyperbolicMirror.with_view((400, 400), 0.96, (np.radians(-55), np.radians(30)))
 
 
 def picture(seed: int = 2, turn: int = 0) -> Image:

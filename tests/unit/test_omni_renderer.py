@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fgslam.omni_cameras.hyperbolic_mirror import mirror_seeing
+from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
 from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.simulation.lighting import flat_light
 from fgslam.simulation.mipmap import TextureBank
@@ -16,7 +16,7 @@ from fgslam.simulation.renderer import Layer
 from tests.omni_house import PANORAMA, plain, room
 
 GREY, RED = (100, 100, 100), (250, 20, 30)
-MIRROR = mirror_seeing(320, 240, 0.92, float(np.deg2rad(25.0)), inner_radius=15.0)
+MIRROR = HyperbolicMirror.with_view((320, 240), 0.92, (np.radians(-65), np.radians(25)))
 MARKS = np.array([[-2.5, 3.0, 0.6], [-0.4, 3.0, 1.2], [1.1, 3.0, 1.9], [2.6, 3.0, 1.0]])
 POSE = camera_pose(np.array([0.4, 0.5, 0.3]), 1.2, np.deg2rad([1.5, -1.0]))
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from fgslam.omni_cameras.hyperbolic_mirror import mirror_seeing
+from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
 from fgslam.omni_cameras.panoramas import Equirectangular
 from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.settings.omni_worlds import HouseCameraSettings, HousePanoramaSettings
+
+_MARGIN_PX = 0.5
 
 
 def make_house_camera(settings: HouseCameraSettings) -> OmniCamera:
@@ -20,6 +20,8 @@ def make_house_camera(settings: HouseCameraSettings) -> OmniCamera:
     """
     if isinstance(settings, HousePanoramaSettings):
         return Equirectangular(settings.width, settings.height)
-    top, bottom = np.deg2rad([settings.top_elevation_deg, settings.bottom_elevation_deg])
-    whole = mirror_seeing(settings.width, settings.height, settings.xi, float(top))
-    return replace(whole, inner_radius=float(whole.radius(bottom)))
+    bottom, top = np.deg2rad([settings.bottom_elevation_deg, settings.top_elevation_deg])
+    size = (settings.width, settings.height)
+    return HyperbolicMirror.with_view(
+        size, settings.xi, (float(bottom), float(top)), margin_px=_MARGIN_PX
+    )
