@@ -182,7 +182,7 @@ def _numbers(
         "longest_link_places": max(gaps, default=None),
         "longest_link_m": None if lengths is None or not len(lengths) else float(lengths.max()),
         "least_support": min((link.support for link in topology.links), default=None),
-        "answers_not_believed": len(topology.rejected),
+        "pairs_not_linked": len(topology.rejected),
         "kilobytes_per_view": kilobytes,
     }
 
@@ -231,7 +231,7 @@ def _table(topology: TopologicalMap, views: Views) -> TextTable:
         ("longest link, places apart in the recording", "longest_link_places"),
         ("longest link, metres", "longest_link_m"),
         ("fewest inliers of a link", "least_support"),
-        ("links found and not believed", "answers_not_believed"),
+        ("pairs tried and not linked", "pairs_not_linked"),
     )
     told = tuple((name, (_value(numbers[key]),)) for name, key in rows)
     column = Column("value", "of the whole map; links.csv has each link")
