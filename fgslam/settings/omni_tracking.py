@@ -19,7 +19,7 @@ class OmniTrackingSettings:
     ] = 720
     window_px: Annotated[
         int, Field(ge=5, le=63, description="side of the tracked window, in the view")
-    ] = 15
+    ] = 9
     pyramid_levels: Annotated[
         int, Field(ge=0, le=6, description="halvings of the view above the view itself")
     ] = 2
@@ -43,12 +43,41 @@ class OmniTrackingSettings:
         Field(
             ge=-1.0,
             le=1.0,
-            description="of a window with the same point's window in the image before",
+            description="of a point's patch with its first one, gain and offset taken out; a point "
+            "that looks less like it is lost",
         ),
-    ] = 0.8
+    ] = 0.7
+    patch_px: Annotated[
+        int,
+        Field(ge=5, le=63, description="side of the patch that holds a point in place"),
+    ] = 13
+    patch_noise_grey: Annotated[
+        float,
+        Field(gt=0.0, description="sigma of its grey values: noise, and what no affine map does"),
+    ] = 4.0
+    patch_deformation: Annotated[
+        float,
+        Field(gt=0.0, description="sigma of its stretching and shearing from image to image"),
+    ] = 0.05
+    max_deformation: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="a point whose patch is stretched and sheared by more (Frobenius norm of "
+            "the affine map less one) is lost",
+        ),
+    ] = 1.0
     sigma_px: Annotated[
         float, Field(gt=0.0, description="of a tracked point, in pixels of the view")
-    ] = 0.35
+    ] = 0.2
+    sigma_deformed_px: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="for each unit of its patch's deformation, added in squares: measured on "
+            "the rendered house (docs/derivations/omni_tracking.md)",
+        ),
+    ] = 1.0
     search_px: Annotated[
         float,
         Field(

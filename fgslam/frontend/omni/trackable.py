@@ -46,7 +46,7 @@ def move_to_trackable(
     centres = _in_view(matches, view)
     strength = _strength(grey, settings.window_px)
     points, strongest = _best_near(strength, centres, radius)
-    rim = settings.window_px / 2.0
+    rim = max(settings.window_px, settings.patch_px) / 2.0
     good = (strongest >= settings.min_eigenvalue) & (points[:, 1] >= rim)
     good &= points[:, 1] <= view.height - 1 - rim
     good &= _distinct(points, strongest, settings.distinct_px)

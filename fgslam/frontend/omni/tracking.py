@@ -1,8 +1,8 @@
 """Tracking of features from image to image: KLT on a steady view (Goedemé et al. IV-A, G21-G23).
 
 Eq. 2's matrix is summed over the window (E-G8). A point is lost for good when it cannot be tracked
-back to where it came from, when its window no longer looks like the one before, or when it leaves
-the view.
+back to where it came from, when it no longer looks as it did when its tracking began
+(:mod:`fgslam.frontend.omni.anchored_patches`), or when it leaves the view.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.errors import EstimatorError
+from fgslam.frontend.omni.anchored_patches import AnchoredPatches, align, anchor
 from fgslam.frontend.omni.steady_view import SteadyImage, SteadyView
 from fgslam.homing_types import TrackedBearings
 from fgslam.omni_cameras.protocol import OmniCamera
@@ -21,7 +22,6 @@ from fgslam.types import BoolArray, FloatArray, Image, IntArray
 Float32 = npt.NDArray[np.float32]
 
 _MAX_TURN = np.deg2rad(60.0)  # between two images; 40 deg/s of a wheelchair seen 5 times a second
-_CORRELATED = np.arange(-4.0, 5.0)  # window of the look-alike check, pixels
 
 
 class BearingTracker:
@@ -34,6 +34,7 @@ class BearingTracker:
         )
         self._last: SteadyImage | None = None
         self._places: FloatArray = np.empty((0, 2))
+        self._patches: AnchoredPatches | None = None
         self._ids: IntArray = np.empty(0, dtype=np.int64)
         self._time = -np.inf
 
@@ -53,13 +54,15 @@ class BearingTracker:
         """
         self._last = self.steady.make(image, None, 0.0)
         self._places = self.steady.to_steady(pixels, self._last)
+        self._patches = self._anchored(self._last, self._places)
         self._ids, self._time = ids.copy(), time
 
     def add(self, ids: IntArray, pixels: FloatArray) -> None:
         """Tracks these points of the last image, too; identities above those before."""
-        if self._last is None:
+        if self._last is None or self._patches is None:
             raise EstimatorError("no image was tracked yet: start before adding points")
         places = self.steady.to_steady(pixels, self._last)
+        self._patches = self._patches.joined(self._anchored(self._last, places))
         self._places = np.vstack([self._places, places])
         self._ids = np.concatenate([self._ids, ids])
 
@@ -70,7 +73,7 @@ class BearingTracker:
             EstimatorError: tracking was not started, or time does not increase.
             FrameError: the image is not the camera's.
         """
-        if self._last is None:
+        if self._last is None or self._patches is None:
             raise EstimatorError("no image was tracked yet: start before tracking")
         if not time > self._time:
             raise EstimatorError(
@@ -80,7 +83,7 @@ class BearingTracker:
         now = self.steady.make(image, self._last, turn)
         if len(self._ids):
             places, kept = self._follow(self._last, now)
-            self._places, self._ids = self._centred(places[kept]), self._ids[kept]
+            self._settle(now, places[kept], self._ids[kept], self._patches.taken(kept))
         self._last, self._time = now, time
         return self._bearings(time)
 
@@ -93,6 +96,21 @@ class BearingTracker:
         if self._last is None:
             return np.empty((0, 2))
         return self.steady.from_steady(self._places, self._last)
+
+    def _anchored(self, image: SteadyImage, places: FloatArray) -> AnchoredPatches:
+        s = self._settings
+        return anchor(image.grey, places, s.patch_px, s.patch_noise_grey, s.patch_deformation)
+
+    def _settle(
+        self, now: SteadyImage, places: FloatArray, ids: IntArray, patches: AnchoredPatches
+    ) -> None:
+        """Aligns each point with its first patch, and keeps those that look like it."""
+        patches, places, correlation = align(patches, now.grey, places)
+        s = self._settings
+        kept = (correlation >= s.min_correlation) & (patches.deformation() <= s.max_deformation)
+        kept &= self._inside(places)
+        self._places, self._ids = self._centred(places[kept]), ids[kept]
+        self._patches = patches.taken(kept)
 
     def _centred(self, places: FloatArray) -> FloatArray:
         """Places between the margins; who crossed the seam goes on at the other end."""
@@ -120,10 +138,9 @@ class BearingTracker:
         missed = np.hypot(*(np.asarray(back, np.float32) - origin).T)
         kept = np.asarray((good[:, 0] == 1) & (good_back[:, 0] == 1) & (missed <= s.max_back_px))
         kept &= self._inside(ends)
-        kept &= _correlation(before.grey, now.grey, origin, ends) >= s.min_correlation
         return ends.astype(np.float64), kept
 
-    def _inside(self, places: Float32) -> BoolArray:
+    def _inside(self, places: Float32 | FloatArray) -> BoolArray:
         """(n,) whether a point's window lies mostly in the view; rows have no continuation."""
         rim, rows = self._settings.window_px / 4.0, self.steady.view.height
         good = (places[:, 1] >= rim) & (places[:, 1] <= rows - 1 - rim)
@@ -131,11 +148,12 @@ class BearingTracker:
         return np.asarray(good & (places[:, 0] >= 0.0) & (places[:, 0] <= columns - 1.0))
 
     def _bearings(self, time: float) -> TrackedBearings:
-        view = self.steady.view
+        s, view = self._settings, self.steady.view
         pixels = self.pixels()
         a_column = 2.0 * np.pi / self.steady.period
         a_row = (view.top_elevation - view.bottom_elevation) / (view.height - 1)
-        sigma = self._settings.sigma_px * np.ones(len(pixels))
+        deformation = np.empty(0) if self._patches is None else self._patches.deformation()
+        sigma = np.hypot(s.sigma_px, s.sigma_deformed_px * deformation)
         return TrackedBearings(
             time=time,
             ids=self._ids.copy(),
@@ -144,29 +162,3 @@ class BearingTracker:
             elevation=view.top_elevation - pixels[:, 1] * a_row,
             sigma_elevation=sigma * a_row,
         )
-
-
-def _correlation(
-    before: Image, now: Image, origin: Float32, found: Float32
-) -> npt.NDArray[np.float64]:
-    """(n,) normalised correlation of small windows around points (n, 2) of two views.
-
-    Blind to gain and offset: exposure may change from image to image.
-    """
-    one, other = (_windows(image, at) for image, at in ((before, origin), (now, found)))
-    return np.asarray(np.sum(one * other, axis=1), dtype=np.float64)
-
-
-def _windows(image: Image, centres: Float32) -> Float32:
-    """(n, k * k) windows around centres, bilinear, zero mean and unit length."""
-    across = (centres[:, :1] + _CORRELATED[None, :]).astype(np.float32)
-    down = (centres[:, 1:] + _CORRELATED[None, :]).astype(np.float32)
-    k, n = len(_CORRELATED), len(centres)
-    columns = np.broadcast_to(across[:, None, :], (n, k, k)).reshape(n, k * k)
-    rows = np.broadcast_to(down[:, :, None], (n, k, k)).reshape(n, k * k)
-    grey = cv2.remap(
-        image, np.ascontiguousarray(columns), np.ascontiguousarray(rows), cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    ).astype(np.float32)  # fmt: skip
-    grey -= grey.mean(axis=1, keepdims=True)
-    return np.asarray(grey / np.maximum(np.linalg.norm(grey, axis=1, keepdims=True), 1e-3))

@@ -1,0 +1,204 @@
+"""Tracked points held to what they looked like when their tracking began.
+
+Tracking from image to image adds up errors: under perspective a window stretches and shears, and
+what moves it is where its contrast happens to lie, not its centre. On the rendered house that is
+three to five percent of the way a point has moved. So every point keeps the patch it began with,
+and each track ends with one step that aligns this patch under an affine map (Shi and Tomasi 1994),
+gain and offset of the light taken out. The step is the inverse compositional one (Baker and
+Matthews 2004): all derivatives are those of the first patch and computed once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from fgslam.types import BoolArray, FloatArray, Image
+
+Float32 = npt.NDArray[np.float32]
+
+_SPREAD = 4.3  # sides of the patch over the sigma of its Gaussian weight
+_FLAT = 1e-3  # keeps patches without any contrast solvable
+_GAIN = (0.2, 5.0)  # of light against the first patch; beyond, it is another thing
+_FARTHEST_PX = 4.0  # of one alignment; the tracker was closer than this, or elsewhere
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AnchoredPatches:
+    """Patches of n points, m pixels each.
+
+    Attributes:
+        size: side, pixels; odd.
+        first: (n, m) grey values when tracking began.
+        light: (n, 2, m) projects grey values on offset and gain against the first patch.
+        step: (n, 6, m) projects what remains on a move (2) and a deformation (2 x 2).
+        contrast: (n,) weighted standard deviation of the first patch, grey values.
+        maps: (n, 2, 2) from the first patch to the present one.
+    """
+
+    size: int
+    first: Float32
+    light: Float32
+    step: Float32
+    contrast: FloatArray
+    maps: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.maps)
+
+    def taken(self, which: BoolArray) -> AnchoredPatches:
+        """Those alone."""
+        return AnchoredPatches(
+            self.size,
+            self.first[which],
+            self.light[which],
+            self.step[which],
+            self.contrast[which],
+            self.maps[which],
+        )
+
+    def joined(self, others: AnchoredPatches) -> AnchoredPatches:
+        """These, then others of the same size."""
+        return AnchoredPatches(
+            self.size,
+            np.concatenate([self.first, others.first]),
+            np.concatenate([self.light, others.light]),
+            np.concatenate([self.step, others.step]),
+            np.concatenate([self.contrast, others.contrast]),
+            np.concatenate([self.maps, others.maps]),
+        )
+
+    def deformation(self) -> FloatArray:
+        """(n,) Frobenius norm of how far each map is from none."""
+        return np.asarray(np.linalg.norm(self.maps - np.eye(2), axis=(1, 2)), dtype=np.float64)
+
+
+def anchor(
+    grey: Image, places: FloatArray, size: int, noise: float, deformation: float
+) -> AnchoredPatches:
+    """Patches around places (n, 2) of a view.
+
+    Args:
+        grey: (h, w) the view.
+        places: column, row.
+        size: side of a patch, pixels; odd.
+        noise: sigma of a grey value, including what no affine map explains.
+        deformation: sigma of each entry of the map from one image to the next; it keeps patches
+            with little contrast from being deformed at will.
+    """
+    maps = np.broadcast_to(np.eye(2), (len(places), 2, 2)).copy()
+    first = _sampled(grey, places, maps, size)
+    across, down = (
+        0.5 * (_sampled(grey, places + e, maps, size) - _sampled(grey, places - e, maps, size))
+        for e in np.eye(2)
+    )
+    x, y = _offsets(size)
+    slopes = [across, down, across * x, across * y, down * x, down * y]
+    weight = _weight(size)
+    light, slopes_only = _without_light(
+        first.astype(np.float64), np.stack(slopes, axis=1).astype(np.float64), weight
+    )
+    prior = np.diag([_FLAT, _FLAT] + 4 * [(noise / deformation) ** 2])
+    weighted = slopes_only * weight
+    step = np.linalg.solve(weighted @ slopes_only.transpose(0, 2, 1) + prior, weighted)
+    return AnchoredPatches(
+        size,
+        first,
+        light.astype(np.float32),
+        step.astype(np.float32),
+        _spread(first - _mean(first, weight)[:, None], weight),
+        maps,
+    )
+
+
+def align(
+    patches: AnchoredPatches, grey: Image, places: FloatArray
+) -> tuple[AnchoredPatches, FloatArray, FloatArray]:
+    """Moves places so that the patches fit the view.
+
+    Args:
+        patches: of the points.
+        grey: (h, w) the present view.
+        places: (n, 2) where the points are thought to be, within a few pixels.
+
+    Returns:
+        The patches with their maps brought up to date, the places (n, 2), and the correlation (n,)
+        of each patch with what was found *before* the move; -1 for what cannot be the same thing.
+    """
+    if not len(patches):
+        return patches, places, np.empty(0)
+    seen = _sampled(grey, places, patches.maps, patches.size)
+    level = (patches.light @ seen[:, :, None])[:, :, 0]
+    gain = np.clip(level[:, 1:], *_GAIN)
+    rest = (seen - level[:, :1]) / gain - patches.first
+    change = (patches.step @ rest[:, :, None])[:, :, 0].astype(np.float64)
+    maps = patches.maps @ np.linalg.inv(np.eye(2) + change[:, 2:].reshape(-1, 2, 2))
+    move = -(maps @ change[:, :2, None])[:, :, 0]
+    unlike = _spread(rest, _weight(patches.size)) / np.maximum(patches.contrast, _FLAT)
+    correlation = 1.0 / np.hypot(1.0, unlike)
+    good = (level[:, 1] > _GAIN[0]) & (level[:, 1] < _GAIN[1])
+    good &= np.hypot(move[:, 0], move[:, 1]) < _FARTHEST_PX
+    fitted = AnchoredPatches(
+        patches.size,
+        patches.first,
+        patches.light,
+        patches.step,
+        patches.contrast,
+        np.where(good[:, None, None], maps, patches.maps),
+    )
+    moved = np.where(good[:, None], places + move, places)
+    return fitted, moved, np.where(good, correlation, -1.0)
+
+
+def _without_light(
+    first: FloatArray, slopes: FloatArray, weight: Float32
+) -> tuple[FloatArray, FloatArray]:
+    """The projection on offset and gain (n, 2, m), and the slopes (n, 6, m) without these two."""
+    light = np.stack([np.ones(first.shape), first], axis=1)
+    weighted = light * weight
+    inverse = np.linalg.inv(weighted @ light.transpose(0, 2, 1) + _FLAT * np.eye(2))
+    projection = inverse @ weighted
+    shares = slopes @ projection.transpose(0, 2, 1)
+    return projection, slopes - shares @ light
+
+
+@lru_cache(maxsize=8)
+def _offsets(size: int) -> tuple[Float32, Float32]:
+    """(m,) columns and rows of a patch's pixels from its centre."""
+    reach = np.arange(size, dtype=np.float32) - (size - 1) / 2.0
+    x, y = np.meshgrid(reach, reach)
+    return x.ravel().astype(np.float32), y.ravel().astype(np.float32)
+
+
+@lru_cache(maxsize=8)
+def _weight(size: int) -> Float32:
+    """(m,) Gaussian weight of a patch's pixels; sums to m."""
+    x, y = _offsets(size)
+    weight = np.exp(-0.5 * (x**2 + y**2) * (_SPREAD / size) ** 2)
+    return np.asarray(weight, dtype=np.float32)
+
+
+def _sampled(grey: Image, places: FloatArray, maps: FloatArray, size: int) -> Float32:
+    """(n, m) grey values of patches around places (n, 2), deformed by maps (n, 2, 2)."""
+    if not len(places):
+        return np.empty((0, size * size), np.float32)  # OpenCV refuses empty maps
+    x, y = _offsets(size)
+    at, turned = places.astype(np.float32), maps.astype(np.float32)
+    columns = at[:, :1] + turned[:, 0, :1] * x + turned[:, 0, 1:] * y
+    rows = at[:, 1:] + turned[:, 1, :1] * x + turned[:, 1, 1:] * y
+    seen = cv2.remap(grey, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(seen, dtype=np.float32)
+
+
+def _mean(values: Float32, weight: Float32) -> FloatArray:
+    """(n,) weighted means of (n, m)."""
+    return np.asarray(values @ weight / weight.sum(), dtype=np.float64)
+
+
+def _spread(values: Float32 | FloatArray, weight: Float32) -> FloatArray:
+    """(n,) weighted root mean square of (n, m)."""
+    return np.asarray(np.sqrt((values * values) @ weight / weight.sum()), dtype=np.float64)
