@@ -1,9 +1,8 @@
 """Features of many images as one compact ``.npz`` of plain arrays (G10): no pixels, no pickle.
 
 Features of all images lie one after the other, with offsets: those of image ``k`` are rows
-``start[k]:start[k + 1]``. Descriptors are bytes, bearings, elevations, sizes and whatever the
-planar test compares are float32 (1e-7 of themselves), deviations, colours and column descriptors
-float16 (5e-4 of themselves). Every member of the archive carries a CRC, which reading checks. Where
+``start[k]:start[k + 1]``. SIFT descriptors are bytes; angles, sizes and column descriptors float32
+(1e-7 of themselves); deviations and colours float16 (5e-4 of themselves). Every member of the archive carries a CRC, which reading checks. Where
 a feature lay in the image is not kept: it is NaN after reading.
 """
 
@@ -36,7 +35,7 @@ _COLUMNS: dict[str, tuple[type, tuple[int, ...]]] = {
     "column_sigma_bearing": (np.float16, ()),
     "column_tangents": (np.float32, (2,)),
     "column_sigma_tangents": (np.float16, (2,)),
-    "column_descriptors": (np.float16, (11,)),
+    "column_descriptors": (np.float32, (11,)),  # float16 changed one column match in seven
 }
 
 

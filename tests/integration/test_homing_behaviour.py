@@ -33,8 +33,9 @@ def test_ten_legs_arrive_and_errors_do_not_build_up(spacing: float) -> None:
     assert sum(r.arrived for r in records) >= 0.98 * SEEDS
     passed = np.array([pass_distances(r) for r in records])
     assert passed.max() <= 0.1 * spacing
-    across = np.array([cross_track(r) for r in records])
-    slope = slope_by_leg(np.tile(np.arange(LEGS), SEEDS), across.ravel())
+    # The first leg is left out: it begins on its own line, the others where a corner was cut.
+    across = np.array([cross_track(r)[1:] for r in records])
+    slope = slope_by_leg(np.tile(np.arange(1, LEGS), SEEDS), across.ravel())
     assert slope.flat
     assert slope.high < 0.005  # metres a leg: the interval is narrow enough to mean something
 

@@ -63,7 +63,7 @@ def test_features_come_back_within_their_rounding(tmp_path: Path) -> None:
         assert after.columns.bearing == pytest.approx(before.columns.bearing, abs=2e-7)
         assert after.columns.tangents == pytest.approx(before.columns.tangents, abs=2e-7)
         assert after.columns.descriptors == pytest.approx(
-            before.columns.descriptors, rel=5e-4, abs=1e-6
+            before.columns.descriptors, rel=1e-6, abs=1e-7
         )
 
 
