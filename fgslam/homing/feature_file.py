@@ -2,8 +2,9 @@
 
 Features of all images lie one after the other, with offsets: those of image ``k`` are rows
 ``start[k]:start[k + 1]``. SIFT descriptors are bytes; angles, sizes and column descriptors float32
-(1e-7 of themselves); deviations and colours float16 (5e-4 of themselves). Every member of the archive carries a CRC, which reading checks. Where
-a feature lay in the image is not kept: it is NaN after reading.
+(1e-7 of themselves); deviations and colours float16 (5e-4 of themselves). Every member of the
+archive carries a CRC, which reading checks. Where a feature lay in the image is not kept: it is NaN
+after reading.
 """
 
 from __future__ import annotations
