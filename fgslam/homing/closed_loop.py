@@ -95,13 +95,13 @@ def follow(
         clock.lap()
         drive = driver.drive(command, world, dt)
         clock.lap()
-        # The last step brings the robot to a stand; without it the record would end in motion.
         world.drive(drive.speed, drive.turn_rate, dt)
         clock.lap()
         recorder.note(pose, command, drive, follower.controller.underway, clock.laps)
         if watch is not None:
             watch(command, image)
-        if follower.finished:
+        # The record ends with the robot at a stand: brakes need a few steps.
+        if follower.finished and drive.speed == drive.turn_rate == 0.0:
             break
     else:
         follower.interrupt((steps - 1) * dt, f"not finished after {settings.longest_s:g} s")

@@ -56,6 +56,7 @@ class HomingController:
         self._blind_until = -np.inf
         self._standing_since: float | None = None
         self._pending: HomingVector | None = None
+        self._obstacle = ""  # the last refusal's words, while there is nothing newer to say
 
     def step(self, image: ByteArray, time: float) -> Command:
         """Takes in one image.
@@ -71,7 +72,7 @@ class HomingController:
         if self._ended is not None:
             return replace(self._ended, time=time)
         if self.underway is None:
-            return self._seek(image, time, "target not matched yet")
+            return self._seek(image, time)
         return self._go_on(self.underway, image, time)
 
     def _take_time(self, time: float) -> None:
@@ -129,7 +130,8 @@ class HomingController:
         if homing.contradicts(vector):
             # The old tracks are gone with the new ones' start, and one of both must be wrong.
             self.underway, self._pending, self._next_try = None, vector, time
-            return self._hold(time, "new homing vector contradicts the estimate")
+            self._obstacle = "new homing vector contradicts the estimate"
+            return self._hold(time, self._obstacle)
         return self._accept(answer, f"matched anew: {why}")
 
     def _lose(self, image: ByteArray, time: float, why: str) -> Command:
@@ -143,16 +145,21 @@ class HomingController:
     # ----------------------------------------------------------------------------------------
     # Matching the target, for the first time or anew
 
-    def _seek(self, image: ByteArray, time: float, why: str) -> Command:
-        """There is no estimate to drive by: match, or stand (or drive blind) and try again."""
+    def _seek(self, image: ByteArray, time: float, why: str = "") -> Command:
+        """There is no estimate to drive by: match, or stand (or drive blind) and try again.
+
+        ``why`` is what went wrong just now; empty if nothing did.
+        """
         if time < self._next_try:
-            return self._hold(time, why)
+            return self._hold(time, self._obstacle)
         answer = self._begin(image, time)
         if isinstance(answer, Refusal):
+            if why:
+                answer = replace(answer, details=f"{why}; {answer.details}")
             return self._refused(time, answer)
         vector = answer.start.vector
         if self._confirmed(vector):
-            return self._accept(answer, "target matched")
+            return self._accept(answer, f"matched anew: {why}" if why else "target matched")
         self._pending = vector
         return self._refused(time, Refusal(RefusalReason.AMBIGUOUS, "homing vectors contradict"))
 
@@ -188,6 +195,7 @@ class HomingController:
         """Stands, or drives blind, until there was nothing but refusals for too long."""
         if refusal.reason is RefusalReason.AT_TARGET:
             return self._end(time, HomingState.ARRIVED, refusal.details)
+        self._obstacle = refusal.details
         command = self._hold(time, refusal.details)
         since = self._standing_since
         if since is None or time - since < self._settings.give_up_s:

@@ -45,7 +45,10 @@ def test_targets_on_the_way_are_passed_without_a_stop(record: DriveRecord) -> No
         assert after.began == before.ended
     moving = record.speed[(record.time > 3.0) & (record.target < 3)]
     assert moving.min() > 0.05
-    assert record.state.count(HomingState.DRIVE.value) >= len(record) - 1
+    driving = record.state.count(HomingState.DRIVE.value)
+    assert set(record.state[driving:]) == {HomingState.ARRIVED.value}
+    assert (record.speed[-1], record.turn_rate[-1]) == (0.0, 0.0)
+    assert len(record) - driving < 10
 
 
 def test_heading_does_not_oscillate(record: DriveRecord) -> None:
