@@ -84,7 +84,8 @@ class HomingUnderWay:
             self._estimator.update(tracked)
         except EstimatorError as error:
             return Fault(str(error), False)
-        self.tracked, self.estimate = tracked, self._estimator.estimate()
+        self.tracked = tracked
+        self.estimate = self._estimator.estimate(landmarks=False)
         self.history.append(tracked)
         self.home = self._home()
         return self._divergence() or self._weakness()

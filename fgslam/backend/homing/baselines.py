@@ -72,7 +72,7 @@ class BearingAverage:
         """
         raise NotImplementedError
 
-    def estimate(self) -> HomingEstimate:
+    def estimate(self, landmarks: bool = True) -> HomingEstimate:
         """The home direction as an estimate; see the class."""
         ids = self._features.alive
         return HomingEstimate(

@@ -81,7 +81,7 @@ class HomingEkf:
         mean[TARGET], covariance[TARGET, TARGET] = own.mean, own.covariance
         return FilterState(state.ids, mean, covariance)
 
-    def estimate(self) -> HomingEstimate:
+    def estimate(self, landmarks: bool = True) -> HomingEstimate:
         """The present state; see the protocol."""
         state = self._state
         target = state.mean[TARGET]

@@ -51,18 +51,16 @@ class HomingGraph:
         if collapsed:
             self._solver.move(collapsed, tracked.time)
 
-    def estimate(self) -> HomingEstimate:
+    def estimate(self, landmarks: bool = True) -> HomingEstimate:
         """The present state; see the protocol."""
         values = self._solver.values
         robot = _pose(values, pose_key(self._image))
         target = _pose(values, target_key())
         ids, rows = self._alive()
-        covariance = self._joint(rows)
+        covariance = self._joint(rows if landmarks else [])
         turn = np.eye(len(covariance))
         turn[:3, :3], turn[3:6, 3:6] = tangent_to_pose(robot), tangent_to_pose(target)
         covariance = turn @ covariance @ turn.T
-        n = len(ids)
-        every = np.arange(n)
         return HomingEstimate(
             time=self._features.time,
             robot=robot,
@@ -70,7 +68,7 @@ class HomingGraph:
             covariance=covariance[:6, :6],
             ids=ids,
             landmarks=self._points(rows),
-            landmark_covariances=covariance[6:, 6:].reshape(n, 2, n, 2)[every, :, every, :],
+            landmark_covariances=_blocks(covariance[6:, 6:], len(ids)),
         )
 
     def _alive(self) -> tuple[Any, list[int]]:
@@ -89,10 +87,11 @@ class HomingGraph:
 
     def _joint(self, rows: list[int]) -> FloatArray:
         """Covariance of robot, target and landmarks, in GTSAM's tangent spaces."""
-        if self._covariance is None:
+        size = 6 + 2 * len(rows)
+        if self._covariance is None or len(self._covariance) < size:
             keys = [pose_key(self._image), target_key(), *(landmark_key(row) for row in rows)]
             self._covariance = self._solver.joint_covariance(keys)
-        return self._covariance
+        return self._covariance[:size, :size]
 
     def _motion(self) -> Motion:
         values = self._solver.values
@@ -107,6 +106,14 @@ class HomingGraph:
         key = pose_key(image)
         turn = tangent_to_pose(_pose(self._solver.values, key))
         return np.asarray(np.diagonal(turn @ self._solver.joint_covariance([key]) @ turn.T))
+
+
+def _blocks(covariance: FloatArray, count: int) -> FloatArray:
+    """(count, 2, 2) diagonal blocks; NaN where there is no covariance."""
+    if len(covariance) < 2 * count:
+        return np.full((count, 2, 2), np.nan)
+    every = np.arange(count)
+    return np.asarray(covariance.reshape(count, 2, count, 2)[every, :, every, :])
 
 
 def _pose(values: Any, key: int) -> FloatArray:

@@ -20,6 +20,11 @@ class HomingEstimator(Protocol):
         """Takes in one image; features that are absent are deleted from the map (G28)."""
         ...
 
-    def estimate(self) -> HomingEstimate:
-        """The present state; changes nothing."""
+    def estimate(self, landmarks: bool = True) -> HomingEstimate:
+        """The present state; changes nothing.
+
+        Args:
+            landmarks: whether their covariances are wanted, too; they may be NaN where not. For a
+                graph they cost more than all the rest of an image.
+        """
         ...
