@@ -67,8 +67,8 @@ class LinkChecks:
         turn = abs(float(wrap(np.array(ab.rotation + bc.rotation - ac.rotation))))
         if turn > max(limit, _SIGMAS * np.sqrt(_variance(1, ab, bc, ac))):
             return False
-        misfit = between_misfit(ab.direction, ab.rotation + bc.direction, ac.direction)
         allowed = max(limit, _SIGMAS * np.sqrt(_variance(0, ab, bc, ac)))
+        misfit = between_misfit(ab.direction, ab.rotation + bc.direction, ac.direction, allowed)
         # Without a direction (one place) there is nothing to contradict.
         return not misfit > allowed
 
@@ -128,19 +128,22 @@ class LinkChecks:
             self._drop(pairs[worst], f"{degrees:.0f} deg off all other rotations", rejected)
 
 
-def between_misfit(first: float, second: float, whole: float) -> float:
+def between_misfit(first: float, second: float, whole: float, slack: float = 0.0) -> float:
     """By how much a triangle's long side leaves the cone of its two steps, radians.
 
     Args:
         first: direction of the first step.
         second: of the second step, in the same axes.
         whole: of both together.
+        slack: steps that lead back to within so much leave any direction open, as noise chooses
+            the side on which the third image lies: corridors are full of them.
     """
     turn, reached = wrap(np.array([second - first, whole - first]))
+    if not np.isfinite(turn + reached) or abs(turn) >= np.pi - slack:
+        return 0.0
     if turn < 0.0:
         turn, reached = -turn, -reached
-    # Steps in opposite directions leave any direction between them, to one side or the other.
-    return float(max(0.0, -reached, reached - turn)) if np.isfinite(turn + reached) else 0.0
+    return float(max(0.0, -reached, reached - turn))
 
 
 def _variance(row: int, *links: Link) -> float:

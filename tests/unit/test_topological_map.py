@@ -132,6 +132,11 @@ def test_true_triangles_hold(seed: int) -> None:
     assert between_misfit(0.0, 1.0, -0.2) == pytest.approx(0.2)
     assert between_misfit(0.0, 1.0, 1.3) == pytest.approx(0.3)
     assert between_misfit(1.0, 0.0, 0.5) == 0.0
+    # There and almost straight back: the side is a matter of noise.
+    for back in (3.1, -3.1):
+        assert between_misfit(0.0, back, 1.0, slack=0.1) == 0.0
+        assert between_misfit(0.0, back, -1.0, slack=0.1) == 0.0
+    assert between_misfit(0.0, -3.0, 1.0, slack=0.1) == pytest.approx(1.0)
 
 
 def all_links(poses: FloatArray, reach: float = 5.0) -> list[Link]:
