@@ -266,7 +266,7 @@ class TopologicalMapSettings:
             description="inliers of an edge that no third image confirms, unless its images follow "
             "each other in an ordered set",
         ),
-    ] = 40
+    ] = 100
     mutual_deg: Annotated[
         float,
         Field(

@@ -179,8 +179,8 @@ def test_strong_lone_link_that_is_turned_breaks_a_loop() -> None:
     """Enough inliers to stand alone, but its rotation is not that of the way around."""
     angle = np.arange(10) * 2.0 * np.pi / 10.0
     poses = np.column_stack([4.0 * np.cos(angle), 4.0 * np.sin(angle), angle])
-    ring = [true_link(poses, *sorted((k, (k + 1) % 10)), 80) for k in range(10)]
-    across = turned(true_link(poses, 2, 7, 60), np.deg2rad(90.0))
+    ring = [true_link(poses, *sorted((k, (k + 1) % 10)), 120) for k in range(10)]
+    across = turned(true_link(poses, 2, 7, 110), np.deg2rad(90.0))
     believed, rejected = LinkChecks(10, [*ring, across], SETTINGS).believed(ordered=True)
     assert set(rejected) == {(2, 7)}
     assert "off all other rotations" in rejected[2, 7]
@@ -278,7 +278,7 @@ def test_routes_that_are_none_are_told() -> None:
     _, images = hall()
     poses = hall()[0]
     answers: dict[tuple[int, int], Answer] = {
-        pair: true_vector(poses[pair[0]], poses[pair[1]])
+        pair: true_vector(poses[pair[0]], poses[pair[1]], SETTINGS.lone_support)
         for pair in ((0, 1), (1, 0), (2, 3), (3, 2), (4, 5))
     }
     topology = map_of_answers(images[:6], answers, SETTINGS)
