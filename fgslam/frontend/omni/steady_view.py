@@ -8,10 +8,12 @@ parallax; and since columns then stand still, hardly a point ever crosses the se
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.fft import next_fast_len
 
 from fgslam.errors import FrameError
 from fgslam.frontend.omni.features import pixels_a_radian
@@ -47,7 +49,7 @@ class SteadyView:
     def __init__(self, camera: OmniCamera, max_width: int, window: int, levels: int) -> None:
         self._size = (camera.height, camera.width)
         resolution = pixels_a_radian(camera)
-        width = min(max_width, round(2.0 * np.pi * resolution))
+        width = _fast_period(min(max_width, round(2.0 * np.pi * resolution)) - 1) + 1
         bottom, top = _seen_elevations(camera)
         height = max(round((top - bottom) * (width - 1) / (2.0 * np.pi)) + 1, 2)
         self.view = Equirectangular(width, height, top, bottom)
@@ -87,9 +89,10 @@ class SteadyView:
             turned = _common_shift(before.bands, bands, self.period, max_shift)
             # The picture moved right by `turned` columns: undo it on top of what was undone before.
             shift = (before.shift - turned) % self.period
-        steady = np.roll(grey, shift, axis=1)
-        padded = cv2.copyMakeBorder(steady, 0, 0, self.margin, self.margin, cv2.BORDER_WRAP)
-        return SteadyImage(np.asarray(padded, dtype=np.uint8), bands, shift)
+        first = (-shift - self.margin) % self.period
+        last = first + self.period + 2 * self.margin
+        repeated = np.concatenate([grey] * -(-last // self.period), axis=1)
+        return SteadyImage(repeated[:, first:last], bands, shift)
 
     def to_steady(self, pixels: FloatArray, image: SteadyImage) -> FloatArray:
         """(n, 2) places in the padded view of places (n, 2) in the view itself."""
@@ -121,6 +124,11 @@ def _seen_elevations(camera: OmniCamera) -> tuple[float, float]:
     return float(whole[0]), float(whole[-1])
 
 
+def _fast_period(longest: int) -> int:
+    """A period that Fourier transforms are fast for, at most a few columns shorter."""
+    return next(n for n in range(longest, 0, -1) if next_fast_len(n) == n)
+
+
 def _period_maps(camera: OmniCamera, view: Equirectangular) -> tuple[Float32, Float32]:
     """Maps of the view without its last column, which shows what the first does."""
     columns, rows = unwrap_maps(camera, view)
@@ -130,8 +138,11 @@ def _period_maps(camera: OmniCamera, view: Equirectangular) -> tuple[Float32, Fl
 def _spectra(grey: Image) -> npt.NDArray[np.complex128]:
     """(bands, frequencies) spectra of the mean rows of bands, without their own means."""
     edges = np.linspace(0, len(grey), min(_BANDS, len(grey)) + 1).astype(int)
-    sums = np.add.reduceat(grey, edges[:-1], axis=0, dtype=np.float64)
-    rows = sums / np.diff(edges)[:, None]
+    means = [
+        cv2.reduce(grey[low:high], 0, cv2.REDUCE_AVG, dtype=cv2.CV_32F)
+        for low, high in pairwise(edges.tolist())
+    ]
+    rows = np.concatenate(means).astype(np.float64)
     return np.asarray(np.fft.rfft(rows - rows.mean(axis=1, keepdims=True), axis=1))
 
 

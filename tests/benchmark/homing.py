@@ -1,0 +1,220 @@
+"""Speed of visual homing as ratios to raw OpenCV calls on the same images (docs/results.md).
+
+Processor times of this process, one thread each for OpenCV and BLAS; medians are quoted. The images
+are those of a homing in the rendered house: the paper's camera, 320x240 pixels.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.frontend.omni.features import OmniFeatureExtractor
+from fgslam.homing.controller import HomingController
+from fgslam.homing.eyes import HomingEyes
+from fgslam.homing.image_eyes import EyesSettings, ImageEyes
+from fgslam.homing_types import OmniFeatures, TrackedBearings
+from fgslam.runs.threads import one_blas_thread
+from fgslam.settings.homing_behaviour import HomingControlSettings
+from fgslam.settings.homing_estimators import (
+    HomingEkfSettings,
+    HomingEstimatorSettings,
+    HomingGraphSettings,
+)
+from fgslam.settings.homing_vector import HomingVectorSettings
+from fgslam.settings.omni_features import OmniFeatureSettings, OmniMatchingSettings
+from fgslam.settings.omni_tracking import OmniTrackingSettings
+from fgslam.settings.omni_worlds import HousePathSettings, OmniHouseSettings
+from fgslam.simulation.omni.omni_world import OmniWorld
+from fgslam.types import FloatArray, Image
+from tests.benchmark.drives import cpu_seconds, interleaved
+
+LIMITS = {
+    "homing_track_over_raw_klt": 2.0,
+    "homing_update_graph_over_raw_klt": 2.0,
+    "homing_update_ekf_over_raw_klt": 2.0,
+    "homing_initialisation_over_raw_sift": 1.5,
+    "columns_over_sift": 0.5,
+}
+ESTIMATORS: dict[str, HomingEstimatorSettings] = {
+    "graph": HomingGraphSettings(),
+    "ekf": HomingEkfSettings(),
+}
+SEEDS = (0, 1, 2)
+IMAGES = 26  # at 10 a second and 0.4 m/s: the first half of a leg
+REPEATS = 7
+# Never matched anew, so that every timed step is an update and nothing else.
+CONTROL = replace(HomingControlSettings(), retry_s=1e3)
+
+
+@dataclass(frozen=True)
+class Leg:
+    """What is seen on the way to one target."""
+
+    world: OmniWorld
+    images: tuple[Image, ...]
+
+
+def open_leg(seed: int) -> Leg:
+    """Images on the straight way from a path's start towards its first target."""
+    world = OmniWorld(OmniHouseSettings(path=HousePathSettings(legs=1, spacing_m=2.0)), seed)
+    start, target = world.reference_poses[:2]
+    way = target[:2] - start[:2]
+    heading = float(np.arctan2(way[1], way[0]))
+    images = []
+    for k in range(IMAGES):
+        place = start[:2] + way * (0.04 * k / np.hypot(*way))
+        world.put(np.array([*place, heading + 0.2 * np.sin(0.3 * k)]))
+        images.append(world.image(0.1 * k))
+    return Leg(world, tuple(images))
+
+
+class NotedEyes:
+    """Eyes that keep where the tracked points were seen in the camera's own images."""
+
+    def __init__(self, world: OmniWorld) -> None:
+        settings = EyesSettings(
+            OmniFeatureSettings(),
+            OmniMatchingSettings(),
+            HomingVectorSettings(),
+            OmniTrackingSettings(),
+        )
+        self._camera = world.camera
+        self.inner = ImageEyes(world.camera, settings, np.random.default_rng(1))
+        self.seen: list[TrackedBearings] = []
+
+    def describe(self, image: Image) -> OmniFeatures:
+        return self.inner.describe(image)
+
+    def begin(self, image: Image, target: OmniFeatures, time: float) -> object:
+        return self.inner.begin(image, target, time)
+
+    def track(self, image: Image, time: float) -> TrackedBearings:
+        self.seen.append(self.inner.track(image, time))
+        return self.seen[-1]
+
+    def pixels(self, k: int) -> FloatArray:
+        """(n, 1, 2) float32, where update ``k`` found its points."""
+        b = self.seen[k]
+        rays = np.column_stack([np.cos(b.bearing), np.sin(b.bearing), np.tan(b.elevation)])
+        found = self._camera.pixels(rays)
+        return found[np.isfinite(found[:, 0])].astype(np.float32)[:, None]
+
+
+def track_ratios(leg: Leg) -> list[float]:
+    """The same for tracking alone."""
+    eyes = NotedEyes(leg.world)
+    eyes.begin(leg.images[0], eyes.describe(leg.world.targets[0]), 0.0)
+    return [ratio for ratio, _ in timed_against_klt(eyes, leg, eyes.track)]
+
+
+def update_ratios(leg: Leg, settings: HomingEstimatorSettings) -> list[tuple[float, int]]:
+    """Each update's time over that of raw KLT from its image before; and the points' number."""
+    noted = NotedEyes(leg.world)
+    eyes: HomingEyes = noted  # type: ignore[assignment]
+    target = eyes.describe(leg.world.targets[0])
+    controller = HomingController(
+        eyes, target, lambda start: make_homing_estimator(start, settings), CONTROL
+    )
+    controller.step(leg.images[0], 0.0)
+    return timed_against_klt(noted, leg, controller.step)
+
+
+def timed_against_klt(
+    noted: NotedEyes, leg: Leg, step: Callable[[Image, float], object]
+) -> list[tuple[float, int]]:
+    """All later images, step by step."""
+    greys = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in leg.images]
+    found = []
+    for k in range(1, len(leg.images)):
+        before = len(noted.seen)
+        own = cpu_seconds(lambda k=k: step(leg.images[k], 0.1 * k))  # type: ignore[misc]
+        if len(noted.seen) == before or before < 1:
+            continue  # an initialisation, or no points of an image before to start raw KLT from
+        points = noted.pixels(before - 1)
+        raw = statistics.median(raw_klt(greys[k - 1], greys[k], points) for _ in range(3))
+        found.append((own / raw, len(points)))
+    return found
+
+
+def raw_klt(before: Image, now: Image, points: FloatArray) -> float:
+    """Seconds of OpenCV's tracker with its own window, levels and criteria."""
+    return cpu_seconds(
+        lambda: cv2.calcOpticalFlowPyrLK(before, now, points, None)  # type: ignore[call-overload]
+    )
+
+
+def front_end_ratios(leg: Leg) -> dict[str, float]:
+    """Initialisation, and columns, beside raw SIFT."""
+    camera, image, other = leg.world.camera, leg.images[0], leg.world.targets[0]
+    settings = OmniFeatureSettings()
+    extractor = OmniFeatureExtractor(camera, settings)
+    eyes = NotedEyes(leg.world)
+    times = interleaved(
+        {
+            "raw": lambda: cpu_seconds(lambda: raw_sift_matching(image, other)),
+            "own": lambda: cpu_seconds(lambda: initialise(eyes, leg)),
+            "columns": lambda: cpu_seconds(lambda: extractor.extract_columns(image)),
+            "sift": lambda: cpu_seconds(lambda: extractor.extract_sift(image)),
+        },
+        REPEATS,
+    )
+    return {
+        "homing_initialisation_over_raw_sift": times["own"] / times["raw"],
+        "columns_over_sift": times["columns"] / times["sift"],
+        "homing_initialisation_ms": 1e3 * times["own"],
+        "raw_sift_matching_ms": 1e3 * times["raw"],
+    }
+
+
+def initialise(eyes: NotedEyes, leg: Leg) -> None:
+    """Features of both images, matches, homing vector, local map, and the start of tracking."""
+    eyes.begin(leg.images[0], eyes.describe(leg.world.targets[0]), 0.0)
+
+
+def raw_sift_matching(image: Image, other: Image) -> None:
+    """OpenCV's own: SIFT of both images, and brute force with two neighbours."""
+    detector = cv2.SIFT.create()
+    greys = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (image, other))
+    one, two = (detector.detectAndCompute(grey, None)[1] for grey in greys)
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    matcher.knnMatch(one, two, k=2)
+
+
+@one_blas_thread()
+def ratios_of_homing() -> dict[str, float]:
+    """All of it: a flat map of names to numbers."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        legs = [open_leg(seed) for seed in SEEDS]
+        found = medians_of(legs)
+    finally:
+        cv2.setNumThreads(threads)
+    return found
+
+
+def medians_of(legs: list[Leg]) -> dict[str, float]:
+    """Medians over updates and legs."""
+    found: dict[str, float] = {}
+    for name, settings in ESTIMATORS.items():
+        every = [pair for leg in legs for pair in update_ratios(leg, settings)]
+        found[f"homing_update_{name}_over_raw_klt"] = statistics.median(r for r, _ in every)
+        found["homing_points"] = statistics.median(n for _, n in every)
+    tracked = [ratio for leg in legs for ratio in track_ratios(leg)]
+    found["homing_track_over_raw_klt"] = statistics.median(tracked)
+    each = [front_end_ratios(leg) for leg in legs]
+    return found | {name: statistics.median(e[name] for e in each) for name in each[0]}
+
+
+if __name__ == "__main__":
+    start = time.perf_counter()
+    for name, value in ratios_of_homing().items():
+        print(f"{name:40s} {value:.3f}")
+    print(f"{time.perf_counter() - start:.0f} s")
