@@ -190,6 +190,15 @@ class DrivingConfig(HomingExperiment):
             "from where homing succeeds (G36)",
         ),
     ] = 0.0
+    wrong_matches: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            lt=0.9,
+            description="share of wrong matches mixed into those of start and target, to try how "
+            "much homing bears",
+        ),
+    ] = 0.0
 
 
 class HomingConfig(DrivingConfig):

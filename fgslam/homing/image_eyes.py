@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgslam.frontend.omni.features import OmniFeatureExtractor
-from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
+from fgslam.frontend.omni.homing_ransac import estimate_homing_vector, paired_anew
 from fgslam.frontend.omni.local_map import make_local_map, triangulable
-from fgslam.frontend.omni.matching import match_features
+from fgslam.frontend.omni.matching import joined, match_features
 from fgslam.frontend.omni.trackable import move_to_trackable
 from fgslam.frontend.omni.tracking import BearingTracker
 from fgslam.homing_types import (
@@ -33,12 +33,17 @@ _MAX_RELATIVE_SIGMA = 1.0  # of a distance; whoever knows less of a feature wait
 
 @dataclass(frozen=True, slots=True)
 class EyesSettings:
-    """What every stage of the front-end is set to."""
+    """What every stage of the front-end is set to.
+
+    ``wrong_matches`` is the share of wrong ones that is mixed into all matches, to try how much the
+    rest bears; 0 in earnest.
+    """
 
     features: OmniFeatureSettings
     matching: OmniMatchingSettings
     homing_vector: HomingVectorSettings
     tracking: OmniTrackingSettings
+    wrong_matches: float = 0.0
 
 
 class ImageEyes:
@@ -65,6 +70,8 @@ class ImageEyes:
             return refusal
         s = self._settings
         matches = match_features(present, target, s.matching)
+        if s.wrong_matches > 0.0:
+            matches = mixed_with_wrong(matches, s.wrong_matches, self._rng)
         vector = estimate_homing_vector(matches, s.homing_vector, self._rng)
         if isinstance(vector, Refusal):
             return vector
@@ -103,6 +110,26 @@ class ImageEyes:
         local_map = make_local_map(vector, points)
         self._tracker.start(image, time, local_map.ids, pixels)
         return HomingStart(time, vector, local_map, points)
+
+
+def mixed_with_wrong(
+    matches: BearingMatches, share: float, rng: np.random.Generator
+) -> BearingMatches:
+    """Matches with wrong ones among them: features of two matches, as distinct as right ones.
+
+    Args:
+        matches: (n).
+        share: of wrong ones among the (n + m) returned, in [0, 1).
+        rng: which features are paired.
+    """
+    extra = round(len(matches) * share / (1.0 - share))
+    if not extra:
+        return matches
+    n = len(matches)
+    first = rng.integers(0, n, extra)
+    second = (first + rng.integers(1, max(n, 2), extra)) % n
+    wrong = paired_anew(matches, first, second)
+    return joined(matches, wrong)
 
 
 def _unusable(image: ByteArray, present: OmniFeatures) -> Refusal | None:

@@ -266,7 +266,8 @@ class _Search:
         """
         n, sigmas = len(self._matches), self._settings.inlier_sigmas
         shuffled = np.concatenate([self._rng.permutation(n) for _ in range(_SHUFFLES)])
-        wrong = EpipolarTest.of(_repaired(self._matches, shuffled), self._tilt)
+        every = np.tile(np.arange(n), _SHUFFLES)
+        wrong = EpipolarTest.of(paired_anew(self._matches, every, shuffled), self._tilt)
         good, _ = wrong.inliers(
             best.parameters[:1], best.parameters[1:2], sigmas, self._least_parallax
         )
@@ -337,10 +338,9 @@ def _cells(matches: BearingMatches) -> IntArray:
     return np.asarray(cells.ravel(), dtype=np.int64)
 
 
-def _repaired(matches: BearingMatches, order: IntArray) -> BearingMatches:
-    """Each feature of the first view with another one of the second, repeatedly."""
-    first = np.resize(np.arange(len(matches)), len(order))
-    a, b = matches.taken(first), matches.taken(order)
+def paired_anew(matches: BearingMatches, first: IntArray, second: IntArray) -> BearingMatches:
+    """(m) features of the first view, of matches (m,), each with one of the second view."""
+    a, b = matches.taken(first), matches.taken(second)
     return BearingMatches(
         a.kind, a.index_a, b.index_b, a.bearing_a, a.elevation_a, b.bearing_b, b.elevation_b,
         np.column_stack([a.sigma[:, :2], b.sigma[:, 2:]]), a.quality,

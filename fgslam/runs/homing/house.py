@@ -14,6 +14,10 @@ def open_house_drive(config: DrivingConfig, seed: int) -> Opened:
     """World and eyes of one seed. Raises FgslamError where the house cannot be built."""
     world = OmniWorld(config.dataset, seed)
     settings = EyesSettings(
-        config.features, config.features.matching, config.homing_vector, config.tracking
+        config.features,
+        config.features.matching,
+        config.homing_vector,
+        config.tracking,
+        config.wrong_matches,
     )
     return world, ImageEyes(world.camera, settings, np.random.default_rng((seed, 8)))
