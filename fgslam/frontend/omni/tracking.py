@@ -21,6 +21,8 @@ from fgslam.types import BoolArray, FloatArray, Image, IntArray
 
 Float32 = npt.NDArray[np.float32]
 
+_GAIN = (0.2, 5.0)  # from one exposure to the next
+_SAME_GAIN, _SAME_LEVEL = 0.02, 1.0  # less is left as it is: rounding would be worse
 _MAX_TURN = np.deg2rad(60.0)  # between two images; 40 deg/s of a wheelchair seen 5 times a second
 
 
@@ -125,13 +127,14 @@ class BearingTracker:
         kinds = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT
         criteria = (kinds, s.iterations, s.precision_px)
         start = np.empty_like(origin)  # not read without the flag
+        alike = _in_light_of(before.grey, now.grey)
         found, good, _ = cv2.calcOpticalFlowPyrLK(
-            before.grey, now.grey, origin, start, None, None,
+            before.grey, alike, origin, start, None, None,
             window, s.pyramid_levels, criteria, 0, s.min_eigenvalue,
         )  # fmt: skip
         # The way back starts at its end, so that the finest level alone does: it costs a third.
         back, good_back, _ = cv2.calcOpticalFlowPyrLK(
-            now.grey, before.grey, found, origin.copy(), None, None,
+            alike, before.grey, found, origin.copy(), None, None,
             window, 0, criteria, cv2.OPTFLOW_USE_INITIAL_FLOW, s.min_eigenvalue,
         )  # fmt: skip
         ends = np.asarray(found, np.float32)
@@ -162,3 +165,19 @@ class BearingTracker:
             elevation=view.top_elevation - pixels[:, 1] * a_row,
             sigma_elevation=sigma * a_row,
         )
+
+
+def _in_light_of(before: Image, now: Image) -> Image:
+    """The present view with mean and contrast of the one before.
+
+    OpenCV's tracker takes a brighter exposure for motion wherever contrast is low.
+    """
+    (mean, spread), (mean_now, spread_now) = (
+        (float(m[0, 0]), float(s[0, 0])) for m, s in map(cv2.meanStdDev, (before, now))
+    )
+    gain = float(np.clip(spread / max(spread_now, 1.0), *_GAIN))
+    offset = mean - gain * mean_now
+    if abs(gain - 1.0) < _SAME_GAIN and abs(offset + (gain - 1.0) * mean_now) < _SAME_LEVEL:
+        return now
+    levels = np.clip(np.round(gain * np.arange(256) + offset), 0, 255).astype(np.uint8)
+    return np.asarray(cv2.LUT(now, levels), dtype=np.uint8)

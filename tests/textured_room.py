@@ -1,0 +1,60 @@
+"""A square room with textured walls, seen in panoramas: exact truth for tests of tracking."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from fgslam.omni_cameras.panoramas import Equirectangular
+from fgslam.types import FloatArray, Image
+
+CAMERA = Equirectangular(601, 181, np.deg2rad(54.0), np.deg2rad(-54.0))
+HALF = 3.0
+"""Metres from the middle to each wall; walls have no end upwards or downwards."""
+
+_A_METRE = 40.0  # texels
+
+
+def _texture() -> FloatArray:
+    """Smooth noise that continues itself in both directions."""
+    noise = np.random.default_rng(11).normal(size=(400, int(8 * HALF * _A_METRE)))
+    fine, coarse = (ndimage.gaussian_filter(noise, s, mode="wrap") for s in (2.5, 8.0))
+    mixed = fine / fine.std() + coarse / coarse.std()
+    return np.asarray(np.clip(128.0 + 30.0 * mixed, 0.0, 255.0), dtype=np.float64)
+
+
+TEXTURE = _texture()
+
+
+def hits(pose: FloatArray, rays: FloatArray) -> FloatArray:
+    """(n, 3) where rays (n, 3) of the camera at a planar pose (3,) meet the walls."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    along = np.column_stack([c * rays[:, 0] - s * rays[:, 1], s * rays[:, 0] + c * rays[:, 1]])
+    with np.errstate(divide="ignore"):
+        far = (np.sign(along) * HALF - pose[:2]) / along
+    distance = far.min(axis=1)
+    return np.column_stack([pose[:2] + distance[:, None] * along, distance * rays[:, 2]])
+
+
+def angles(pose: FloatArray, points: FloatArray) -> FloatArray:
+    """(n, 2) bearing and elevation of points (n, 3) from a planar pose (3,)."""
+    away = points[:, :2] - pose[:2]
+    bearing = np.arctan2(away[:, 1], away[:, 0]) - pose[2]
+    return np.column_stack([bearing, np.arctan2(points[:, 2], np.hypot(*away.T))])
+
+
+def picture(pose: FloatArray) -> Image:
+    """(h, w, 3) what the camera sees from a planar pose (3,)."""
+    columns, rows = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+    pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
+    points = hits(pose, CAMERA.rays(pixels))
+    east_or_west = np.abs(points[:, 0]) > np.abs(points[:, 1])
+    # Places along the walls, each wall with its own stretch of the texture.
+    side = np.where(east_or_west, points[:, 1], points[:, 0])
+    wall = np.where(east_or_west, np.where(points[:, 0] > 0, 0, 1), 2 + (points[:, 1] > 0))
+    u = (side + HALF * (1 + 2 * wall)) * _A_METRE
+    grey = ndimage.map_coordinates(
+        TEXTURE, np.stack([points[:, 2] * _A_METRE, u]), order=1, mode="grid-wrap"
+    )
+    flat = np.round(grey).astype(np.uint8).reshape(CAMERA.height, CAMERA.width)
+    return np.repeat(flat[:, :, None], 3, axis=2)
