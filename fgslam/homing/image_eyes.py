@@ -115,20 +115,24 @@ class ImageEyes:
 def mixed_with_wrong(
     matches: BearingMatches, share: float, rng: np.random.Generator
 ) -> BearingMatches:
-    """Matches with wrong ones among them: features of two matches, as distinct as right ones.
+    """Matches with wrong ones among them: features of two matches of one kind, as distinct.
 
     Args:
         matches: (n).
         share: of wrong ones among the (n + m) returned, in [0, 1).
         rng: which features are paired.
     """
-    extra = round(len(matches) * share / (1.0 - share))
-    if not extra:
+    first, second = [], []
+    for kind in np.unique(matches.kind):
+        rows = np.flatnonzero(matches.kind == kind)
+        extra = round(len(rows) * share / (1.0 - share)) if len(rows) > 1 else 0
+        at = rng.integers(0, len(rows), extra)
+        other = (at + rng.integers(1, max(len(rows), 2), extra)) % len(rows)
+        first.append(rows[at])
+        second.append(rows[other])
+    if not first:
         return matches
-    n = len(matches)
-    first = rng.integers(0, n, extra)
-    second = (first + rng.integers(1, max(n, 2), extra)) % n
-    wrong = paired_anew(matches, first, second)
+    wrong = paired_anew(matches, np.concatenate(first), np.concatenate(second))
     return joined(matches, wrong)
 
 

@@ -1,0 +1,49 @@
+"""Wrong matches on purpose, and images that say nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from fgslam.homing.image_eyes import EyesSettings, ImageEyes, mixed_with_wrong
+from fgslam.homing_types import FeatureKind, Refusal, RefusalReason
+from fgslam.omni_cameras.panoramas import Equirectangular
+from fgslam.settings.homing_vector import HomingVectorSettings
+from fgslam.settings.omni_features import OmniFeatureSettings
+from fgslam.settings.omni_tracking import OmniTrackingSettings
+from tests.homing import two_views
+
+
+def eyes() -> ImageEyes:
+    features = OmniFeatureSettings()
+    settings = EyesSettings(
+        features, features.matching, HomingVectorSettings(), OmniTrackingSettings()
+    )
+    return ImageEyes(Equirectangular(256, 128), settings, np.random.default_rng(0))
+
+
+def test_share_of_wrong_matches_is_as_asked_and_none_is_right() -> None:
+    views = two_views(0, 70)
+    kinds = np.where(np.arange(70) < 40, int(FeatureKind.SIFT), int(FeatureKind.COLUMN))
+    matches = dataclasses.replace(views.matches, kind=kinds)
+    mixed = mixed_with_wrong(matches, 0.3, np.random.default_rng(1))
+    added = mixed.taken(np.arange(70, len(mixed)))
+    assert len(added) / len(mixed) == pytest.approx(0.3, abs=0.01)
+    assert not np.any(added.index_a == added.index_b)
+    of_b = dict(zip(matches.index_b.tolist(), matches.kind.tolist(), strict=True))
+    assert [of_b[k] for k in added.index_b.tolist()] == added.kind.tolist()
+
+
+@pytest.mark.parametrize(
+    ("level", "reason"),
+    [(0, RefusalReason.TOO_DARK), (5, RefusalReason.TOO_DARK), (128, RefusalReason.NO_FEATURES)],
+)
+def test_dark_and_blank_images_are_refused(level: int, reason: RefusalReason) -> None:
+    robot = eyes()
+    rng = np.random.default_rng(2)
+    target = robot.describe(rng.integers(0, 255, (128, 256, 3)).astype(np.uint8))
+    answer = robot.begin(np.full((128, 256, 3), level, dtype=np.uint8), target, 0.0)
+    assert isinstance(answer, Refusal)
+    assert answer.reason is reason
