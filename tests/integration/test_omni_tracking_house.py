@@ -1,0 +1,102 @@
+"""Tracking and the choice of trackable points in the rendered house, against its truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fgslam.frontend.omni.features import OmniFeatureExtractor
+from fgslam.frontend.omni.matching import match_features
+from fgslam.frontend.omni.trackable import move_to_trackable
+from fgslam.frontend.omni.tracking import BearingTracker
+from fgslam.homing_types import BearingMatches
+from fgslam.planar import wrap
+from fgslam.settings.omni_features import OmniFeatureSettings, OmniMatchingSettings
+from fgslam.settings.omni_tracking import OmniTrackingSettings
+from fgslam.settings.omni_worlds import HousePathSettings, OmniHouseSettings
+from fgslam.simulation.omni.omni_world import OmniWorld
+from fgslam.types import FloatArray, Image
+
+SETTINGS = OmniTrackingSettings()
+STEPS = 20
+
+
+class Leg:
+    """Images on the way to a target, and where its points really are."""
+
+    def __init__(self) -> None:
+        path = HousePathSettings(legs=1, spacing_m=2.0)
+        self.world = OmniWorld(OmniHouseSettings(path=path), 1)
+        self.start, self.target = self.world.reference_poses[:2]
+        self.images = []
+        way = self.target[:2] - self.start[:2]
+        self.poses = []
+        for k in range(STEPS + 1):
+            turn = self.start[2] + 0.3 * np.sin(0.3 * k)
+            self.poses.append(np.array([*(self.start[:2] + way * (0.02 * k)), turn]))
+            self.world.put(self.poses[-1])
+            self.images.append(self.world.image(0.1 * k))
+        self.tracker = BearingTracker(self.world.camera, SETTINGS)
+
+    def matched(
+        self, other: Image
+    ) -> tuple[BearingMatches, BearingMatches, FloatArray, FloatArray]:
+        """Matches with another image, the same moved to trackable points, and their places."""
+        extractor = OmniFeatureExtractor(self.world.camera, OmniFeatureSettings())
+        features = extractor.extract(self.images[0]), extractor.extract(other)
+        matches = match_features(*features, OmniMatchingSettings())
+        steady = self.tracker.steady
+        rows, pixels, moved = move_to_trackable(
+            steady.grey(self.images[0]), steady.view, matches, features, SETTINGS
+        )
+        found = self.world.camera.pixels(steady.view.rays(pixels))
+        return matches.taken(rows), moved, pixels, self.world.points(self.poses[0], found)
+
+    def angles(self, pose: FloatArray, points: FloatArray) -> FloatArray:
+        """(n, 2) true bearing and elevation of points (n, 3)."""
+        away = points - np.array([*pose[:2], self.world.settings.camera_height_m])
+        bearing = np.arctan2(away[:, 1], away[:, 0]) - pose[2]
+        return np.column_stack([bearing, np.arctan2(away[:, 2], np.hypot(*away[:, :2].T))])
+
+
+@pytest.fixture(scope="module")
+def leg() -> Leg:
+    return Leg()
+
+
+def test_tracked_bearings_and_their_sigmas(leg: Leg) -> None:
+    _, _, pixels, points = leg.matched(leg.world.targets[0])
+    leg.tracker.start(leg.images[0], 0.0, np.arange(len(pixels)), pixels)
+    for k in range(1, STEPS + 1):
+        found = leg.tracker.track(leg.images[k], 0.1 * k)
+        truth = leg.angles(leg.poses[k], points[found.ids])
+        off = wrap(np.column_stack([found.bearing, found.elevation]) - truth)
+        sigma = np.column_stack([found.sigma_bearing, found.sigma_elevation])
+    assert len(found) > 0.7 * len(pixels)
+    # After 0.8 m and turns of 17 degrees.
+    assert np.median(np.abs(off)) < np.deg2rad(0.15)
+    # Some corners are where a near thing ends before a far one: no place is true of them.
+    within = np.abs(off) < 2.0 * sigma
+    assert np.mean(within) > 0.8
+    assert 0.15 < 1.48 * np.median(np.abs(off / sigma)) < 1.0
+
+
+def test_mapped_bearings_of_true_matches(leg: Leg) -> None:
+    """G23: from a target half a metre off, under other light."""
+    pose = leg.poses[STEPS // 2]
+    matches, moved, pixels, points = leg.matched(leg.world.picture(pose, 7))
+    truth = leg.angles(pose, points)
+    features = leg.world.points(leg.poses[0], camera_pixels(leg, matches))
+    right = np.abs(wrap(matches.bearing_b - leg.angles(pose, features)[:, 0])) < np.deg2rad(1.5)
+    assert right.sum() > 40
+    off = wrap(np.column_stack([moved.bearing_b, moved.elevation_b]) - truth)[right]
+    assert len(pixels) == len(moved)
+    assert np.median(np.abs(off[:, 0])) < np.deg2rad(0.5)
+    assert np.median(np.abs(off[:, 1])) < np.deg2rad(0.5)
+    assert np.mean(np.abs(off) < 3.0 * moved.sigma[right, 2:]) > 0.85
+
+
+def camera_pixels(leg: Leg, matches: BearingMatches) -> FloatArray:
+    """(n, 2) where the start image shows the features."""
+    level = np.column_stack([np.cos(matches.bearing_a), np.sin(matches.bearing_a)])
+    return leg.world.camera.pixels(np.column_stack([level, np.tan(matches.elevation_a)]))

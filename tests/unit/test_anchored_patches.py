@@ -1,0 +1,74 @@
+"""Alignment of patches with what they looked like at first."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from fgslam.frontend.omni.anchored_patches import align, anchor
+from fgslam.types import FloatArray, Image
+from tests.textured_room import TEXTURE
+
+PLACES = np.array([[60.0, 60.0], [100.0, 60.0], [60.0, 100.0], [90.0, 90.0]])
+GREY = np.asarray(np.round(TEXTURE[:160, :160]), dtype=np.uint8)
+
+
+def deformed(linear: FloatArray, shift: FloatArray) -> tuple[Image, FloatArray]:
+    """The picture under an affine map about its middle, and where the places go."""
+    middle = np.array([80.0, 80.0])
+    affine = np.column_stack([linear, middle - linear @ middle + shift])
+    image = cv2.warpAffine(GREY, affine, (160, 160), flags=cv2.INTER_CUBIC)
+    return np.asarray(image, dtype=np.uint8), (PLACES - middle) @ linear.T + middle + shift
+
+
+@pytest.mark.parametrize(
+    "linear", [np.eye(2), 1.06 * np.eye(2), np.array([[1.0, 0.05], [0.0, 0.96]])]
+)
+def test_affine_maps_are_found(linear: FloatArray) -> None:
+    patches = anchor(GREY, PLACES, 13, 4.0, 0.05)
+    image, truth = deformed(linear, np.array([1.3, -0.7]))
+    places = truth + np.array([[0.8, -0.5], [-0.6, 0.6], [0.5, 0.5], [-0.9, 0.2]])
+    for _ in range(6):
+        patches, places, correlation = align(patches, image, places)
+    np.testing.assert_allclose(places, truth, atol=0.1)
+    np.testing.assert_allclose(patches.maps, np.broadcast_to(linear, (4, 2, 2)), atol=0.03)
+    assert correlation.min() > 0.98
+
+
+def test_one_step_is_most_of_the_way_and_light_does_not_matter() -> None:
+    patches = anchor(GREY, PLACES, 13, 4.0, 0.05)
+    image, truth = deformed(1.02 * np.eye(2), np.array([2.0, 1.0]))
+    dim = np.asarray(np.round(0.6 * image + 20.0), dtype=np.uint8)
+    wrong = truth + np.array([0.6, -0.4])
+    for seen in (image, dim):
+        _, places, correlation = align(patches, seen, wrong)
+        assert np.hypot(*(places - truth).T).max() < 0.25
+        assert correlation.min() > 0.8
+
+
+def test_something_else_does_not_correlate() -> None:
+    patches = anchor(GREY, PLACES, 13, 4.0, 0.05)
+    other = np.asarray(np.round(TEXTURE[200:360, 500:660]), dtype=np.uint8)
+    negative = np.asarray(255 - GREY, dtype=np.uint8)
+    for image in (other, negative, np.zeros_like(GREY)):
+        kept, places, correlation = align(patches, image, PLACES)
+        assert correlation.max() < 0.7
+        assert np.isfinite(places).all()
+        assert np.isfinite(kept.maps).all()
+    for image in (negative, np.zeros_like(GREY)):  # refused outright: nothing has moved
+        _, places, correlation = align(patches, image, PLACES)
+        np.testing.assert_array_equal(places, PLACES)
+        np.testing.assert_array_equal(correlation, -1.0)
+
+
+def test_taken_joined_and_none() -> None:
+    patches = anchor(GREY, PLACES, 13, 4.0, 0.05)
+    some = patches.taken(np.array([True, False, True, False]))
+    both = some.joined(patches.taken(np.array([False, True, False, True])))
+    assert len(both) == 4
+    np.testing.assert_array_equal(both.first, patches.first[[0, 2, 1, 3]])
+    none = anchor(GREY, np.empty((0, 2)), 13, 4.0, 0.05)
+    aligned, places, correlation = align(none, GREY, np.empty((0, 2)))
+    assert len(aligned) == len(places) == len(correlation) == 0
+    assert len(none.joined(some)) == 2
