@@ -62,6 +62,14 @@ class ReplenishedTracker:
             tracked = self._tracker.bearings()
         return TrackedImage(tracked, survivors, added)
 
+    def pixels(self) -> FloatArray:
+        """(n, 2) where the points are in the view (:meth:`view`) of the last image."""
+        return self._tracker.pixels()
+
+    def view(self, image: Image) -> Image:
+        """(height, width) the unwrapped grey view of an image (h, w, 3)."""
+        return self._tracker.steady.grey(image)
+
     def _fill(self, image: Image) -> IntArray:
         """(k,) identities of the strongest corners away from the points that there are."""
         present = self._tracker.pixels()

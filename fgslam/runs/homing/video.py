@@ -11,10 +11,12 @@ import numpy as np
 
 from fgslam.datasets.omni_opening import open_omni
 from fgslam.datasets.omni_recording import OmniRecording
-from fgslam.export.atomic import ExistingFolder
+from fgslam.export.atomic import ExistingFolder, make_subfolder
 from fgslam.export.homing_report import Column, TextTable
 from fgslam.export.homing_report.curves import Line, curve_figure
 from fgslam.export.metrics import JsonValue, UpdateTime
+from fgslam.export.pictures.view_tracks import draw_view_tracks
+from fgslam.export.report.data import Picture
 from fgslam.export.tables import write_csv
 from fgslam.frontend.omni.video_tracking import ReplenishedTracker, TrackedImage
 from fgslam.homing_config import OmniVideoConfig
@@ -27,9 +29,12 @@ from fgslam.runs.homing.results import (
     write_document,
     write_page,
 )
+from fgslam.types import FloatArray
 
 FRAMES_FILE = "frames.csv"
 TRACKS_FILE = "tracks.csv"
+PICTURES = "pictures"
+_TRAIL = 15  # images
 
 
 @dataclass(slots=True, eq=False)
@@ -41,6 +46,8 @@ class _Tracks:
     last: dict[int, int] = field(default_factory=dict)
     track_ms: list[float] = field(default_factory=list)
     read_ms: list[float] = field(default_factory=list)
+    trails: dict[int, FloatArray] = field(default_factory=dict)
+    pictures: list[Picture] = field(default_factory=list)
 
     def note(self, name: str, time: float, before: int, found: TrackedImage) -> None:
         frame, ids = len(self.frames), found.tracked.ids.tolist()
@@ -49,6 +56,14 @@ class _Tracks:
         for identity in ids:
             self.first.setdefault(identity, frame)
             self.last[identity] = frame
+
+    def follow(self, found: TrackedImage, pixels: FloatArray) -> None:
+        """The last places of those points that are still there."""
+        none = np.empty((0, 2))
+        self.trails = {
+            i: np.vstack([self.trails.get(i, none)[1 - _TRAIL :], place])
+            for i, place in zip(found.tracked.ids.tolist(), pixels, strict=True)
+        }
 
     def lives(self) -> np.ndarray:
         """(n,) frames in which each point was seen."""
@@ -66,7 +81,7 @@ def run_omni_video(
     recording = open_omni(config.dataset)
     provenance = {"name": recording.name, "identity": recording.identity}
     begin(config, folder, existing, {"dataset": provenance})
-    tracks = _track(config, recording, progress, stopped)
+    tracks = _track(config, recording, folder, progress, stopped)
     status: Status = "finished" if len(tracks.frames) == len(recording) else "interrupted"
     columns = ("frame", "time", "points", "added", "lost")
     write_csv(folder / FRAMES_FILE, columns, tracks.frames)
@@ -83,17 +98,23 @@ def run_omni_video(
     figure = curve_figure(
         words, [Line("points", 0, frames, counts)], ("frame", "points"), y={"rangemode": "tozero"}
     )
-    write_page(result, f"{len(tracks.frames)} frames of {recording.name}", figures=(figure,))
+    subtitle = f"{len(tracks.frames)} frames of {recording.name}"
+    write_page(result, subtitle, figures=(figure,), pictures=tuple(tracks.pictures))
     return result
 
 
 def _track(
-    config: OmniVideoConfig, recording: OmniRecording, progress: Progress, stopped: Stopped
+    config: OmniVideoConfig,
+    recording: OmniRecording,
+    folder: Path,
+    progress: Progress,
+    stopped: Stopped,
 ) -> _Tracks:
     tracker = ReplenishedTracker(
         recording.camera, config.tracking, config.least_points, config.most_points
     )
     tracks, before = _Tracks(), 0
+    shown = np.linspace(0, len(recording), config.output.pictures + 1).astype(int)[1:] - 1
     for i in range(len(recording)):
         if stopped():
             break
@@ -107,6 +128,12 @@ def _track(
         tracks.read_ms.append(1e3 * (read - start))
         tracks.note(recording.names[i], time, before, found)
         before = len(found.tracked)
+        tracks.follow(found, tracker.pixels())
+        if i in shown:
+            told = f"{recording.names[i]}: {before} points, {len(found.added)} of them new"
+            path = make_subfolder(folder, PICTURES) / f"tracks_{i:06d}.png"
+            draw_view_tracks(path, tracker.view(image), list(tracks.trails.values()), told)
+            tracks.pictures.append(Picture(told, path.read_bytes()))
         progress("tracking", i + 1, len(recording))
     return tracks
 
