@@ -17,6 +17,8 @@ from fgslam.types import FloatArray
 
 _AHEAD = np.deg2rad(45.0)  # farther off than this: turn on the spot
 _BRAKE = 0.5  # part of the speed at which the clear way is driven in a second
+_TURNING = 1.0 / 3.0  # an about-face of five seconds is a third as bad as being blocked
+_STANDING = 0.02  # m/s; slower is no driving
 
 
 class RangeScan(NamedTuple):
@@ -62,6 +64,9 @@ class CorridorAvoidance:
     robot's width, and it is free if that is longer than the look-ahead, which grows with
     speed. Home's own direction is taken whenever it is free: then nothing is overridden except that
     the speed is bounded by the clear way.
+
+    Corridors end in corners. Where the robot has been held up for a while it drives a bit along the
+    longest way that its bare body fits through, wherever that leads, and looks for corridors again.
     """
 
     def __init__(self, settings: AvoidanceSettings) -> None:
@@ -69,9 +74,42 @@ class CorridorAvoidance:
         step = 2.0 * np.pi / settings.directions
         self._directions: FloatArray = -np.pi + step * np.arange(settings.directions, dtype=float)
         self._chosen: float | None = None
+        self._held_up = 0.0  # steps in which the robot was not let drive
+        self._escaping = 0  # steps that are left of a way out
 
     def override(self, wanted: Drive, heading: float, scan: RangeScan) -> Drive:
         """See :class:`ObstacleAvoider`."""
+        if self._escaping > 0:
+            self._escaping -= 1
+            return self._escape(wanted, _points(scan))
+        driven = self._in_corridor(wanted, heading, scan)
+        stands = driven.overridden and driven.speed < _STANDING
+        self._held_up = self._held_up + self._impatience() if stands else 0.0
+        if self._held_up >= self._settings.escape_after:
+            self._held_up, self._chosen = 0.0, None
+            self._escaping = self._settings.escape_steps
+        return driven
+
+    def _impatience(self) -> float:
+        """What a step at a stand counts: turning towards a way takes its time."""
+        faces = self._chosen is None or abs(self._chosen) <= _AHEAD
+        return 1.0 if faces else _TURNING
+
+    def _escape(self, wanted: Drive, points: FloatArray) -> Drive:
+        s = self._settings
+        ways = clear_ways(self._directions, points, s.body_m)
+        # Of ways that are long enough the one that needs the least turning.
+        worth = np.minimum(ways, s.escape_m) - 0.1 * np.abs(self._directions)
+        direction = float(self._directions[int(np.argmax(worth))])
+        limit = np.deg2rad(s.max_turn_deg_s)
+        rate = float(np.clip(s.gain_per_s * direction, -limit, limit))
+        if abs(direction) > _AHEAD:
+            self._escaping += 1  # turning does not count
+            return Drive(0.0, rate, True)
+        way = float(clear_ways(np.zeros(1), points, s.body_m)[0])
+        return Drive(min(s.escape_mps, _BRAKE * max(way, 0.0)), rate, True)
+
+    def _in_corridor(self, wanted: Drive, heading: float, scan: RangeScan) -> Drive:
         if wanted.speed <= 0.0 and self._chosen is None:
             return wanted  # turning on the spot endangers nobody
         s = self._settings

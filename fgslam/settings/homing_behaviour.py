@@ -181,6 +181,19 @@ class AvoidanceSettings:
     gain_per_s: Annotated[
         float, Field(gt=0.0, description="turning rate over the chosen direction")
     ] = 2.0
+    body_m: Annotated[
+        float, Field(gt=0.0, description="half width of the bare robot, for ways out of corners")
+    ] = 0.37
+    escape_after: Annotated[
+        int, Field(ge=1, description="steps held up until a way out is taken; 2 s at 10 a second")
+    ] = 20
+    escape_steps: Annotated[
+        int, Field(ge=1, description="steps of driving along it; 2 s at 10 a second")
+    ] = 20
+    escape_m: Annotated[
+        float, Field(gt=0.0, description="ways longer than this are equally good ways out")
+    ] = 1.2
+    escape_mps: Annotated[float, Field(gt=0.0, description="speed on the way out")] = 0.25
 
 
 @dataclass(frozen=True, config=STRICT)
