@@ -25,8 +25,9 @@ from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.settings.homing_vector import HomingVectorSettings
 from fgslam.settings.omni_features import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.settings.omni_tracking import OmniTrackingSettings
-from fgslam.types import ByteArray
+from fgslam.types import ByteArray, IntArray
 
+_SECTORS = 8  # of 45 degrees
 _DARK = 8.0  # mean grey value of what the camera sees
 _MAX_RELATIVE_SIGMA = 1.0  # of a distance; whoever knows less of a feature waits for parallax
 
@@ -98,7 +99,8 @@ class ImageEyes:
             features,
             self._settings.tracking,
         )
-        known = triangulable(make_local_map(vector, points), _MAX_RELATIVE_SIGMA)
+        known = np.flatnonzero(triangulable(make_local_map(vector, points), _MAX_RELATIVE_SIGMA))
+        known = known[surest_all_around(points.taken(known), self._settings.tracking.max_points)]
         points, pixels = points.taken(known), pixels[known]
         least = self._settings.homing_vector.min_inliers
         if len(points) < least:
@@ -110,6 +112,21 @@ class ImageEyes:
         local_map = make_local_map(vector, points)
         self._tracker.start(image, time, local_map.ids, pixels)
         return HomingStart(time, vector, local_map, points)
+
+
+def surest_all_around(matches: BearingMatches, most: int) -> IntArray:
+    """Rows, ascending, of at most so many matches: the most distinctive of each sector in turn.
+
+    Features on one side alone would leave the homing vector open along a valley.
+    """
+    order = np.argsort(-matches.quality, kind="stable")
+    sector = np.floor(np.mod(matches.bearing_a[order], 2.0 * np.pi) / (2.0 * np.pi / _SECTORS))
+    rank = np.zeros(len(order), dtype=np.int64)
+    for k in range(_SECTORS):
+        inside = sector == k
+        rank[inside] = np.arange(np.count_nonzero(inside))
+    turn = np.argsort(rank, kind="stable")
+    return np.asarray(np.sort(order[turn[:most]]), dtype=np.int64)
 
 
 def mixed_with_wrong(

@@ -14,6 +14,14 @@ from fgslam.settings.base import STRICT
 class OmniTrackingSettings:
     """KLT tracking on an unwrapped view of each image, and the choice of trackable points."""
 
+    max_points: Annotated[
+        int,
+        Field(
+            ge=3,
+            description="tracked in one homing, the surest of all directions alike; the paper finds "
+            "30 to 50, and an image's cost grows with them",
+        ),
+    ] = 50
     max_view_width: Annotated[
         int, Field(ge=64, le=4096, description="columns of the view; less for coarser cameras")
     ] = 720

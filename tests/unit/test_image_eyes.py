@@ -7,7 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from fgslam.homing.image_eyes import EyesSettings, ImageEyes, mixed_with_wrong
+from fgslam.homing.image_eyes import (
+    EyesSettings,
+    ImageEyes,
+    mixed_with_wrong,
+    surest_all_around,
+)
 from fgslam.homing_types import FeatureKind, Refusal, RefusalReason
 from fgslam.omni_cameras.panoramas import Equirectangular
 from fgslam.settings.homing_vector import HomingVectorSettings
@@ -47,3 +52,14 @@ def test_dark_and_blank_images_are_refused(level: int, reason: RefusalReason) ->
     answer = robot.begin(np.full((128, 256, 3), level, dtype=np.uint8), target, 0.0)
     assert isinstance(answer, Refusal)
     assert answer.reason is reason
+
+
+def test_points_are_chosen_from_all_directions_the_surest_first() -> None:
+    bearing = np.concatenate([np.linspace(0.1, 0.6, 30), [1.0, 2.0, 3.0, -0.5, -1.0, -2.0, -3.0]])
+    quality = np.concatenate([np.linspace(0.9, 0.5, 30), np.full(7, 0.1)])
+    views = two_views(0, 37)
+    matches = dataclasses.replace(views.matches, bearing_a=bearing, quality=quality)
+    chosen = surest_all_around(matches, 10)
+    assert set(range(30, 37)) <= set(chosen.tolist())  # every other direction has its say
+    np.testing.assert_array_equal(chosen[:3], [0, 1, 2])
+    np.testing.assert_array_equal(surest_all_around(matches, 100), np.arange(37))
