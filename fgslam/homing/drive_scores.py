@@ -10,12 +10,31 @@ from scipy.stats import t as student_t
 from fgslam.homing.record import DriveRecord
 from fgslam.types import FloatArray, IntArray
 
+ARRIVED_M = 0.5
+"""Metres: a robot that claims an arrival and stands farther from the last target has not arrived.
+It stops where the switch fraction of the leg is left, 0.28 m of a leg of 4 m by default."""
+
+
+def end_distance(record: DriveRecord) -> float:
+    """Metres from where the robot stood at last to the last target; NaN where that is unknown."""
+    if len(record.targets) == 0:
+        return float("nan")
+    return float(np.hypot(*(record.end[:2] - record.targets[-1, :2])))
+
+
+def truly_arrived(record: DriveRecord) -> bool:
+    """Whether the robot says that it reached the last target, and stands within ARRIVED_M of it.
+
+    Where the truth is not known, what the robot says has to do.
+    """
+    return record.arrived and not end_distance(record) > ARRIVED_M
+
 
 def pass_distances(record: DriveRecord) -> FloatArray:
     """(m,) metres to each target where the robot was nearest, on its leg or on the next one.
 
-    Infinite for targets that were never aimed at. The next leg counts, as the robot turns away
-    from a target shortly before it is there.
+    Infinite for targets that were never aimed at, NaN where the place is unknown. The next leg
+    counts, as the robot turns away from a target shortly before it is there.
     """
     way = np.vstack([record.truth[:, :2], record.end[:2]])
     aimed = np.append(record.target, record.target[-1:])
@@ -31,15 +50,17 @@ def cross_track(record: DriveRecord) -> FloatArray:
     """(m,) root mean square distance (metres) from the straight line of each leg.
 
     The line runs from the target before (for the first, from where the robot stood) to the leg's
-    target; NaN for legs that were not driven.
+    target; NaN for legs that were not driven, or whose line has no direction: two targets in one
+    place.
     """
     ends = np.vstack([record.truth[0, :2], record.targets[:, :2]])
     out = np.full(len(record.targets), np.nan)
     for k in range(len(record.targets)):
         rows = record.target == k
-        if rows.any():
+        length = np.hypot(*(ends[k + 1] - ends[k]))
+        if rows.any() and length > 0.0:
             offsets = record.truth[rows, :2] - ends[k]
-            along = (ends[k + 1] - ends[k]) / np.hypot(*(ends[k + 1] - ends[k]))
+            along = (ends[k + 1] - ends[k]) / length
             across = offsets[:, 1] * along[0] - offsets[:, 0] * along[1]
             out[k] = np.sqrt(np.mean(across**2))
     return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -12,7 +13,7 @@ import pytest
 from landmark_world import drive_path, winding_path
 
 from fgslam.evaluation.homing import homing_errors
-from fgslam.homing.drive_scores import pass_distances
+from fgslam.homing.drive_scores import cross_track, pass_distances, truly_arrived
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.record import DriveRecord
 from fgslam.homing_config import PathFollowingConfig, parse_homing
@@ -95,6 +96,48 @@ def test_arrival_counts_the_last_target(record: DriveRecord) -> None:
     assert numbers["arrived"] == 2
     assert numbers["targets_aimed_at"] == 4
     assert numbers["legs"] == {"arrived": 4}
+    assert (numbers["false_arrivals"], numbers["failed"]) == (0, 0)
+    assert numbers["arrival_rate"] == 1.0
+
+
+def test_an_arrival_elsewhere_is_none(record: DriveRecord) -> None:
+    """What the robot says counts only where it stands near the last target in truth."""
+    off = np.array([0.6, 0.0, 0.0])
+    assert truly_arrived(record)
+    lost = replace(record, end=record.targets[-1] + off)
+    assert lost.arrived
+    assert not truly_arrived(lost)
+    numbers = drive_numbers([record, lost])
+    assert (numbers["arrived"], numbers["false_arrivals"]) == (1, 1)
+    assert numbers["arrival_rate"] == 0.5
+    assert numbers["end_distance_max_m"] == pytest.approx(0.6)
+    assert truly_arrived(replace(lost, targets=np.full((2, 3), np.nan)))  # nobody knows better
+
+
+def test_drives_that_break_down_and_targets_never_aimed_at_count(record: DriveRecord) -> None:
+    """Shares are of all drives and all targets, not of those that went well."""
+    early = replace(record, target=np.zeros_like(record.target), legs=record.legs[:0])
+    numbers = drive_numbers([record, early], failed=2)
+    assert (numbers["drives"], numbers["failed"], numbers["arrived"]) == (4, 2, 1)
+    assert numbers["arrival_rate"] == 0.25
+    assert (numbers["targets"], numbers["targets_aimed_at"]) == (8, 3)
+    near = np.isfinite(pass_distances(early)) & (pass_distances(early) <= 0.2)
+    both = np.count_nonzero(pass_distances(record) <= 0.2) + np.count_nonzero(near)
+    assert numbers["passed_within_0_2_m"] == both / 8
+
+
+def test_slope_of_pass_distances_leaves_the_last_target_out(record: DriveRecord) -> None:
+    """The robot stops short of that one by design."""
+    longer = replace(
+        record,
+        targets=np.vstack([record.targets, record.targets[-1:], record.targets[-1:] + 9.0]),
+        target=np.repeat(np.arange(4), [1, 1, 1, len(record) - 3]),
+    )
+    value = cast(Any, drive_numbers([longer])["pass_distance_slope"])["value"]
+    expected = np.polyfit([1, 2, 3], pass_distances(longer)[:3], 1)[0]
+    assert value == pytest.approx(expected)
+    assert np.isnan(cross_track(longer)[2])  # two targets in one place: no line between them
+    assert np.isfinite(cross_track(longer)[3])
 
 
 def test_one_homing_is_a_path_of_one_leg() -> None:

@@ -14,7 +14,15 @@ from fgslam.export.homing_report.local_map import local_map_figure
 from fgslam.export.homing_report.plan import PASS_RADIUS_M, catchment_figure, drive_figure
 from fgslam.export.metrics import JsonValue, UpdateTime
 from fgslam.export.report.traces import Figure
-from fgslam.homing.drive_scores import Slope, cross_track, pass_distances, slope_by_leg
+from fgslam.homing.drive_scores import (
+    ARRIVED_M,
+    Slope,
+    cross_track,
+    end_distance,
+    pass_distances,
+    slope_by_leg,
+    truly_arrived,
+)
 from fgslam.homing.record import STAGES, DriveRecord
 from fgslam.homing_config import DrivingConfig
 from fgslam.planar import between
@@ -47,7 +55,7 @@ def finish_drives(
     write_drive(folder, records)
     for one in driven[: config.output.logs]:
         write_logs(folder, one.seed, one.record)
-    numbers = drive_numbers([record for _, record in records])
+    numbers = drive_numbers([record for _, record in records], len(failures))
     if driven:
         numbers["kilobytes_per_image"] = driven[0].memory.save(folder / MEMORY_FILE)
     numbers["seeds"] = [one.seed for one in driven]
@@ -60,26 +68,42 @@ def finish_drives(
     return result
 
 
-def drive_numbers(records: Sequence[DriveRecord]) -> dict[str, JsonValue]:
-    """Metrics over drives; null where nothing is known."""
+def drive_numbers(records: Sequence[DriveRecord], failed: int = 0) -> dict[str, JsonValue]:
+    """Metrics over drives; null where nothing is known.
+
+    Args:
+        records: of the drives that left one.
+        failed: drives that broke down; they did not arrive, and passed no target.
+    """
     passed = [pass_distances(record) for record in records]
     across = [cross_track(record) for record in records]
     reached = _finite(passed)
     results = [leg.result for record in records for leg in record.legs]
-    legs = np.concatenate([np.arange(len(a)) + 1 for a in across]) if across else np.empty(0)
-    slope = slope_by_leg(legs.astype(np.int64), np.concatenate([np.empty(0), *across]))
+    arrived = sum(truly_arrived(record) for record in records)
+    claimed = sum(record.arrived for record in records)
+    ends = _finite([np.array([end_distance(r)]) for r in records if r.arrived])
+    targets = _known(passed) + failed * max((len(p) for p in passed), default=0)
     return {
-        "drives": len(records),
-        "arrived": sum(record.arrived for record in records),
-        "arrival_rate": float(np.mean([r.arrived for r in records])) if records else None,
+        "drives": len(records) + failed,
+        "failed": failed,
+        "arrived": arrived,
+        "arrival_rate": arrived / (len(records) + failed) if records or failed else None,
+        "false_arrivals": claimed - arrived,
+        "end_distance_median_m": _median(ends),
+        "end_distance_max_m": float(ends.max()) if len(ends) else None,
         "legs": {name: results.count(name) for name in dict.fromkeys(results)},
         "initialisations_median": _median([leg.initialisations for r in records for leg in r.legs]),
         "pass_distance_median_m": _median(reached),
         "pass_distance_max_m": float(reached.max()) if len(reached) else None,
-        "passed_within_0_2_m": float(np.mean(reached <= PASS_RADIUS_M)) if len(reached) else None,
+        "passed_within_0_2_m": float(np.count_nonzero(reached <= PASS_RADIUS_M)) / targets
+        if targets
+        else None,
+        "targets": targets,
         "targets_aimed_at": len(reached),
+        # At the last target the robot stops where the switch fraction is left, by design.
+        "pass_distance_slope": _slope([distances[:-1] for distances in passed]),
         "cross_track_median_m": _median(_finite(across)),
-        "cross_track_slope": {**asdict(slope), "flat": _flat(slope)},
+        "cross_track_slope": _slope(across),
         "duration_median_s": _median([float(r.time[-1] - r.time[0]) for r in records if len(r)]),
         "overridden": float(np.mean(np.concatenate([r.overridden for r in records])))
         if records
@@ -91,6 +115,18 @@ def drive_numbers(records: Sequence[DriveRecord]) -> dict[str, JsonValue]:
 def _finite(values: Sequence[FloatArray]) -> FloatArray:
     every: FloatArray = np.concatenate([np.empty(0), *values])
     return np.asarray(every[np.isfinite(every)])
+
+
+def _known(passed: Sequence[FloatArray]) -> int:
+    """Targets whose place is known, aimed at or not."""
+    return sum(int(np.count_nonzero(~np.isnan(distances))) for distances in passed)
+
+
+def _slope(values: Sequence[FloatArray]) -> dict[str, JsonValue]:
+    """Growth of values, one array a drive and one value a leg, with the leg's number."""
+    legs = np.concatenate([np.empty(0, np.int64), *(np.arange(len(v)) + 1 for v in values)])
+    slope = slope_by_leg(legs, np.concatenate([np.empty(0), *values]))
+    return {**asdict(slope), "flat": _flat(slope)}
 
 
 def _median(values: Sequence[float] | FloatArray) -> float | None:
@@ -111,7 +147,12 @@ def _stages(records: Sequence[DriveRecord]) -> dict[str, JsonValue]:
 
 
 def _verdict(numbers: dict[str, JsonValue]) -> tuple[str, ...]:
-    lines = [f"{numbers['arrived']} of {numbers['drives']} drives arrive at the last target."]
+    lines = [
+        f"{numbers['arrived']} of {numbers['drives']} drives arrive at the last target (within "
+        f"{ARRIVED_M:g} m)."
+    ]
+    if numbers["false_arrivals"]:
+        lines.append(f"{numbers['false_arrivals']} more claim an arrival and stand farther away.")
     median, largest = numbers["pass_distance_median_m"], numbers["pass_distance_max_m"]
     if isinstance(median, float) and isinstance(largest, float):
         lines.append(
@@ -129,7 +170,10 @@ def _verdict(numbers: dict[str, JsonValue]) -> tuple[str, ...]:
 
 
 _COLUMNS = (
-    Column("arrived", "drives that passed on from this target, of those that aimed at it"),
+    Column(
+        "arrived",
+        "drives that counted this target as reached, by what they saw, of those that aimed at it",
+    ),
     Column("pass distance cm median", "nearest to the place of the target's image"),
     Column("max", "the worst drive"),
     Column("across the way cm", "root mean square distance from the leg's straight line, median"),
@@ -196,9 +240,15 @@ def _remaining(driven: Sequence[DrivenSeed]) -> Figure:
 def _catchment(driven: Sequence[DrivenSeed]) -> Figure:
     known = [one for one in driven if len(one.record)]
     offsets = [between(one.record.targets[0], one.record.truth[0])[:2] for one in known]
-    arrived = np.array([bool(r.legs) and r.legs[0].result == "arrived" for r in _records(known)])
+    arrived = np.array([_reached_first(record) for record in _records(known)])
     told = [f"seed {one.seed}: {one.record.legs[0].reason}" for one in known if one.record.legs]
     return catchment_figure(np.array(offsets), arrived, told)
+
+
+def _reached_first(record: DriveRecord) -> bool:
+    """Whether the first target was reached: by what the robot says, and in truth."""
+    said = bool(record.legs) and record.legs[0].result == "arrived"
+    return said and bool(pass_distances(record)[0] <= ARRIVED_M)
 
 
 def _records(driven: Sequence[DrivenSeed]) -> list[DriveRecord]:
