@@ -106,7 +106,11 @@ def run_topological_map(
         "finished" if whole else "interrupted",
         _verdict(topology, routes, located),
         (_table(topology, views),),
-        (*failures, *(f"route {'-'.join(r.asked)}: {r.reason}" for r in routes if r.reason)),
+        (
+            *views.recording.notes,
+            *failures,
+            *(f"route {'-'.join(r.asked)}: {r.reason}" for r in routes if r.reason),
+        ),
     )
     write_csv(folder / LINKS_FILE, _LINK_COLUMNS, _link_rows(topology, views))
     write_csv(folder / ROUTES_FILE, ("asked", "found", "reason"), _route_rows(routes))

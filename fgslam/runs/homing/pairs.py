@@ -81,7 +81,7 @@ def run_homing_pairs(
         "finished" if whole else "interrupted",
         _verdict(numbers, errors),
         _tables(errors),
-        tuple(failures),
+        (*views.recording.notes, *failures),
     )
     write_document(result, numbers)
     pictures = draw_pairs(folder, views, search, answers, errors, config.output.pictures)

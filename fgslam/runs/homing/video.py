@@ -9,7 +9,6 @@ from time import perf_counter
 
 import numpy as np
 
-from fgslam.datasets.omni_opening import open_omni
 from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.export.atomic import ExistingFolder, make_subfolder
 from fgslam.export.homing_report import Column, TextTable
@@ -20,6 +19,7 @@ from fgslam.export.report.data import Picture
 from fgslam.export.tables import write_csv
 from fgslam.frontend.omni.video_tracking import ReplenishedTracker, TrackedImage
 from fgslam.homing_config import OmniVideoConfig
+from fgslam.runs.homing.mirror_check import open_checked
 from fgslam.runs.homing.results import (
     HomingResult,
     Progress,
@@ -78,7 +78,7 @@ def run_omni_video(
     stopped: Stopped,
 ) -> HomingResult:
     """Tracks from the first frame to the last; stopped early, the frames so far count."""
-    recording = open_omni(config.dataset)
+    recording = open_checked(config.dataset)
     provenance = {"name": recording.name, "identity": recording.identity}
     begin(config, folder, existing, {"dataset": provenance})
     tracks = _track(config, recording, folder, progress, stopped)

@@ -13,6 +13,7 @@ from fgslam.frontend.omni.column_segments import empty_segments
 from fgslam.frontend.omni.features import OmniFeatureExtractor
 from fgslam.frontend.omni.plain_sift import plain_sift
 from fgslam.homing_types import OmniFeatures
+from fgslam.runs.homing.mirror_check import open_checked
 from fgslam.runs.homing.results import Progress, Stopped
 from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.settings.omni_datasets import OmniDatasetSettings
@@ -66,8 +67,8 @@ class _Block:
 
 
 def open_views(settings: OmniDatasetSettings) -> Views:
-    """Opens the recording. Raises DatasetError."""
-    return Views(settings, open_omni(settings))
+    """Opens the recording and checks its mirror, if it has one. Raises DatasetError."""
+    return Views(settings, open_checked(settings))
 
 
 def extract_features(

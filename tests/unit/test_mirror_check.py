@@ -1,0 +1,77 @@
+"""A mirror that lies off the stated centre is told with the measured offset."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
+from fgslam.omni_cameras.radial import MirrorFrame
+from fgslam.runs.homing.mirror_check import open_checked
+from fgslam.settings.omni_cameras import EquirectangularSettings, HyperbolicMirrorSettings
+from fgslam.settings.omni_datasets import OmniPathSettings
+from fgslam.types import Image
+
+SIZE = (320, 240)
+CENTRE = (162.0, 118.0)
+RADIUS = 110.0
+
+
+def picture(holder: bool = False) -> Image:
+    """A bright mirror with stripes on a dark ground, perhaps in a bright ring that holds it."""
+    mirror = HyperbolicMirror(MirrorFrame(*SIZE, CENTRE), 15.0, RADIUS, xi=0.92, focal_px=60.0)
+    columns, rows = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
+    rays = mirror.rays(pixels)
+    levels = 120.0 + 50.0 * np.sign(np.sin(9.0 * np.arctan2(rays[:, 1], rays[:, 0])))
+    levels = np.where(np.isfinite(levels), levels, 12.0)
+    if holder:
+        radius = np.hypot(*(pixels - CENTRE).T)
+        levels = np.where((radius > 1.06 * RADIUS) & (radius < 1.1 * RADIUS), 250.0, levels)
+    noisy = levels + np.random.default_rng(0).normal(0.0, 2.0, len(levels))
+    grey = np.clip(np.rint(noisy), 0, 255).astype(np.uint8).reshape(SIZE[1], SIZE[0])
+    return np.repeat(grey[..., None], 3, axis=2)
+
+
+def notes(
+    folder: Path, image: Image, centre: tuple[float, float], equirectangular: bool = False
+) -> tuple[str, ...]:
+    assert cv2.imwrite(str(folder / "m1.png"), image)
+    mirror = HyperbolicMirrorSettings(
+        centre=centre, focal_px=60.0, inner_radius_px=15.0, outer_radius_px=RADIUS
+    )
+    camera = EquirectangularSettings() if equirectangular else mirror
+    return open_checked(OmniPathSettings(path=str(folder), camera=camera)).notes
+
+
+@pytest.mark.parametrize("off", [(0.0, 0.0), (1.5, -1.5)])
+def test_a_mirror_in_its_place_is_not_worth_a_note(
+    tmp_path: Path, off: tuple[float, float]
+) -> None:
+    assert notes(tmp_path, picture(), (CENTRE[0] + off[0], CENTRE[1] + off[1])) == ()
+
+
+@pytest.mark.parametrize("holder", [False, True])
+@pytest.mark.parametrize("off", [(3.0, 4.0), (-24.0, 18.0)])
+def test_a_mirror_off_its_place_is_told_with_the_offset(
+    tmp_path: Path, off: tuple[float, float], holder: bool
+) -> None:
+    stated = (CENTRE[0] + off[0], CENTRE[1] + off[1])
+    (note,) = notes(tmp_path, picture(holder), stated)
+    told = re.search(r"lies ([\d.]+) px off .* rim's is \(([\d.]+), ([\d.]+)\)", note)
+    assert told is not None
+    found = [float(number) for number in told.groups()]
+    np.testing.assert_allclose(found, [np.hypot(*off), *CENTRE], atol=0.5)
+
+
+def test_a_rim_that_cannot_be_found_is_told(tmp_path: Path) -> None:
+    (note,) = notes(tmp_path, np.full((*SIZE[::-1], 3), 90, np.uint8), CENTRE)
+    assert note == "the mirror's rim is not found in m1.png, so its centre is unchecked"
+
+
+def test_panoramas_have_no_mirror(tmp_path: Path) -> None:
+    assert notes(tmp_path, picture(), CENTRE, equirectangular=True) == ()
