@@ -95,8 +95,10 @@ class HomingController:
         home = homing.home
         self.remaining, self._heading = home.distance, home.direction
         arrival = self._arrival(homing.unit)
-        if arrival:
+        if arrival and homing.vouched:
             return self._end(time, HomingState.ARRIVED, arrival)
+        if arrival and fault is None:
+            fault = Fault(f"no track confirms it: {arrival}", True)
         if self._progress.stalled(self.remaining, time):
             fault = Fault(f"no progress for {self._settings.stall_s:g} s", True)
             if self._progress.stalls >= self._settings.max_stalls:

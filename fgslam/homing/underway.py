@@ -64,6 +64,8 @@ class HomingUnderWay:
         self._settings = settings
         self._estimator = make_estimator(start)
         self.estimate = self._estimator.estimate()
+        # Averages of bearings know neither map nor covariance; who has a map must know both.
+        self._maps = bool(np.isfinite(self.estimate.landmarks).all())
         self.home = self._home()
         self.tracked = _seen_at(start)
         self.history: list[TrackedBearings] = []
@@ -74,6 +76,20 @@ class HomingUnderWay:
             scale = np.array([self.unit, 1.0, 1.0])
             covariance = home.covariance * scale[:, None] * scale
         return HomeVector(self.unit * home.distance, home.direction, home.rotation, covariance)
+
+    @property
+    def vouched(self) -> bool:
+        """Whether tracks in the map and a covariance stand behind the estimate.
+
+        Without them a filter or graph only carries the last motion on, and so might into the
+        target. Always so of estimators that never have either.
+        """
+        misfit = tracked_misfit(self.estimate, self.tracked)
+        return not self._maps or (self._determined and bool(np.isfinite(misfit)))
+
+    @property
+    def _determined(self) -> bool:
+        return bool(np.isfinite(self.estimate.covariance).all())
 
     def update(self, tracked: TrackedBearings) -> Fault | None:
         """Takes in one image; what is wrong afterwards, the worst first, or None."""
@@ -120,6 +136,8 @@ class HomingUnderWay:
         s, count = self._settings, len(self.tracked)
         if count < min(s.min_tracks, _KEPT_SHARE * len(self.start.matches)):
             return Fault(f"{count} tracks left", True)
+        if self._maps and not self._determined:
+            return Fault("target uncertain: the estimator has no covariance", True)
         home = self.home
         with np.errstate(invalid="ignore"):
             across = float(home.distance * np.sqrt(home.covariance[1, 1]))

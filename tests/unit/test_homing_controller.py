@@ -11,6 +11,7 @@ from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.errors import EstimatorError
 from fgslam.homing.command import Command, HomingState
 from fgslam.homing.controller import HomingController
+from fgslam.homing.underway import HomingUnderWay
 from fgslam.homing_types import (
     HomingEstimate,
     HomingStart,
@@ -23,7 +24,13 @@ from fgslam.homing_types import (
 )
 from fgslam.planar import bearings, unit, wrap
 from fgslam.settings.homing_behaviour import HomingControlSettings
-from fgslam.settings.homing_estimators import HomingEkfSettings, HomingGraphSettings
+from fgslam.settings.homing_estimators import (
+    AverageLandmarkVectorSettings,
+    HomingEkfSettings,
+    HomingEstimatorSettings,
+    HomingGraphSettings,
+    SnapshotSettings,
+)
 from fgslam.types import ByteArray, FloatArray
 from tests.homing import make_matches
 from tests.landmark_world import DARK, Setting, winding_path
@@ -58,6 +65,7 @@ class OracleEstimator:
 
     def __init__(self, start: HomingStart) -> None:
         self.time, self.robot, self.sigma = start.time, np.zeros(3), 1e-3
+        self.mapped = 20
         self.target = np.array([*unit(np.array(start.vector.direction)), start.vector.rotation])
 
     def update(self, tracked: TrackedBearings) -> None:
@@ -66,10 +74,11 @@ class OracleEstimator:
 
     def estimate(self, landmarks: bool = True) -> HomingEstimate:
         """As told; the map is exact."""
-        covariance = np.eye(6) * self.sigma**2
+        covariance = np.eye(6) * self.sigma**2  # NaN where sigma is
         many = np.tile(np.eye(2) * 1e-6, (20, 1, 1))
+        n = self.mapped
         return HomingEstimate(
-            self.time, self.robot, self.target, covariance, np.arange(20), POINTS, many
+            self.time, self.robot, self.target, covariance, np.arange(n), POINTS[:n], many[:n]
         )
 
 
@@ -255,6 +264,46 @@ def test_uncertain_estimate_is_matched_anew() -> None:
     command = b.step(SETTINGS.retry_s)
     assert "uncertain" in command.reason
     assert b.controller.initialisations == 2
+
+
+def test_estimate_without_a_covariance_is_uncertain() -> None:
+    """NaN is no small number: matched anew, and no arrival is believed meanwhile."""
+    b = bench(vector_to(0.0), FEW)
+    b.step()
+    b.at(0.4)
+    b.estimators[-1].sigma = float("nan")
+    command = b.step(SETTINGS.retry_s)
+    assert command.state is HomingState.DRIVE
+    assert "no covariance" in command.reason
+    assert len(b.eyes.begun) == 2
+    b.at(0.999)
+    assert b.step().state is HomingState.DRIVE
+    b.estimators[-1].sigma = 1e-3
+    assert b.step().state is HomingState.ARRIVED
+
+
+def test_arrival_needs_tracks_in_the_map() -> None:
+    """Carried on by its motion alone an estimate reaches any target: match anew, then."""
+    b = bench(vector_to(0.0), FEW)
+    b.step()
+    b.at(0.999)
+    b.estimators[-1].mapped = 2
+    command = b.step(SETTINGS.retry_s)
+    assert command.state is HomingState.DRIVE
+    assert "no track confirms it: reached" in command.reason
+    assert len(b.eyes.begun) == 2
+    b.estimators[-1].mapped = 3
+    assert b.step().state is HomingState.ARRIVED
+
+
+@pytest.mark.parametrize("settings", [AverageLandmarkVectorSettings(), SnapshotSettings()])
+def test_averages_without_map_and_covariance_drive(settings: HomingEstimatorSettings) -> None:
+    """They never have any; that is no fault of theirs."""
+    start = start_at(0.0, vector_to(0.0))
+    homing = HomingUnderWay(start, lambda s: make_homing_estimator(s, settings), 1.0, SETTINGS)
+    eyes = ScriptedEyes([FEW], robot=np.array([0.2, 0.0, 0.0]))
+    assert homing.update(eyes.track(DARK, 0.1)) is None
+    assert homing.vouched
 
 
 def test_diverged_estimate_is_not_driven_by() -> None:
