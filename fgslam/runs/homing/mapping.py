@@ -106,11 +106,7 @@ def run_topological_map(
         "finished" if whole else "interrupted",
         _verdict(topology, routes, located),
         (_table(topology, views),),
-        (
-            *views.recording.notes,
-            *failures,
-            *(f"route {'-'.join(r.asked)}: {r.reason}" for r in routes if r.reason),
-        ),
+        _remarks(views, failures, routes),
     )
     write_csv(folder / LINKS_FILE, _LINK_COLUMNS, _link_rows(topology, views))
     write_csv(folder / ROUTES_FILE, ("asked", "found", "reason"), _route_rows(routes))
@@ -168,6 +164,11 @@ def _localised(
 
 # --------------------------------------------------------------------------------------------
 # Numbers and words
+
+
+def _remarks(views: Views, failures: Sequence[str], routes: Sequence[Route]) -> tuple[str, ...]:
+    missing = [f"route {'-'.join(r.asked)}: {r.reason}" for r in routes if r.reason]
+    return (*views.recording.notes, *failures, *missing)
 
 
 def _numbers(
