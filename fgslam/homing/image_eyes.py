@@ -25,7 +25,7 @@ from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.settings.homing_vector import HomingVectorSettings
 from fgslam.settings.omni_features import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.settings.omni_tracking import OmniTrackingSettings
-from fgslam.types import ByteArray, IntArray
+from fgslam.types import ByteArray, FloatArray, IntArray
 
 _SECTORS = 8  # of 45 degrees
 _DARK = 8.0  # mean grey value of what the camera sees
@@ -81,6 +81,16 @@ class ImageEyes:
     def track(self, image: ByteArray, time: float) -> TrackedBearings:
         """The features in the next image. Raises as :meth:`BearingTracker.track`."""
         return self._tracker.track(image, time)
+
+    def unwrapped(self, image: ByteArray) -> ByteArray:
+        """(height, width) grey view that points are tracked in. Raises as :meth:`track`."""
+        return self._tracker.steady.grey(image)
+
+    def places(self, tracked: TrackedBearings) -> FloatArray:
+        """(m, 2) column and row of tracked points in that view."""
+        rise = np.tan(tracked.elevation)
+        rays = np.column_stack([np.cos(tracked.bearing), np.sin(tracked.bearing), rise])
+        return self._tracker.view.pixels(rays)
 
     def _started(
         self,

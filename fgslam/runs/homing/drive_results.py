@@ -33,6 +33,7 @@ from fgslam.runs.homing.drive_files import (
     write_legs,
     write_logs,
 )
+from fgslam.runs.homing.drive_pictures import draw_leg_views
 from fgslam.runs.homing.driven import DrivenSeed
 from fgslam.runs.homing.replay import replay_homing
 from fgslam.runs.homing.results import HomingResult, Status, write_document, write_page
@@ -64,7 +65,8 @@ def finish_drives(
     )
     write_document(result, numbers)
     subtitle = f"{len(driven)} drives, seeds {config.seed} to {config.seed + config.trials - 1}"
-    write_page(result, subtitle, figures=tuple(_figures(config, driven)))
+    pictures = draw_leg_views(folder, driven[0].seed, driven[0].views) if driven else ()
+    write_page(result, subtitle, figures=tuple(_figures(config, driven)), pictures=pictures)
     return result
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.record import DriveRecord
+from fgslam.runs.homing.drive_pictures import LegView
 from fgslam.types import FloatArray
 
 
@@ -19,6 +20,7 @@ class DrivenSeed:
         memory: the path as it is remembered.
         outlines: of the world.
         leg_m: true length of the first leg as driven: start to target.
+        views: what the camera saw at the legs' ends; of the first seed alone.
     """
 
     seed: int
@@ -26,3 +28,4 @@ class DrivenSeed:
     memory: PathMemory
     outlines: tuple[FloatArray, ...]
     leg_m: float
+    views: tuple[LegView, ...] = ()

@@ -20,6 +20,7 @@ from fgslam.homing.path_following import PathFollower
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.steering import Steering
 from fgslam.homing_config import DrivingConfig
+from fgslam.runs.homing.drive_pictures import DriveWatcher, Unwrapping
 from fgslam.runs.homing.drive_results import finish_drives
 from fgslam.runs.homing.driven import DrivenSeed
 from fgslam.runs.homing.results import HomingResult, Progress, Status, Stopped, begin, jobs_of
@@ -113,9 +114,12 @@ def perform_drive(task: DriveTask) -> DrivenSeed:
     )
     driver = Driver(Steering(behaviour.steering), make_avoider(behaviour.avoidance))
     start = np.array(world.true_pose)
-    record = follow(world, follower, driver, behaviour.loop, world.target_poses)
+    shown = config.output.pictures if task.seed == config.seed else 0
+    watcher = DriveWatcher(eyes, follower) if shown and isinstance(eyes, Unwrapping) else None
+    record = follow(world, follower, driver, behaviour.loop, world.target_poses, watcher)
     leg = float(np.hypot(*(world.target_poses[0, :2] - start[:2])))
-    return DrivenSeed(task.seed, record, memory, tuple(world.outlines), leg)
+    views = () if watcher is None else watcher.views(shown)
+    return DrivenSeed(task.seed, record, memory, tuple(world.outlines), leg, views)
 
 
 def _displaced(world: PathWorld, radius: float, rng: np.random.Generator) -> FloatArray:
