@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from fgslam.frontend.omni.epipolar import EpipolarTest
-from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
+from fgslam.frontend.omni.homing_ransac import _cells, estimate_homing_vector
 from fgslam.frontend.omni.homing_refinement import HomingRefinement, RefinementPrior
 from fgslam.frontend.omni.local_map import make_local_map, triangulable, triangulate
 from fgslam.homing_types import (
@@ -117,6 +117,36 @@ def test_both_views_from_one_place() -> None:
     assert isinstance(refusal, Refusal)
     assert refusal.reason is RefusalReason.AT_TARGET
     assert refusal.rotation == pytest.approx(views.rotation, abs=np.deg2rad(0.2))
+
+
+@pytest.mark.parametrize("half_width_deg", [2.0, 8.0])
+def test_one_thing_of_the_same_kind_elsewhere_is_no_arrival(half_width_deg: float) -> None:
+    """A poster that hangs in another room, too, amid wrong matches: that looks like a turn."""
+    reasons = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        angles = rng.uniform(-np.pi, np.pi, (80, 4))
+        angles[:, 1::2] = rng.uniform(0.05, 0.6, (80, 2)) * rng.choice([-1.0, 1.0], (80, 1))
+        size = np.deg2rad(half_width_deg)
+        angles[:20, :2] = np.array([0.5, 0.2]) + rng.uniform(-size, size, (20, 2))
+        angles[:20, 2:] = angles[:20, :2] + [1.0, 0.0] + rng.normal(0.0, 0.004, (20, 2))
+        quality = np.where(np.arange(80) < 20, 0.7, rng.uniform(0.2, 0.5, 80))
+        matches = dataclasses.replace(make_matches(angles, HALF_DEGREE), quality=quality)
+        found = estimate_homing_vector(matches, SETTINGS, rng)
+        reasons.append(found.reason if isinstance(found, Refusal) else None)
+    assert RefusalReason.AT_TARGET not in reasons
+    assert reasons.count(None) <= 1  # a rigid thing fits some motion, too; hardly ever best
+
+
+def test_witnesses_are_counted_across_the_seam() -> None:
+    """What lies behind is one thing on both sides of the turn from +pi to -pi."""
+    behind = np.pi - np.deg2rad([0.3, 0.6, -0.3, -0.6])
+    angles = np.column_stack([wrap(behind), np.full(4, 0.2), np.full(4, 1.0), np.full(4, 0.2)])
+    for turn in (0.0, 1.0):
+        turned = angles + np.array([0.0, 0.0, turn, 0.0])
+        assert len(np.unique(_cells(make_matches(turned, HALF_DEGREE)))) == 1
+    apart = angles + np.deg2rad(3.0) * np.arange(4)[:, None] * np.array([0.0, 1.0, 0.0, 0.0])
+    assert len(np.unique(_cells(make_matches(apart, HALF_DEGREE)))) == 4
 
 
 def test_epipolar_residual_of_truth_is_zero_and_of_unit_variance_under_noise() -> None:

@@ -180,3 +180,13 @@ def test_few_segments_match_nothing() -> None:
     assert isinstance(none, ColumnSegments)
     assert len(match_columns(some, none, OmniMatchingSettings())) == 0
     assert len(match_columns(none, some, OmniMatchingSettings())) == 0
+
+
+def test_two_equal_segments_are_rivals_of_a_third_equal_one() -> None:
+    one = np.array([[1.0, 2.0], [5.0, 5.0]])
+    i, j, distance, ratio = nearest_segments(one, np.array([[1.0, 2.0], [1.0, 2.0], [5.0, 6.0]]))
+    assert i.tolist() == [0, 1]
+    assert distance.tolist() == [0.0, 1.0]
+    assert ratio[0] == 1.0
+    assert ratio[1] == pytest.approx(0.2)
+    assert j[1] == 2

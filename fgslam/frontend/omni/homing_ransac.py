@@ -22,7 +22,7 @@ from fgslam.frontend.omni.match_odds import (
 )
 from fgslam.frontend.omni.two_point import TwoPointSamples, solve_two_point
 from fgslam.homing_types import BearingMatches, HomingVector, Refusal, RefusalReason
-from fgslam.planar import wrap
+from fgslam.planar import unit, wrap
 from fgslam.settings.homing_vector import HomingVectorSettings
 from fgslam.types import BoolArray, FloatArray, IntArray
 
@@ -33,7 +33,9 @@ _REFINED = 8  # different hypotheses that are refined, the best supported first
 _ALIKE = np.deg2rad(5.0)  # hypotheses closer than this lead to the same refined solution, mostly
 _SAME = np.deg2rad(0.2)  # refined solutions closer than this are one
 _TEMPER = 2.0  # residuals have common causes: so many of them count as one, see `covariance`
-_CELL = np.deg2rad(2.0)  # matches within one cell in both views are one witness
+_CELLS_AROUND = 180  # of 2 degrees: matches within one cell in both views are one witness
+_TURNED = 3.0  # times the median's limit: what is explained by the turn alone
+_LEAST_SPREAD = 0.25  # of directions; half a turn has 0.31, all around 0.71
 
 
 def estimate_homing_vector(
@@ -211,14 +213,25 @@ class _Search:
         return len(np.unique(self._cells[which]))
 
     def turn_at_target(self, best: Refined) -> Refusal | None:
-        """Both views from one place (D6): there is a turn, but no direction."""
+        """Both views from one place (D6): there is a turn, but no direction.
+
+        That must be as well supported as any answer, and from enough sides: a single thing looks
+        alike from anywhere, and like turned when it is another one of its kind.
+        """
         m, limit = self._matches, np.deg2rad(self._settings.at_target_parallax_deg)
         if not np.any(best.inliers):
             return None
-        turns = wrap(m.bearing_a - m.bearing_b)[best.inliers]
-        psi = float(np.angle(np.mean(np.exp(1j * turns))))
-        parallax = float(np.median(np.abs(wrap(turns - psi))))
+        turns = wrap(m.bearing_a - m.bearing_b)
+        psi = float(np.angle(np.mean(np.exp(1j * turns[best.inliers]))))
+        parallaxes = np.abs(wrap(turns - psi))
+        parallax = float(np.median(parallaxes[best.inliers]))
         if parallax >= limit:
+            return None
+        turned = best.inliers & (parallaxes < _TURNED * limit)
+        if (
+            self.witnesses(turned) < self._settings.min_inliers
+            or _spread(m.bearing_a[turned]) < _LEAST_SPREAD
+        ):
             return None
         return Refusal(
             RefusalReason.AT_TARGET,
@@ -278,6 +291,16 @@ class _Search:
         return tests - log_likelihood_ratio(gains[witnesses], self._right[witnesses])
 
 
+def _spread(bearing: FloatArray) -> float:
+    """How well bearings (n,) would show a short leg, whichever way it goes.
+
+    A leg of length r shifts what is at distance d by r / d times the sine of its bearing from the
+    leg; what is the same for all is taken for a turn. So the measure is the standard deviation of
+    unit vectors along the direction where it is least.
+    """
+    return float(np.sqrt(max(np.linalg.eigvalsh(np.cov(unit(bearing).T, bias=True))[0], 0.0)))
+
+
 def _one_a_cell(gains: FloatArray, cells: IntArray) -> IntArray:
     """(m,) of each cell the match that agrees best: the others say the same again."""
     order = np.lexsort((-gains, cells))
@@ -331,10 +354,10 @@ def _log_ratios(
 
 def _cells(matches: BearingMatches) -> IntArray:
     """(n,) number of the cell of both views that a match lies in: one cell, one witness."""
-    grid = np.column_stack(
-        [matches.bearing_a, matches.bearing_b, matches.elevation_a, matches.elevation_b]
-    )
-    _, cells = np.unique(np.round(grid / _CELL), axis=0, return_inverse=True)
+    angles = [matches.bearing_a, matches.bearing_b, matches.elevation_a, matches.elevation_b]
+    grid = np.round(np.column_stack(angles) * (_CELLS_AROUND / (2.0 * np.pi)))
+    grid[:, :2] %= _CELLS_AROUND  # both sides of the seam are one cell
+    _, cells = np.unique(grid, axis=0, return_inverse=True)
     return np.asarray(cells.ravel(), dtype=np.int64)
 
 

@@ -188,7 +188,9 @@ def nearest_segments(
     distance, nearest = cKDTree(b).query(a, k=2)
     back = cKDTree(a).query(b, k=1)[1]
     i = np.flatnonzero(back[nearest[:, 0]] == np.arange(len(a)))
-    ratio = distance[i, 0] / np.maximum(distance[i, 1], 1e-12)
+    # A second one just as near, be it at no distance at all, is a full rival.
+    ratio = np.ones(len(i))
+    np.divide(distance[i, 0], distance[i, 1], out=ratio, where=distance[i, 1] > 0.0)
     return i, nearest[i, 0].astype(np.int64), distance[i, 0], ratio
 
 
