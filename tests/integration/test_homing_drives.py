@@ -10,20 +10,26 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from landmark_world import drive_path, winding_path
+from landmark_world import drive_path, make_follower, winding_path
 
 from fgslam.evaluation.homing import homing_errors
+from fgslam.homing.avoidance import NoAvoidance
+from fgslam.homing.closed_loop import Driver, follow
 from fgslam.homing.drive_scores import cross_track, pass_distances, truly_arrived
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.record import DriveRecord
+from fgslam.homing.steering import Steering
 from fgslam.homing_config import PathFollowingConfig, parse_homing
+from fgslam.homing_types import TrackedBearings
 from fgslam.runs.homing.drive_files import bearing_log
+from fgslam.runs.homing.drive_pictures import DriveWatcher, Unwrapping, draw_leg_views
 from fgslam.runs.homing.drive_results import drive_numbers, finish_drives
 from fgslam.runs.homing.driven import DrivenSeed
 from fgslam.runs.homing.driving import _displaced, with_one_leg
 from fgslam.runs.homing.logs import load_bearing_logs
 from fgslam.runs.homing.replay import replay_homing
 from fgslam.runs.homing.results import begin
+from fgslam.settings.homing_behaviour import HomingBehaviourSettings
 
 EKF = {"kind": "homing_ekf"}
 
@@ -155,3 +161,44 @@ def test_displaced_starts_stay_near_and_free() -> None:
     assert (np.hypot(*places[:, :2].T) <= 1.0).all()
     assert (places[:, 0] <= 0.3).all()
     assert np.ptp(places[:, 2]) > 3.0
+
+
+class ShowingEyes:
+    """Eyes of the landmark world, with a grey picture whose columns are bearings in degrees."""
+
+    def __init__(self, eyes: Any) -> None:
+        self._eyes = eyes
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._eyes, name)
+
+    def unwrapped(self, image: np.ndarray) -> np.ndarray:
+        return np.full((30, 360), 90, np.uint8)
+
+    def places(self, tracked: TrackedBearings) -> np.ndarray:
+        columns = np.rad2deg(np.pi - tracked.bearing)
+        return np.column_stack([columns, np.full(len(tracked), 15.0)])
+
+
+def test_the_camera_s_last_view_of_each_leg_is_drawn(tmp_path: Path) -> None:
+    setting, behaviour = winding_path(4, 3, 2.0), HomingBehaviourSettings()
+    follower = make_follower(setting, behaviour, None)
+    assert not isinstance(setting.eyes, Unwrapping)
+    watcher = DriveWatcher(cast(Unwrapping, ShowingEyes(setting.eyes)), follower)
+    driver = Driver(Steering(behaviour.steering), NoAvoidance())
+    record = follow(setting.world, follower, driver, behaviour.loop, setting.targets, watch=watcher)
+    assert record.arrived
+    assert [view.target for view in watcher.views(8)] == [0, 1, 2]
+    assert [view.target for view in watcher.views(1)] == [2]
+    assert watcher.views(0) == ()
+    views = watcher.views(2)
+    assert len(views) == 2
+    last = record.homings[-1].tracks[-1]  # nothing is drawn that another image showed
+    assert f"{last.time:.1f} s, {len(last)} tracks" in views[-1].told
+    ends = np.array([trail[-1, 0] for trail in views[-1].trails])
+    np.testing.assert_allclose(ends, np.rad2deg(np.pi - last.bearing))
+    assert max(len(trail) for trail in views[-1].trails) == 15
+    pictures = draw_leg_views(tmp_path, 4, views)
+    assert all((tmp_path / "pictures" / f"leg_{v.target + 1:02d}.png").is_file() for v in views)
+    assert all(picture.content.startswith(b"\x89PNG") for picture in pictures)
+    assert "Seed 4, leg 3" in pictures[-1].caption

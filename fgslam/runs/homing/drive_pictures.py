@@ -74,8 +74,10 @@ class DriveWatcher:
             i: np.vstack([before.get(i, none)[1 - _TRAIL :], place])
             for i, place in zip(homing.tracked.ids.tolist(), places, strict=True)
         }
-        told = f"{len(places)} tracks, {command.remaining:.2f} of the leg left: {command.reason}"
-        self._last[command.target] = (image, self._trails, f"{command.time:.1f} s, {told}")
+        told = (
+            f"{command.time:.1f} s, {len(places)} tracks, {command.remaining:.2f} of the leg left"
+        )
+        self._last[command.target] = (image, self._trails, told)
 
     def views(self, most: int) -> tuple[LegView, ...]:
         """At most so many legs, spread evenly, the last one among them."""

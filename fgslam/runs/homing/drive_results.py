@@ -64,7 +64,9 @@ def finish_drives(
         config, folder, status, _verdict(numbers), _tables(driven), tuple(failures)
     )
     write_document(result, numbers)
-    subtitle = f"{len(driven)} drives, seeds {config.seed} to {config.seed + config.trials - 1}"
+    subtitle = f"seeds {config.seed} to {config.seed + config.trials - 1}, {len(driven)} driven"
+    if config.trials == 1:
+        subtitle = f"one drive, seed {config.seed}"
     pictures = draw_leg_views(folder, driven[0].seed, driven[0].views) if driven else ()
     write_page(result, subtitle, figures=tuple(_figures(config, driven)), pictures=pictures)
     return result
