@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TypeAlias
 
@@ -95,8 +96,10 @@ def pictures_in(folder: Path, pattern: str = "*") -> list[Path]:
         raise DatasetError(f"{folder} does not exist or is no folder; check dataset.path")
     found = [
         path
-        for path in folder.glob(pattern)
-        if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
+        for path in folder.iterdir()
+        if fnmatchcase(path.name, pattern)
+        and path.suffix.lower() in IMAGE_SUFFIXES
+        and path.is_file()
     ]
     if not found:
         raise DatasetError(

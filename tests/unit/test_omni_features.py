@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fgslam.errors import FrameError
-from fgslam.frontend.omni.features import OmniFeatureExtractor
+from fgslam.frontend.omni.features import OmniFeatureExtractor, _View
 from fgslam.frontend.omni.matching import match_features, match_sift
 from fgslam.frontend.omni.plain_sift import match_plain, plain_sift
 from fgslam.frontend.omni.sift import up_in_image, wrapping_period
@@ -124,6 +124,16 @@ def test_dark_and_blank_images_have_no_features(camera: object, view: str) -> No
         found = each.extract(np.full(shape, grey, np.uint8))
         assert (len(found.sift), len(found.columns)) == (0, 0)
         assert len(match_features(found, found, OmniMatchingSettings())) == 0
+
+
+def test_a_cropped_panorama_leaves_unseen_rows_black() -> None:
+    whole = Equirectangular(257, 129)
+    cropped = Equirectangular(257, 65, np.pi / 4, -np.pi / 4)
+    view = _View(cropped, whole)
+    shown = view.of(np.full((65, 257, 3), 200, np.uint8))
+    assert view.seen is not None
+    assert not shown[~view.seen].any()
+    assert np.all(shown[33:96] == 200)
 
 
 def test_another_size_is_refused() -> None:

@@ -24,11 +24,13 @@ class _View:
         self._maps = unwrap_maps(source, target)
         seen = self._maps[0] > -1.0
         self.seen = None if seen.all() else seen
-        self._wraps = wrapping_period(source) is not None
 
     def of(self, image: Image) -> Image:
-        border = cv2.BORDER_WRAP if self._wraps else cv2.BORDER_CONSTANT
-        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=border))
+        """The picture, black where the source does not see.
+
+        A panorama's seam needs no care: its last column repeats the first.
+        """
+        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR))
 
 
 class OmniFeatureExtractor:
