@@ -125,6 +125,7 @@ class HomingSummary:
         rotation_median_deg, rotation_p95_deg: of the rotation.
         distance_median, distance_p95: of the distance left, legs; None where unknown.
         diverged: trials whose direction is off by more than :data:`DIVERGED_RAD`, or no number.
+        unjudged: trials without a covariance of the home vector, which no NEES counts.
         robot, target, joint, home: NEES per degree of freedom with its band; None without.
     """
 
@@ -136,6 +137,7 @@ class HomingSummary:
     distance_median: float | None
     distance_p95: float | None
     diverged: int
+    unjudged: int
     robot: Consistency | None
     target: Consistency | None
     joint: Consistency | None
@@ -162,6 +164,7 @@ def summarise_homings(errors: Sequence[HomingErrors]) -> HomingSummary:
         distance_median=float(np.median(known)) if len(known) else None,
         distance_p95=float(np.quantile(known, 0.95)) if len(known) else None,
         diverged=int(np.count_nonzero(~(direction <= DIVERGED_RAD))),
+        unjudged=sum(not one.home.dof.any() for one in last),
         robot=judge([one.robot for one in last]),
         target=judge([one.target for one in last]),
         joint=judge([one.joint for one in last]),

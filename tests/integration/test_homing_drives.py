@@ -30,6 +30,7 @@ from fgslam.runs.homing.logs import load_bearing_logs
 from fgslam.runs.homing.replay import replay_homing
 from fgslam.runs.homing.results import begin
 from fgslam.settings.homing_behaviour import HomingBehaviourSettings
+from fgslam.settings.homing_estimators import HomingGraphSettings
 
 EKF = {"kind": "homing_ekf"}
 
@@ -69,6 +70,20 @@ def test_a_replayed_log_tells_the_true_way_home(record: DriveRecord) -> None:
     errors = homing_errors(replayed.estimates, log.truth)
     half = len(log.images) // 2
     assert np.rad2deg(np.median(np.abs(errors.direction[:half]))) < 3.0
+
+
+def test_covariances_of_landmarks_are_kept_where_wanted(record: DriveRecord) -> None:
+    """They are not what a robot drives by, and so not in the time of an update."""
+    log = bearing_log(record, record.homings[0])
+    graph = HomingGraphSettings()
+    few = log.images[:2]
+    plain, whole = (replay_homing(log.start, few, graph, landmarks=b) for b in (False, True))
+    assert np.isnan(plain.estimates[-1].landmark_covariances).all()
+    assert np.isfinite(whole.estimates[-1].landmark_covariances).all()
+    np.testing.assert_array_equal(plain.estimates[-1].robot, whole.estimates[-1].robot)
+    np.testing.assert_allclose(
+        plain.estimates[-1].covariance, whole.estimates[-1].covariance, rtol=1e-6, atol=1e-14
+    )
 
 
 def test_files_and_numbers_of_drives(record: DriveRecord, tmp_path: Path) -> None:

@@ -100,3 +100,14 @@ def test_consistent_estimates_are_found_consistent_and_divergence_is_counted() -
     ]
     assert summarise_homings(over).diverged == 1
     assert summarise_homings(runs).trials == 400
+
+
+def test_estimates_without_a_covariance_are_counted() -> None:
+    """No NEES can tell of them; a verdict over the others must not pass for one over all."""
+    one = HomingTruth(TRUTH.target, TRUTH.robots[:1], TRUTH.landmarks)
+    exact = in_legs(TRUTH.robots[0]), in_legs(TRUTH.target)
+    known, unknown = estimate(*exact, np.eye(6)), estimate(*exact, np.full((6, 6), np.nan))
+    summary = summarise_homings([homing_errors([e], one) for e in (known, unknown, unknown)])
+    assert (summary.trials, summary.unjudged) == (3, 2)
+    assert summary.home is not None
+    assert summary.home.items == 1

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from homings import trial
 
+from fgslam.backend.homing import ekf
 from fgslam.backend.homing.baselines import AverageDisplacement, AverageLandmarkVector
 from fgslam.backend.homing.ekf import HomingEkf
-from fgslam.backend.homing.ekf_model import initial_state, motion
+from fgslam.backend.homing.ekf_model import FilterState, initial_state, motion
+from fgslam.errors import EstimatorError
 from fgslam.homing_types import HomingStart, HomingVector, LocalMap, TrackedBearings
 from fgslam.planar import bearings, wrap
 from fgslam.settings.homing_estimators import PAPER, FilterMotionSettings, HomingEkfSettings
@@ -160,3 +162,24 @@ def test_a_compass_takes_the_rotation_over(
     estimator.update(image, compass=-0.8)
     assert estimator.estimate().home().rotation == pytest.approx(-0.8)
     assert estimator.estimate().home().direction == pytest.approx(np.pi / 4 - 0.5, abs=0.02)
+
+
+@pytest.mark.parametrize("broken", ["covariance", "solve"])
+def test_a_filter_that_breaks_down_says_so_and_stays(
+    broken: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A covariance that is no number is no estimate, and a failed solution no traceback."""
+    case = trial(3)
+    estimator = HomingEkf(case.start, HomingEkfSettings())
+    estimator.update(case.tracks[0])
+    before = estimator.state
+
+    def spoilt(state: FilterState, *_: object) -> FilterState:
+        if broken == "solve":
+            raise np.linalg.LinAlgError("Singular matrix")
+        return replace(state, covariance=np.full_like(state.covariance, np.nan))
+
+    monkeypatch.setattr(ekf, "updated", spoilt)
+    with pytest.raises(EstimatorError, match=r"filter.* at \d"):
+        estimator.update(case.tracks[1])
+    assert estimator.state is before

@@ -53,16 +53,24 @@ class HomingEkf:
         return self._state
 
     def update(self, tracked: TrackedBearings) -> None:
-        """Takes in one image; see the protocol."""
+        """Takes in one image; see the protocol.
+
+        Raises:
+            EstimatorError: as the protocol says, or the filter ran to infinity; it stays as it
+                was before then.
+        """
         step, taken = self._features.take(tracked)
         state = self._state.keeping(np.isin(self._state.ids, self._features.alive))
         state = predicted(state, step, self._settings.motion)
         rows = taken & np.isin(tracked.ids, state.ids)
         seen = seen_from_robot(state, tracked.bearing[rows], tracked.sigma_bearing[rows])
-        state = updated(state, seen, self._settings.gate_sigmas)
-        if self._settings.target == "separate":
-            state = self._with_target(state)
-        if not np.isfinite(state.mean).all():
+        try:
+            state = updated(state, seen, self._settings.gate_sigmas)
+            if self._settings.target == "separate":
+                state = self._with_target(state)
+        except np.linalg.LinAlgError as error:
+            raise EstimatorError(f"the filter failed at {tracked.time:.3f} s: {error}") from None
+        if not (np.isfinite(state.mean).all() and np.isfinite(state.covariance).all()):
             raise EstimatorError(f"the filter's state ran to infinity at {tracked.time:.3f} s")
         self._state = state
 

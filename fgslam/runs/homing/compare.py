@@ -121,8 +121,10 @@ def _replay_all(
 
 
 def _perform(task: _Task) -> dict[str, ReplayedHoming]:
+    shown = next(iter(task.logs), None)  # the local map that is drawn is the first log's
     return {
-        name: replay_homing(log.start, log.images, task.settings) for name, log in task.logs.items()
+        name: replay_homing(log.start, log.images, task.settings, landmarks=name == shown)
+        for name, log in task.logs.items()
     }
 
 

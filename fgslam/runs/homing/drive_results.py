@@ -219,7 +219,7 @@ def _figures(config: DrivingConfig, driven: Sequence[DrivenSeed]) -> Iterator[Fi
     homing = next((h for h in first.record.homings if h.tracks), None)
     if homing is not None:
         log = bearing_log(first.record, homing)
-        replayed = replay_homing(log.start, log.images, config.estimator)
+        replayed = replay_homing(log.start, log.images, config.estimator, landmarks=True)
         heading = f"The local map on the way to target {homing.target + 1}"
         if replayed.estimates:
             yield local_map_figure(replayed.estimates, log.truth, heading=heading)

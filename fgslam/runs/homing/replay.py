@@ -22,7 +22,8 @@ class ReplayedHoming:
     Attributes:
         title, kind: which estimator.
         estimates: one after each image.
-        update_ms: (k,) time of each update and estimate, milliseconds.
+        update_ms: (k,) time of each update, and of the estimate that a robot drives by: without
+            covariances of landmarks; milliseconds.
         failure: why it ended early; empty where it did not.
     """
 
@@ -34,9 +35,15 @@ class ReplayedHoming:
 
 
 def replay_homing(
-    start: HomingStart, tracks: Sequence[TrackedBearings], settings: HomingEstimatorSettings
+    start: HomingStart,
+    tracks: Sequence[TrackedBearings],
+    settings: HomingEstimatorSettings,
+    landmarks: bool = False,
 ) -> ReplayedHoming:
-    """Runs one estimator over all images; an error ends it, with what it had until then."""
+    """Runs one estimator over all images; an error ends it, with what it had until then.
+
+    ``landmarks``: their covariances are kept, too; asked for apart from what is timed.
+    """
     estimates: list[HomingEstimate] = []
     times: list[float] = []
     failure = ""
@@ -45,9 +52,9 @@ def replay_homing(
         for tracked in tracks:
             began = time.perf_counter()
             estimator.update(tracked)
-            estimate = estimator.estimate()
+            estimate = estimator.estimate(landmarks=False)
             times.append(1e3 * (time.perf_counter() - began))
-            estimates.append(estimate)
+            estimates.append(estimator.estimate() if landmarks else estimate)
     except EstimatorError as error:
         failure = f"image {len(estimates)}: {error}"
     return ReplayedHoming(settings.title, settings.kind, tuple(estimates), np.array(times), failure)

@@ -176,7 +176,7 @@ TRIAL_COLUMNS = (
     ),
     Column("NEES target", "the same of the target"),
     Column("NEES home", "the same of the home vector"),
-    Column("update ms", "median time of an update with its estimate"),
+    Column("update ms", "median time of an update, with the estimate that a robot drives by"),
 )
 
 
