@@ -141,6 +141,10 @@ def test_another_size_is_refused() -> None:
         extractor().extract(np.zeros((256, 512, 3), np.uint8))
     with pytest.raises(FrameError, match="camera's are uint8"):
         extractor().extract(np.zeros((257, 513), np.uint8))
+    each = extractor()
+    for extract in (each.extract_sift, each.extract_columns):
+        with pytest.raises(FrameError, match="camera's are uint8"):
+            extract(np.zeros((512, 1024, 3), np.uint8))
 
 
 @pytest.mark.parametrize("view", ["raw", "unwrapped"])

@@ -7,6 +7,7 @@ import numpy as np
 
 from fgslam.errors import FrameError
 from fgslam.frontend.omni.column_segments import ColumnSegmentFinder, empty_segments
+from fgslam.frontend.omni.epipolar import unit_rays
 from fgslam.frontend.omni.sift import UprightSift, empty_features, up_in_image, wrapping_period
 from fgslam.homing_types import ColumnSegments, OmniFeatures, UprightFeatures
 from fgslam.omni_cameras.panoramas import Cylinder, Equirectangular
@@ -56,11 +57,11 @@ class OmniFeatureExtractor:
 
         A blank or dark image has none. Raises FrameError where the image is not this camera's.
         """
-        self._check(image)
         return OmniFeatures(self.extract_sift(image), self.extract_columns(image))
 
     def extract_sift(self, image: Image) -> UprightFeatures:
         """Upright SIFT features alone; none where the settings exclude them."""
+        self._check(image)
         if self._kinds == "columns":
             return empty_features()
         if self._sift_view is None:
@@ -70,6 +71,7 @@ class OmniFeatureExtractor:
 
     def extract_columns(self, image: Image) -> ColumnSegments:
         """Column segments alone; none where the settings exclude them."""
+        self._check(image)
         if self._kinds == "sift":
             return empty_segments()
         return self._columns.extract(self._cylinder.of(image))
@@ -94,15 +96,7 @@ class OmniFeatureExtractor:
     def _in_given_image(self, found: UprightFeatures) -> UprightFeatures:
         if not len(found):
             return found
-        level = np.cos(found.elevation)
-        rays = np.column_stack(
-            [
-                level * np.cos(found.bearing),
-                level * np.sin(found.bearing),
-                np.sin(found.elevation),
-            ]
-        )
-        pixels = self._camera.pixels(rays)
+        pixels = self._camera.pixels(unit_rays(found.bearing, found.elevation))
         seen = np.isfinite(pixels).all(axis=1)
         return UprightFeatures(
             pixels[seen],
