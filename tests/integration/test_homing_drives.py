@@ -105,6 +105,18 @@ def test_files_and_numbers_of_drives(record: DriveRecord, tmp_path: Path) -> Non
     assert len(PathMemory.load(tmp_path / "path_memory.npz")) == 2
 
 
+def test_a_drive_by_an_average_has_a_page_without_a_map(
+    record: DriveRecord, tmp_path: Path
+) -> None:
+    """Estimators without a map, and without a covariance, are no reason to lose a drive."""
+    config = configuration(estimator={"kind": "alv"})
+    begin(config, tmp_path, "refuse", {})
+    finish_drives(config, tmp_path, "finished", [driven(record)], [])
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "plot-drive" in page
+    assert "plot-local-map" not in page
+
+
 def test_numbers_of_no_drive_at_all_are_null() -> None:
     numbers = drive_numbers([])
     assert numbers["drives"] == 0

@@ -177,7 +177,8 @@ def _layout(estimates: Sequence[HomingEstimate]) -> dict[str, Any]:
     """Axes that do not jump from moment to moment; far features may lie outside."""
     points = [np.array([[0.0, 0.0], [1.0, 0.0]])]
     points += [np.vstack([e.landmarks, e.robot[None, :2], e.target[None, :2]]) for e in estimates]
-    seen = upwards(np.vstack(points))
+    every = np.vstack(points)
+    seen = upwards(every[np.isfinite(every).all(axis=1)])
     ranges = {axis: np.percentile(values, _BULK) for axis, values in seen.items()}
     padded = {
         axis: [float(low - 0.1 * (high - low) - 0.2), float(high + 0.1 * (high - low) + 0.2)]

@@ -221,7 +221,8 @@ def _figures(config: DrivingConfig, driven: Sequence[DrivenSeed]) -> Iterator[Fi
         log = bearing_log(first.record, homing)
         replayed = replay_homing(log.start, log.images, config.estimator, landmarks=True)
         heading = f"The local map on the way to target {homing.target + 1}"
-        if replayed.estimates:
+        # Averages of bearings have no map to show.
+        if replayed.estimates and np.isfinite(replayed.estimates[-1].landmarks).all():
             yield local_map_figure(replayed.estimates, log.truth, heading=heading)
     yield _remaining(driven[: config.output.logs] or driven[:1])
     if config.start_offset_m > 0.0 and len(driven) > 1:
