@@ -113,8 +113,8 @@ def test_a_drive_by_an_average_has_a_page_without_a_map(
     begin(config, tmp_path, "refuse", {})
     finish_drives(config, tmp_path, "finished", [driven(record)], [])
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "plot-drive" in page
-    assert "plot-local-map" not in page
+    assert 'id="plot-drive"' in page
+    assert 'id="plot-local-map"' not in page
 
 
 def test_numbers_of_no_drive_at_all_are_null() -> None:
