@@ -162,6 +162,24 @@ def test_covariances_are_symmetric_and_positive(
     assert estimate.landmarks.shape == (len(estimate.ids), 2)
 
 
+@every_map
+def test_features_without_elevations_are_estimated_by_their_bearings(
+    case: Trial, settings: HomingEstimatorSettings
+) -> None:
+    """A height that no view tells is no variable; the others keep theirs."""
+    matches = case.start.matches
+    unknown = np.arange(len(matches)) % 2 == 0
+    up = [np.where(unknown, np.nan, e) for e in (matches.elevation_a, matches.elevation_b)]
+    some = replace(matches, elevation_a=up[0], elevation_b=up[1])
+    estimator = make_homing_estimator(replace(case.start, matches=some), settings)
+    for image in case.tracks:
+        estimator.update(image)
+    found = estimator.estimate()
+    assert np.isfinite(found.covariance).all()
+    assert len(found.ids) > 0
+    assert np.isfinite(found.landmark_covariances).all()
+
+
 def test_start_must_fit_together(case: Trial) -> None:
     start = replace(case.start, matches=case.start.matches.taken(np.arange(3)))
     with pytest.raises(EstimatorError, match="3 matches for"):

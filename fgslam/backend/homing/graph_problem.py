@@ -80,6 +80,7 @@ class HomingProblem:
         self._density = np.array([motion.forward, motion.sideways, turning]) ** 2
         self._ids = start.local_map.ids
         self._entered = np.zeros(len(self._ids), np.bool_)
+        self._tall = np.zeros(len(self._ids), np.bool_)  # their height is a variable
         self._guesses = np.full((len(self._ids), 2), np.nan)
         self._sighted = np.full((len(self._ids), 2), np.nan)  # distance and deviation, when waiting
         self._agreed = np.zeros(len(self._ids), np.int64)
@@ -188,7 +189,7 @@ class HomingProblem:
         new.keys.add(landmark)
         sigma = float(tracked.sigma_bearing[k])
         new.graph.add(self._robust.bearing(pose, landmark, float(tracked.bearing[k]), sigma))
-        if self._settings.elevations == "all" and np.isfinite(tracked.elevation[k]):
+        if self._tall[row] and np.isfinite(tracked.elevation[k]):
             new.keys.add(height_key(row))
             measured, sigma = float(tracked.elevation[k]), float(tracked.sigma_elevation[k])
             new.graph.add(self._robust.elevation(pose, landmark, height_key(row), measured, sigma))
@@ -214,9 +215,10 @@ class HomingProblem:
         at_start, at_target = float(matches.bearing_a[row]), float(matches.bearing_b[row])
         new.graph.add(self._robust.bearing(pose_key(0), landmark, at_start, from_start))
         new.graph.add(self._robust.bearing(target_key(), landmark, at_target, from_target))
-        if settings.elevations == "all":
+        known = bool(np.isfinite(self._elevations(row)).all())
+        if settings.elevations == "all" and known:
             self._enter_height(new, row, distance)
-        elif settings.elevations == "two_views" and np.isfinite(self._elevations(row)).all():
+        elif settings.elevations == "two_views" and known:
             vector = self._start.vector
             at = unit(np.array(vector.direction))
             both = self._elevations(row)
@@ -235,6 +237,7 @@ class HomingProblem:
         up, up_target = float(matches.elevation_a[row]), float(matches.elevation_b[row])
         _, sigma, _, sigma_target = matches.sigma[row].tolist()
         tall = distance * float(np.tan(up))
+        self._tall[row] = True
         new.values.insert(height, tall)
         new.keys.add(height)
         new.graph.add(weak_height_prior(height, tall, self._settings.prior_distances * distance))
