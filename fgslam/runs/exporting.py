@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from fgslam.errors import ConfigError, DatasetError
-from fgslam.export.atomic import is_run_folder
+from fgslam.export.atomic import RUN_MARKER, is_run_folder
 from fgslam.export.metrics import read_metrics
 from fgslam.export.point_cloud import read_ply, write_map
 from fgslam.export.trajectories import read_tum, write_trajectory
+from fgslam.homing_config import is_homing
 from fgslam.runs.checkpoint import LOG_FILE
 from fgslam.runs.graph_export import export_graph
 
@@ -67,6 +68,11 @@ def _require_elsewhere(run: Path, targets: tuple[Path | None, ...]) -> None:
 def _estimator_of(run: Path, wanted: str | None) -> str:
     if not is_run_folder(run):
         raise DatasetError(f"{run}: not a run folder (no config.yaml); give what fgslam run wrote")
+    if is_homing(run / RUN_MARKER):
+        raise DatasetError(
+            f"{run}: is a homing run, and has no graph of SLAM to export; its tables are "
+            "trajectory.csv and logs/*.npz"
+        )
     found = sorted(path.parent.name for path in run.glob("*/final.tum"))
     if not found:
         raise DatasetError(f"{run}: holds no results yet; resume the run first")

@@ -58,6 +58,11 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
     metrics = read_metrics(folder / "metrics.json")
     config_text = _text(_find(places, RUN_MARKER))
     config = _mapping(config_text)
+    if "task" in config:
+        raise DatasetError(
+            f"{folder}: is a homing run ({config['task']}), and this needs one of SLAM; open its "
+            "report.html, or give it to `fgslam compare`"
+        )
     truth_file = _find(places, "ground_truth.tum")
     truth = None if truth_file is None else read_tum(truth_file)
     live = _live_title(config)

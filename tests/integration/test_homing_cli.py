@@ -13,9 +13,11 @@ from PIL import Image as PictureFile
 from running import main, write_config
 
 from fgslam.bearing_log import BearingLog
+from fgslam.errors import DatasetError
 from fgslam.export.atomic import RUN_MARKER
 from fgslam.homing_config import load_homing, parse_homing
 from fgslam.runs.homing.run import run_homing
+from fgslam.runs.report import report_from_folder
 
 Capture = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch
@@ -153,6 +155,15 @@ def test_other_commands_say_that_it_is_homing(
 ) -> None:
     line = mistake(capfd, monkeypatch, "inspect", trials / RUN_MARKER)
     assert "task homing_trials is a homing experiment" in line
+    line = mistake(capfd, monkeypatch, "export", trials, "--graph", trials / "x.g2o")
+    assert "is a homing run, and has no graph of SLAM to export" in line
+
+
+def test_the_page_of_slam_never_takes_the_place_of_homing_s(trials: Path) -> None:
+    page = (trials / "report.html").read_bytes()
+    with pytest.raises(DatasetError, match=r"is a homing run \(homing_trials\)"):
+        report_from_folder(trials)
+    assert (trials / "report.html").read_bytes() == page
 
 
 def test_stopped_at_once_the_files_are_valid(tmp_path: Path) -> None:
