@@ -21,7 +21,7 @@ from fgslam.homing.record import DriveRecord
 from fgslam.homing.steering import Steering
 from fgslam.homing_config import PathFollowingConfig, parse_homing
 from fgslam.homing_types import TrackedBearings
-from fgslam.runs.homing.drive_files import bearing_log
+from fgslam.runs.homing.drive_files import bearing_log, drive_of
 from fgslam.runs.homing.drive_pictures import DriveWatcher, Unwrapping, draw_leg_views
 from fgslam.runs.homing.drive_results import drive_numbers, finish_drives
 from fgslam.runs.homing.driven import DrivenSeed
@@ -115,6 +115,17 @@ def test_a_drive_by_an_average_has_a_page_without_a_map(
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert 'id="plot-drive"' in page
     assert 'id="plot-local-map"' not in page
+
+
+def test_direction_of_home_is_drawn_only_while_it_is_known(record: DriveRecord) -> None:
+    shown = drive_of(record)
+    driving = np.array([state == "drive" for state in record.state])
+    assert not driving[-1]  # arrived, and braking
+    np.testing.assert_array_equal(np.isfinite(shown.headings), driving)
+    k = int(np.flatnonzero(driving)[len(driving) // 3])
+    target = record.targets[record.target[k], :2] - record.truth[k, :2]
+    off = shown.headings[k] - np.arctan2(target[1], target[0])
+    assert abs(np.angle(np.exp(1j * off))) < 0.1
 
 
 def test_numbers_of_no_drive_at_all_are_null() -> None:

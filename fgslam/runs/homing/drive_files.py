@@ -10,6 +10,7 @@ import numpy as np
 from fgslam.bearing_log import BearingLog
 from fgslam.export.homing_report.plan import Drive
 from fgslam.export.tables import Cell, write_csv
+from fgslam.homing.command import HomingState
 from fgslam.homing.drive_scores import cross_track, pass_distances
 from fgslam.homing.record import DriveRecord, HomingLog
 from fgslam.homing_types import HomingTruth
@@ -89,8 +90,11 @@ def bearing_log(record: DriveRecord, homing: HomingLog) -> BearingLog:
 
 
 def drive_of(record: DriveRecord, outlines: Sequence[FloatArray] = ()) -> Drive:
-    """What the figure of the drive shows; headings are those of the estimator, in the world."""
-    known = np.isfinite(record.robot[:, 0])
+    """What the figure of the drive shows; headings are those of the estimator, in the world.
+
+    There is none while the robot stands or drives blind: its command's heading means nothing then.
+    """
+    known = np.array([state == HomingState.DRIVE.value for state in record.state], np.bool_)
     headings = np.where(known, wrap(record.truth[:, 2] + record.heading), np.nan)
     return Drive(
         record.time, record.truth, record.target, headings, record.targets, tuple(outlines)
