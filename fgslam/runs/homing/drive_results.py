@@ -165,10 +165,11 @@ def _verdict(numbers: dict[str, JsonValue]) -> tuple[str, ...]:
         )
     slope = numbers["cross_track_slope"]
     if isinstance(slope, dict) and slope["flat"] is not None:
-        grows = "does not grow" if slope["flat"] else "changes"
+        # An interval that holds zero may be wide, too: no proof that nothing grows.
+        within = "within" if slope["flat"] else "outside"
         lines.append(
-            f"The error across the way {grows} with the leg's number: {100.0 * slope['value']:.2f} "
-            f"cm a leg [{100.0 * slope['low']:.2f}, {100.0 * slope['high']:.2f}]."
+            f"The error across the way changes by {100.0 * slope['value']:.2f} cm a leg; zero lies "
+            f"{within} its 95 % interval [{100.0 * slope['low']:.2f}, {100.0 * slope['high']:.2f}]."
         )
     return tuple(lines)
 
