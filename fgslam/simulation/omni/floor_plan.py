@@ -15,6 +15,9 @@ HEIGHT = 2.7
 DOOR_HEIGHT = 2.1
 HALF_WALL = 0.06
 _TILE = 3.2
+_FLOOR_TILE_M = 5.3
+"""No whole number of legs: with tiles of 4 m a leg of 4 m shows the same floor at the same place,
+and homing vectors follow the pattern instead of the room."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +93,8 @@ def shell(doors: tuple[Opening, ...]) -> list[Thing]:
     out: list[Thing] = []
     for room in ROOMS:
         w, d = room.east - room.west, room.north - room.south
-        floor = rectangle((room.west, room.north, 0), (w, 0, 0), (0, -d, 0), Surface(room.floor, 4))
+        cover = Surface(room.floor, _FLOOR_TILE_M)
+        floor = rectangle((room.west, room.north, 0), (w, 0, 0), (0, -d, 0), cover)
         above = Surface("ceiling", 4.8)
         ceiling = rectangle((room.west, room.south, HEIGHT), (w, 0, 0), (0, d, 0), above)
         out += [Thing(f"floor_{room.name}", (floor,)), Thing(f"ceiling_{room.name}", (ceiling,))]
