@@ -18,8 +18,8 @@ class OmniTrackingSettings:
         int,
         Field(
             ge=3,
-            description="tracked in one homing, the surest of all directions alike; the paper finds "
-            "30 to 50, and an image's cost grows with them",
+            description="tracked in one homing, the surest of all directions alike; the paper "
+            "finds 30 to 50, and an image's cost grows with them",
         ),
     ] = 50
     max_view_width: Annotated[

@@ -1,0 +1,46 @@
+"""What docs/homing_results.md states, held to its bounds. Slow: minutes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fgslam.homing_config import load_homing
+from fgslam.runs.homing.run import run_homing
+
+pytestmark = pytest.mark.slow
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+
+
+def metrics_of(name: str, out: Path, *overrides: str) -> dict[str, Any]:
+    config = load_homing(EXPERIMENTS / f"{name}.yaml", (*overrides, "output.pictures=0"))
+    run_homing(config, out, "refuse", lambda what, done, total: None, lambda: False)
+    values = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
+    assert isinstance(values, dict)
+    return values
+
+
+@pytest.mark.data
+def test_pairs_of_real_panoramas(shared_data: Path, tmp_path: Path) -> None:
+    folder = shared_data / "omni_home"
+    if not folder.is_dir():
+        pytest.skip(f"no recording {folder}: this test needs it")
+    values = metrics_of("homing_panoramas", tmp_path / "run", f"dataset.path={folder}")
+    errors = values["errors"]
+    assert values["pairs"] == 120
+    assert values["answered"] >= 1.5 * values["reference"]["answered"]
+    assert values["answered"] >= 20
+    assert errors["direction_median_deg"] <= 1.0
+    assert errors["rotation_median_deg"] <= 0.35
+    assert errors["worse_than_10_deg"] == 0
+    assert errors["covered_direction_2_sigma"] >= 0.9
+    assert errors["covered_rotation_2_sigma"] >= 0.9
+
+
+def test_a_path_in_the_rendered_house(tmp_path: Path) -> None:
+    values = metrics_of("path_following", tmp_path / "run", "trials=2")
+    assert values["arrived"] == 2
+    assert values["pass_distance_max_m"] <= 0.2
