@@ -9,7 +9,7 @@ link's rotation is held against all others' together (rotation averaging).
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 import numpy as np
 
@@ -33,17 +33,20 @@ class LinkChecks:
         self._links = {(link.a, link.b): link for link in links}
         self._verdicts = self._judge_triangles()
 
-    def believed(self, *, ordered: bool) -> tuple[list[Link], dict[Pair, str]]:
+    def believed(
+        self, *, ordered: bool, witnessed: Collection[Pair] = ()
+    ) -> tuple[list[Link], dict[Pair, str]]:
         """Links that pass every check, by pair, and why the others do not.
 
         Args:
             ordered: images follow each other on a way; neighbours in it need no third witness. It
                 is no proof: their link must still not contradict others.
+            witnessed: links that third images confirm in other ways, likewise.
         """
         rejected: dict[Pair, str] = {}
-        self._drop_contradicted(rejected)
-        self._drop_lone(rejected, ordered=ordered)
-        self._drop_turned(rejected)
+        self._drop_contradicted(rejected, ordered=ordered)
+        self._drop_lone(rejected, witnessed, ordered=ordered)
+        self._drop_turned(rejected, ordered=ordered)
         return [self._links[pair] for pair in sorted(self._links)], rejected
 
     # ----------------------------------------------------------------------------------------
@@ -81,23 +84,31 @@ class LinkChecks:
                 out[pair] = (good + holds, bad + (not holds))
         return out
 
-    def _drop_contradicted(self, rejected: dict[Pair, str]) -> None:
+    def _drop_contradicted(self, rejected: dict[Pair, str], *, ordered: bool) -> None:
+        """The worst first; that images follow each other counts as one more triangle kept."""
         while True:
             votes = self.votes()
-            suspects = [p for p, (good, bad) in votes.items() if bad and bad >= good]
+            excess = {
+                p: bad - good - (ordered and p[1] == p[0] + 1)
+                for p, (good, bad) in votes.items()
+                if bad
+            }
+            suspects = [p for p in excess if excess[p] >= 0]
             if not suspects:
                 return
             worst = max(
                 suspects,
-                key=lambda p: (votes[p][1] - votes[p][0], -self._links[p].support, p),
+                key=lambda p: (excess[p], p[1] - p[0] > 1, -self._links[p].support, p),
             )
             good, bad = votes[worst]
             self._drop(worst, f"breaks {bad} of {good + bad} triangles", rejected)
 
-    def _drop_lone(self, rejected: dict[Pair, str], *, ordered: bool) -> None:
+    def _drop_lone(
+        self, rejected: dict[Pair, str], witnessed: Collection[Pair], *, ordered: bool
+    ) -> None:
         for pair, (good, _) in self.votes().items():
             support = self._links[pair].support
-            follows = ordered and pair[1] == pair[0] + 1
+            follows = (ordered and pair[1] == pair[0] + 1) or pair in witnessed
             if good == 0 and not follows and support < self._settings.lone_support:
                 text = f"no third image confirms it, and {support} inliers are too few alone"
                 self._drop(pair, text, rejected)
@@ -114,12 +125,16 @@ class LinkChecks:
     # ----------------------------------------------------------------------------------------
     # Headings
 
-    def _drop_turned(self, rejected: dict[Pair, str]) -> None:
+    def _drop_turned(self, rejected: dict[Pair, str], *, ordered: bool) -> None:
+        """Of an ordered set neighbours weigh more than any other link: headings follow the walk."""
         limit = np.deg2rad(self._settings.heading_deg)
         while self._links:
             pairs = list(self._links)
             rotations = np.array([self._links[p].rotation for p in pairs])
             supports = np.array([self._links[p].support for p in pairs], dtype=np.float64)
+            if ordered:
+                follows = np.array([b - a == 1 for a, b in pairs])
+                supports = supports + follows * supports.max()
             residual = np.abs(heading_residuals(self._count, pairs, rotations, supports))
             worst = int(np.argmax(residual))
             if residual[worst] <= limit:

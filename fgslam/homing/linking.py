@@ -19,6 +19,7 @@ Linker: TypeAlias = Callable[[OmniFeatures, OmniFeatures], Answer]
 Pair: TypeAlias = tuple[int, int]
 
 _SIGMAS = 3.0
+_UNDECIDED = (RefusalReason.AMBIGUOUS, RefusalReason.UNCERTAIN)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,13 +91,14 @@ def _one_way(
 ) -> Link | str:
     """One direction is answered, the other cannot decide: what holds there holds back.
 
-    Which of the two solutions (design D3) the few decisive features support may hang on the draw;
-    that is no contradiction. Any other refusal is, as both answers come from the same views.
+    Which of the two solutions (design D3) the few decisive features support, or which minimum of a
+    valley, may hang on the draw; that is no contradiction. Any other refusal is, as both answers
+    come from the same views.
     """
     answer, other = (back, there) if isinstance(there, Refusal) else (there, back)
     if isinstance(answer, Refusal) or not isinstance(other, Refusal):
         raise TypeError("one direction must be answered, the other refused")
-    if other.reason is not RefusalReason.AMBIGUOUS:
+    if other.reason not in _UNDECIDED:
         return f"refused in one direction: {other.details}"
     if answer.support < settings.one_way_support:
         return (

@@ -23,6 +23,7 @@ from fgslam.homing.link_checks import LinkChecks
 from fgslam.homing.linking import Answer, Link, Linker, Pair, link_pairs
 from fgslam.homing.path_memory import PathMemory, read_names
 from fgslam.homing.retrieval import VisualWords, candidate_pairs
+from fgslam.homing.third_views import InlierRows, ThirdViews
 from fgslam.homing_types import OmniFeatures
 from fgslam.settings.homing_behaviour import TopologicalMapSettings
 from fgslam.types import FloatArray, IntArray, StateArrays
@@ -179,6 +180,7 @@ def map_of_answers(
     *,
     ordered: bool = False,
     names: Sequence[str] | None = None,
+    rows: InlierRows | None = None,
 ) -> TopologicalMap:
     """The map of homings that were searched elsewhere, in processes say.
 
@@ -188,10 +190,16 @@ def map_of_answers(
         settings: checks.
         ordered: as in :func:`build_map`.
         names: likewise.
+        rows: inliers of the answers; with them, far links of an ordered set need third views.
     """
     memory = PathMemory.of(images, names)
     links, refused = link_pairs(answers, settings)
-    believed, rejected = LinkChecks(len(images), links, settings).believed(ordered=ordered)
+    seen: set[Pair] = set()
+    if ordered and rows is not None:
+        links, seen, unseen = ThirdViews(images, links, rows, settings).confirmed()
+        refused |= unseen
+    checks = LinkChecks(len(images), links, settings)
+    believed, rejected = checks.believed(ordered=ordered, witnessed=seen)
     costs = np.array([link_cost(link, settings) for link in believed])
     return TopologicalMap(memory.images, memory.names, tuple(believed), costs, refused | rejected)
 

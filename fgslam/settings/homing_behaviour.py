@@ -280,6 +280,22 @@ class TopologicalMapSettings:
             "each other in an ordered set",
         ),
     ] = 100
+    order_reach: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="ordered sets: images farther apart than this in the order need third "
+            "views, these neighbours of theirs, that confirm their link's features",
+        ),
+    ] = 3
+    third_views: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="such confirmations an inlier, on average, that a link so far needs; "
+            "`docs/homing.md` has what true and false ones got",
+        ),
+    ] = 1.0
     mutual_deg: Annotated[
         float,
         Field(

@@ -15,6 +15,7 @@ from fgslam.frontend.omni.matching import match_features
 from fgslam.homing.linking import Answer, Pair
 from fgslam.homing.localisation import Localiser
 from fgslam.homing.retrieval import VisualWords
+from fgslam.homing.third_views import InlierRows
 from fgslam.homing.topological_map import map_of_answers
 from fgslam.homing_config import TopologicalMapConfig
 from fgslam.homing_types import HomingVector, OmniFeatures, Refusal
@@ -52,6 +53,7 @@ def localise(
     config: TopologicalMapConfig,
     features: Sequence[OmniFeatures],
     answers: dict[Pair, Answer],
+    rows: InlierRows,
     names: Sequence[str],
     progress: Progress,
     stopped: Stopped,
@@ -70,8 +72,18 @@ def localise(
         for (a, b), answer in answers.items()
         if a in number and b in number
     }
+    kept_rows = {
+        (number[a], number[b]): inliers
+        for (a, b), inliers in rows.items()
+        if a in number and b in number
+    }
     topology = map_of_answers(
-        nodes, among, config.map, ordered=config.ordered, names=[names[k] for k in kept]
+        nodes,
+        among,
+        config.map,
+        ordered=config.ordered,
+        names=[names[k] for k in kept],
+        rows=kept_rows,
     )
     rng = np.random.default_rng((config.seed, 1))
 

@@ -18,6 +18,7 @@ from fgslam.export.report.data import Picture
 from fgslam.export.report.traces import Figure
 from fgslam.export.tables import Cell, write_csv
 from fgslam.homing.linking import Answer, Link, Pair
+from fgslam.homing.third_views import InlierRows
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
 from fgslam.homing_config import TopologicalMapConfig
 from fgslam.homing_types import OmniFeatures
@@ -93,10 +94,13 @@ def run_topological_map(
     found, failures = answer_pairs(search, jobs, progress, stopped)
     answers: dict[Pair, Answer] = {(answer.a, answer.b): answer.found for answer in found}
     names = views.names[: len(features)]
-    topology = map_of_answers(features, answers, config.map, ordered=config.ordered, names=names)
+    rows = {(answer.a, answer.b): answer.rows for answer in found if answer.rows is not None}
+    topology = map_of_answers(
+        features, answers, config.map, ordered=config.ordered, names=names, rows=rows
+    )
     kilobytes = topology.save(folder / MAP_FILE)
     routes = [_route(topology, asked) for asked in config.routes]
-    located = _localised(config, features, answers, names, progress, stopped)
+    located = _localised(config, features, answers, rows, names, progress, stopped)
     whole = len(features) == len(views) and len(found) == len(pairs) and not stopped()
     numbers = _numbers(topology, views, answers, kilobytes) | _of_routes(routes)
     numbers["localisation"] = localised_numbers(located)
@@ -153,13 +157,14 @@ def _localised(
     config: TopologicalMapConfig,
     features: Sequence[OmniFeatures],
     answers: dict[Pair, Answer],
+    rows: InlierRows,
     names: Sequence[str],
     progress: Progress,
     stopped: Stopped,
 ) -> Localised | None:
     if not config.held_out_every or stopped():
         return None
-    return localise(config, features, answers, names, progress, stopped)
+    return localise(config, features, answers, rows, names, progress, stopped)
 
 
 # --------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from fgslam.export.metrics import JsonValue
 from fgslam.export.tables import Cell, write_csv
 from fgslam.homing_types import HomingVector, Refusal, RefusalReason
 from fgslam.planar import wrap
-from fgslam.types import BoolArray, FloatArray
+from fgslam.types import BoolArray, FloatArray, IntArray
 
 PAIR_COLUMNS = (
     "from",
@@ -41,12 +41,14 @@ class PairAnswer:
         a, b: numbers of the views; b is the target.
         found: the homing vector, or why there is none.
         matches: tentative ones.
+        rows: (k, 2) SIFT features of both views that are inliers; None where nobody asked.
     """
 
     a: int
     b: int
     found: HomingVector | Refusal
     matches: int
+    rows: IntArray | None = None
 
     @property
     def answered(self) -> bool:

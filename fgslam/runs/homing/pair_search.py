@@ -10,12 +10,13 @@ import numpy as np
 
 from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
 from fgslam.frontend.omni.matching import match_features
-from fgslam.homing_types import BearingMatches, OmniFeatures
+from fgslam.homing_types import BearingMatches, FeatureKind, HomingVector, OmniFeatures, Refusal
 from fgslam.runs.homing.pair_answers import PairAnswer
 from fgslam.runs.homing.results import Progress, Stopped
 from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.settings.homing_vector import HomingVectorSettings
 from fgslam.settings.omni_features import OmniMatchingSettings
+from fgslam.types import IntArray
 
 PLAIN_MATCHING = OmniMatchingSettings(
     ratio=0.8, root=False, max_colour_distance=1e9, planar_gates=False
@@ -72,7 +73,7 @@ def answer_pair(search: PairSearch, a: int, b: int) -> tuple[PairAnswer, Bearing
     matches = match_features(search.features[a], search.features[b], search.matching)
     rng = pair_generator(search.seed, a, b)
     found = estimate_homing_vector(matches, search.vector, rng)
-    return PairAnswer(a, b, found, len(matches)), matches
+    return PairAnswer(a, b, found, len(matches), _inlier_rows(found, matches)), matches
 
 
 def answer_pairs(
@@ -97,6 +98,13 @@ def answer_pairs(
 def search_of(search: PairSearch, pairs: Sequence[tuple[int, int]]) -> PairSearch:
     """The same search for some pairs only."""
     return PairSearch(search.features, tuple(pairs), search.matching, search.vector, search.seed)
+
+
+def _inlier_rows(found: HomingVector | Refusal, matches: BearingMatches) -> IntArray | None:
+    if isinstance(found, Refusal):
+        return None
+    kept = matches.taken(found.inliers & (matches.kind == FeatureKind.SIFT))
+    return np.column_stack([kept.index_a, kept.index_b])
 
 
 def _perform(search: PairSearch) -> list[PairAnswer]:
