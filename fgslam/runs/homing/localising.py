@@ -93,16 +93,16 @@ def localise(
 
     words = VisualWords(nodes, config.map.retrieval, rng)
     localiser = Localiser(topology, words, linker, config.localisation)
-    rows = []
+    told = []
     progress("localising", 0, len(out))
     for done, view in enumerate(out):
         if stopped():
             break
         localiser.update(features[view])
         node, probability = localiser.best()
-        rows.append((names[view], names[kept[node]], probability, _next_to(view, kept, node)))
+        told.append((names[view], names[kept[node]], probability, _next_to(view, kept, node)))
         progress("localising", done + 1, len(out))
-    return Localised(*zip(*rows, strict=True)) if rows else Localised((), (), (), ())
+    return Localised(*zip(*told, strict=True)) if told else Localised((), (), (), ())
 
 
 def localised_numbers(found: Localised | None) -> JsonValue:

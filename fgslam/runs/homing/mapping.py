@@ -25,7 +25,7 @@ from fgslam.homing_types import OmniFeatures
 from fgslam.runs.homing.localising import Localised, localise, localised_numbers, write_localised
 from fgslam.runs.homing.pair_answers import PairAnswer
 from fgslam.runs.homing.pair_pictures import draw_pair
-from fgslam.runs.homing.pair_search import PairSearch, answer_pairs
+from fgslam.runs.homing.pair_search import PairSearch, answer_pairs, inlier_rows
 from fgslam.runs.homing.results import (
     HomingResult,
     Progress,
@@ -93,8 +93,7 @@ def run_topological_map(
     )
     found, failures = answer_pairs(search, jobs, progress, stopped)
     answers: dict[Pair, Answer] = {(answer.a, answer.b): answer.found for answer in found}
-    names = views.names[: len(features)]
-    rows = {(answer.a, answer.b): answer.rows for answer in found if answer.rows is not None}
+    names, rows = views.names[: len(features)], inlier_rows(found)
     topology = map_of_answers(
         features, answers, config.map, ordered=config.ordered, names=names, rows=rows
     )
@@ -103,7 +102,7 @@ def run_topological_map(
     located = _localised(config, features, answers, rows, names, progress, stopped)
     whole = len(features) == len(views) and len(found) == len(pairs) and not stopped()
     numbers = _numbers(topology, views, answers, kilobytes) | _of_routes(routes)
-    numbers["localisation"] = localised_numbers(located)
+    numbers |= {"localisation": localised_numbers(located)}
     result = HomingResult(
         config,
         folder,

@@ -95,6 +95,11 @@ def answer_pairs(
     return sorted(answers, key=lambda answer: place[answer.a, answer.b]), failures
 
 
+def inlier_rows(answers: Sequence[PairAnswer]) -> dict[tuple[int, int], IntArray]:
+    """Of each answered pair (a, b): (k, 2) SIFT features of both views that are inliers."""
+    return {(k.a, k.b): k.rows for k in answers if k.rows is not None}
+
+
 def search_of(search: PairSearch, pairs: Sequence[tuple[int, int]]) -> PairSearch:
     """The same search for some pairs only."""
     return PairSearch(search.features, tuple(pairs), search.matching, search.vector, search.seed)
