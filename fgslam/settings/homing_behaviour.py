@@ -277,9 +277,9 @@ class TopologicalMapSettings:
         Field(
             ge=3,
             description="inliers of an edge that no third image confirms, unless its images follow "
-            "each other in an ordered set",
+            "each other in an ordered set (false ones had up to 39 on `omni_home`)",
         ),
-    ] = 100
+    ] = 50
     order_reach: Annotated[
         int,
         Field(
