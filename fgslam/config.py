@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeAlias, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from fgslam.config_reading import Reader, read_mapping
+from fgslam.config_reading import Reader, kind_as_settings, read_mapping, with_default_kind
 from fgslam.errors import ConfigError
 from fgslam.settings.backend import EstimatorSettings, LandmarkKalmanSettings
 from fgslam.settings.datasets import (
@@ -39,19 +39,7 @@ DatasetSettings: TypeAlias = Annotated[
 ]
 
 
-def _as_settings(value: Any) -> Any:
-    """A bare kind stands for that estimator with its defaults."""
-    return {"kind": value} if isinstance(value, str) else value
-
-
-def _with_default_kind(value: Any) -> Any:
-    """Keys without a kind mean the paper's estimator."""
-    if isinstance(value, dict) and "kind" not in value:
-        return {"kind": LandmarkKalmanSettings.kind, **value}
-    return value
-
-
-ComparedEstimator: TypeAlias = Annotated[EstimatorSettings, BeforeValidator(_as_settings)]
+ComparedEstimator: TypeAlias = Annotated[EstimatorSettings, BeforeValidator(kind_as_settings)]
 
 _Values = TypeVar("_Values", bound=Mapping[str, Any])
 
@@ -71,9 +59,9 @@ class ExperimentConfig(BaseModel):
     dataset: DatasetSettings
     odometry: OdometrySettings = RecordedOdometrySettings()
     frontend: FrontendSettings = FrontendSettings()
-    estimator: Annotated[EstimatorSettings, BeforeValidator(_with_default_kind)] = (
-        LandmarkKalmanSettings()
-    )
+    estimator: Annotated[
+        EstimatorSettings, BeforeValidator(with_default_kind(LandmarkKalmanSettings.kind))
+    ] = LandmarkKalmanSettings()
     compare: Annotated[
         tuple[ComparedEstimator, ...],
         Field(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -71,6 +71,22 @@ class Reader(Generic[Model]):
                 for key in set(inner) - set(node["properties"]):
                     if f"{group}.{key}" not in given:
                         del inner[key]
+
+
+def kind_as_settings(value: Any) -> Any:
+    """A bare kind stands for that component with its defaults."""
+    return {"kind": value} if isinstance(value, str) else value
+
+
+def with_default_kind(kind: str) -> Callable[[Any], Any]:
+    """Makes keys without a kind mean this one."""
+
+    def given(value: Any) -> Any:
+        if isinstance(value, dict) and "kind" not in value:
+            return {"kind": kind, **value}
+        return value
+
+    return given
 
 
 def apply_overrides(values: dict[str, Any], overrides: Iterable[str]) -> None:

@@ -13,7 +13,13 @@ from typing import Annotated, Any, Literal, TypeAlias
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from fgslam.config import ExperimentConfig, make_config
-from fgslam.config_reading import Reader, apply_overrides, read_mapping
+from fgslam.config_reading import (
+    Reader,
+    apply_overrides,
+    kind_as_settings,
+    read_mapping,
+    with_default_kind,
+)
 from fgslam.errors import ConfigError
 from fgslam.settings.homing_behaviour import (
     HomingBehaviourSettings,
@@ -33,20 +39,10 @@ _TAKEN_FOLDERS = ("pictures", "compare", "logs", "runs")
 _GROUPS_OF_KINDS = ("dataset", "estimator")
 
 
-def _as_settings(value: Any) -> Any:
-    """A bare kind stands for that estimator with its defaults."""
-    return {"kind": value} if isinstance(value, str) else value
-
-
-def _with_default_kind(value: Any) -> Any:
-    """Keys without a kind mean the graph."""
-    if isinstance(value, dict) and "kind" not in value:
-        return {"kind": HomingGraphSettings.kind, **value}
-    return value
-
-
-ComparedHoming: TypeAlias = Annotated[HomingEstimatorSettings, BeforeValidator(_as_settings)]
-LiveHoming: TypeAlias = Annotated[HomingEstimatorSettings, BeforeValidator(_with_default_kind)]
+ComparedHoming: TypeAlias = Annotated[HomingEstimatorSettings, BeforeValidator(kind_as_settings)]
+LiveHoming: TypeAlias = Annotated[
+    HomingEstimatorSettings, BeforeValidator(with_default_kind(HomingGraphSettings.kind))
+]
 ViewName: TypeAlias = Annotated[
     str, BeforeValidator(lambda value: str(value) if isinstance(value, int) else value)
 ]
