@@ -11,6 +11,12 @@ from fgslam.types import FloatArray
 _STEP_PX = 0.05  # of the central difference: its error is a millionth of the derivative
 
 
+def unit_rays(bearing: FloatArray, elevation: FloatArray) -> FloatArray:
+    """(n, 3) rays of bearings and elevations (n,), radians; the inverse of :func:`angles_of`."""
+    level = np.cos(elevation)
+    return np.column_stack([level * np.cos(bearing), level * np.sin(bearing), np.sin(elevation)])
+
+
 def angles_of(rays: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Bearings and elevations (n,) of rays (n, 3), radians."""
     bearing = np.arctan2(rays[:, 1], rays[:, 0])

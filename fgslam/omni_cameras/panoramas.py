@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.errors import CalibrationError
+from fgslam.omni_cameras.bearing_measurement import unit_rays
 from fgslam.omni_cameras.image_bounds import inside, require_size
 from fgslam.types import FloatArray
 
@@ -55,10 +56,7 @@ class Equirectangular:
         pixels = inside(np.asarray(pixels, dtype=np.float64), self.width, self.height)
         bearing = _bearing(pixels[:, 0], self.width)
         elevation = self.top_elevation - pixels[:, 1] * self._per_row()
-        level = np.cos(elevation)
-        return np.column_stack(
-            [level * np.cos(bearing), level * np.sin(bearing), np.sin(elevation)]
-        )
+        return unit_rays(bearing, elevation)
 
     def pixels(self, rays: FloatArray) -> FloatArray:
         """(n, 2) pixels; see :class:`fgslam.omni_cameras.protocol.OmniCamera`."""

@@ -19,18 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.homing_types import BearingMatches
+from fgslam.omni_cameras.bearing_measurement import unit_rays
 from fgslam.planar import wrap
 from fgslam.types import BoolArray, FloatArray
 
 
-def unit_rays(bearing: FloatArray, elevation: FloatArray) -> FloatArray:
-    """(n, 3) rays of bearings and elevations (n,), radians."""
-    level = np.cos(elevation)
-    return np.column_stack([level * np.cos(bearing), level * np.sin(bearing), np.sin(elevation)])
-
-
 def ray_derivatives(bearing: FloatArray, elevation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives (n, 3) of :func:`unit_rays` by bearing and by elevation."""
+    """Derivatives (n, 3) of :func:`.unit_rays` by bearing and by elevation."""
     level, up = np.cos(elevation), np.sin(elevation)
     c, s = np.cos(bearing), np.sin(bearing)
     by_bearing = np.column_stack([-level * s, level * c, np.zeros(len(bearing))])
@@ -42,6 +37,29 @@ def _products(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.column_stack(
         [a[:, 0] * b[:, 2], a[:, 1] * b[:, 2], a[:, 2] * b[:, 0], a[:, 2] * b[:, 1]]
     )
+
+
+def in_front(
+    bearings: tuple[FloatArray, FloatArray],
+    direction: FloatArray,
+    rotation: FloatArray,
+    least_parallax: float,
+) -> BoolArray:
+    """(n, c) both distances positive (D1), or the rays too parallel to tell.
+
+    Args:
+        bearings: (n,) from a and from b, radians.
+        direction: (c,) of the hypotheses.
+        rotation: (c,) likewise.
+        least_parallax: radians.
+    """
+    from_start = bearings[0][:, None]
+    turned = wrap(bearings[1][:, None] + rotation)
+    parallax = np.sin(turned - from_start)
+    from_a = np.sin(turned - direction) * parallax
+    from_b = np.sin(from_start - direction) * parallax
+    parallel = np.abs(wrap(turned - from_start)) < least_parallax
+    return ((from_a > 0.0) & (from_b > 0.0)) | parallel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,17 +108,6 @@ class EpipolarTest:
         sigma = np.sqrt(np.maximum(variance, 1e-24))
         return np.asarray(self.coefficients @ hypothesis / sigma, dtype=np.float64)
 
-    def in_front(
-        self, direction: FloatArray, rotation: FloatArray, least_parallax: float
-    ) -> BoolArray:
-        """(n, c) both distances positive (D1), or the rays too parallel to tell (radians)."""
-        turned = wrap(self.bearing_b[:, None] + rotation)
-        parallax = np.sin(turned - self.bearing_a[:, None])
-        from_a = np.sin(turned - direction) * parallax
-        from_b = np.sin(self.bearing_a[:, None] - direction) * parallax
-        parallel = np.abs(wrap(turned - self.bearing_a[:, None])) < least_parallax
-        return ((from_a > 0.0) & (from_b > 0.0)) | parallel
-
     def inliers(
         self,
         direction: FloatArray,
@@ -111,5 +118,6 @@ class EpipolarTest:
         """(n, c) inliers of c hypotheses, and their normalised residuals."""
         residuals = self.normalised(direction, rotation)
         good = np.abs(residuals) < sigmas
-        good &= self.in_front(direction, rotation, least_parallax)
+        bearings = self.bearing_a, self.bearing_b
+        good &= in_front(bearings, direction, rotation, least_parallax)
         return good, residuals

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.frontend.omni.epipolar import EpipolarTest, ray_derivatives, unit_rays
+from fgslam.frontend.omni.epipolar import in_front, ray_derivatives
 from fgslam.frontend.omni.match_odds import COMMON_CHANCE, gain, right_probability
 from fgslam.homing_types import BearingMatches
+from fgslam.omni_cameras.bearing_measurement import unit_rays
 from fgslam.planar import rotation as planar_rotation
 from fgslam.planar import wrap
 from fgslam.types import BoolArray, FloatArray
@@ -80,7 +81,7 @@ class HomingRefinement:
         noisy = [_outer(d * matches.sigma[:, k, None], b) for k, d in enumerate(by_a)]
         noisy += [_outer(a, d * matches.sigma[:, k + 2, None]) for k, d in enumerate(by_b)]
         self._noisy = np.concatenate(noisy)
-        self._test = EpipolarTest.of(matches)
+        self._bearings = matches.bearing_a, matches.bearing_b
         self._prior = prior.information()
         right = right_probability(matches)
         self._odds = right / (1.0 - right)
@@ -124,7 +125,8 @@ class HomingRefinement:
     def _inliers(
         self, parameters: FloatArray, residuals: FloatArray, widened: float = 1.0
     ) -> BoolArray:
-        ahead = self._test.in_front(parameters[:1], parameters[1:2], self._least_parallax)[:, 0]
+        theta, psi = parameters[:1], parameters[1:2]
+        ahead = in_front(self._bearings, theta, psi, self._least_parallax)[:, 0]
         return np.asarray((np.abs(residuals) < widened * self._sigmas) & ahead)
 
     def _linearised(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
