@@ -30,6 +30,7 @@ from fgslam.frontend.stream import FeatureStream
 from fgslam.frontend.tracker import LandmarkTracker
 from fgslam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
 from fgslam.pipeline import SlamPipeline
+from fgslam.recordings import Sequence
 from fgslam.settings.backend import (
     BatchSettings,
     DeadReckoningSettings,
@@ -50,7 +51,7 @@ from fgslam.settings.datasets import (
 from fgslam.settings.frontend import EgoMotionSettings, FrontendSettings
 from fgslam.settings.lab import RenderedLabSettings
 from fgslam.settings.measurements import MeasurementDatasetSettings
-from fgslam.types import CameraRig, MeasurementType, Prediction, Sensor, Sequence
+from fgslam.types import CameraRig, MeasurementType, Prediction, Sensor
 
 
 def open_sequence(

@@ -13,8 +13,9 @@ from fgslam.geometry import (
     se3_exp,
     se3_log,
 )
+from fgslam.recordings import Sequence
 from fgslam.settings.datasets import ConstantVelocitySettings
-from fgslam.types import FloatArray, Odometry, Sequence, StateArrays
+from fgslam.types import FloatArray, Odometry, StateArrays
 
 
 class MotionModel(Protocol):

@@ -1,11 +1,60 @@
-"""Recordings of measurements instead of images: a finished log with the truth beside it."""
+"""Recordings: of images, as a sequence of frames, and of measurements, as a finished log."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 from fgslam.measurement_log import MeasurementLog
-from fgslam.types import FloatArray, IntArray, Trajectory
+from fgslam.types import CameraRig, FloatArray, Frame, IntArray, Odometry, Trajectory
+
+
+@runtime_checkable
+class Sequence(Protocol):
+    """A recording: calibrated frames in time order, perhaps with odometry and ground truth.
+
+    Indices ``i`` run over the *selected* frames (after start, stop and stride), from 0.
+    """
+
+    @property
+    def name(self) -> str:
+        """Short name for titles."""
+        ...
+
+    @property
+    def rig(self) -> CameraRig:
+        """The calibrated cameras, rectified."""
+        ...
+
+    @property
+    def timestamps(self) -> FloatArray:
+        """(n,) seconds, strictly increasing."""
+        ...
+
+    @property
+    def identity(self) -> str:
+        """Hexadecimal digest of what defines the recording, for the run folder."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def frame(self, i: int) -> Frame:
+        """Images of frame ``i``. Raises FrameError when they are missing or corrupt."""
+        ...
+
+    def odometry(self, i: int) -> Odometry | None:
+        """Body motion from frame ``i - 1`` to ``i``, or None where none was recorded."""
+        ...
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """True poses ``wTc`` of the reference camera in a world of the recording's choice."""
+        ...
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was tolerated when opening the recording, in words (missing frames and the like)."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -119,54 +119,6 @@ class Trajectory:
         return len(self.timestamps)
 
 
-@runtime_checkable
-class Sequence(Protocol):
-    """A recording: calibrated frames in time order, perhaps with odometry and ground truth.
-
-    Indices ``i`` run over the *selected* frames (after start, stop and stride), from 0.
-    """
-
-    @property
-    def name(self) -> str:
-        """Short name for titles."""
-        ...
-
-    @property
-    def rig(self) -> CameraRig:
-        """The calibrated cameras, rectified."""
-        ...
-
-    @property
-    def timestamps(self) -> FloatArray:
-        """(n,) seconds, strictly increasing."""
-        ...
-
-    @property
-    def identity(self) -> str:
-        """Hexadecimal digest of what defines the recording, for the run folder."""
-        ...
-
-    def __len__(self) -> int: ...
-
-    def frame(self, i: int) -> Frame:
-        """Images of frame ``i``. Raises FrameError when they are missing or corrupt."""
-        ...
-
-    def odometry(self, i: int) -> Odometry | None:
-        """Body motion from frame ``i - 1`` to ``i``, or None where none was recorded."""
-        ...
-
-    @property
-    def ground_truth(self) -> Trajectory | None:
-        """True poses ``wTc`` of the reference camera in a world of the recording's choice."""
-        ...
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What was tolerated when opening the recording, in words (missing frames and the like)."""
-        ...
-
-
 # --------------------------------------------------------------------------------------------
 # Front-end
 
@@ -249,6 +201,7 @@ class EgoMotionStatus(str, Enum):
     FIRST = "first"
     OK = "ok"
     CAPPED = "capped"
+    RELOCALISED = "relocalised"
     TOO_FEW_MATCHES = "too_few_matches"
     DIVERGED = "diverged"
     NO_IMAGE = "no_image"
@@ -256,7 +209,11 @@ class EgoMotionStatus(str, Enum):
     @property
     def measured(self) -> bool:
         """Whether the landmarks had a say in the pose (otherwise it is the odometry's)."""
-        return self in (EgoMotionStatus.OK, EgoMotionStatus.CAPPED)
+        return self in (
+            EgoMotionStatus.OK,
+            EgoMotionStatus.CAPPED,
+            EgoMotionStatus.RELOCALISED,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -346,6 +303,26 @@ class Observations:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LoopClosure:
+    """A place seen again: the frame sees landmarks of an earlier frame, under new identities.
+
+    Attributes:
+        frame: position in the log of the earlier frame (0 is the log's first).
+        oTc: (4, 4) pose of the present camera in the earlier frame's camera.
+        covariance: (6, 6) of ``oTc``, [rotation, translation], in the tangent space at it.
+        observations: the earlier landmarks as the present frame measures them, under their old
+            identities.
+        merged: (m, 2) pairs (identity that ends, identity that stays) of landmarks found to be one.
+    """
+
+    frame: int
+    oTc: FloatArray
+    covariance: FloatArray
+    observations: Observations
+    merged: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Increment:
     """Everything that one frame adds to the problem: what the log stores, what estimators consume.
 
@@ -356,7 +333,11 @@ class Increment:
         observations: matched (Type III) and new (Type IV) landmarks.
         rejected: (k,) matched observations that the live run's pose rejected as outliers.
         missed_ids: landmarks expected in view and not matched (Type II).
-        pruned_ids: landmarks that the database dropped after this frame.
+        pruned_ids: landmarks that the database dropped after this frame; those merged into others
+            by a loop closure among them.
+        loops: places recognised in this frame, verified; for estimators that can use them.
+        relocalised: the frame was placed by its landmarks alone, without a prior: its odometry,
+            if any, does not tell where it is.
     """
 
     index: int
@@ -366,6 +347,8 @@ class Increment:
     rejected: BoolArray
     missed_ids: IntArray
     pruned_ids: IntArray
+    loops: tuple[LoopClosure, ...] = ()
+    relocalised: bool = False
 
 
 class MeasurementType(str, Enum):
@@ -374,6 +357,7 @@ class MeasurementType(str, Enum):
     ODOMETRY = "odometry"
     STEREO = "stereo"
     RANGE_BEARING = "range_bearing"
+    LOOP = "loop"
 
 
 # --------------------------------------------------------------------------------------------

@@ -9,7 +9,8 @@ from fgslam.datasets.recording import OdometrySource, Recording
 from fgslam.datasets.trajectories import rows_at
 from fgslam.errors import DatasetError
 from fgslam.geometry import inverse, so3_log
-from fgslam.types import FloatArray, Sequence
+from fgslam.recordings import Sequence
+from fgslam.types import FloatArray
 
 _STAMP_TOLERANCE_S = 1e-3
 _RANGE_S, _STEP_S = 0.2, 0.02

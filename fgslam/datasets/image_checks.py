@@ -10,7 +10,8 @@ import numpy as np
 
 from fgslam.datasets.findings import Finding, Level, listed, share
 from fgslam.errors import FrameError
-from fgslam.types import Frame, Image, IntArray, Sequence
+from fgslam.recordings import Sequence
+from fgslam.types import Frame, Image, IntArray
 
 Told: TypeAlias = Callable[[int, int], None]
 """Called with how much is done, and of how much."""

@@ -8,7 +8,8 @@ from fgslam.datasets.findings import Finding, Level, listed, share
 from fgslam.datasets.trajectories import rows_at
 from fgslam.errors import DatasetError
 from fgslam.geometry import inverse, se3_log
-from fgslam.types import FloatArray, Odometry, Sequence, Trajectory
+from fgslam.recordings import Sequence
+from fgslam.types import FloatArray, Odometry, Trajectory
 
 _STAMP_TOLERANCE_S = 1e-3
 _MAX_JUMP = 8.0

@@ -35,7 +35,7 @@ Progress = Callable[[int, int], None]
 
 
 class RenderedLabSequence:
-    """A drive through the rendered lab; implements :class:`fgslam.types.Sequence`.
+    """A drive through the rendered lab; implements :class:`fgslam.recordings.Sequence`.
 
     The world frame of the ground truth is the reference camera's pose at the drive's first frame.
     """

@@ -7,8 +7,9 @@ import numpy as np
 from fgslam.datasets.trajectories import rows_at
 from fgslam.errors import DatasetError
 from fgslam.geometry import inverse, se3_exp
+from fgslam.recordings import Sequence
 from fgslam.settings.datasets import SyntheticOdometrySettings
-from fgslam.types import CameraRig, FloatArray, Frame, Odometry, Sequence, Trajectory
+from fgslam.types import CameraRig, FloatArray, Frame, Odometry, Trajectory
 
 _STAMP_TOLERANCE_S = 1e-6
 

@@ -10,7 +10,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 from fgslam.errors import FrameError
-from fgslam.types import Features, Frame, Image, Sequence
+from fgslam.recordings import Sequence
+from fgslam.types import Features, Frame, Image
 
 # Frames in work at once. Three images on two cores leave one idle at the end of each frame;
 # the next frame's images fill the gap.

@@ -29,8 +29,9 @@ from fgslam.errors import FrameError
 from fgslam.frontend.descriptor_matching import mutual_nearest
 from fgslam.frontend.sift import SiftExtractor
 from fgslam.frontend.stereo import StereoMatcher
+from fgslam.recordings import Sequence
 from fgslam.settings.frontend import FrontendSettings, StereoSettings
-from fgslam.types import CameraRig, Features, FloatArray, IntArray, Sequence, StereoFeatures
+from fgslam.types import CameraRig, Features, FloatArray, IntArray, StereoFeatures
 
 _FEWEST_FOR_MEDIAN = 10
 _NEAR_LINE_PX = 2.0

@@ -21,6 +21,7 @@ from fgslam.factory import make_pipeline, make_stream, open_sequence
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.measurement_log import MeasurementLog
 from fgslam.pipeline import FrameReport
+from fgslam.recordings import Sequence
 from fgslam.runs import checkpoint
 from fgslam.runs.choosing import compared_with
 from fgslam.runs.comparison import COMPARISON_FILE, Compared, replay_apart, tasks_of
@@ -30,7 +31,7 @@ from fgslam.runs.recorder import RunRecorder
 from fgslam.runs.rendered_truth import TrueDepth
 from fgslam.runs.report import report_from_folder
 from fgslam.runs.threads import one_blas_thread
-from fgslam.types import Sequence, StereoFeatures
+from fgslam.types import StereoFeatures
 
 Progress = Callable[[str, int, int], None]
 """Called with what is under way, how much is done, and of how much."""

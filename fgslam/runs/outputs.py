@@ -29,6 +29,7 @@ from fgslam.export.trajectories import write_tum
 from fgslam.frontend.database import LandmarkDatabase
 from fgslam.homing_config import HomingExperiment
 from fgslam.pipeline import SlamPipeline
+from fgslam.recordings import Sequence
 from fgslam.runs.checkpoint import save_log
 from fgslam.runs.comparison import GROUND_TRUTH_FILE, load_truth, remark_of
 from fgslam.runs.estimator_files import write_estimate
@@ -36,7 +37,7 @@ from fgslam.runs.judging import Truth
 from fgslam.runs.recorder import STAGES, RunRecorder
 from fgslam.runs.rendered_truth import rendered_landmark_truth
 from fgslam.runs.summary import estimator_metrics, run_numbers
-from fgslam.types import Estimate, LandmarkMap, Sequence, Trajectory
+from fgslam.types import Estimate, LandmarkMap, Trajectory
 
 _VERSIONS_OF = ("numpy", "scipy", "opencv-python-headless", "gtsam", "open3d")
 

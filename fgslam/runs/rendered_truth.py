@@ -8,8 +8,8 @@ import numpy as np
 
 from fgslam.geometry import transform_to_world
 from fgslam.measurement_log import MeasurementLog
-from fgslam.recordings import LandmarkTruth
-from fgslam.types import BoolArray, CameraRig, FloatArray, IntArray, Sequence
+from fgslam.recordings import LandmarkTruth, Sequence
+from fgslam.types import BoolArray, CameraRig, FloatArray, IntArray
 
 _LEAST_SIGHTINGS = 3
 _SAME_SURFACE = 0.03

@@ -12,9 +12,10 @@ from fgslam.config import ExperimentConfig
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.stream import FeatureFrame
+from fgslam.recordings import Sequence
 from fgslam.settings.datasets import LightFieldSettings
 from fgslam.settings.frontend import Appearance
-from fgslam.types import BoolArray, FloatArray, IntArray, Sequence
+from fgslam.types import BoolArray, FloatArray, IntArray
 from scripts.results import epi
 from scripts.results.report import Cell, Table
 from scripts.results.runs import DATA, experiment, find_features, say

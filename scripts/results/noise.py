@@ -9,7 +9,8 @@ import numpy as np
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.geometry import inverse, transform_to_camera
-from fgslam.types import BoolArray, CameraRig, FloatArray, IntArray, Observations, Sequence
+from fgslam.recordings import Sequence
+from fgslam.types import BoolArray, CameraRig, FloatArray, IntArray, Observations
 from scripts.results.report import Cell, Table
 from scripts.results.runs import FoundFeatures, experiment, find_features, make_system, process, say
 

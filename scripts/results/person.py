@@ -10,8 +10,9 @@ import numpy as np
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.evaluation.trajectory import to_estimate_world
 from fgslam.pipeline import FrameReport, SlamPipeline
+from fgslam.recordings import Sequence
 from fgslam.settings.lab import RenderedLabSettings
-from fgslam.types import BoolArray, FloatArray, IntArray, Sequence
+from fgslam.types import BoolArray, FloatArray, IntArray
 from scripts.results.report import Cell, Table
 from scripts.results.runs import (
     experiment,

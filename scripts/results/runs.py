@@ -15,8 +15,8 @@ from fgslam.evaluation.trajectory import Alignment, TrajectoryError, evaluate_tr
 from fgslam.factory import make_pipeline, make_stream, open_sequence
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.pipeline import FrameReport, SlamPipeline
+from fgslam.recordings import Sequence
 from fgslam.runs.experiment import RunResult, run_experiment
-from fgslam.types import Sequence
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 DATA = Path(__file__).parents[3] / "shared" / "data"

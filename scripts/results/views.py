@@ -80,7 +80,7 @@ class LabViews:
 
 @dataclass(frozen=True, eq=False)
 class ViewPair:
-    """Two views as a recording of two frames; implements :class:`fgslam.types.Sequence`."""
+    """Two views as a recording of two frames; implements :class:`fgslam.recordings.Sequence`."""
 
     rig: CameraRig
     views: tuple[View, View]

@@ -33,9 +33,10 @@ from fgslam.factory import make_pipeline, make_stream, open_sequence
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.measurement_log import MeasurementLog
 from fgslam.pipeline import SlamPipeline
+from fgslam.recordings import Sequence
 from fgslam.runs.recorder import RunRecorder
 from fgslam.runs.threads import one_blas_thread
-from fgslam.types import CameraRig, FloatArray, Frame, Odometry, Sequence, Trajectory
+from fgslam.types import CameraRig, FloatArray, Frame, Odometry, Trajectory
 from tests.benchmark import estimators, homing, long_drive
 from tests.benchmark.drives import open_drive
 

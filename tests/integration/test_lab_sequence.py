@@ -13,6 +13,7 @@ from fgslam import geometry
 from fgslam.datasets import rendered_lab
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.errors import ConfigError, FrameError, MissingDependencyError
+from fgslam.recordings import Sequence
 from fgslam.settings.lab import (
     LabBlurSettings,
     LabDriveSettings,
@@ -22,7 +23,6 @@ from fgslam.settings.lab import (
     LabRigSettings,
     LabSettings,
 )
-from fgslam.types import Sequence
 
 SMALL = LabRigSettings(width=80, height=60)
 CLEAN = LabEffectsSettings(noise_grey=0.0)

@@ -27,6 +27,8 @@ BASE = frozenset(
         "omni_cameras",
         "homing_types",
         "bearing_log",
+        "map_types",
+        "map_file",
     }
 )
 STAGES = frozenset({"datasets", "simulation", "frontend", "factors", "evaluation", "export"})
@@ -46,6 +48,8 @@ FOUNDATION_ALLOWS: dict[str, frozenset[str]] = {
     "omni_cameras": frozenset({"types", "errors", "planar"}),
     "homing_types": frozenset({"types", "planar"}),
     "bearing_log": frozenset({"types", "errors", "homing_types", "measurement_log"}),
+    "map_types": frozenset({"types"}),
+    "map_file": frozenset({"types", "errors", "geometry", "map_types", "measurement_log"}),
     "measurement_log": frozenset({"types", "errors", "geometry"}),
     "recordings": frozenset({"types", "errors", "geometry", "measurement_log"}),
 }

@@ -23,8 +23,9 @@ from fgslam.datasets.euroc import open_euroc, rectifier
 from fgslam.datasets.recording import Recording
 from fgslam.errors import CalibrationError, DatasetError, FgslamError, FrameError
 from fgslam.geometry import inverse, pose, project, se3_exp, so3_exp, transform_to_camera
+from fgslam.recordings import Sequence
 from fgslam.settings.datasets import EurocSettings
-from fgslam.types import FloatArray, Sequence
+from fgslam.types import FloatArray
 
 # Two cameras that look along the body's x axis, slightly turned against each other, 11 cm apart.
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -19,8 +19,8 @@ from fgslam.datasets.images import read_grey_image
 from fgslam.datasets.recording import Recording
 from fgslam.errors import CalibrationError, DatasetError, FgslamError, FrameError
 from fgslam.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, right_from_left_camera
+from fgslam.recordings import Sequence
 from fgslam.settings.datasets import ImageFolderSettings
-from fgslam.types import Sequence
 
 
 def opened(root: Path, **settings: object) -> Recording:

@@ -9,8 +9,8 @@ from dataset_builders import kitti, picture, save
 from fgslam.datasets.kitti import open_kitti
 from fgslam.datasets.recording import Recording
 from fgslam.errors import CalibrationError, DatasetError, FgslamError, FrameError
+from fgslam.recordings import Sequence
 from fgslam.settings.datasets import KittiSettings
-from fgslam.types import Sequence
 
 
 def opened(root: Path, **settings: object) -> Recording:

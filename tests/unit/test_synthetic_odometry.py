@@ -12,8 +12,9 @@ from fgslam.datasets.recording import Recording
 from fgslam.datasets.synthetic_odometry import SyntheticOdometry
 from fgslam.errors import DatasetError
 from fgslam.geometry import body_to_camera_motion, inverse, se3_log
+from fgslam.recordings import Sequence
 from fgslam.settings.datasets import ImageFolderSettings, SyntheticOdometrySettings
-from fgslam.types import FloatArray, Odometry, Sequence
+from fgslam.types import FloatArray, Odometry
 
 SETTINGS = SyntheticOdometrySettings()
 FRAMES = 300
