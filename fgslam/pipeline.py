@@ -7,12 +7,16 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from fgslam.backend.protocol import Estimator
 from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
+from fgslam.frontend.loops.recognition import PlaceRecognition
+from fgslam.frontend.resection import Resection
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.frontend.tracker import Association, LandmarkTracker
@@ -21,6 +25,7 @@ from fgslam.types import (
     EgoMotion,
     EgoMotionStatus,
     Increment,
+    LoopClosure,
     Observations,
     Odometry,
     Prediction,
@@ -67,42 +72,79 @@ class Stopwatch:
 
 @dataclass(slots=True, eq=False)
 class SlamPipeline:
-    """The parts of the system and the loop over them."""
+    """The parts of the system and the loop over them; places None where none are recognised."""
 
     stereo: StereoMatcher
     tracker: LandmarkTracker
     motion: MotionModel
     estimator: Estimator
+    places: PlaceRecognition | None = None
 
     def process(self, found: FeatureFrame, index: int, timestamp: float) -> FrameReport:
-        """One frame: Sections 2 to 4 of the paper in their order."""
+        """One frame: Sections 2 to 4 of the paper in their order, then what 7 leaves to do."""
         watch = Stopwatch()
         odometry, measured = self.motion.between(found.i, timestamp)
         prediction = self.estimator.predict(odometry)
         watch.lap("predict")
         stereo = self._match_stereo(found)
         watch.lap("stereo")
-        tracking, association = self._track(prediction, found, stereo)
+        seen = self._track(prediction, found, stereo)
         watch.lap("track")
-        increment = _increment(index, timestamp, odometry if measured else None, association)
-        stats = self.estimator.update(increment, tracking, odometry)
-        self.motion.observe(timestamp, stats.wTc, _anchored(increment, tracking, stats))
+        seen = self._recognise(seen, stereo)
+        watch.lap("places")
+        increment = _increment(index, timestamp, odometry if measured else None, seen)
+        stats = self.estimator.update(increment, seen.tracking, odometry)
+        self.motion.observe(timestamp, stats.wTc, _anchored(increment, seen.tracking, stats))
+        self._remember(increment, seen, stats)
         watch.lap("update")
-        return FrameReport(found, stereo, increment, tracking, stats, watch.ms)
+        return FrameReport(found, stereo, increment, seen.tracking, stats, watch.ms)
 
     def _match_stereo(self, found: FeatureFrame) -> StereoFeatures:
         return StereoFeatures.empty() if found.frame is None else self.stereo.match(found.features)
 
-    def _track(
-        self, prediction: Prediction, found: FeatureFrame, stereo: StereoFeatures
-    ) -> tuple[EgoMotion, Association]:
+    def _track(self, prediction: Prediction, found: FeatureFrame, stereo: StereoFeatures) -> _Seen:
         if found.frame is None:
-            return self.tracker.track_blind(prediction), Association.nothing()
-        tracked = self.tracker.track(prediction, self.estimator.landmarks(), stereo)
-        association = self.tracker.associate(tracked, stereo, found.frame.images[0])
+            return _Seen(self.tracker.track_blind(prediction), Association.nothing())
+        landmarks = self.estimator.landmarks()
+        tracked = self.tracker.track(prediction, landmarks, stereo)
+        relocalised, maps_on = False, True
+        if self.places is not None and found.i > 0:
+            tracked, relocalised = self.places.recover(tracked, landmarks, stereo)
+            maps_on = self.places.maps_on
+        image = found.frame.images[0]
+        association = self.tracker.associate(tracked, stereo, image, maps_on)
         if found.i == 0:
-            return unmeasured(prediction, EgoMotionStatus.FIRST), association
-        return tracked.ego_motion, association
+            return _Seen(unmeasured(prediction, EgoMotionStatus.FIRST), association)
+        return _Seen(tracked.ego_motion, association, relocalised=relocalised)
+
+    def _recognise(self, seen: _Seen, stereo: StereoFeatures) -> _Seen:
+        """The frame with the loops that it closes; landmarks found to be one are made one."""
+        if self.places is None:
+            return seen
+        landmarks = self.estimator.landmarks()
+        doubles = self.places.doubles(landmarks)
+        loops = self.places.look(seen.tracking.wTc, landmarks, stereo, seen.association)
+        pairs = np.concatenate([doubles, *(loop.merged for loop in loops)])
+        ended = self.tracker.merge(pairs)
+        association = dataclasses.replace(
+            seen.association, pruned_ids=np.union1d(seen.association.pruned_ids, ended)
+        )
+        return dataclasses.replace(seen, association=association, loops=loops)
+
+    def _remember(self, increment: Increment, seen: _Seen, stats: UpdateStats) -> None:
+        if self.places is not None:
+            self.places.remember(increment, seen.tracking.wTc)
+            self.places.moved_to(stats.wTc)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """One frame matched: its pose, what its landmarks are, and which places it recognised."""
+
+    tracking: EgoMotion
+    association: Association
+    loops: tuple[LoopClosure, ...] = ()
+    relocalised: bool = False
 
 
 def replay_step(
@@ -133,8 +175,10 @@ def replay_frame(
     matched = increment.observations.select(~increment.observations.is_new)
     if k == 0:
         tracking = unmeasured(prediction, EgoMotionStatus.FIRST)
+    elif increment.relocalised:
+        tracking = _relocated(estimator, ego_motion, prediction, matched)
     else:
-        tracking = _solve(estimator, ego_motion, prediction, matched)
+        tracking = _solve(estimator, partial(ego_motion.solve, prediction), matched)
     watch.lap("track")
     stats = estimator.update(increment, tracking, odometry)
     motion.observe(increment.timestamp, stats.wTc, _anchored(increment, tracking, stats))
@@ -143,21 +187,32 @@ def replay_frame(
 
 
 def _solve(
-    estimator: Estimator,
-    ego_motion: EgoMotionSolver,
-    prediction: Prediction,
-    matched: Observations,
+    estimator: Estimator, solve: Callable[[PoseProblem], EgoMotion], matched: Observations
 ) -> EgoMotion:
     """Against the landmarks that the estimator holds; the others are no inliers."""
     landmarks = estimator.landmarks()
     held = np.isin(matched.ids, landmarks.ids)
     if held.all():
-        return ego_motion.solve(prediction, PoseProblem.of(landmarks, matched))
-    solved = ego_motion.solve(prediction, PoseProblem.of(landmarks, matched.select(held)))
+        return solve(PoseProblem.of(landmarks, matched))
+    solved = solve(PoseProblem.of(landmarks, matched.select(held)))
     inliers = np.zeros(len(matched), np.bool_)
     residuals = np.full(len(matched), np.inf)
     inliers[held], residuals[held] = solved.inliers, solved.residuals
     return dataclasses.replace(solved, inliers=inliers, residuals=residuals)
+
+
+def _relocated(
+    estimator: Estimator,
+    ego_motion: EgoMotionSolver,
+    prediction: Prediction,
+    matched: Observations,
+) -> EgoMotion:
+    """Without the prediction, which it contradicts; with it where the landmarks are too few."""
+    resection = Resection(ego_motion)
+    found = _solve(estimator, resection.solve, matched)
+    if found.status.measured:
+        return found
+    return _solve(estimator, partial(ego_motion.solve, prediction), matched)
 
 
 def _anchored(increment: Increment, tracking: EgoMotion, stats: UpdateStats) -> bool:
@@ -166,9 +221,8 @@ def _anchored(increment: Increment, tracking: EgoMotion, stats: UpdateStats) -> 
     return increment.odometry is not None or tracking.status.measured or founding
 
 
-def _increment(
-    index: int, timestamp: float, odometry: Odometry | None, association: Association
-) -> Increment:
+def _increment(index: int, timestamp: float, odometry: Odometry | None, seen: _Seen) -> Increment:
+    association = seen.association
     return Increment(
         index=index,
         timestamp=timestamp,
@@ -177,4 +231,6 @@ def _increment(
         rejected=association.rejected,
         missed_ids=association.missed_ids,
         pruned_ids=association.pruned_ids,
+        loops=seen.loops,
+        relocalised=seen.relocalised,
     )

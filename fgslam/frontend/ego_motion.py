@@ -114,7 +114,7 @@ class EgoMotionSolver:
 
         Of a range-bearing sensor, matches are judged by ``outlier_sigmas`` alone.
         """
-        self._sensor = sensor
+        self.sensor = sensor
         self._settings = settings
         self.floor = Floor.under(sensor, settings.dof)
         """Which poses are allowed."""
@@ -123,7 +123,7 @@ class EgoMotionSolver:
         """Pose with covariance, inliers, residuals and a status; the odometry's where it fails."""
         prediction = Prediction(self.floor.constrain(prediction.wTc), prediction.covariance)
         start = prediction.wTc
-        used = inliers = in_front(self._sensor, transform_to_camera(start, problem.points))
+        used = inliers = in_front(self.sensor, transform_to_camera(start, problem.points))
         iterations = 0
         wTc, robust = start, self._settings.kernel != "none"
         for _ in range(_REPEATS):
@@ -192,7 +192,7 @@ class EgoMotionSolver:
             covariance = problem.measurement_covariance
         if settings.weighting == "landmark":
             points = transform_to_camera(wTc, problem.points)
-            jacobian = projection_jacobian(self._sensor, points) @ wTc[:3, :3].T
+            jacobian = projection_jacobian(self.sensor, points) @ wTc[:3, :3].T
             covariance = covariance + congruence(jacobian, problem.point_covariances)
         if settings.residuals == "image_disparity":
             return inverse_spd3(covariance)
@@ -205,10 +205,10 @@ class EgoMotionSolver:
     ) -> tuple[float, FloatArray, FloatArray]:
         """Cost, Gauss-Newton Hessian (6, 6) and gradient (6,) at ``wTc``."""
         points = transform_to_camera(wTc, problem.points)
-        if not in_front(self._sensor, points).all():
+        if not in_front(self.sensor, points).all():
             return np.inf, np.eye(6), np.zeros(6)
         residual = self._residual(points, problem.measurement)
-        jacobian = projection_jacobian(self._sensor, points) @ point_pose_jacobian(points)
+        jacobian = projection_jacobian(self.sensor, points) @ point_pose_jacobian(points)
         squared = np.einsum("ki,kij,kj->k", residual, information, residual)
         rho, weight = self._kernel(squared, robust)
         weighted = weight[:, None, None] * (information @ jacobian)
@@ -242,16 +242,16 @@ class EgoMotionSolver:
             return None
 
     @property
-    def _farthest(self) -> float:
+    def farthest(self) -> float:
         """Largest image residual of an inlier; of a range sensor, more than any angle."""
-        return self._settings.outlier_px if isinstance(self._sensor, CameraRig) else 2.0 * math.pi
+        return self._settings.outlier_px if isinstance(self.sensor, CameraRig) else 2.0 * math.pi
 
     def _residual(self, points: FloatArray, measurement: FloatArray) -> FloatArray:
         """Predicted less measured (k, 3)."""
-        return measurement_difference(self._sensor, project(self._sensor, points), measurement)
+        return measurement_difference(self.sensor, project(self.sensor, points), measurement)
 
     def _inliers(self, wTc: FloatArray, problem: PoseProblem) -> BoolArray:
-        near = self.image_residuals(wTc, problem) <= self._farthest  # so in front, too
+        near = self.image_residuals(wTc, problem) <= self.farthest  # so in front, too
         if self._settings.outlier_sigmas > 0.0 and self._settings.weighting != "uniform":
             candidates = problem.select(near)
             points = transform_to_camera(wTc, candidates.points)
@@ -326,7 +326,7 @@ class EgoMotionSolver:
         Pixels; of a range-bearing sensor the angle in radians, range aside.
         """
         points = transform_to_camera(wTc, problem.points)
-        behind = ~in_front(self._sensor, points)
+        behind = ~in_front(self.sensor, points)
         points[behind] = (0.0, 0.0, 1.0)
         error = np.linalg.norm(self._residual(points, problem.measurement)[:, :2], axis=1)
         return np.where(behind, np.inf, error)

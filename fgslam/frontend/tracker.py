@@ -6,9 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgslam.frontend.database import ExpectedLandmarks, LandmarkDatabase, predicted_covariance
+from fgslam.frontend.database import LandmarkDatabase
 from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.map_matching import MapMatcher, MapMatches
+from fgslam.frontend.visibility import (
+    ExpectedLandmarks,
+    directions_to,
+    predicted_covariance,
+)
+from fgslam.frontend.resection import Resection
 from fgslam.types import (
     BoolArray,
     ByteArray,
@@ -43,19 +49,27 @@ class Association:
         rejected: (k,) matched ones whose residual made them outliers; they count as misses.
         missed_ids: landmarks expected in view and not seen.
         pruned_ids: landmarks dropped now.
+        features: (k,) the frame's features that were observed.
     """
 
     observations: Observations
     rejected: BoolArray
     missed_ids: IntArray
     pruned_ids: IntArray
+    features: IntArray
+
+    def partners(self, count: int) -> IntArray:
+        """The landmark that each of ``count`` features is taken for; -1 for none."""
+        out = np.full(count, -1, np.int64)
+        out[self.features[~self.rejected]] = self.observations.ids[~self.rejected]
+        return out
 
     @staticmethod
     def nothing() -> Association:
         """Of a frame without images: no landmark was looked for."""
         none = np.empty(0, np.int64)
         observations = StereoFeatures.empty().observations(none, none, is_new=False)
-        return Association(observations, np.empty(0, np.bool_), none, none)
+        return Association(observations, np.empty(0, np.bool_), none, none, none)
 
 
 class LandmarkTracker:
@@ -73,6 +87,7 @@ class LandmarkTracker:
         self.database = database
         self._matcher = matcher
         self._ego_motion = ego_motion
+        self.resection = Resection(ego_motion)
 
     def track(
         self, prediction: Prediction, landmarks: LandmarkMap, features: StereoFeatures
@@ -89,6 +104,15 @@ class LandmarkTracker:
             refined = self._attempt(prediction, around, landmarks, features)
             tracked = refined if refined.ego_motion.status.measured else tracked
         return tracked
+
+    def track_anew(
+        self, around: Prediction, landmarks: LandmarkMap, features: StereoFeatures
+    ) -> Tracked:
+        """Matches in the neighbourhood of a pose found without a prior, and solves without one."""
+        expected = self.database.expected(landmarks, around.wTc)
+        matches = self._match_around(around, expected, landmarks, features)
+        problem = PoseProblem.of(landmarks, _matched(expected, matches, features))
+        return Tracked(expected, matches, self.resection.solve(problem))
 
     def track_blind(self, prediction: Prediction) -> EgoMotion:
         """The odometry's pose, for a frame without images; the same that its replay will find."""
@@ -109,13 +133,24 @@ class LandmarkTracker:
         if anywhere:
             matches = self._matcher.match_anywhere(expected, features)
         else:
-            uncertainty = self._uncertainty(around, landmarks, expected)
-            matches = self._matcher.match(expected, features, uncertainty)
+            matches = self._match_around(around, expected, landmarks, features)
         problem = PoseProblem.of(landmarks, _matched(expected, matches, features))
         return Tracked(expected, matches, self._ego_motion.solve(prediction, problem))
 
-    def associate(self, tracked: Tracked, features: StereoFeatures, image: Image) -> Association:
-        """Books hits and misses, starts new tracks, prunes (4.1 to 4.3)."""
+    def _match_around(
+        self,
+        around: Prediction,
+        expected: ExpectedLandmarks,
+        landmarks: LandmarkMap,
+        features: StereoFeatures,
+    ) -> MapMatches:
+        uncertainty = self._uncertainty(around, landmarks, expected)
+        return self._matcher.match(expected, features, uncertainty)
+
+    def associate(
+        self, tracked: Tracked, features: StereoFeatures, image: Image, start_new: bool = True
+    ) -> Association:
+        """Books hits and misses, starts new tracks if it may, prunes (4.1 to 4.3)."""
         expected, matches = tracked.expected, tracked.matches
         inliers = tracked.ego_motion.inliers
         matched = _matched(expected, matches, features)
@@ -124,7 +159,7 @@ class LandmarkTracker:
         missed_ids = expected.ids[expected.certain & ~hit]
         self.database.record_hits(matched.ids[inliers], features, matches.features[inliers])
         self.database.record_misses(missed_ids)
-        fresh = np.flatnonzero(~matches.had_candidates)
+        fresh = np.flatnonzero(~matches.had_candidates & start_new)
         new_ids = self.database.add(features, fresh, _grey_values(image, features, fresh))
         new = features.observations(fresh, new_ids, is_new=True)
         return Association(
@@ -132,7 +167,23 @@ class LandmarkTracker:
             rejected=np.concatenate([~inliers, np.zeros(len(new), np.bool_)]),
             missed_ids=missed_ids,
             pruned_ids=self.database.prune(),
+            features=np.concatenate([matches.features, fresh]),
         )
+
+    def merge(self, pairs: IntArray) -> IntArray:
+        """Makes landmarks found to be one into one; returns the identities that end.
+
+        Args:
+            pairs: (m, 2) (identity that ends, identity that stays); what is no longer in the
+                database, or would go to one that ends itself, is left out.
+        """
+        known = np.isin(pairs, self.database.ids).all(axis=1)
+        known &= ~np.isin(pairs[:, 1], pairs[:, 0])
+        _, first = np.unique(pairs[known, 0], return_index=True)
+        chosen = pairs[known][first]
+        if len(chosen):
+            self.database.merge(chosen)
+        return np.asarray(chosen[:, 0])
 
     def _uncertainty(
         self,

@@ -12,7 +12,7 @@ from fgslam.measurement_log import MeasurementLog
 from fgslam.pipeline import FrameReport
 from fgslam.types import FloatArray, StateArrays
 
-STAGES = ("load", "sift", "wait", "predict", "stereo", "track", "update")
+STAGES = ("load", "sift", "wait", "predict", "stereo", "track", "places", "update")
 """Per frame: `load` and `sift` run in threads beside the loop, `wait` is what they held it up."""
 
 

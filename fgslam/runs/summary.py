@@ -14,7 +14,7 @@ from fgslam.runs.replay import peak_memory_mb
 from fgslam.types import EgoMotionStatus, Estimate, FloatArray, IntArray, Trajectory, correlation
 
 _ESTIMATOR_STAGES = ("predict", "update")
-_LOOP_STAGES = ("predict", "stereo", "track", "update")
+_LOOP_STAGES = ("predict", "stereo", "track", "places", "update")
 
 
 def estimator_metrics(estimate: Estimate, truth: Truth, recorder: RunRecorder) -> EstimatorMetrics:

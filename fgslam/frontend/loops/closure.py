@@ -1,0 +1,64 @@
+"""A recognised place as a measurement: where the frame stands beside an earlier one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.frontend.ego_motion import PoseProblem
+from fgslam.frontend.loops.memory import SightingMemory
+from fgslam.frontend.resection import Resection
+from fgslam.geometry import adjoint, congruence, inverse
+from fgslam.map_types import Relocalisation
+from fgslam.types import (
+    EgoMotion,
+    FloatArray,
+    IntArray,
+    LandmarkMap,
+    LoopClosure,
+    StereoFeatures,
+)
+
+
+def close_loop(
+    memory: SightingMemory,
+    landmarks: LandmarkMap,
+    features: StereoFeatures,
+    found: Relocalisation,
+    partners: IntArray,
+    resection: Resection,
+) -> LoopClosure | None:
+    """The closure that a frame's sighting of old landmarks means; None where it is too weak.
+
+    Both frames are located by the same old landmarks, each alone, so that neither the drift between
+    them nor any estimator's past has a say in what is measured.
+
+    Args:
+        memory: who saw what.
+        landmarks: the map.
+        features: the present frame's.
+        found: which of them are which old landmarks.
+        partners: (n,) the identity that each feature has got since the drift, -1 for none.
+        resection: locates a frame by known landmarks.
+    """
+    earlier = memory.best_view_of(found.ids)
+    seen = features.observations(found.features, found.ids, is_new=False)
+    there = resection.solve(PoseProblem.of(landmarks, memory.view(earlier, landmarks)))
+    here = resection.solve(PoseProblem.of(landmarks, seen))
+    if not (there.status.measured and here.status.measured):
+        return None
+    taken_for = partners[found.features[here.inliers]]
+    kept = seen.select(here.inliers)
+    twice = (taken_for >= 0) & (taken_for != kept.ids)
+    return LoopClosure(
+        frame=earlier,
+        oTc=inverse(there.wTc) @ here.wTc,
+        covariance=_relative_covariance(there, here),
+        observations=kept,
+        merged=np.column_stack([taken_for, kept.ids])[twice],
+    )
+
+
+def _relative_covariance(there: EgoMotion, here: EgoMotion) -> FloatArray:
+    """Of ``oTc`` in the tangent space at it: both poses' own, as if independent."""
+    carried = adjoint(inverse(inverse(there.wTc) @ here.wTc))
+    return np.asarray(here.covariance + congruence(carried, there.covariance))

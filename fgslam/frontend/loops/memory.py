@@ -1,0 +1,108 @@
+"""Who saw what, frame by frame: what a return is recognised against."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.measurement_log import MeasurementLog
+from fgslam.types import (
+    BoolArray,
+    FloatArray,
+    Increment,
+    IntArray,
+    LandmarkMap,
+    Observations,
+    StateArrays,
+)
+
+
+class SightingMemory:
+    """Observations of all frames so far, and when each landmark was last seen.
+
+    The observations are those of the log; nothing is copied.
+    """
+
+    def __init__(self) -> None:
+        """Nothing was seen yet."""
+        self._seen: list[Observations] = []
+        self._way: list[float] = []
+        self._newest: list[int] = []
+        self._last_seen: IntArray = np.empty(0, np.int64)
+
+    def __len__(self) -> int:
+        return len(self._seen)
+
+    def add(self, increment: Increment, step: FloatArray) -> None:
+        """Books a frame.
+
+        Args:
+            increment: its measurements.
+            step: (4, 4) the camera's motion since the frame before, as estimated.
+        """
+        way = self._way[-1] if self._way else 0.0
+        self._way.append(way + float(np.linalg.norm(step[:3, 3])))
+        self._book(increment)
+
+    def way_since(self, frame: int) -> float:
+        """Metres driven since a frame."""
+        return self._way[-1] - self._way[frame] if self._way else 0.0
+
+    def unseen_for(self, frames: int, ids: IntArray) -> IntArray:
+        """Those of the landmarks that the last ``frames`` frames did not see."""
+        known = ids[ids < len(self._last_seen)]
+        last = self._last_seen[known]
+        return known[(last >= 0) & (last < len(self) - frames)]
+
+    def made_after(self, frame: int, ids: IntArray) -> BoolArray:
+        """Which of the landmarks (k,) were new only after a frame."""
+        return np.asarray(ids > self._newest[frame])
+
+    def last_seen(self, ids: IntArray) -> int:
+        """The last frame that saw any of the landmarks; -1 where none did."""
+        return int(self._last_seen[ids].max(initial=-1))
+
+    def best_view_of(self, ids: IntArray) -> int:
+        """The frame that saw most of the landmarks; the latest of several.
+
+        Raises:
+            ValueError: none of them was ever seen.
+        """
+        wanted = np.zeros(len(self._last_seen), np.bool_)
+        wanted[ids] = True
+        last = self.last_seen(ids)
+        counts = [int(wanted[seen.ids].sum()) for seen in self._seen[: last + 1]]
+        if max(counts, default=0) == 0:
+            raise ValueError(f"landmarks never seen: {ids[:5].tolist()}")
+        return last - int(np.argmax(counts[::-1]))
+
+    def view(self, frame: int, landmarks: LandmarkMap) -> Observations:
+        """What a frame saw of the landmarks that are still in the map."""
+        seen = self._seen[frame]
+        return seen.select(np.isin(seen.ids, landmarks.ids))
+
+    def state(self) -> StateArrays:
+        """What the log does not tell."""
+        return {"way": np.array(self._way)}
+
+    def restore(self, state: StateArrays, log: MeasurementLog) -> None:
+        """Continues from :meth:`state` and the log of as many frames."""
+        self._seen, self._newest, self._last_seen = [], [], np.empty(0, np.int64)
+        for increment in log:
+            self._book(increment)
+        self._way = state["way"].tolist()
+
+    def _book(self, increment: Increment) -> None:
+        seen = increment.observations.select(~increment.rejected)
+        ids = np.concatenate([seen.ids, *(loop.observations.ids for loop in increment.loops)])
+        self._grow(int(ids.max(initial=-1)) + 1)
+        self._last_seen[ids] = len(self._seen)
+        self._seen.append(seen)
+        newest = self._newest[-1] if self._newest else -1
+        self._newest.append(int(increment.observations.ids.max(initial=newest)))
+
+    def _grow(self, count: int) -> None:
+        lacking = count - len(self._last_seen)
+        if lacking > 0:
+            # Twice what is needed: identities only grow, and copies shall not come every frame.
+            more = np.full(max(lacking, len(self._last_seen)), -1, np.int64)
+            self._last_seen = np.concatenate([self._last_seen, more])

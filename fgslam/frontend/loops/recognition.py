@@ -1,0 +1,233 @@
+"""Place recognition beside the loop: the return to a mapped place, and oneself when lost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from fgslam.frontend.loops.closure import close_loop
+from fgslam.frontend.loops.confirmation import Confirmation, drift_allows
+from fgslam.frontend.loops.fusion import duplicates
+from fgslam.frontend.loops.memory import SightingMemory
+from fgslam.frontend.tracker import Association, LandmarkTracker, Tracked
+from fgslam.geometry import inverse
+from fgslam.map_types import LandmarkAppearances, Relocalisation
+from fgslam.measurement_log import MeasurementLog
+from fgslam.settings.frontend import AppearanceSettings
+from fgslam.settings.loops import LoopSettings, LostSettings
+from fgslam.types import (
+    FloatArray,
+    Increment,
+    IntArray,
+    LandmarkMap,
+    LoopClosure,
+    Prediction,
+    StateArrays,
+    StereoFeatures,
+)
+
+_STREAM = 11  # of random numbers, beside those of the recording
+
+
+class Locator(Protocol):
+    """Finds a frame in a map without a prior; :mod:`fgslam.frontend.relocalisation` is one."""
+
+    def learn(self, landmarks: LandmarkMap, appearances: LandmarkAppearances) -> None:
+        """Makes these landmarks the ones to be found."""
+        ...
+
+    def locate(self, features: StereoFeatures, rng: np.random.Generator) -> Relocalisation:
+        """The frame's pose among them, or why there is none to be believed."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecognitionParts:
+    """What place recognition works with; loops or lost None where it is not wanted."""
+
+    loops: LoopSettings | None
+    lost: LostSettings | None
+    appearance: AppearanceSettings
+    relocaliser: Locator
+    seed: int
+
+
+class PlaceRecognition:
+    """Remembers who saw what, looks for returns, and finds the camera when it is lost.
+
+    All of it happens at fixed frames and with random numbers of the frame's own: the same recording
+    gives the same closures, interrupted or not.
+    """
+
+    def __init__(self, parts: RecognitionParts, tracker: LandmarkTracker) -> None:
+        """Nothing is remembered yet; the tracker is the run's own."""
+        self._parts = parts
+        self._tracker = tracker
+        self._memory = SightingMemory()
+        self._confirmation = None if parts.loops is None else Confirmation(parts.loops)
+        self._lost = 0
+        self._closed = -1  # frame of the last closure
+        self._fuse_since = -1  # a frame: landmarks made after it may be older ones' doubles
+        self._pose: FloatArray = np.eye(4)
+
+    @property
+    def maps_on(self) -> bool:
+        """Whether new landmarks may enter the map: not while it is unknown where they are."""
+        lost = self._parts.lost
+        return lost is None or not lost.after <= self._lost < lost.give_up_after
+
+    # -- lost --------------------------------------------------------------------------------
+
+    def recover(
+        self, tracked: Tracked, landmarks: LandmarkMap, features: StereoFeatures
+    ) -> tuple[Tracked, bool]:
+        """The frame as tracked; or, when that failed for long, as found in the whole map.
+
+        Returns:
+            The result, and whether it was found without a prior.
+        """
+        lost = self._parts.lost
+        self._lost = 0 if tracked.ego_motion.status.measured else self._lost + 1
+        if lost is None or self._lost < lost.after or not len(features):
+            return tracked, False
+        found = self._locate(landmarks, self._trusted(), features)
+        if not found.found:
+            return tracked, False
+        around = Prediction(found.wTc, found.covariance)
+        anew = self._tracker.track_anew(around, landmarks, features)
+        if not anew.ego_motion.status.measured:
+            return tracked, False
+        self._lost = 0
+        return anew, True
+
+    # -- loops -------------------------------------------------------------------------------
+
+    def look(
+        self,
+        wTc: FloatArray,
+        landmarks: LandmarkMap,
+        features: StereoFeatures,
+        association: Association,
+    ) -> tuple[LoopClosure, ...]:
+        """Looks for a return, where it is time to; the closure once it is confirmed.
+
+        Args:
+            wTc: (4, 4) the frame's pose as tracked.
+            landmarks: the map before this frame's update.
+            features: the frame's.
+            association: which landmarks they are taken for.
+        """
+        loops, confirmation = self._parts.loops, self._confirmation
+        if loops is None or confirmation is None or not self._time_to_look(loops, confirmation):
+            return ()
+        found = self._old_place(loops, landmarks, features)
+        if found is None or not self._plausible(found, wTc, loops):
+            confirmation.forget()
+            return ()
+        if not confirmation.offer(found.wTc, wTc):
+            return ()
+        confirmation.forget()
+        closure = close_loop(
+            self._memory,
+            landmarks,
+            features,
+            found,
+            association.partners(len(features)),
+            self._tracker.resection,
+        )
+        if closure is None:
+            return ()
+        self._closed = len(self._memory)
+        self._fuse_since = self._memory.last_seen(found.ids)
+        return (closure,)
+
+    def doubles(self, landmarks: LandmarkMap) -> IntArray:
+        """After a closure: pairs (m, 2) of (landmark that ends, that stays), once corrected.
+
+        Asked in the frame after it, when the estimator has moved the map.
+        """
+        loops = self._parts.loops
+        if loops is None or self._fuse_since < 0 or loops.fuse_m == 0.0:
+            return np.empty((0, 2), np.int64)
+        new = self._memory.made_after(self._fuse_since, landmarks.ids)
+        self._fuse_since = -1
+        sides = landmarks.ids[new], landmarks.ids[~new]
+        looks = self._tracker.database.appearances()
+        return duplicates(landmarks, looks, sides, loops.fuse_m, self._parts.appearance)
+
+    # -- upkeep ------------------------------------------------------------------------------
+
+    def remember(self, increment: Increment, wTc: FloatArray) -> None:
+        """Books a frame with its pose before any loop was closed in it."""
+        step = inverse(self._pose) @ wTc if len(self._memory) else np.eye(4)
+        self._memory.add(increment, step)
+
+    def moved_to(self, wTc: FloatArray) -> None:
+        """Books where the estimator has the frame now."""
+        self._pose = wTc
+
+    def state(self) -> StateArrays:
+        """All but what the log tells."""
+        confirmation = self._confirmation
+        return self._memory.state() | {
+            "counts": np.array(
+                [
+                    self._lost,
+                    self._closed,
+                    self._fuse_since,
+                    0 if confirmation is None else confirmation.count,
+                ]
+            ),
+            "offset": np.eye(4) if confirmation is None else confirmation.offset,
+            "pose": self._pose,
+        }
+
+    def restore(self, state: StateArrays, log: MeasurementLog) -> None:
+        """Continues from :meth:`state` and the log of as many frames."""
+        self._memory.restore(state, log)
+        self._lost, self._closed, self._fuse_since, count = state["counts"].tolist()
+        self._pose = state["pose"]
+        if self._confirmation is not None:
+            self._confirmation.count, self._confirmation.offset = count, state["offset"]
+
+    # ----------------------------------------------------------------------------------------
+
+    def _time_to_look(self, loops: LoopSettings, confirmation: Confirmation) -> bool:
+        frame = len(self._memory)
+        if self._lost or (self._closed >= 0 and frame - self._closed <= loops.rest):
+            return False
+        return confirmation.hopeful or frame % loops.every == 0
+
+    def _old_place(
+        self, loops: LoopSettings, landmarks: LandmarkMap, features: StereoFeatures
+    ) -> Relocalisation | None:
+        """The frame located by landmarks that were not seen for long; None where it is not."""
+        trusted = self._trusted()
+        known = trusted[np.isin(trusted, landmarks.ids)]
+        old = self._memory.unseen_for(loops.forgotten_after, known)
+        if not len(old) or not len(features):
+            return None
+        found = self._locate(landmarks, old, features)
+        return found if found.found else None
+
+    def _trusted(self) -> IntArray:
+        """Landmarks seen often enough to be there (Se et al. 6.1)."""
+        database = self._tracker.database
+        return database.ids[database.valid]
+
+    def _plausible(self, found: Relocalisation, wTc: FloatArray, loops: LoopSettings) -> bool:
+        way = self._memory.way_since(self._memory.best_view_of(found.ids))
+        return drift_allows(found.wTc, wTc, way, loops)
+
+    def _locate(
+        self, landmarks: LandmarkMap, among: IntArray, features: StereoFeatures
+    ) -> Relocalisation:
+        rng = np.random.default_rng([self._parts.seed, _STREAM, len(self._memory)])
+        rows = np.flatnonzero(np.isin(landmarks.ids, among))
+        chosen = LandmarkMap(
+            landmarks.ids[rows], landmarks.positions[rows], landmarks.covariances[rows]
+        )
+        self._parts.relocaliser.learn(chosen, self._tracker.database.appearances().of(chosen.ids))
+        return self._parts.relocaliser.locate(features, rng)
