@@ -2,6 +2,9 @@
 
 One uncompressed ``.npz`` of plain arrays (no pickle). Ragged rows are stored flat with offsets:
 rows of frame ``k`` are ``start[k]:start[k + 1]``.
+
+A log without loop closures and relocalised frames is written as version 2, to the same bytes as
+before there were any; one that has them is version 3. All three versions are read.
 """
 
 from __future__ import annotations
@@ -19,10 +22,12 @@ import numpy as np
 
 from fgslam.errors import MeasurementLogError
 from fgslam.types import (
+    BoolArray,
     CameraRig,
     FloatArray,
     Increment,
     IntArray,
+    LoopClosure,
     Observations,
     Odometry,
     RangeBearingSensor,
@@ -31,9 +36,9 @@ from fgslam.types import (
 )
 
 FORMAT = "fgslam measurement log"
-VERSION = 2
-_READABLE = (1, 2)
-"""Version 1 knew cameras only."""
+VERSION = 3
+_READABLE = (1, 2, 3)
+"""Version 1 knew cameras only; version 2 no loops."""
 _UPPER = np.triu_indices(3)
 _UNREADABLE = (
     OSError,
@@ -62,6 +67,12 @@ _PER_OBSERVATION: dict[str, tuple[str, tuple[int, ...]]] = {
     "pixels": ("f", (3, 2)),
     "is_new": ("b", ()),
     "rejected": ("b", ()),
+}
+_LOOPS = "loop_"  # before the names of the arrays of the loops' own observations
+_PER_LOOP: dict[str, tuple[str, tuple[int, ...]]] = {
+    "loop_frame": ("i", ()),
+    "loop_oTc": ("f", (4, 4)),
+    "loop_covariance": ("f", (6, 6)),
 }
 _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
 _SENSOR_KEYS = {"stereo": _RIG, "range_bearing": ("max_range_m",)}
@@ -101,7 +112,8 @@ class MeasurementLog:
         """The log as the arrays of its file."""
         kind = "stereo" if isinstance(self.rig, CameraRig) else "range_bearing"
         sensor = {"kind": kind} | {name: getattr(self.rig, name) for name in _SENSOR_KEYS[kind]}
-        header = {"format": FORMAT, "version": VERSION, "sensor": sensor}
+        version = VERSION if self._has_loops() else 2
+        header = {"format": FORMAT, "version": version, "sensor": sensor}
         header["motion"] = self.motion_model
         out: StateArrays = {
             "header": np.array(json.dumps(header, sort_keys=True)),
@@ -113,28 +125,34 @@ class MeasurementLog:
         }
         out |= _ragged("missed", [s.missed_ids for s in self])
         out |= _ragged("pruned", [s.pruned_ids for s in self])
-        return out | self._observation_arrays()
+        out |= _observation_arrays([s.observations for s in self], "")
+        out["rejected"] = _concatenate([s.rejected for s in self], (), np.bool_)
+        return out | (self._loop_arrays() if version == VERSION else {})
 
-    def _observation_arrays(self) -> StateArrays:
-        seen = [s.observations for s in self]
+    def _has_loops(self) -> bool:
+        """Whether anything is there that version 2 had no place for."""
+        return any(s.loops or s.relocalised for s in self)
+
+    def _loop_arrays(self) -> StateArrays:
+        loops = [loop for s in self for loop in s.loops]
         return {
-            **_ragged("observation", [o.ids for o in seen]),
-            "measurement": _concatenate([o.measurement for o in seen], (3,)),
-            "measurement_covariance": _concatenate(
-                [o.covariance[:, _UPPER[0], _UPPER[1]] for o in seen], (6,)
-            ),
-            "pixels": _concatenate([o.pixels for o in seen], (3, 2)),
-            "is_new": _concatenate([o.is_new for o in seen], (), np.bool_),
-            "rejected": _concatenate([s.rejected for s in self], (), np.bool_),
-        }
+            "relocalised": np.array([s.relocalised for s in self], np.bool_),
+            "loop_start": _starts([len(s.loops) for s in self]),
+            "loop_frame": np.array([loop.frame for loop in loops], np.int64),
+            "loop_oTc": _stack([loop.oTc for loop in loops], (4, 4)),
+            "loop_covariance": _stack([loop.covariance for loop in loops], (6, 6)),
+            "loop_merged_start": _starts([len(loop.merged) for loop in loops]),
+            "loop_merged": _concatenate([loop.merged for loop in loops], (2,), np.int64),
+        } | _observation_arrays([loop.observations for loop in loops], _LOOPS)
 
     @staticmethod
     def from_arrays(arrays: StateArrays, where: str) -> MeasurementLog:
         """The log back from its arrays; ``where`` names the source in messages."""
         header = _read_header(arrays, where)
         _require_consistent(arrays, where)
+        loops, relocalised = _loops(arrays, header["version"], where)
         log = MeasurementLog(_sensor(header["sensor"], arrays["rig_bTc"]), header["motion"])
-        observed = _split_observations(arrays)
+        observed = _split_observations(arrays, "")
         missed = _split(arrays, "missed")
         pruned = _split(arrays, "pruned")
         start = arrays["observation_start"]
@@ -148,6 +166,8 @@ class MeasurementLog:
                     rejected=arrays["rejected"][start[k] : start[k + 1]],
                     missed_ids=missed[k],
                     pruned_ids=pruned[k],
+                    loops=loops[k],
+                    relocalised=bool(relocalised[k]),
                 )
             )
         return log
@@ -216,14 +236,78 @@ def _require_consistent(arrays: StateArrays, where: str) -> None:
     expected |= {name: (kind, (seen, *item)) for name, (kind, item) in _PER_OBSERVATION.items()}
     for name in ("observation", "missed", "pruned"):
         expected[f"{name}_start"] = ("i", (frames + 1,))
-    for name, (kind, shape) in expected.items():
-        array = arrays.get(name)
-        if array is None or array.dtype.kind != kind or array.shape != shape:
-            raise MeasurementLogError(f"{where}: array {name} is absent or damaged; run again")
+    _require_arrays(arrays, expected, where)
     for name in ("observation", "missed", "pruned"):
         start, ids = arrays[f"{name}_start"], arrays.get(f"{name}_id", np.empty(0))
         if ids.dtype.kind != "i" or not _covers(start, len(ids)):
             raise MeasurementLogError(f"{where}: array {name}_id is absent or damaged; run again")
+
+
+def _loops(
+    arrays: StateArrays, version: int, where: str
+) -> tuple[list[tuple[LoopClosure, ...]], BoolArray]:
+    """Loop closures of each frame, and which frames (n,) were relocalised; none before version 3.
+
+    Raises MeasurementLogError where their arrays do not fit together, or a loop leads nowhere.
+    """
+    frames = len(arrays["frame_index"])
+    if version < VERSION:
+        return [()] * frames, np.zeros(frames, np.bool_)
+    _require_consistent_loops(arrays, where)
+    observed = _split_observations(arrays, _LOOPS)
+    merged = np.split(arrays["loop_merged"], arrays["loop_merged_start"][1:-1])
+    of_all = [
+        LoopClosure(int(frame), arrays["loop_oTc"][i], arrays["loop_covariance"][i], seen, pairs)
+        for i, (frame, seen, pairs) in enumerate(
+            zip(arrays["loop_frame"], observed, merged, strict=False)
+        )
+    ]
+    out = [tuple(of_all[a:b]) for a, b in itertools.pairwise(arrays["loop_start"])]
+    for k, loops in enumerate(out):
+        astray = [loop.frame for loop in loops if not 0 <= loop.frame < k]
+        if astray:
+            raise MeasurementLogError(
+                f"{where}: a loop closure of frame {k} leads to frame {astray[0]}, which does not "
+                "come before it; run again"
+            )
+    return out, arrays["relocalised"]
+
+
+def _require_consistent_loops(arrays: StateArrays, where: str) -> None:
+    """Raises MeasurementLogError unless the loops' arrays are there, of the right type and size."""
+    frames, count = len(arrays["frame_index"]), _length(arrays, "loop_frame")
+    seen, merged = _length(arrays, "loop_observation_id"), _length(arrays, "loop_merged")
+    expected: dict[str, tuple[str, tuple[int, ...]]] = {
+        "relocalised": ("b", (frames,)),
+        "loop_start": ("i", (frames + 1,)),
+        "loop_observation_start": ("i", (count + 1,)),
+        "loop_merged_start": ("i", (count + 1,)),
+        "loop_merged": ("i", (merged, 2)),
+    }
+    expected |= {name: (kind, (count, *item)) for name, (kind, item) in _PER_LOOP.items()}
+    for name, (kind, item) in _PER_OBSERVATION.items():
+        if name != "rejected":
+            expected[_LOOPS + name] = (kind, (seen, *item))
+    _require_arrays(arrays, expected, where)
+    ends = {"loop_start": count, "loop_observation_start": seen, "loop_merged_start": merged}
+    for name, total in ends.items():
+        if not _covers(arrays[name], total):
+            raise MeasurementLogError(f"{where}: array {name} is absent or damaged; run again")
+
+
+def _length(arrays: StateArrays, name: str) -> int:
+    """Rows of an array; 0 where it is absent or a scalar."""
+    array = arrays.get(name)
+    return 0 if array is None or array.ndim == 0 else len(array)
+
+
+def _require_arrays(
+    arrays: StateArrays, expected: dict[str, tuple[str, tuple[int, ...]]], where: str
+) -> None:
+    for name, (kind, shape) in expected.items():
+        array = arrays.get(name)
+        if array is None or array.dtype.kind != kind or array.shape != shape:
+            raise MeasurementLogError(f"{where}: array {name} is absent or damaged; run again")
 
 
 def _covers(start: IntArray, count: int) -> bool:
@@ -259,10 +343,26 @@ def _concatenate(
 
 
 def _ragged(name: str, parts: list[IntArray]) -> StateArrays:
-    sizes = np.array([0, *(len(p) for p in parts)], np.int64)
     return {
-        f"{name}_start": np.cumsum(sizes),
+        f"{name}_start": _starts([len(p) for p in parts]),
         f"{name}_id": _concatenate(parts, (), np.int64),
+    }
+
+
+def _starts(sizes: list[int]) -> IntArray:
+    """Offsets (n + 1,) of parts of these sizes."""
+    return np.cumsum(np.array([0, *sizes], np.int64))
+
+
+def _observation_arrays(seen: list[Observations], prefix: str) -> StateArrays:
+    return {
+        **_ragged(f"{prefix}observation", [o.ids for o in seen]),
+        f"{prefix}measurement": _concatenate([o.measurement for o in seen], (3,)),
+        f"{prefix}measurement_covariance": _concatenate(
+            [o.covariance[:, _UPPER[0], _UPPER[1]] for o in seen], (6,)
+        ),
+        f"{prefix}pixels": _concatenate([o.pixels for o in seen], (3, 2)),
+        f"{prefix}is_new": _concatenate([o.is_new for o in seen], (), np.bool_),
     }
 
 
@@ -270,17 +370,17 @@ def _split(arrays: StateArrays, name: str) -> list[IntArray]:
     return np.split(arrays[f"{name}_id"], arrays[f"{name}_start"][1:-1])
 
 
-def _split_observations(arrays: StateArrays) -> list[Observations]:
-    upper = arrays["measurement_covariance"]
+def _split_observations(arrays: StateArrays, prefix: str) -> list[Observations]:
+    upper = arrays[f"{prefix}measurement_covariance"]
     covariance = np.empty((len(upper), 3, 3))
     covariance[:, _UPPER[0], _UPPER[1]] = upper
     covariance[:, _UPPER[1], _UPPER[0]] = upper
     everything = Observations(
-        arrays["observation_id"],
-        arrays["measurement"],
+        arrays[f"{prefix}observation_id"],
+        arrays[f"{prefix}measurement"],
         covariance,
-        arrays["pixels"],
-        arrays["is_new"],
+        arrays[f"{prefix}pixels"],
+        arrays[f"{prefix}is_new"],
     )
-    start = arrays["observation_start"]
+    start = arrays[f"{prefix}observation_start"]
     return [everything.select(np.arange(a, b)) for a, b in itertools.pairwise(start)]

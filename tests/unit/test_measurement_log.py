@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,14 @@ from fgslam import geometry as g
 from fgslam.errors import MeasurementLogError
 from fgslam.measurement_log import MeasurementLog, load_arrays
 from fgslam.runs.checkpoint import save_log, write_arrays
-from fgslam.types import CameraRig, Increment, Observations, Odometry, RangeBearingSensor
+from fgslam.types import (
+    CameraRig,
+    Increment,
+    LoopClosure,
+    Observations,
+    Odometry,
+    RangeBearingSensor,
+)
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 
@@ -172,13 +179,13 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
     assert not (tmp_path / "exploded").exists()
 
 
-@pytest.mark.parametrize("version", [3, 99, "1", None])
+@pytest.mark.parametrize("version", [4, 99, "1", None])
 def test_another_version_is_refused(file: Path, version: object) -> None:
     arrays = load_arrays(file)
     header = json.loads(str(arrays["header"])) | {"version": version}
     arrays["header"] = np.array(json.dumps(header))
     with pytest.raises(
-        MeasurementLogError, match=rf"version {version}, this fgslam reads .* 1 to 2"
+        MeasurementLogError, match=rf"version {version}, this fgslam reads .* 1 to 3"
     ):
         MeasurementLog.from_arrays(arrays, "x.npz")
 
@@ -243,3 +250,79 @@ def test_a_log_of_a_range_sensor_round_trips(file: Path, tmp_path: Path) -> None
     assert_same(back.rig, log.rig)
     for before, after in zip(log, back, strict=True):
         assert_same(before, after)
+
+
+# --------------------------------------------------------------------------------------------
+# Version 3: loop closures and relocalised frames
+
+
+def loop(frame: int, rng: np.random.Generator, seen: int, merged: int) -> LoopClosure:
+    step = rng.standard_normal((6, 6))
+    return LoopClosure(
+        frame=frame,
+        oTc=rng.standard_normal((4, 4)),
+        covariance=step @ step.T,
+        observations=increment(0, rng, seen, with_odometry=False).observations,
+        merged=rng.integers(0, 2**40, (merged, 2)),
+    )
+
+
+@pytest.fixture
+def looped(log: MeasurementLog, rng: np.random.Generator) -> MeasurementLog:
+    """Frames with two loops, one, and none; one relocalised."""
+    changed = {
+        2: {"loops": (loop(0, rng, 3, 2), loop(1, rng, 0, 0))},
+        4: {"loops": (loop(3, rng, 5, 1),), "relocalised": True},
+    }
+    return MeasurementLog(
+        log.rig, log.motion_model, [replace(s, **changed.get(k, {})) for k, s in enumerate(log)]
+    )
+
+
+def test_every_bit_of_loops_survives(looped: MeasurementLog, tmp_path: Path) -> None:
+    save_log(tmp_path, looped)
+    loaded = MeasurementLog.load(tmp_path / "measurements.npz")
+    assert [len(s.loops) for s in loaded] == [0, 0, 2, 0, 1, 0]
+    assert [s.relocalised for s in loaded] == [False] * 4 + [True, False]
+    for before, after in zip(looped, loaded, strict=True):
+        assert_same(after, before)
+
+
+def test_a_relocalised_frame_alone_makes_version_3(log: MeasurementLog, tmp_path: Path) -> None:
+    log.increments[5] = replace(log.increments[5], relocalised=True)
+    save_log(tmp_path, log)
+    loaded = MeasurementLog.load(tmp_path / "measurements.npz")
+    assert [s.relocalised for s in loaded] == [False] * 5 + [True]
+
+
+def test_a_log_without_loops_stays_version_2(file: Path) -> None:
+    """Older programs read it."""
+    arrays = load_arrays(file)
+    assert json.loads(str(arrays["header"]))["version"] == 2
+    assert not [name for name in arrays if "loop" in name or "relocalised" in name]
+
+
+def test_each_array_of_the_loops_must_be_there_whole_and_of_its_type(
+    looped: MeasurementLog,
+) -> None:
+    whole = looped.to_arrays()
+    names = [name for name in whole if name.startswith("loop") or name == "relocalised"]
+    assert len(names) == 13
+    for name in names:
+        broken: list[dict[str, np.ndarray]] = [
+            {k: v for k, v in whole.items() if k != name},
+            whole | {name: whole[name][:-1]},
+            whole | {name: np.array(0)},
+            whole | {name: np.full(whole[name].shape, "x")},
+        ]
+        for arrays in broken:
+            with pytest.raises(MeasurementLogError, match=r"x\.npz: array .* absent or damaged"):
+                MeasurementLog.from_arrays(arrays, "x.npz")
+
+
+@pytest.mark.parametrize("frame", [-1, 2, 5])
+def test_a_loop_that_does_not_lead_back_is_refused(looped: MeasurementLog, frame: int) -> None:
+    arrays = looped.to_arrays()
+    arrays["loop_frame"] = np.array([frame, *arrays["loop_frame"][1:]])
+    with pytest.raises(MeasurementLogError, match=f"frame 2 leads to frame {frame}"):
+        MeasurementLog.from_arrays(arrays, "x.npz")
