@@ -115,6 +115,16 @@ def chair() -> list[Patch]:
     return out
 
 
+def sofa(width: float, cover: str) -> list[Patch]:
+    """Seat, back and two arms."""
+    cloth, w = Surface(cover, 0.6), width / 2
+    out = box((-w, -0.85, 0.05), (w, 0.0, 0.42), cloth)
+    out += box((-w, -0.22, 0.42), (w, 0.0, 0.85), cloth)
+    for side in (-w, w - 0.18):
+        out += box((side, -0.85, 0.42), (side + 0.18, -0.22, 0.6), cloth)
+    return out
+
+
 def hanging(width: float, height: float, surface: Surface) -> list[Patch]:
     """A flat board, its lower edge at z = 0, just before y = 0: posters, windows, doors."""
     gap = 0.004

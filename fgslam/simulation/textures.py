@@ -28,12 +28,12 @@ def fractal_noise(rng: np.random.Generator, shape: tuple[int, int], beta: float)
     return np.asarray(noise / noise.std(), dtype=np.float32)
 
 
-def plaster(rng: np.random.Generator, size: int, base: float) -> Grey:
+def plaster(rng: np.random.Generator, size: int, base: float, scuffs: int = 60) -> Grey:
     """A painted wall: faint clouds, specks, and a few scuffs and nail holes."""
     image = base + 4.0 * fractal_noise(rng, (size, size), 2.2)
     image += 2.0 * fractal_noise(rng, (size, size), 0.6)
     marks = np.zeros((size, size), dtype=np.float32)
-    for _ in range(60):
+    for _ in range(scuffs):
         row, column = rng.integers(0, size, 2)
         height, width = rng.integers(2, 12, 2)
         marks[row : row + height, column : column + width] -= rng.uniform(15.0, 90.0)
@@ -346,6 +346,34 @@ def panelled(rng: np.random.Generator, height: int, width: int, base: float) -> 
     sign[:] = 225.0
     sign -= 180.0 * text_lines(rng, (sign.shape[0], sign.shape[1]), 2, 1.0)
     return _soft(image)
+
+
+def wallpaper(rng: np.random.Generator, size: int, base: float) -> Grey:
+    """Striped paper with small faded flowers, on top of plaster."""
+    image = plaster(rng, size, base)
+    x = np.arange(size) / size
+    image += 7.0 * np.sign(np.sin(2 * np.pi * 16 * x)).astype(np.float32)[None, :]
+    y, z = np.mgrid[0:size, 0:size] / size
+    petals = np.hypot((16 * z) % 1.0 - 0.5, (12 * y) % 1.0 - 0.5) < 0.14
+    image[petals] -= 16.0
+    return image
+
+
+def abstract(rng: np.random.Generator, side: int) -> Grey:
+    """An abstract picture: blots, bars and discs of many levels."""
+    noise = fractal_noise(rng, (side, side), float(rng.uniform(2.2, 3.4)))
+    image = 120.0 + 45.0 * noise
+    y, x = np.mgrid[0:side, 0:side] / side
+    for _ in range(int(rng.integers(8, 18))):
+        row, column, wide, high = rng.random(4)
+        level = rng.uniform(30.0, 225.0)
+        if rng.random() < 0.5:
+            inside = np.hypot(y - row, x - column) < 0.03 + 0.16 * wide
+        else:
+            tall = np.abs(y - row) < 0.02 + 0.2 * high
+            inside = tall & (np.abs(x - column) < 0.02 + 0.2 * wide)
+        image[inside] = level + 6.0 * noise[inside]
+    return np.asarray(image, dtype=np.float32)
 
 
 def _soft(image: npt.NDArray[np.floating]) -> Grey:

@@ -12,9 +12,9 @@ from fgslam.settings.omni_worlds import (
     RangeSensorSettings,
     WheelchairSettings,
 )
+from fgslam.simulation.floor_space import FloorSpace
 from fgslam.simulation.omni.disturbances import CameraTilt, camera_pose, exposed, noisy
 from fgslam.simulation.omni.floor_plan import DEPTH, WIDTH, room_at
-from fgslam.simulation.omni.floor_space import FloorSpace
 from fgslam.simulation.omni.house import House, build_house
 from fgslam.simulation.omni.house_camera import make_house_camera
 from fgslam.simulation.omni.people import Walker

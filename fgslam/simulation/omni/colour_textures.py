@@ -53,36 +53,13 @@ def ramped(rng: np.random.Generator, grey: Grey, saturation: float) -> Colour:
 
 
 def painting(rng: np.random.Generator, side: int) -> Colour:
-    """An abstract picture: blots, bars and discs of many colours in a dark or light frame."""
-    noise = textures.fractal_noise(rng, (side, side), float(rng.uniform(2.2, 3.4)))
-    image = 120.0 + 45.0 * noise
-    y, x = np.mgrid[0:side, 0:side] / side
-    for _ in range(int(rng.integers(8, 18))):
-        row, column, wide, high = rng.random(4)
-        level = rng.uniform(30.0, 225.0)
-        if rng.random() < 0.5:
-            inside = np.hypot(y - row, x - column) < 0.03 + 0.16 * wide
-        else:
-            tall = np.abs(y - row) < 0.02 + 0.2 * high
-            inside = tall & (np.abs(x - column) < 0.02 + 0.2 * wide)
-        image[inside] = level + 6.0 * noise[inside]
-    out = ramped(rng, np.asarray(image, dtype=np.float32), 0.75)
+    """An abstract picture of many colours in a dark or light frame."""
+    out = ramped(rng, textures.abstract(rng, side), 0.75)
     edge = max(side // 24, 2)
     frame = np.array(rng.choice([[52.0, 40.0, 30.0], [215.0, 205.0, 190.0], [120.0, 90.0, 45.0]]))
     for part in (out[:edge], out[-edge:], out[:, :edge], out[:, -edge:]):
         part[:] = frame
     return out
-
-
-def wallpaper(rng: np.random.Generator, size: int, base: float) -> Grey:
-    """Striped paper with small faded flowers, on top of plaster."""
-    image = textures.plaster(rng, size, base)
-    x = np.arange(size) / size
-    image += 7.0 * np.sign(np.sin(2 * np.pi * 16 * x)).astype(np.float32)[None, :]
-    y, z = np.mgrid[0:size, 0:size] / size
-    petals = np.hypot((16 * z) % 1.0 - 0.5, (12 * y) % 1.0 - 0.5) < 0.14
-    image[petals] -= 16.0
-    return image
 
 
 def build_colour_library(rng: np.random.Generator) -> dict[str, Colour]:
@@ -135,8 +112,8 @@ def _walls(rng: np.random.Generator) -> dict[str, Colour]:
         "wall_cream": tinted(textures.plaster(rng, 512, 185.0), 0.06, -0.22),
         "wall_white": tinted(textures.plaster(rng, 512, 200.0), 0.0, -0.04),
         "wall_blue": tinted(textures.plaster(rng, 512, 150.0), -0.22, 0.30),
-        "wall_green": tinted(wallpaper(rng, 512, 150.0), -0.18, -0.15),
-        "wall_rose": tinted(wallpaper(rng, 512, 160.0), 0.25, 0.0),
+        "wall_green": tinted(textures.wallpaper(rng, 512, 150.0), -0.18, -0.15),
+        "wall_rose": tinted(textures.wallpaper(rng, 512, 160.0), 0.25, 0.0),
         "wall_ochre": tinted(textures.plaster(rng, 512, 150.0), 0.28, -0.5),
         "bricks": tinted(textures.bricks(rng, 512, 30), 0.55, -0.25),
     }

@@ -10,16 +10,6 @@ from fgslam.simulation.patches import Patch, Surface, box, placed, prism, rectan
 _POT = Surface("bricks", 0.8)
 
 
-def sofa(width: float, cover: str) -> list[Patch]:
-    """Seat, back and two arms."""
-    cloth, w = Surface(cover, 0.6), width / 2
-    out = box((-w, -0.85, 0.05), (w, 0.0, 0.42), cloth)
-    out += box((-w, -0.22, 0.42), (w, 0.0, 0.85), cloth)
-    for side in (-w, w - 0.18):
-        out += box((side, -0.85, 0.42), (side + 0.18, -0.22, 0.6), cloth)
-    return out
-
-
 def bed(cover: str) -> list[Patch]:
     """A bed, its head against the wall, with a pillow and a bedspread."""
     wood = Surface("wood_dark", 0.8)

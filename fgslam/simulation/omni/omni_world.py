@@ -13,12 +13,12 @@ import numpy as np
 
 from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.settings.omni_worlds import OmniHouseSettings
+from fgslam.simulation.floor_space import FloorSpace
 from fgslam.simulation.lighting import bake
 from fgslam.simulation.omni import disturbances
 from fgslam.simulation.omni.colour_bank import ColourBank
 from fgslam.simulation.omni.colour_textures import build_colour_library
 from fgslam.simulation.omni.floor_plan import DEPTH, WIDTH
-from fgslam.simulation.omni.floor_space import FloorSpace
 from fgslam.simulation.omni.house import build_house
 from fgslam.simulation.omni.house_camera import make_house_camera
 from fgslam.simulation.omni.mirror_renderer import MirrorRenderer, surface_points, visible

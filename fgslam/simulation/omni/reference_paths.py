@@ -16,8 +16,9 @@ from scipy.sparse.csgraph import dijkstra
 
 from fgslam.errors import DatasetError
 from fgslam.planar import unit, wrap
-from fgslam.simulation.omni.floor_plan import ROOMS, Room
-from fgslam.simulation.omni.floor_space import FloorSpace
+from fgslam.simulation.buildings.floor_plan import Room
+from fgslam.simulation.floor_space import FloorSpace
+from fgslam.simulation.omni.floor_plan import ROOMS
 from fgslam.types import FloatArray, IntArray
 
 # A closed walk through the house: every room, and the corridor twice.

@@ -1,0 +1,1 @@
+"""Buildings: floor plans of rooms, corridors and doors, and what stands in them."""
