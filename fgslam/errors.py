@@ -39,6 +39,10 @@ class StoredMapError(FgslamError):
     """A path memory or a topological map is truncated, foreign, or of an unknown version."""
 
 
+class MapError(FgslamError):
+    """A saved map cannot be used: truncated, foreign, damaged, newer, or of another rig."""
+
+
 class OutputError(FgslamError):
     """The run folder cannot be written, or it exists already."""
 

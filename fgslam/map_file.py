@@ -1,20 +1,64 @@
-"""The saved map: landmarks with their looks and counts, the drive that made them, one file."""
+"""The saved map: landmarks with their looks and counts, the drive that made them, one file.
+
+The file is a zip of plain ``.npy`` arrays with a JSON header, as ``numpy.load`` reads it, without
+pickle; docs/maps.md has its table. The header holds the SHA-256 of all contents. The same map gives
+the same bytes, and a file is written whole or not at all.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import zipfile
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from fgslam.errors import MapError, MeasurementLogError
 from fgslam.map_types import LandmarkAppearances
+from fgslam.measurement_log import load_arrays
 from fgslam.types import (
     BoolArray,
     ByteArray,
     CameraRig,
+    FloatArray,
     IntArray,
     LandmarkMap,
     StateArrays,
     Trajectory,
 )
+from fgslam.whole_files import replacing
+
+FORMAT = "fgslam map"
+VERSION = 1
+_SESSION = "session/"
+_UPPER = np.triu_indices(3)
+_LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the zip format's first moment: no file tells when it was made
+_RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
+_SAME_RIG = 1e-6  # relative: the same calibration, perhaps read from another text
+
+# Arrays by what their first axis counts, with type and the shape of an item.
+_ITEMS: dict[str, dict[str, tuple[str, tuple[int, ...]]]] = {
+    "landmarks": {
+        "landmark_id": ("i", ()),
+        "landmark_position": ("f", (3,)),
+        "landmark_covariance": ("f", (3, 3)),
+        "landmark_hits": ("i", ()),
+        "landmark_misses": ("i", ()),
+        "landmark_permanent": ("b", ()),
+        "landmark_colour": ("u", ()),
+    },
+    "views": {
+        "view_landmark": ("i", ()),
+        "view_descriptor": ("u", (128,)),
+        "view_size": ("f", ()),
+        "view_orientation": ("f", ()),
+        "view_direction": ("f", (3,)),
+    },
+    "poses": {"pose_time": ("f", ()), "pose": ("f", (4, 4))},
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,3 +91,291 @@ class SavedMap:
 
     def __len__(self) -> int:
         return len(self.landmarks)
+
+
+def save_map(saved: SavedMap, path: Path) -> int:
+    """Writes a map, whole or not at all; the same map gives the same bytes.
+
+    Returns:
+        Size of the file in bytes.
+
+    Raises:
+        MapError: the map's parts do not fit each other, or ``about`` is not plain JSON.
+        OutputError: the file cannot be written.
+    """
+    arrays = _to_arrays(saved)
+    header = _header(saved, str(path))
+    _require_consistent(header, arrays, str(path))
+    arrays, header["triangles"] = _without_mirrors(arrays)
+    arrays, header["same_as"] = _without_repeats(arrays)
+    header["sha256"] = _digest(header, arrays)
+    members = {"header": np.array(json.dumps(header, sort_keys=True))} | arrays
+    with replacing(path) as partial, partial.open("wb") as file:
+        with zipfile.ZipFile(file, "w", compresslevel=1) as archive:
+            for name, array in members.items():
+                _write_member(archive, name, array)
+        return file.tell()
+
+
+def load_map(path: Path) -> SavedMap:
+    """Reads a map and checks its checksum.
+
+    Raises:
+        MapError: the file is missing, truncated, damaged, foreign, or of a newer fgslam.
+    """
+    arrays = _read(path)
+    header = _read_header(arrays, str(path))
+    if header.pop("sha256", None) != _digest(header, arrays):
+        raise MapError(
+            f"{path}: damaged: its contents do not have the checksum that they were saved with; "
+            "restore the file or make the map again"
+        )
+    arrays = _with_mirrors(_with_repeats(arrays, header, str(path)), header, str(path))
+    _require_consistent(header, arrays, str(path))
+    return _from_arrays(header, arrays, str(path))
+
+
+def require_rig(saved: SavedMap, rig: CameraRig, where: str) -> None:
+    """Refuses a map that other cameras made: sizes, places and depths would not agree.
+
+    Raises:
+        MapError: what differs first; ``where`` names the map.
+    """
+    for name in _RIG:
+        theirs, ours = getattr(saved.rig, name), getattr(rig, name)
+        if (theirs is None) != (ours is None) or (
+            ours is not None and not np.isclose(theirs, ours, rtol=_SAME_RIG, atol=0.0)
+        ):
+            raise MapError(
+                f"{where}: made with another rig ({name} {theirs}, the recording's is {ours}); "
+                "give a map of the same cameras"
+            )
+    if not np.allclose(saved.rig.bTc, rig.bTc, rtol=0.0, atol=_SAME_RIG):
+        raise MapError(
+            f"{where}: made with the cameras mounted otherwise on the robot (bTc differs); give a "
+            "map of the same robot"
+        )
+
+
+# --------------------------------------------------------------------------------------------
+# Map to arrays and back
+
+
+def _to_arrays(saved: SavedMap) -> StateArrays:
+    landmarks, views = saved.landmarks, saved.appearances
+    return {
+        "rig_bTc": saved.rig.bTc,
+        "landmark_id": landmarks.ids,
+        "landmark_position": landmarks.positions,
+        "landmark_covariance": landmarks.covariances,
+        "landmark_hits": saved.hits,
+        "landmark_misses": saved.misses,
+        "landmark_permanent": saved.permanent,
+        "landmark_colour": saved.colour,
+        "view_landmark": views.ids,
+        "view_descriptor": views.descriptors,
+        "view_size": views.size,
+        "view_orientation": views.orientation,
+        "view_direction": views.direction,
+        "pose_time": saved.trajectory.timestamps,
+        "pose": saved.trajectory.poses,
+        **{f"{_SESSION}{name}": array for name, array in sorted(saved.session.items())},
+    }
+
+
+def _from_arrays(header: dict[str, Any], arrays: StateArrays, where: str) -> SavedMap:
+    ids = arrays["landmark_id"]
+    return SavedMap(
+        rig=_rig(header, arrays["rig_bTc"], where),
+        landmarks=LandmarkMap(ids, arrays["landmark_position"], arrays["landmark_covariance"]),
+        appearances=LandmarkAppearances(
+            arrays["view_landmark"],
+            arrays["view_descriptor"],
+            arrays["view_size"],
+            arrays["view_orientation"],
+            arrays["view_direction"],
+        ),
+        hits=arrays["landmark_hits"],
+        misses=arrays["landmark_misses"],
+        permanent=arrays["landmark_permanent"],
+        colour=arrays["landmark_colour"],
+        trajectory=Trajectory(arrays["pose_time"], arrays["pose"]),
+        about=header["about"],
+        session={
+            name.removeprefix(_SESSION): array
+            for name, array in arrays.items()
+            if name.startswith(_SESSION)
+        },
+    )
+
+
+def _without_mirrors(arrays: StateArrays) -> tuple[StateArrays, list[str]]:
+    """Matrices (n, 3, 3) that are symmetric to the bit as their upper triangles (n, 6)."""
+    out, names = dict(arrays), []
+    for name, array in arrays.items():
+        if array.ndim == 3 and array.shape[1:] == (3, 3) and _mirrors(array):
+            out[name] = array[:, _UPPER[0], _UPPER[1]]
+            names.append(name)
+    return out, names
+
+
+def _mirrors(array: np.ndarray[Any, Any]) -> bool:
+    """To the bit: not even the sign of a zero may be lost."""
+    return array.tobytes() == np.swapaxes(array, 1, 2).tobytes()
+
+
+def _with_mirrors(arrays: StateArrays, header: dict[str, Any], where: str) -> StateArrays:
+    out = dict(arrays)
+    for name in header["triangles"]:
+        upper = arrays.get(name)
+        if upper is None or upper.ndim != 2 or upper.shape[1] != 6:
+            raise MapError(f"{where}: array {name} is absent or damaged; make the map again")
+        full = np.empty((len(upper), 3, 3), upper.dtype)
+        full[:, _UPPER[0], _UPPER[1]] = upper
+        full[:, _UPPER[1], _UPPER[0]] = upper
+        out[name] = full
+    return out
+
+
+def _without_repeats(arrays: StateArrays) -> tuple[StateArrays, dict[str, str]]:
+    """Each content once: the rest by the name of the one that is kept.
+
+    What the map holds the session often holds, too, and a smoother's inputs are the log.
+    """
+    kept: StateArrays = {}
+    same_as: dict[str, str] = {}
+    first: dict[bytes, str] = {}
+    for name, array in arrays.items():
+        digest = _digest_of("", array)
+        if digest in first:
+            same_as[name] = first[digest]
+        else:
+            first[digest] = name
+            kept[name] = array
+    return kept, same_as
+
+
+def _with_repeats(arrays: StateArrays, header: dict[str, Any], where: str) -> StateArrays:
+    out = dict(arrays)
+    for name, source in header["same_as"].items():
+        if source not in arrays:
+            raise MapError(f"{where}: array {source} is absent or damaged; make the map again")
+        out[name] = arrays[source].copy()  # owners write to what they restore
+    return out
+
+
+# --------------------------------------------------------------------------------------------
+# Header and checks
+
+
+def _header(saved: SavedMap, where: str) -> dict[str, Any]:
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "counts": {
+            "landmarks": len(saved),
+            "views": len(saved.appearances),
+            "poses": len(saved.trajectory),
+        },
+        "rig": {name: getattr(saved.rig, name) for name in _RIG},
+        "about": saved.about,
+    }
+    try:
+        told = json.loads(json.dumps(header, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise MapError(
+            f"{where}: what the map tells about itself is not plain JSON ({error}); leave it out"
+        ) from None
+    return dict(told)
+
+
+def _read(path: Path) -> StateArrays:
+    try:
+        path.open("rb").close()
+        return load_arrays(path)
+    except FileNotFoundError:
+        raise MapError(f"{path}: no such file; save a map with fgslam run --map-out") from None
+    except IsADirectoryError:
+        raise MapError(f"{path}: is a folder; give the map file itself") from None
+    except OSError as error:
+        raise MapError(f"{path}: cannot be read ({error.strerror}); mend that") from None
+    except MeasurementLogError:
+        raise MapError(
+            f"{path}: not a readable map file: truncated, damaged, or something else altogether; "
+            "restore it or make the map again"
+        ) from None
+
+
+def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
+    """Takes the header out of the arrays."""
+    try:
+        header = json.loads(str(arrays.pop("header")))
+    except (KeyError, json.JSONDecodeError):
+        header = None
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise MapError(f"{where}: not an fgslam map; give a file that fgslam run --map-out wrote")
+    version = header.get("version")
+    if version != VERSION:
+        raise MapError(
+            f"{where}: map of version {version}, this fgslam reads version {VERSION}; use the "
+            "fgslam that wrote it, or make the map again"
+        )
+    groups = ("counts", "rig", "about", "same_as")
+    sound = all(isinstance(header.get(name), dict) for name in groups)
+    if not sound or not isinstance(header.get("triangles"), list):
+        raise MapError(f"{where}: the map's header is damaged; make the map again")
+    return header
+
+
+def _digest(header: dict[str, Any], arrays: StateArrays) -> str:
+    """SHA-256 over the header and all arrays: names, types, shapes and bytes."""
+    whole = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(arrays):
+        whole.update(_digest_of(name, arrays[name]))
+    return whole.hexdigest()
+
+
+def _digest_of(name: str, array: np.ndarray[Any, Any]) -> bytes:
+    one = hashlib.sha256(f"{name} {array.dtype.str} {array.shape}".encode())
+    one.update(np.ascontiguousarray(array).view(np.uint8).data if array.size else b"")
+    return one.digest()
+
+
+def _require_consistent(header: dict[str, Any], arrays: StateArrays, where: str) -> None:
+    """Raises MapError unless all arrays are there, of the right type and size, and fit."""
+    expected: dict[str, tuple[str, tuple[int, ...]]] = {"rig_bTc": ("f", (4, 4))}
+    for counted, items in _ITEMS.items():
+        count = header["counts"].get(counted)
+        expected |= {name: (kind, (count, *item)) for name, (kind, item) in items.items()}
+    for name, (kind, shape) in expected.items():
+        array = arrays.get(name)
+        if array is None or array.dtype.kind != kind or array.shape != shape:
+            raise MapError(f"{where}: array {name} is absent or damaged; make the map again")
+    ids, views = arrays["landmark_id"], arrays["view_landmark"]
+    finite = ("rig_bTc", "landmark_position", "landmark_covariance", "pose", "pose_time")
+    for name, sound in {
+        "landmark_id": bool((np.diff(ids) > 0).all()),
+        "view_landmark": bool((np.diff(views) >= 0).all() and np.isin(views, ids).all()),
+        "pose_time": bool((np.diff(arrays["pose_time"]) > 0).all()),
+    }.items():
+        if not sound:
+            raise MapError(f"{where}: array {name} is out of order; make the map again")
+    for name in finite:
+        if not np.isfinite(arrays[name]).all():
+            raise MapError(f"{where}: array {name} is not finite; make the map again")
+
+
+def _rig(header: dict[str, Any], bTc: FloatArray, where: str) -> CameraRig:
+    values = header["rig"]
+    if set(values) != set(_RIG):
+        raise MapError(f"{where}: the map's header names no rig; make the map again")
+    return CameraRig(**values, bTc=bTc)
+
+
+def _write_member(archive: zipfile.ZipFile, name: str, array: np.ndarray[Any, Any]) -> None:
+    """One array; floats as they are, since nothing of their mantissas can be packed."""
+    info = zipfile.ZipInfo(f"{name}.npy", _LONG_AGO)
+    packs = array.dtype.kind != "f"
+    info.compress_type = zipfile.ZIP_DEFLATED if packs else zipfile.ZIP_STORED
+    with archive.open(info, "w", force_zip64=True) as member:
+        np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)

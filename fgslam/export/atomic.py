@@ -1,19 +1,33 @@
-"""Files that are either whole or absent, and the folder they live in.
+"""The run folder: what it may hold, and how one is begun, resumed or replaced.
 
-Every file is written beside its place and then renamed over it, which POSIX does in one step: an
-interrupted run leaves the previous version or none, never half a file.
+Its files are written whole or not at all: :mod:`fgslam.whole_files`.
 """
 
 from __future__ import annotations
 
-import errno
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal, TypeAlias
 
 from fgslam.errors import OutputError
+from fgslam.whole_files import (
+    clear_output_errors,
+    replacing,
+    require_writable,
+    write_bytes,
+    write_text,
+)
+
+__all__ = [
+    "RUN_MARKER",
+    "ExistingFolder",
+    "clear_output_errors",
+    "create_run_folder",
+    "is_run_folder",
+    "make_subfolder",
+    "replacing",
+    "write_bytes",
+    "write_text",
+]
 
 ExistingFolder: TypeAlias = Literal["refuse", "overwrite", "resume"]
 
@@ -59,72 +73,6 @@ _RUN_FILES = (
     "**/.*.partial*",
 )
 
-_MENDS = {
-    errno.ENOSPC: "the disk is full; free some space or choose another folder",
-    errno.EDQUOT: "the disk quota is used up; free some space or choose another folder",
-    errno.EACCES: "permission denied; choose a folder that you may write to",
-    errno.EPERM: "permission denied; choose a folder that you may write to",
-    errno.EROFS: "the file system is read-only; choose another folder",
-    errno.ENOTDIR: "part of the path is a file, not a folder; choose another folder",
-    errno.EISDIR: "that is a folder; name a file",
-    errno.ENOENT: "its folder does not exist; choose another folder",
-    errno.EFBIG: "the file grew beyond the allowed size; raise the limit (ulimit -f)",
-    errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
-}
-
-
-@contextmanager
-def clear_output_errors(path: Path) -> Iterator[None]:
-    """Turn an OSError about ``path`` into an OutputError of one line with its mend."""
-    try:
-        yield
-    except OSError as error:
-        cause = error.strerror or str(error)
-        mend = _MENDS.get(error.errno or 0, f"{cause}; choose another folder")
-        raise OutputError(f"cannot write {path}: {mend}") from error
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A path beside ``path`` to write to; it takes the place of ``path`` when all went well.
-
-    Args:
-        path: the file to write; its folder must exist.
-
-    Yields:
-        The temporary path, with the same suffix, so that writers which look at it are content.
-
-    Raises:
-        OutputError: the folder cannot be written to, or the disk is full.
-    """
-    partial = path.with_name(f".{path.name}.partial{path.suffix}")
-    with clear_output_errors(path):
-        try:
-            yield partial
-            os.replace(partial, path)
-        finally:
-            # Still there only when something failed; what failed is what the user must hear of.
-            _remove_quietly(partial)
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a whole file atomically. Raises OutputError when it cannot be written."""
-    with replacing(path) as partial:
-        partial.write_bytes(content)
-
-
-def write_text(path: Path, content: str) -> None:
-    """Write a whole UTF-8 file atomically, with Unix line ends. Raises OutputError."""
-    write_bytes(path, content.encode("utf-8"))
-
-
-def _remove_quietly(path: Path) -> None:
-    try:
-        path.unlink(missing_ok=True)
-    except OSError:
-        return
-
-
 # --------------------------------------------------------------------------------------------
 # The run folder
 
@@ -150,12 +98,7 @@ def create_run_folder(path: Path, existing: ExistingFolder = "refuse") -> Path:
         _make_room(path, overwrite=existing == "overwrite")
     with clear_output_errors(path):
         path.mkdir(parents=True, exist_ok=True)
-    probe = path / ".writable.partial"
-    with clear_output_errors(path):
-        try:
-            probe.write_bytes(b"\0")
-        finally:
-            _remove_quietly(probe)
+    require_writable(path)
     return path
 
 

@@ -27,6 +27,7 @@ BASE = frozenset(
         "omni_cameras",
         "homing_types",
         "bearing_log",
+        "whole_files",
         "map_types",
         "map_file",
     }
@@ -49,7 +50,10 @@ FOUNDATION_ALLOWS: dict[str, frozenset[str]] = {
     "homing_types": frozenset({"types", "planar"}),
     "bearing_log": frozenset({"types", "errors", "homing_types", "measurement_log"}),
     "map_types": frozenset({"types"}),
-    "map_file": frozenset({"types", "errors", "geometry", "map_types", "measurement_log"}),
+    "whole_files": frozenset({"errors"}),
+    "map_file": frozenset(
+        {"types", "errors", "geometry", "map_types", "measurement_log", "whole_files"}
+    ),
     "measurement_log": frozenset({"types", "errors", "geometry"}),
     "recordings": frozenset({"types", "errors", "geometry", "measurement_log"}),
 }

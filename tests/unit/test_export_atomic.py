@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fgslam import whole_files
 from fgslam.errors import OutputError
-from fgslam.export import atomic
 from fgslam.export.atomic import (
     create_run_folder,
     is_run_folder,
@@ -80,7 +80,7 @@ def test_system_errors_become_one_clear_line(
     def refuse(*_: object) -> None:
         raise OSError(code, os.strerror(code))
 
-    monkeypatch.setattr(atomic.os, "replace", refuse)
+    monkeypatch.setattr(whole_files.os, "replace", refuse)
     with pytest.raises(OutputError, match=words) as caught:
         write_bytes(tmp_path / "a.bin", b"content")
     assert "\n" not in str(caught.value)
