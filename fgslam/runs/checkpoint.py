@@ -26,6 +26,8 @@ def save(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
         "motion": pipeline.motion.state(),
         "recorder": recorder.state(),
     }
+    if pipeline.places is not None:
+        parts["places"] = pipeline.places.state()
     write_arrays(
         folder / STATE_FILE,
         {
@@ -65,6 +67,8 @@ def load(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
         pipeline.estimator.restore(_part(state, "estimator"))
         pipeline.motion.restore(_part(state, "motion"))
         recorder.restore(_part(state, "recorder"), log)
+        if pipeline.places is not None:
+            pipeline.places.restore(_part(state, "places"), recorder.log)
     except (KeyError, ValueError, IndexError) as error:
         raise OutputError(
             f"{folder / STATE_FILE}: not a state that this fgslam wrote ({error}); start again "

@@ -8,6 +8,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fgslam.settings.base import STRICT
+from fgslam.settings.loops import LoopSettings, LostSettings
 
 Appearance: TypeAlias = Literal["descriptor", "paper"]
 
@@ -144,6 +145,72 @@ class MapMatchingSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
+class PermanenceSettings:
+    """Landmarks that are never pruned for being missed (Se et al. 6.2), and when they lose that."""
+
+    ratio: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            lt=1.0,
+            description="a landmark becomes permanent when hits / (hits + misses) exceeds this; "
+            "unstated in 6.2",
+        ),
+    ] = 0.5
+    hits: Annotated[
+        int,
+        Field(ge=1, description="and when it has at least so many hits, and valid_hits (6.1)"),
+    ] = 3
+    when: Annotated[
+        Literal["running", "saved"],
+        Field(
+            description="`running`: with the hit that makes it so; `saved`: all together when the "
+            "map is saved, as 6.2 does beforehand"
+        ),
+    ] = "running"
+    blind_below: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            le=1.0,
+            description="a frame that matches less than this share of the landmarks expected well "
+            "in view is blocked or lost: it tells of no landmark that it is gone; 0 believes all",
+        ),
+    ] = 0.1
+    contradicted_after: Annotated[
+        int | None,
+        Field(
+            ge=1,
+            description="frames that contradict a permanent landmark (rejected as an outlier, or "
+            "missed where the view is clear), no hit between them, until it is an ordinary one "
+            "again; null: never",
+        ),
+    ] = 20
+    near_px: Annotated[
+        float,
+        Field(gt=0.0, description="what tells whether a place is clear is seen this near to it"),
+    ] = 20.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class ViewpointSettings:
+    """Several looks of a landmark, from different directions (Se et al. 6.3)."""
+
+    view_angle_deg: Annotated[
+        float,
+        Field(gt=0.0, lt=180.0, description="farther than this from every view: a view of its own"),
+    ] = 20.0
+    max_views: Annotated[
+        int,
+        Field(
+            ge=2,
+            le=64,
+            description="views of a landmark; a further one replaces that matched longest ago",
+        ),
+    ] = 8
+
+
+@dataclass(frozen=True, config=STRICT)
 class DatabaseSettings:
     """Life and death of landmarks (Se et al. 4 and 6.1)."""
 
@@ -179,6 +246,14 @@ class DatabaseSettings:
             description="this near to an image's edge a landmark may be matched but is not missed",
         ),
     ] = 8.0
+    permanence: Annotated[
+        PermanenceSettings | None,
+        Field(description="permanent landmarks (6.2); null: none but those of a map loaded"),
+    ] = None
+    viewpoints: Annotated[
+        ViewpointSettings | None,
+        Field(description="several views a landmark (6.3); null: the latest one alone"),
+    ] = None
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -244,3 +319,11 @@ class FrontendSettings:
     matching: MapMatchingSettings = MapMatchingSettings()
     database: DatabaseSettings = DatabaseSettings()
     ego_motion: EgoMotionSettings = EgoMotionSettings()
+    loops: Annotated[
+        LoopSettings | None,
+        Field(description="look for returns to mapped places and close the loop; null does not"),
+    ] = None
+    lost: Annotated[
+        LostSettings | None,
+        Field(description="search the whole map when lost; null goes on by odometry alone"),
+    ] = None
