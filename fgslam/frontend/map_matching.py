@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.frontend.candidates import alike, pairs_within, pick, resembling
-from fgslam.frontend.database import ExpectedLandmarks
+from fgslam.frontend.visibility import ExpectedLandmarks
 from fgslam.settings.frontend import AppearanceSettings, MapMatchingSettings
 from fgslam.types import BoolArray, FloatArray, IntArray, StereoFeatures
 

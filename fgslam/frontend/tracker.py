@@ -9,12 +9,8 @@ import numpy as np
 from fgslam.frontend.database import LandmarkDatabase
 from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.map_matching import MapMatcher, MapMatches
-from fgslam.frontend.visibility import (
-    ExpectedLandmarks,
-    directions_to,
-    predicted_covariance,
-)
 from fgslam.frontend.resection import Resection
+from fgslam.frontend.visibility import ExpectedLandmarks, directions_to, predicted_covariance
 from fgslam.types import (
     BoolArray,
     ByteArray,
@@ -156,11 +152,19 @@ class LandmarkTracker:
         matched = _matched(expected, matches, features)
         hit = np.zeros(len(expected), np.bool_)
         hit[matches.landmarks[inliers]] = True
-        missed_ids = expected.ids[expected.certain & ~hit]
-        self.database.record_hits(matched.ids[inliers], features, matches.features[inliers])
+        missed_ids = self.database.missing(expected, hit)
+        directions = directions_to(tracked.ego_motion.wTc, features.position)
+        seen = matches.features[inliers]
+        self.database.record_hits(matched.ids[inliers], features, seen, directions[seen])
         self.database.record_misses(missed_ids)
+        if tracked.ego_motion.status.measured:
+            known = np.zeros(len(features), np.bool_)
+            known[seen] = True
+            rejected = matched.ids[~inliers]
+            self.database.weigh(expected, missed_ids, rejected, (features.measurement, known))
         fresh = np.flatnonzero(~matches.had_candidates & start_new)
-        new_ids = self.database.add(features, fresh, _grey_values(image, features, fresh))
+        colour = _grey_values(image, features, fresh)
+        new_ids = self.database.add(features, fresh, colour, directions[fresh])
         new = features.observations(fresh, new_ids, is_new=True)
         return Association(
             observations=matched.join(new),

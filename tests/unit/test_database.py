@@ -10,7 +10,8 @@ import pytest
 from simulated import RIG, assert_same_bits
 
 from fgslam import geometry as g
-from fgslam.frontend.database import LandmarkDatabase, predicted_covariance
+from fgslam.frontend.database import LandmarkDatabase
+from fgslam.frontend.visibility import predicted_covariance
 from fgslam.settings.frontend import DatabaseSettings
 from fgslam.types import CameraRig, FloatArray, IntArray, LandmarkMap, Prediction, StereoFeatures
 

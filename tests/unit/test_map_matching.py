@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from fgslam.frontend.database import ExpectedLandmarks
 from fgslam.frontend.map_matching import MapMatcher, MapMatches
+from fgslam.frontend.visibility import ExpectedLandmarks
 from fgslam.settings.frontend import AppearanceSettings, MapMatchingSettings
 from fgslam.types import FloatArray, StereoFeatures
 
