@@ -96,7 +96,9 @@ class OmniWorld:
         self.reference_poses = planner.reference_path(
             settings.path.spacing_m, settings.path.legs, self._rng(0), within
         )
-        self._people = People(self._people_routes(), self._rng(1), self.model.bank)
+        self._people = People(
+            self._people_routes(), self._rng(1), self.model.bank, self._lets_people_stand
+        )
         self._tilt = disturbances.CameraTilt(settings.tilt, self._rng(2))
         self._sensor = RangeSensor(settings.range_sensor, self.model.layer.caster)
         self._scene = disturbances.lit(self.model.layer, self.model.evening, settings.light)
@@ -222,6 +224,9 @@ class OmniWorld:
             route = planner.walk(tour, _PEOPLE_STEP_M, _PEOPLE_STEPS, rng)
             routes.append(places if route is None else route)
         return routes
+
+    def _lets_people_stand(self, places: FloatArray) -> BoolArray:
+        return self.clearance(places) > PERSON_RADIUS
 
     def _touches(self, place: FloatArray) -> bool:
         radius = self.settings.wheelchair.radius_m
