@@ -22,6 +22,7 @@ from fgslam.homing_types import (
     BearingMatches,
     ColumnSegments,
     HomingStart,
+    HomingVector,
     OmniFeatures,
     Refusal,
     RefusalReason,
@@ -114,6 +115,7 @@ class SimulatedEyes:
     _points: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     _ids: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     begun: int = 0
+    look_rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(5))
 
     def describe(self, image: ByteArray) -> OmniFeatures:
         """Of the robot's true pose."""
@@ -135,6 +137,14 @@ class SimulatedEyes:
         start, rows = begun
         self._points, self._ids = points[rows], start.local_map.ids
         return start
+
+    def look(self, image: ByteArray, target: OmniFeatures) -> HomingVector | Refusal:
+        """Matches in the same way, by a chance of its own."""
+        pose, rng = self.world.true_pose, self.look_rng
+        seen = landmark_features(self.world.points, pose, self.reach, self.sigma, rng)
+        matches, _ = match_landmarks(seen, target, self.wrong, rng)
+        begun = start_from_matches(0.0, matches, self.settings, rng)
+        return begun if isinstance(begun, Refusal) else begun[0].vector
 
     def track(self, image: ByteArray, time: float) -> TrackedBearings:
         """True bearings with noise; what is beyond reach is lost."""

@@ -94,6 +94,8 @@ def follow(
         command = follower.step(image, time)
         clock.lap()
         drive = driver.drive(command, world, dt)
+        if drive.overridden:
+            follower.held_up(dt)
         clock.lap()
         world.drive(drive.speed, drive.turn_rate, dt)
         clock.lap()

@@ -21,6 +21,8 @@ class HomingState(str, Enum):
     """Slowly straight on: there are no tracks, and the target is not matched anew yet."""
     WAIT = "wait"
     """Standing: the same, after the longest blind drive."""
+    SEARCH = "search"
+    """Slowly straight on: where it stood the target was refused, from elsewhere it may not be."""
     ARRIVED = "arrived"
     REFUSED = "refused"
 

@@ -51,9 +51,13 @@ class HomingController:
         self._ended: Command | None = None
         self._heading = 0.0
         self._was_ahead = False
-        self._progress = _Progress(settings.stall_s)
+        self._progress, self._patience = _Progress(settings.stall_s), settings.wait_s
         self._next_try = -np.inf
         self._blind_until = -np.inf
+        self._search_until, self._searches = -np.inf, 0
+        self._recognised = settings.near_fraction == 0.0
+        self._next_look = -np.inf
+        self._ambiguous = False
         self._standing_since: float | None = None
         self._pending: HomingVector | None = None
         self._obstacle = ""  # the last refusal's words, while there is nothing newer to say
@@ -75,6 +79,11 @@ class HomingController:
             return self._seek(image, time)
         return self._go_on(self.underway, image, time)
 
+    def held_up(self, seconds: float) -> None:
+        """Obstacles, not homing, decided on the last ``seconds``: that is no lack of progress."""
+        self._progress.excuse(min(seconds, self._patience))
+        self._patience = max(self._patience - seconds, 0.0)
+
     def _take_time(self, time: float) -> None:
         last = self._time
         if not np.isfinite(time) or (last is not None and time <= last):
@@ -95,6 +104,9 @@ class HomingController:
         home = homing.home
         self.remaining, self._heading = home.distance, home.direction
         arrival = self._arrival(homing.unit)
+        doubt = self._recognise(homing, image, time, arrival)
+        if doubt is not None:
+            return doubt
         if arrival and homing.vouched:
             return self._end(time, HomingState.ARRIVED, arrival)
         if arrival and fault is None:
@@ -119,6 +131,44 @@ class HomingController:
         self._was_ahead = self._was_ahead or not behind
         return ""
 
+    def _recognise(
+        self, homing: HomingUnderWay, image: ByteArray, time: float, arrival: str
+    ) -> Command | None:
+        """Near the target, it must be seen where the estimate has it; None to go on.
+
+        A homing vector may be wrong and sure of itself: where things repeat, its tracks fit a
+        target that is not there. So near, right matches are many: the look is a test of its own.
+        """
+        due = time >= self._next_look and self.remaining <= self._settings.near_fraction
+        if self._recognised or not (due or arrival):
+            return None
+        self._next_look = time + self._settings.retry_s
+        answer = self._eyes.look(image, self._target)
+        if isinstance(answer, HomingVector):
+            if homing.contradicts(answer):
+                return self._doubt(time, "near the target it is seen elsewhere", answer)
+            self._recognised = True
+        elif answer.reason is RefusalReason.AT_TARGET:
+            return self._end(time, HomingState.ARRIVED, answer.details)
+        elif arrival:
+            return self._doubt(time, f"target not seen where it is believed: {answer.details}")
+        return None
+
+    def _doubt(self, time: float, why: str, vector: HomingVector | None = None) -> Command:
+        """The estimate is given up, and the leg begins anew where the robot stands.
+
+        Args:
+            time: now.
+            why: for the record.
+            vector: what contradicts the estimate; it must be confirmed itself.
+        """
+        self.underway, self._pending, self._next_try = None, vector, time
+        self.remaining, self._was_ahead, self._obstacle = 1.0, False, why
+        self._progress.begin_anew(time)
+        if self._progress.stalls >= self._settings.max_stalls:
+            return self._refuse(time, Refusal(RefusalReason.LOST, why))
+        return self._hold(time, why)
+
     def _renew(self, homing: HomingUnderWay, image: ByteArray, time: float, why: str) -> Command:
         """The estimate is usable, but weak: match anew while driving on by it."""
         if time < self._next_try:
@@ -131,9 +181,7 @@ class HomingController:
         vector = answer.start.vector
         if homing.contradicts(vector):
             # The old tracks are gone with the new ones' start, and one of both must be wrong.
-            self.underway, self._pending, self._next_try = None, vector, time
-            self._obstacle = "new homing vector contradicts the estimate"
-            return self._hold(time, self._obstacle)
+            return self._doubt(time, "new homing vector contradicts the estimate", vector)
         return self._accept(answer, f"matched anew: {why}")
 
     def _lose(self, image: ByteArray, time: float, why: str) -> Command:
@@ -156,14 +204,19 @@ class HomingController:
             return self._hold(time, self._obstacle)
         answer = self._begin(image, time)
         if isinstance(answer, Refusal):
+            self._ambiguous |= answer.reason is RefusalReason.AMBIGUOUS
             if why:
                 answer = replace(answer, details=f"{why}; {answer.details}")
             return self._refused(time, answer)
         vector = answer.start.vector
         if self._confirmed(vector):
             return self._accept(answer, f"matched anew: {why}" if why else "target matched")
+        if self._pending is None:
+            words, self._next_try = "ambiguous before, needs another image", time
+        else:
+            words = "homing vectors contradict"
         self._pending = vector
-        return self._refused(time, Refusal(RefusalReason.AMBIGUOUS, "homing vectors contradict"))
+        return self._refused(time, Refusal(RefusalReason.AMBIGUOUS, words))
 
     def _begin(self, image: ByteArray, time: float) -> HomingUnderWay | Refusal:
         self._next_try = time + self._settings.retry_s
@@ -178,7 +231,7 @@ class HomingController:
     def _confirmed(self, vector: HomingVector) -> bool:
         """Whether a new vector is to be believed: nothing was in doubt, or two images agree."""
         if self._pending is None:
-            return True
+            return not self._ambiguous
         turn = float(np.abs(wrap(np.array(vector.direction - self._pending.direction))))
         return bool(turn <= np.deg2rad(self._settings.contradiction_deg))
 
@@ -190,11 +243,15 @@ class HomingController:
         self._heading = homing.start.vector.direction
         self._was_ahead = self._was_ahead or abs(self._heading) <= np.pi / 2
         self._pending = self._standing_since = None
+        self._ambiguous, self._search_until = False, -np.inf
         self.initialisations += 1
         return self._drive(homing, time, why)
 
     def _refused(self, time: float, refusal: Refusal) -> Command:
-        """Stands, or drives blind, until there was nothing but refusals for too long."""
+        """Stands, or drives blind, until there was nothing but refusals for too long.
+
+        Then it looks from farther on, the way it came: other images tell more than the same again.
+        """
         if refusal.reason is RefusalReason.AT_TARGET:
             return self._end(time, HomingState.ARRIVED, refusal.details)
         self._obstacle = refusal.details
@@ -202,9 +259,18 @@ class HomingController:
         since = self._standing_since
         if since is None or time - since < self._settings.give_up_s:
             return command
+        if self._searches < self._settings.farther_tries:
+            return self._search(time, refusal.details)
         if self.initialisations:
             refusal = Refusal(RefusalReason.LOST, f"lost, then: {refusal.details}")
         return self._refuse(time, refusal)
+
+    def _search(self, time: float, why: str) -> Command:
+        self._searches += 1
+        self._search_until = time + self._settings.farther_s
+        self._standing_since = self._pending = None
+        self._progress.pause(time)
+        return self._hold(time, why)
 
     # ----------------------------------------------------------------------------------------
     # Commands
@@ -223,9 +289,11 @@ class HomingController:
         )
 
     def _hold(self, time: float, why: str) -> Command:
-        """Without an estimate: blind while that is allowed, then standing."""
+        """Without an estimate: blind, or searching, while that is allowed, then standing."""
         if self._pending is None and time < self._blind_until:
             return self._without_estimate(time, HomingState.BLIND, why)
+        if self._pending is None and time < self._search_until:
+            return self._without_estimate(time, HomingState.SEARCH, why)
         if self._standing_since is None:
             self._standing_since = time
         state = HomingState.WAIT if self.initialisations else HomingState.INITIALISE
@@ -252,7 +320,7 @@ class HomingController:
             remaining=self.remaining,
             rotation=float("nan"),
             covariance=np.full((3, 3), np.nan),
-            stop=state is not HomingState.BLIND,
+            stop=state not in (HomingState.BLIND, HomingState.SEARCH),
             reason=why,
             refusal=refusal,
         )
@@ -278,6 +346,15 @@ class _Progress:
             self._best, self._since = remaining, time
         self.stalls += late
         return late
+
+    def begin_anew(self, time: float) -> None:
+        """What seemed progress was none: that counts as one stall."""
+        self._best, self._since = np.inf, time
+        self.stalls += 1
+
+    def excuse(self, seconds: float) -> None:
+        """So much of the time does not count."""
+        self._since += seconds
 
     def pause(self, time: float) -> None:
         """The robot stood until now; that is not driving without progress."""

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from fgslam.homing_types import HomingStart, OmniFeatures, Refusal, TrackedBearings
+from fgslam.homing_types import (
+    HomingStart,
+    HomingVector,
+    OmniFeatures,
+    Refusal,
+    TrackedBearings,
+)
 from fgslam.types import ByteArray
 
 
@@ -24,6 +30,10 @@ class HomingEyes(Protocol):
 
         A refusal leaves the tracks that there are alone.
         """
+        ...
+
+    def look(self, image: ByteArray, target: OmniFeatures) -> HomingVector | Refusal:
+        """Matches the image with a target, and leaves all tracks alone."""
         ...
 
     def track(self, image: ByteArray, time: float) -> TrackedBearings:

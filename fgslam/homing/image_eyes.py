@@ -69,14 +69,20 @@ class ImageEyes:
         refusal = _unusable(image, present)
         if refusal is not None:
             return refusal
-        s = self._settings
-        matches = match_features(present, target, s.matching)
-        if s.wrong_matches > 0.0:
-            matches = mixed_with_wrong(matches, s.wrong_matches, self._rng)
-        vector = estimate_homing_vector(matches, s.homing_vector, self._rng)
+        matches = self._matches(present, target)
+        vector = estimate_homing_vector(matches, self._settings.homing_vector, self._rng)
         if isinstance(vector, Refusal):
             return vector
         return self._started(image, time, vector, matches, (present, target))
+
+    def look(self, image: ByteArray, target: OmniFeatures) -> HomingVector | Refusal:
+        """The homing vector alone."""
+        present = self.describe(image)
+        refusal = _unusable(image, present)
+        if refusal is not None:
+            return refusal
+        matches = self._matches(present, target)
+        return estimate_homing_vector(matches, self._settings.homing_vector, self._rng)
 
     def track(self, image: ByteArray, time: float) -> TrackedBearings:
         """The features in the next image. Raises as :meth:`BearingTracker.track`."""
@@ -91,6 +97,12 @@ class ImageEyes:
         rise = np.tan(tracked.elevation)
         rays = np.column_stack([np.cos(tracked.bearing), np.sin(tracked.bearing), rise])
         return self._tracker.view.pixels(rays)
+
+    def _matches(self, present: OmniFeatures, target: OmniFeatures) -> BearingMatches:
+        matches = match_features(present, target, self._settings.matching)
+        if self._settings.wrong_matches > 0.0:
+            matches = mixed_with_wrong(matches, self._settings.wrong_matches, self._rng)
+        return matches
 
     def _started(
         self,

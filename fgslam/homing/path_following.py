@@ -99,6 +99,10 @@ class PathFollower:
             command = self._numbered(self.controller.step(image, time))
         return command
 
+    def held_up(self, seconds: float) -> None:
+        """See :meth:`HomingController.held_up`."""
+        self.controller.held_up(seconds)
+
     def interrupt(self, time: float, reason: str) -> None:
         """Notes the present leg as unfinished: the drive is ended from outside."""
         if self._ended is None:

@@ -60,7 +60,7 @@ class Steering:
 
     def _share(self, command: Command) -> float:
         s = self._settings
-        if command.state is HomingState.BLIND:
+        if command.state in (HomingState.BLIND, HomingState.SEARCH):
             return s.blind_share
         least = s.least_share if command.final else s.passing_share
         return float(np.clip(command.remaining / s.slow_fraction, least, 1.0))

@@ -85,8 +85,33 @@ class HomingControlSettings:
         ),
     ] = 20.0
     give_up_s: Annotated[
-        float, Field(ge=0.0, description="refusals for so long, standing, end the homing")
+        float,
+        Field(
+            ge=0.0,
+            description="after refusals for so long, standing, the robot looks from farther on, or "
+            "ends the homing",
+        ),
     ] = 3.0
+    farther_s: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="drive straight on, at reduced speed, to look for a refused target from "
+            "elsewhere; 0.4 m with the default steering",
+        ),
+    ] = 2.5
+    farther_tries: Annotated[
+        int, Field(ge=0, description="such drives for one target; 0: refused is refused")
+    ] = 3
+    near_fraction: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            lt=1.0,
+            description="from this part of the leg on, another look must show the target where the "
+            "estimate has it before it counts as reached; 0: it need not",
+        ),
+    ] = 0.3
     contradiction_deg: Annotated[
         float,
         Field(
@@ -99,8 +124,19 @@ class HomingControlSettings:
         float,
         Field(gt=0.0, description="without progress for so long, the target is matched anew"),
     ] = 15.0
+    wait_s: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="on one leg the robot waits so long, on top, for a blocked way to clear",
+        ),
+    ] = 60.0
     max_stalls: Annotated[
-        int, Field(ge=1, description="so many times without progress end the homing")
+        int,
+        Field(
+            ge=1,
+            description="so often without progress, or with an estimate given up, ends the homing",
+        ),
     ] = 3
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,7 +23,7 @@ from fgslam.homing_types import (
     RefusalReason,
     TrackedBearings,
 )
-from fgslam.planar import bearings, unit, wrap
+from fgslam.planar import bearings, between, unit, wrap
 from fgslam.settings.homing_behaviour import HomingControlSettings
 from fgslam.settings.homing_estimators import (
     AverageLandmarkVectorSettings,
@@ -91,6 +92,9 @@ class ScriptedEyes:
     tracks: int = 20
     turned: float = 0.0
     begun: list[float] = field(default_factory=list)
+    looks: list[HomingVector | Refusal] = field(default_factory=list)
+    looked: int = 0
+    home: FloatArray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
 
     def describe(self, image: ByteArray) -> OmniFeatures:
         """Never asked."""
@@ -100,7 +104,18 @@ class ScriptedEyes:
         """The next answer."""
         self.begun.append(time)
         answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
-        return answer if isinstance(answer, Refusal) else start_at(time, answer)
+        if isinstance(answer, Refusal):
+            return answer
+        self.home = np.array([*unit(np.array(answer.direction)), answer.rotation])
+        return start_at(time, answer)
+
+    def look(self, image: ByteArray, target: OmniFeatures) -> HomingVector | Refusal:
+        """From a list, the last one repeated; without one the truth since the last match."""
+        self.looked += 1
+        if self.looks:
+            return self.looks.pop(0) if len(self.looks) > 1 else self.looks[0]
+        way = between(self.robot, self.home)
+        return vector_to(float(np.arctan2(way[1], way[0])), float(way[2]))
 
     def track(self, image: ByteArray, time: float) -> TrackedBearings:
         """Exact bearings."""
@@ -202,7 +217,7 @@ def test_one_place_is_arrival() -> None:
 
 def test_refused_target_is_tried_for_a_while_and_then_given_up() -> None:
     """Standing all the time, one attempt a retry period, the refusal handed on."""
-    b = bench(FEW)
+    b = bench(FEW, farther_tries=0)
     commands = [b.step() for _ in range(40)]
     assert {c.state for c in commands[:30]} == {HomingState.INITIALISE}
     assert all(c.stop for c in commands)
@@ -336,7 +351,7 @@ def test_all_tracks_lost_in_one_frame_heals_in_the_same() -> None:
 
 def test_blind_is_short_then_stands_then_refuses() -> None:
     """Lost and not healing: straight on for a second at most, then standing, then the end."""
-    b = bench(vector_to(0.0), FEW)
+    b = bench(vector_to(0.0), FEW, farther_tries=0)
     b.step()
     b.step()
     b.eyes.tracks = 0
@@ -420,7 +435,7 @@ def test_contradicting_vector_is_confirmed_before_it_is_driven_by() -> None:
 def test_vectors_that_keep_contradicting_end_the_homing() -> None:
     """Never a confident wrong vector: no two images agree, so there is no answer."""
     answers = [vector_to(0.0)] + [vector_to(2.0 * (-1.0) ** k) for k in range(60)]
-    b = bench(*answers)
+    b = bench(*answers, farther_tries=0)
     b.step()
     b.step()
     b.eyes.tracks = 9
@@ -437,6 +452,108 @@ def test_no_progress_is_noticed() -> None:
     assert commands[-1].refusal is not None
     assert commands[-1].refusal.reason is RefusalReason.NO_PROGRESS
     assert b.controller.initialisations == SETTINGS.max_stalls
+
+
+def test_refused_target_is_looked_for_from_farther_on() -> None:
+    """Standing did not help: slowly straight on, and the first answer is driven by."""
+    standing = int(SETTINGS.give_up_s / SETTINGS.retry_s) + 1
+    b = bench(*[FEW] * (standing + 2), vector_to(0.1))
+    commands = [b.step() for _ in range(60)]
+    states = [c.state for c in commands]
+    first = states.index(HomingState.SEARCH)
+    assert states[:first] == [HomingState.INITIALISE] * first
+    searching = [c for c in commands if c.state is HomingState.SEARCH]
+    assert all(not c.stop and c.heading == 0.0 for c in searching)
+    assert states[first + len(searching)] is HomingState.DRIVE
+    assert b.controller.initialisations == 1
+
+
+def test_search_is_bounded() -> None:
+    """So many drives of that length, standing and trying in between; then the refusal."""
+    b = bench(FEW)
+    states = [b.step().state for _ in range(400)]
+    assert states[-1] is HomingState.REFUSED
+    driven = 0.1 * states.count(HomingState.SEARCH)
+    assert driven == pytest.approx(SETTINGS.farther_tries * SETTINGS.farther_s, abs=0.5)
+    begun = [now for was, now in itertools.pairwise(states) if now is not was]
+    assert begun.count(HomingState.SEARCH) == SETTINGS.farther_tries
+
+
+def test_answer_after_an_ambiguous_one_needs_another_image() -> None:
+    """Two images must agree; one that says something else is not driven by."""
+    doubtful = Refusal(RefusalReason.AMBIGUOUS, "34 inliers, 38 for a different solution")
+    b = bench(doubtful, vector_to(2.0), vector_to(0.1), vector_to(0.12))
+    commands = [b.step() for _ in range(20)]
+    states = [c.state for c in commands]
+    assert HomingState.CONFIRM in states
+    driven = states.index(HomingState.DRIVE)
+    assert all(c.stop for c in commands[:driven])
+    assert commands[driven].heading == pytest.approx(0.12)
+    assert len(b.eyes.begun) == 4
+
+
+def test_near_the_target_one_look_confirms_it() -> None:
+    """Not before, and not again once it agreed; the tracks go on."""
+    b = bench(vector_to(0.0))
+    b.step()
+    b.at(1.0 - 1.1 * SETTINGS.near_fraction)
+    b.step()
+    assert b.eyes.looked == 0
+    b.at(1.0 - 0.9 * SETTINGS.near_fraction)
+    assert b.step().state is HomingState.DRIVE
+    b.at(0.95)
+    assert b.step().state is HomingState.ARRIVED
+    assert b.eyes.looked == 1
+    assert b.controller.initialisations == 1
+
+
+def test_target_seen_elsewhere_begins_the_leg_anew() -> None:
+    """A wrong vector that was sure of itself: two images that agree on another one win."""
+    b = bench(vector_to(0.0), vector_to(1.5))
+    b.eyes.looks = [vector_to(1.4)]
+    b.step()
+    b.at(0.8)
+    doubt = b.step()
+    assert doubt.state is HomingState.CONFIRM
+    assert "seen elsewhere" in doubt.reason
+    b.eyes.robot, b.eyes.looks = np.zeros(3), []
+    anew = b.step()
+    assert anew.state is HomingState.DRIVE
+    assert anew.heading == pytest.approx(1.5)
+    assert anew.remaining == pytest.approx(1.0)
+
+
+def test_no_arrival_where_the_target_is_not_seen() -> None:
+    """The estimate is there, the look is refused: given up, then matched again or refused."""
+    b = bench(vector_to(0.0), FEW)
+    b.eyes.looks = [FEW]
+    b.step()
+    b.at(0.99)
+    commands = [b.step() for _ in range(300)]
+    assert commands[0].stop
+    assert "not seen where it is believed" in commands[0].reason
+    assert HomingState.ARRIVED not in {c.state for c in commands}
+    assert commands[-1].refusal is not None
+    assert commands[-1].refusal.reason is RefusalReason.LOST
+
+
+def test_look_from_the_target_itself_is_arrival() -> None:
+    """Both views are from one place, whatever the estimate says of the last bit."""
+    b = bench(vector_to(0.0))
+    b.eyes.looks = [Refusal(RefusalReason.AT_TARGET, "median parallax 0.1 deg", 0.0)]
+    b.step()
+    b.at(0.85)
+    assert b.step().state is HomingState.ARRIVED
+
+
+def test_blocked_way_is_waited_for() -> None:
+    """Held up by obstacles is no lack of progress, for so long; then it is."""
+    b = bench(vector_to(0.0), stall_s=1.0, wait_s=2.0, max_stalls=1)
+    ended = []
+    for _ in range(60):
+        b.controller.held_up(0.1)
+        ended.append(b.step().state is HomingState.REFUSED)
+    assert 0.1 * ended.index(True) == pytest.approx(3.0, abs=0.35)
 
 
 @pytest.mark.parametrize("time", [0.0, -1.0, float("nan"), float("inf")])
@@ -485,6 +602,6 @@ def test_dark_from_the_beginning_is_refused() -> None:
     setting = winding_path(3, 1, 2.0)
     setting.eyes.dark = lambda _: True
     controller = real_controller(setting, HomingEkfSettings())
-    commands = [controller.step(DARK, 0.1 * k) for k in range(40)]
+    commands = [controller.step(DARK, 0.1 * k) for k in range(250)]
     assert commands[-1].refusal is not None
     assert commands[-1].refusal.reason is RefusalReason.TOO_DARK

@@ -108,7 +108,7 @@ def follower_with_unknown(count: int, path: PathFollowingSettings) -> PathFollow
     elsewhere = setting.eyes.features_at(np.array([80.0, 80.0, 0.0]))
     images = [elsewhere] * count + setting.path()[count:]
     kind = HomingEkfSettings()
-    control = replace(HomingControlSettings(), give_up_s=0.5)
+    control = replace(HomingControlSettings(), give_up_s=0.5, farther_tries=0)
     return PathFollower(
         setting.eyes, images, lambda start: make_homing_estimator(start, kind), control, path
     )
@@ -123,6 +123,16 @@ def test_target_that_cannot_be_matched_is_skipped() -> None:
     assert commands[-1].target == 1
     assert [leg.result for leg in follower.outcomes] == ["skipped"]
     assert "matches" in follower.outcomes[0].reason
+
+
+def test_refusal_does_not_end_a_drive() -> None:
+    """Blind for longer than a refused target is tried at a stand: looked for from farther on."""
+    setting = winding_path(7, 2, 2.0)
+    setting.eyes.dark = lambda t: t < 5.0
+    record = drive_path(setting)
+    assert HomingState.SEARCH.value in record.state
+    assert [leg.result for leg in record.legs] == ["arrived", "arrived"]
+    assert pass_distances(record).max() < 0.2
 
 
 @pytest.mark.parametrize(
