@@ -80,13 +80,17 @@ def read_frames(path: Path) -> list[ReplayRow]:
 def points_from_log(
     landmarks: LandmarkMap, log: MeasurementLog, look: MapPoints | None
 ) -> MapPoints:
-    """The map with hits and misses as the log has them, grey where no colour is known."""
+    """The map with hits and misses as the log has them; colour and permanence as ``look`` has them.
+
+    What is not in ``look`` is grey.
+    """
     seen = [increment.observations.ids[~increment.rejected] for increment in log]
     hits = _counts(seen, landmarks.ids)
     colours = np.full((len(landmarks), 3), _GREY, np.uint8)
+    permanent = np.zeros(len(landmarks), np.bool_)
     if look is not None:
         _, rows, of = np.intersect1d(landmarks.ids, look.ids, return_indices=True)
-        colours[rows] = look.colours[of]
+        colours[rows], permanent[rows] = look.colours[of], look.permanent[of]
     return MapPoints(
         ids=landmarks.ids,
         positions=landmarks.positions,
@@ -95,7 +99,7 @@ def points_from_log(
         hits=hits,
         misses=_counts([increment.missed_ids for increment in log], landmarks.ids),
         valid=hits >= _VALID_HITS,
-        permanent=np.zeros(len(landmarks), np.bool_),
+        permanent=permanent,
     )
 
 
