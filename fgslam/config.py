@@ -15,35 +15,18 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from fgslam.config_reading import Reader, kind_as_settings, read_mapping, with_default_kind
 from fgslam.errors import ConfigError
 from fgslam.settings.backend import EstimatorSettings, LandmarkKalmanSettings
-from fgslam.settings.datasets import (
-    EurocSettings,
-    ImageFolderSettings,
-    KittiSettings,
-    LightFieldSettings,
-    OdometrySettings,
-    RecordedOdometrySettings,
-)
+from fgslam.settings.datasets import OdometrySettings, RecordedOdometrySettings
 from fgslam.settings.frontend import FrontendSettings
-from fgslam.settings.lab import RenderedLabSettings
+from fgslam.settings.maps import MapSettings
 from fgslam.settings.measurements import MeasurementDatasetSettings
 from fgslam.settings.output import OutputSettings
-
-DatasetSettings: TypeAlias = Annotated[
-    RenderedLabSettings
-    | ImageFolderSettings
-    | KittiSettings
-    | EurocSettings
-    | LightFieldSettings
-    | MeasurementDatasetSettings,
-    Field(discriminator="kind"),
-]
-
+from fgslam.settings.recordings import DatasetSettings
 
 ComparedEstimator: TypeAlias = Annotated[EstimatorSettings, BeforeValidator(kind_as_settings)]
 
 _Values = TypeVar("_Values", bound=Mapping[str, Any])
 
-_TAKEN_FOLDERS = ("pictures", "compare", "trials")
+_TAKEN_FOLDERS = ("pictures", "compare", "trials", "first")
 _GROUPS_OF_KINDS = ("dataset", "odometry", "estimator")
 
 
@@ -69,6 +52,7 @@ class ExperimentConfig(BaseModel):
             "groups of keys as under `estimator`"
         ),
     ] = ()
+    map: MapSettings = MapSettings()
     output: OutputSettings = OutputSettings()
     provenance: Annotated[
         dict[str, Any] | None,
@@ -116,7 +100,43 @@ def _of_slam(values: _Values, where: str) -> _Values:
 
 def _checked(config: ExperimentConfig, where: str) -> ExperimentConfig:
     _require_own_folders(config, where)
+    problem = _map_problem(config)
+    if problem:
+        raise ConfigError(f"{where}: {problem}")
     return config
+
+
+def _map_problem(config: ExperimentConfig) -> str:
+    """What is contradictory about the map, with its mend; empty where nothing is."""
+    given, first = config.map, config.map.made_from
+    datasets = (config.dataset, *(() if first is None else (first.dataset,)))
+    measurements = any(isinstance(one, MeasurementDatasetSettings) for one in datasets)
+    as_default = (given.start, given.extend) == ("relocalise", True)
+    goes_on = given.start == "continue"
+    problems = {
+        "map: measurements have no appearance to keep; give recordings of images": (
+            measurements and given != MapSettings()
+        ),
+        "map.load and map.made_from exclude each other; give one of them": (
+            first is not None and given.load is not None
+        ),
+        "map.start and map.extend mean nothing without a map; give map.load (--map-in)": (
+            not given.given and not as_default
+        ),
+        "map.extend is false, so there is no new map to save; leave map.save out": (
+            not given.extend and given.save is not None
+        ),
+        "map.load and map.save are one file; save to another name": (
+            given.load is not None and given.load == given.save
+        ),
+        "map.start continue goes on with the run that was saved; it takes map.load alone": (
+            goes_on and (first is not None or not given.extend)
+        ),
+        "frontend.loops would correct a map that is to stay as it is; set it to null": (
+            not given.extend and config.frontend.loops is not None
+        ),
+    }
+    return next((words for words, wrong in problems.items() if wrong), "")
 
 
 def _require_own_folders(config: ExperimentConfig, where: str) -> None:

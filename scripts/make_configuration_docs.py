@@ -17,6 +17,7 @@ Node: TypeAlias = dict[str, Any]
 
 PAGE = Path(__file__).parents[1] / "docs" / "configuration.md"
 _UNWRITTEN = ("kind", "task", "provenance")
+_TOLD_ELSEWHERE = ("map.made_from.dataset", "map.made_from.odometry")
 _INTRODUCTION = """# Configuration
 
 <!-- Made by scripts/make_configuration_docs.py: edit the settings' descriptions, not this page. -->
@@ -77,8 +78,9 @@ def _sections(schema: Node, node: Node, dotted: str, level: int) -> Iterator[str
         table = _table(schema, group)
         yield "\n".join([*lines, *(table or ["Groups of keys:"])])
         for name, inner in group["properties"].items():
-            if name not in _UNWRITTEN:
-                yield from _sections(schema, inner, f"{dotted}.{name}", min(level + 1, 4))
+            below = f"{dotted}.{name}"
+            if name not in _UNWRITTEN and below not in _TOLD_ELSEWHERE:
+                yield from _sections(schema, inner, below, min(level + 1, 4))
 
 
 def _table(schema: Node, group: Node) -> list[str]:

@@ -1,0 +1,87 @@
+"""Settings of maps that outlive their run: where one comes from, what becomes of it (S41)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fgslam.settings.base import STRICT
+from fgslam.settings.datasets import OdometrySettings, RecordedOdometrySettings
+from fgslam.settings.recordings import DatasetSettings
+
+
+@dataclass(frozen=True, config=STRICT)
+class FirstDriveSettings:
+    """A drive that makes the map, with the run's own front-end and estimator."""
+
+    dataset: Annotated[DatasetSettings, Field(description="keys as under `dataset`")]
+    odometry: Annotated[OdometrySettings, Field(description="keys as under `odometry`")] = (
+        RecordedOdometrySettings()
+    )
+    seed: Annotated[
+        Annotated[int, Field(ge=0)] | None,
+        Field(description="of everything random in it; null: the run's own"),
+    ] = None
+
+
+@dataclass(frozen=True, config=STRICT)
+class MapStartSettings:
+    """How a run finds its place in the map that it is given."""
+
+    within: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="frames searched for the first that can be located; those before it are "
+            "left out of the run",
+        ),
+    ] = 30
+    sigma_m: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="standard deviation of the first pose before its landmarks are seen, per "
+            "axis, metres: how well a robot is put back by hand",
+        ),
+    ] = 0.1
+    sigma_deg: Annotated[
+        float, Field(gt=0.0, lt=90.0, description="the same of its rotation, degrees")
+    ] = 3.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class MapSettings:
+    """The map that a run is given, and the one that it leaves."""
+
+    load: Annotated[
+        str | None, Field(description="map file to go on with; null starts with an empty map")
+    ] = None
+    save: Annotated[
+        str | None, Field(description="map file to write when the run has finished")
+    ] = None
+    made_from: Annotated[
+        FirstDriveSettings | None,
+        Field(description="drive this first, into RUN/first, and go on with its map"),
+    ] = None
+    start: Annotated[
+        Literal["relocalise", "origin", "last", "continue"],
+        Field(
+            description="`relocalise`: found in the map without a prior; `origin`, `last`: put "
+            "back where the map's drive began, or stopped; `continue`: the same run goes on"
+        ),
+    ] = "relocalise"
+    extend: Annotated[
+        bool, Field(description="false leaves the map as it is: the run only localises in it")
+    ] = True
+    session: Annotated[
+        bool,
+        Field(description="save what `start: continue` needs as well; without it a map is smaller"),
+    ] = True
+    begin: MapStartSettings = MapStartSettings()
+
+    @property
+    def given(self) -> bool:
+        """Whether the run goes on with a map."""
+        return self.load is not None or self.made_from is not None
