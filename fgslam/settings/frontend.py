@@ -9,6 +9,7 @@ from pydantic.dataclasses import dataclass
 
 from fgslam.settings.base import STRICT
 from fgslam.settings.loops import LoopSettings, LostSettings
+from fgslam.settings.relocalisation import RelocalisationSettings
 
 Appearance: TypeAlias = Literal["descriptor", "paper"]
 
@@ -319,6 +320,7 @@ class FrontendSettings:
     matching: MapMatchingSettings = MapMatchingSettings()
     database: DatabaseSettings = DatabaseSettings()
     ego_motion: EgoMotionSettings = EgoMotionSettings()
+    relocalisation: RelocalisationSettings = RelocalisationSettings()
     loops: Annotated[
         LoopSettings | None,
         Field(description="look for returns to mapped places and close the loop; null does not"),

@@ -1,0 +1,158 @@
+"""A proposed pose refined: agreeing matches, guided re-matching around it, least squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.floor import Floor
+from fgslam.frontend.relocalisation.known_map import KnownMap
+from fgslam.frontend.relocalisation.least_squares import refine
+from fgslam.frontend.relocalisation.proposals import Evidence
+from fgslam.frontend.relocalisation.residuals import (
+    Pairs,
+    SeenPoints,
+    residuals,
+    squared_distances,
+)
+from fgslam.frontend.relocalisation.tentative import gated
+from fgslam.settings.relocalisation import RelocalisationSettings
+from fgslam.types import ByteArray, CameraRig, FloatArray, IntArray, StereoFeatures
+
+_ROUNDS = 4  # of choosing matches and solving; the choice rests after two or three
+_STEPS = 6
+_KERNEL_WIDTH = 2.0  # as the tracker's
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refined:
+    """A pose with all that agrees with it.
+
+    Attributes:
+        wTc: (4, 4).
+        covariance: (6, 6).
+        features: (k,) indices.
+        landmarks: (k,) rows of the map, unique.
+        residual_px: root mean square of the image residuals.
+        proposed: how many of the frame's tentatively matched features agree.
+        expected: (m,) rows of landmarks that the pose should see.
+    """
+
+    wTc: FloatArray
+    covariance: FloatArray
+    features: IntArray
+    landmarks: IntArray
+    residual_px: float
+    proposed: int
+    expected: IntArray
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refiner:
+    """What refinement needs beside the pose."""
+
+    rig: CameraRig
+    floor: Floor
+    known: KnownMap
+    features: StereoFeatures
+    seen: SeenPoints
+    evidence: Evidence
+    settings: RelocalisationSettings
+
+    def refine(self, wTc: FloatArray, covariance: FloatArray) -> Refined | None:
+        """The pose at rest with its matches; None where they do not fix it."""
+        tentative = self.evidence.tentative
+        least = 2 if self.floor.rigid_dof == 3 else 3
+        chosen = tentative.features[:0], tentative.landmarks[:0]
+        for guided in (False, True):
+            for _ in range(_ROUNDS):
+                before = chosen
+                chosen = self._choose(wTc, covariance, guided)
+                if len(chosen[0]) < least:
+                    return None
+                wTc, covariance = self._solve(wTc, chosen)
+                if not np.isfinite(covariance).all():
+                    return None
+                if np.array_equal(before[0], chosen[0]) and np.array_equal(before[1], chosen[1]):
+                    break
+        return self._finish(wTc, covariance, chosen)
+
+    def _choose(
+        self, wTc: FloatArray, covariance: FloatArray, guided: bool
+    ) -> tuple[IntArray, IntArray]:
+        """One-to-one matches (features, landmarks) that agree with the pose."""
+        tentative = self.evidence.tentative
+        i, j, cost = tentative.features, tentative.landmarks, tentative.distances
+        if guided:
+            i, j, cost = self._around(wTc)
+        pairs = Pairs.of(self.seen, i, self.known.landmarks, j)
+        squared = squared_distances(residuals(self.rig, wTc, pairs), covariance)
+        near = squared <= self.settings.gate_sigmas**2
+        return _one_to_one(i[near], j[near], cost[near])
+
+    def _around(self, wTc: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+        """Pairs of features and landmarks in view that look alike, with their distances."""
+        rows, _ = self.known.in_view(self.rig, wTc)
+        wanted = np.zeros(len(self.known.landmarks), np.bool_)
+        wanted[rows] = True
+        views = np.flatnonzero(wanted[self.known.owners])
+        distance = _distances(self.features.descriptors, self.known.views.descriptors[views])
+        i, column = np.nonzero(distance <= self.settings.max_distance)
+        cost, v = distance[i, column], views[column]
+        looks = (self.known.views, self.known.owners)
+        keep = gated(self.features, (i, v), self.known.landmarks, looks, self.floor, self.settings)
+        tentative = self.evidence.tentative
+        return (
+            np.concatenate([i[keep], tentative.features]),
+            np.concatenate([self.known.owners[v[keep]], tentative.landmarks]),
+            np.concatenate([cost[keep], tentative.distances]),
+        )
+
+    def _solve(
+        self, wTc: FloatArray, chosen: tuple[IntArray, IntArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        pairs = Pairs.of(self.seen, chosen[0], self.known.landmarks, chosen[1])
+        rows = np.zeros(len(pairs), np.int64)
+        poses, covariances = refine(
+            self.rig, self.floor, wTc[None], pairs, rows, _STEPS, _KERNEL_WIDTH
+        )
+        return poses[0], covariances[0]
+
+    def _finish(
+        self, wTc: FloatArray, covariance: FloatArray, chosen: tuple[IntArray, IntArray]
+    ) -> Refined:
+        pairs = Pairs.of(self.seen, chosen[0], self.known.landmarks, chosen[1])
+        found = residuals(self.rig, wTc, pairs)
+        image = found.residual[pairs.seen.in_image][:, :2]
+        rms = float(np.sqrt(np.mean(np.sum(image**2, axis=1)))) if len(image) else float("nan")
+        rows, _ = self.known.in_view(self.rig, wTc)
+        expected = rows[self.known.recognisable(wTc, rows, np.deg2rad(30.0), 2.0)]
+        tentative = np.unique(self.evidence.tentative.features)
+        proposed = int(np.isin(tentative, chosen[0]).sum())
+        return Refined(wTc, covariance, chosen[0], chosen[1], rms, proposed, expected)
+
+
+def _distances(a: ByteArray, b: ByteArray) -> FloatArray:
+    """Euclidean distances (n, m) of descriptors; exact sums in float32 (below 2^24)."""
+    x, y = a.astype(np.float32), b.astype(np.float32)
+    squared = np.einsum("ij,ij->i", x, x)[:, None] + np.einsum("ij,ij->i", y, y)
+    return np.asarray(np.sqrt((squared - 2.0 * (x @ y.T)).astype(np.float64)))
+
+
+def _one_to_one(i: IntArray, j: IntArray, cost: FloatArray) -> tuple[IntArray, IntArray]:
+    """The pairs that are each other's cheapest; ascending in the first."""
+    best_i = np.zeros(len(i), np.bool_)
+    best_i[np.unique(i[(order := np.lexsort((j, cost, i)))], return_index=True)[1]] = True
+    first = np.zeros(len(i), np.bool_)
+    first[order] = best_i
+    best_j = np.zeros(len(i), np.bool_)
+    best_j[np.unique(j[(order := np.lexsort((i, cost, j)))], return_index=True)[1]] = True
+    second = np.zeros(len(i), np.bool_)
+    second[order] = best_j
+    keep = np.flatnonzero(first & second)
+    keep = keep[np.argsort(i[keep], kind="stable")]
+    return i[keep], j[keep]

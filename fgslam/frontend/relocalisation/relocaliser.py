@@ -1,0 +1,101 @@
+"""The pose of a frame in a map without a prior: propose, refine, compare, judge."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.floor import Floor
+from fgslam.frontend.relocalisation import ransac
+from fgslam.frontend.relocalisation.known_map import KnownMap
+from fgslam.frontend.relocalisation.proposals import Evidence, Proposals, apart, distinct
+from fgslam.frontend.relocalisation.refinement import Refined, Refiner
+from fgslam.frontend.relocalisation.residuals import Pairs, SeenPoints, log_uniform
+from fgslam.frontend.relocalisation.tentative import Tentative, gated, specific
+from fgslam.frontend.relocalisation.verdict import judge
+from fgslam.map_types import LandmarkAppearances, Relocalisation
+from fgslam.settings.relocalisation import RelocalisationSettings
+from fgslam.types import CameraRig, LandmarkMap, StereoFeatures
+
+_MAX_DISPARITY_PX = 40.0
+
+
+class Relocaliser:
+    """Finds frames in a map that it has learnt."""
+
+    def __init__(self, rig: CameraRig, floor: Floor, settings: RelocalisationSettings) -> None:
+        """Knows no map yet; ``floor`` says which camera motions the map's robot makes."""
+        self._rig = rig
+        self._floor = floor
+        self._settings = settings
+        none = np.empty(0, np.int64)
+        self._known = KnownMap.of(
+            LandmarkMap(none, np.empty((0, 3)), np.empty((0, 3, 3))),
+            LandmarkAppearances(
+                none, np.empty((0, 128), np.uint8), np.empty(0), np.empty(0), np.empty((0, 3))
+            ),
+        )
+
+    def __len__(self) -> int:
+        """Landmarks known."""
+        return len(self._known.landmarks)
+
+    def learn(self, landmarks: LandmarkMap, appearances: LandmarkAppearances) -> None:
+        """Replaces the map; landmarks without a stored view cannot be recognised: left out."""
+        self._known = KnownMap.of(landmarks, appearances)
+
+    def locate(self, features: StereoFeatures, rng: np.random.Generator) -> Relocalisation:
+        """The frame's pose, or why there is none to be believed.
+
+        Args:
+            features: of one frame, or of a short submap in its last camera's frame; positions
+                outside the image count by their own covariances.
+            rng: draws the samples.
+        """
+        tentative = self.tentative(features)
+        seen = SeenPoints.of(features, self._rig)
+        evidence = self._evidence(seen, tentative)
+        proposals = ransac.propose(evidence, self._floor, self._settings, rng)
+        refined = self._refine(features, seen, evidence, proposals)
+        return judge(tentative, refined, self._known.landmarks, self._settings)
+
+    def tentative(self, features: StereoFeatures) -> Tentative:
+        """Matches of the features with landmarks anywhere in the map."""
+        known, settings = self._known, self._settings
+        found = known.index.query(features.descriptors, settings.neighbours)
+        i, k = np.nonzero(found.owners >= 0)
+        looks = (known.views, known.owners)
+        pairs = (i, found.owners[i, k])
+        keep = np.zeros(found.owners.shape, np.bool_)
+        keep[i, k] = gated(features, pairs, known.landmarks, looks, self._floor, settings)
+        return specific(found, keep, known.owners, known.landmarks, settings)
+
+    def _evidence(self, seen: SeenPoints, tentative: Tentative) -> Evidence:
+        landmarks = self._known.landmarks
+        pairs = Pairs.of(seen, tentative.features, landmarks, tentative.landmarks)
+        extent = np.ptp(landmarks.positions, axis=0) if len(landmarks) else np.ones(3)
+        room = float(np.prod(np.maximum(extent, 1.0)))
+        chance = log_uniform(self._rig, pairs.seen, _MAX_DISPARITY_PX, room)
+        return Evidence(self._rig, tentative, pairs, chance)
+
+    def _refine(
+        self,
+        features: StereoFeatures,
+        seen: SeenPoints,
+        evidence: Evidence,
+        proposals: Proposals,
+    ) -> list[Refined]:
+        """The best distinct poses refined, that with most matches first."""
+        settings = self._settings
+        limits = settings.elsewhere_m, float(np.deg2rad(settings.elsewhere_deg))
+        refiner = Refiner(self._rig, self._floor, self._known, features, seen, evidence, settings)
+        out: list[Refined] = []
+        for k in range(len(best := distinct(proposals, settings.refined, *limits))):
+            found = refiner.refine(best.poses[k], best.covariances[k])
+            if found is not None:
+                out.append(found)
+        out.sort(key=lambda r: -len(r))
+        first: list[Refined] = []
+        for candidate in out:
+            if all(apart(candidate.wTc[None], other.wTc, *limits)[0] for other in first):
+                first.append(candidate)
+        return first

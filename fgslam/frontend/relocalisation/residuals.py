@@ -1,0 +1,199 @@
+"""Residuals of many matches at many poses, with their covariances.
+
+A feature is compared in the image as (column, row, disparity), where its noise is Gaussian. A
+feature of a submap may project outside the image or lie behind the camera; it is compared in space
+by its position (X, Y, Z) instead. Both give three numbers with a covariance (3, 3), and all that
+follows treats them alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.geometry import (
+    inverse_spd3,
+    point_pose_jacobian,
+    project,
+    projection_jacobian,
+)
+from fgslam.types import (
+    BoolArray,
+    CameraRig,
+    FloatArray,
+    IntArray,
+    LandmarkMap,
+    StereoFeatures,
+)
+
+_NEAREST_DEPTH_M = 0.1
+_LOG_TWO_PI = float(np.log(2.0 * np.pi))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenPoints:
+    """Features as they are compared with landmarks.
+
+    Attributes:
+        in_image: (n,) True where compared in the image, False where in space.
+        value: (n, 3) (column, row, disparity), or (X, Y, Z) in the camera's frame.
+        covariance: (n, 3, 3) of it.
+        position: (n, 3) in the camera's frame, metres.
+        position_covariance: (n, 3, 3).
+    """
+
+    in_image: BoolArray
+    value: FloatArray
+    covariance: FloatArray
+    position: FloatArray
+    position_covariance: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.in_image)
+
+    @staticmethod
+    def of(features: StereoFeatures, rig: CameraRig) -> SeenPoints:
+        """The features of a frame, or of a submap in its last camera's frame."""
+        column, row, disparity = features.measurement.T
+        inside = (column >= -0.5) & (column <= rig.width - 0.5)
+        inside &= (row >= -0.5) & (row <= rig.height - 0.5)
+        inside &= (disparity > 0.0) & (features.position[:, 2] > _NEAREST_DEPTH_M)
+        pick = inside[:, None, None]
+        return SeenPoints(
+            in_image=inside,
+            value=np.where(inside[:, None], features.measurement, features.position),
+            covariance=np.where(
+                pick, features.measurement_covariance, features.position_covariance
+            ),
+            position=features.position,
+            position_covariance=features.position_covariance,
+        )
+
+    def select(self, rows: IntArray) -> SeenPoints:
+        """The chosen rows."""
+        return SeenPoints(
+            self.in_image[rows],
+            self.value[rows],
+            self.covariance[rows],
+            self.position[rows],
+            self.position_covariance[rows],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """Features matched with landmarks, row by row.
+
+    Attributes:
+        seen: the features, k rows.
+        points: (k, 3) the landmarks, world.
+        point_covariances: (k, 3, 3).
+    """
+
+    seen: SeenPoints
+    points: FloatArray
+    point_covariances: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @staticmethod
+    def of(seen: SeenPoints, features: IntArray, landmarks: LandmarkMap, rows: IntArray) -> Pairs:
+        """Features (k,) by index with landmarks (k,) by row of the map."""
+        return Pairs(seen.select(features), landmarks.positions[rows], landmarks.covariances[rows])
+
+    def select(self, rows: IntArray) -> Pairs:
+        """The chosen rows."""
+        return Pairs(self.seen.select(rows), self.points[rows], self.point_covariances[rows])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """Measured less predicted, for m matches: one row each.
+
+    Attributes:
+        valid: (m,) False where a landmark to be seen in the image lies behind the camera.
+        residual: (m, 3).
+        by_pose: (m, 3, 6) derivative of the *prediction* by the pose's tangent vector.
+        covariance: (m, 3, 3) of the measurement and of the landmark as seen from the pose.
+    """
+
+    valid: BoolArray
+    residual: FloatArray
+    by_pose: FloatArray
+    covariance: FloatArray
+
+
+def residuals(
+    rig: CameraRig,
+    poses: FloatArray,
+    pairs: Pairs,
+    pose_rows: IntArray | None = None,
+) -> Residuals:
+    """Residuals of all pairs at one pose (4, 4), or of each pair at its own.
+
+    Args:
+        rig: the cameras.
+        poses: (4, 4), or (h, 4, 4) with ``pose_rows`` (k,) naming each pair's.
+        pairs: k matches.
+        pose_rows: None for a single pose.
+    """
+    wTc = poses if pose_rows is None else poses[pose_rows]
+    wRc = np.broadcast_to(wTc[..., :3, :3], (len(pairs), 3, 3))
+    offset = pairs.points - wTc[..., :3, 3]
+    points = np.einsum("kji,kj->ki", wRc, offset)
+    seen = pairs.seen
+    valid = (points[:, 2] > _NEAREST_DEPTH_M) | ~seen.in_image
+    safe = np.where((points[:, 2] > _NEAREST_DEPTH_M)[:, None], points, [0.0, 0.0, 1.0])
+    pick = seen.in_image[:, None]
+    predicted = np.where(pick, project(rig, safe), points)
+    jacobian = np.where(pick[:, :, None], projection_jacobian(rig, safe), np.eye(3))
+    to_value = jacobian @ np.swapaxes(wRc, 1, 2)
+    covariance = to_value @ pairs.point_covariances @ np.swapaxes(to_value, 1, 2)
+    return Residuals(
+        valid=valid,
+        residual=seen.value - predicted,
+        by_pose=jacobian @ point_pose_jacobian(points),
+        covariance=covariance + seen.covariance,
+    )
+
+
+def squared_distances(found: Residuals, pose_covariance: FloatArray | None = None) -> FloatArray:
+    """Mahalanobis distances squared (m,); infinite where invalid.
+
+    ``pose_covariance`` (6, 6) or (m, 6, 6) is that of the poses, where they are uncertain.
+    """
+    information, _ = _information(found, pose_covariance)
+    squared = np.einsum("mi,mij,mj->m", found.residual, information, found.residual)
+    return np.where(found.valid, squared, np.inf)
+
+
+def log_likelihoods(found: Residuals, pose_covariance: FloatArray | None = None) -> FloatArray:
+    """Log densities (m,) of the residuals as Gaussians; minus infinity where invalid."""
+    information, log_determinant = _information(found, pose_covariance)
+    squared = np.einsum("mi,mij,mj->m", found.residual, information, found.residual)
+    logs = -0.5 * (squared + log_determinant + 3.0 * _LOG_TWO_PI)
+    return np.where(found.valid, logs, -np.inf)
+
+
+def _information(
+    found: Residuals, pose_covariance: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Inverse covariances (m, 3, 3) and log determinants (m,) of the covariances."""
+    covariance = found.covariance
+    if pose_covariance is not None:
+        spread = found.by_pose @ pose_covariance @ np.swapaxes(found.by_pose, 1, 2)
+        covariance = covariance + 0.5 * (spread + np.swapaxes(spread, 1, 2))
+    return inverse_spd3(covariance), np.linalg.slogdet(covariance)[1]
+
+
+def log_uniform(
+    rig: CameraRig, seen: SeenPoints, max_disparity_px: float, room: float
+) -> FloatArray:
+    """Log density (n,) of a feature that has nothing to do with its landmark.
+
+    In the image uniform over its pixels and disparities; in space over ``room`` cubic metres.
+    """
+    image = -np.log(rig.width * rig.height * max_disparity_px)
+    return np.asarray(np.where(seen.in_image, image, -np.log(room)))

@@ -1,0 +1,105 @@
+"""Settings of relocalisation: the pose of a frame in a map without any prior."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fgslam.settings.base import STRICT
+
+
+@dataclass(frozen=True, config=STRICT)
+class RelocalisationSettings:
+    """Global localisation from one frame, or from a short submap of frames (design B4)."""
+
+    method: Annotated[
+        Literal["ransac", "hough"],
+        Field(description="how poses are proposed: from minimal samples of matches, or by votes"),
+    ] = "ransac"
+    descriptors: Annotated[
+        bool,
+        Field(
+            description="propose matches by SIFT descriptor; false: by size, height and "
+            "orientation alone, as features without descriptors would"
+        ),
+    ] = True
+    neighbours: Annotated[
+        int, Field(ge=2, le=64, description="stored views asked of the index for each feature")
+    ] = 12
+    max_distance: Annotated[
+        float,
+        Field(gt=0.0, description="largest distance of descriptors, whose norm is 512"),
+    ] = 330.0
+    ratio: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            le=1.0,
+            description="a feature's candidates end where the next place's distance is farther by "
+            "this ratio; without such a gap the feature says nothing",
+        ),
+    ] = 0.85
+    candidates: Annotated[
+        int,
+        Field(ge=1, le=16, description="places that may share a feature before it says nothing"),
+    ] = 3
+    same_place_m: Annotated[
+        float, Field(gt=0.0, description="landmarks this near to one another are one place, metres")
+    ] = 0.3
+    size_ratio: Annotated[
+        float,
+        Field(gt=1.0, description="largest ratio of a feature's physical size to a landmark's"),
+    ] = 1.6
+    orientation_deg: Annotated[
+        float,
+        Field(gt=0.0, le=180.0, description="planar: largest difference of orientations"),
+    ] = 30.0
+    height_m: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="planar: largest difference of heights beyond what the covariances allow",
+        ),
+    ] = 0.05
+    samples: Annotated[
+        int,
+        Field(ge=16, description="minimal samples drawn at a time; most fail the rigidity test"),
+    ] = 4096
+    hypotheses: Annotated[
+        int, Field(ge=4, description="poses scored at a time, from the rigid samples")
+    ] = 64
+    rounds: Annotated[int, Field(ge=1, description="times that samples are drawn at most")] = 6
+    confidence: Annotated[
+        float,
+        Field(gt=0.0, lt=1.0, description="that one sample was clean, at which the search ends"),
+    ] = 0.999
+    refined: Annotated[
+        int, Field(ge=2, description="distinct best poses that are refined and compared")
+    ] = 4
+    gate_sigmas: Annotated[
+        float,
+        Field(gt=0.0, description="largest normalised residual (three numbers) of an inlier"),
+    ] = 4.0
+    min_inliers: Annotated[int, Field(ge=3, description="fewer inliers than this are no pose")] = 12
+    ambiguous_share: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            le=1.0,
+            description="the second-best pose elsewhere may have this share of the best's inliers",
+        ),
+    ] = 0.5
+    elsewhere_m: Annotated[
+        float, Field(gt=0.0, description="poses farther apart than this are different places")
+    ] = 0.5
+    elsewhere_deg: Annotated[
+        float, Field(gt=0.0, description="poses turned by more than this are different places")
+    ] = 15.0
+    max_sigma_m: Annotated[
+        float, Field(gt=0.0, description="largest standard deviation of an accepted position")
+    ] = 0.05
+    max_sigma_deg: Annotated[
+        float, Field(gt=0.0, description="largest standard deviation of an accepted heading")
+    ] = 1.0
