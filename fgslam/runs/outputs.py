@@ -34,6 +34,7 @@ from fgslam.runs.checkpoint import save_log
 from fgslam.runs.comparison import GROUND_TRUTH_FILE, load_truth, remark_of
 from fgslam.runs.estimator_files import write_estimate
 from fgslam.runs.judging import Truth
+from fgslam.runs.places import closures_of, place_numbers, write_closures
 from fgslam.runs.recorder import STAGES, RunRecorder
 from fgslam.runs.rendered_truth import rendered_landmark_truth
 from fgslam.runs.summary import estimator_metrics, run_numbers
@@ -81,6 +82,11 @@ class RunOutputs:
     def write_metrics(self, estimators: Mapping[str, EstimatorMetrics], status: str) -> None:
         """metrics.json of the live estimator and of those that replayed its log."""
         about = self._about(status) | run_numbers(self.recorder)
+        if self.pipeline.places is not None:
+            truth = load_truth(self.folder, self.recorder.log).trajectory
+            closures = closures_of(self.recorder, truth)
+            write_closures(self.folder, self.recorder, closures)
+            about["places"] = place_numbers(self.recorder, closures)
         write_metrics(self.folder / "metrics.json", len(self.recorder), estimators, about)
 
     def _with_kind(self, metrics: EstimatorMetrics) -> EstimatorMetrics:
@@ -131,6 +137,7 @@ class RunOutputs:
             "status": status,
             "frames_in_recording": len(self.sequence),
             "odometry": self.config.odometry.kind,
+            "landmarks_permanent": int(self.pipeline.tracker.database.permanent.sum()),
             "remark": self.remark or None,
             "notes": list(self.sequence.notes),
         }
@@ -161,7 +168,7 @@ def map_points(landmarks: LandmarkMap, database: LandmarkDatabase) -> MapPoints:
         hits=database.hits[rows],
         misses=database.misses[rows],
         valid=database.valid[rows],
-        permanent=np.zeros(len(landmarks), np.bool_),
+        permanent=database.permanent[rows],
     )
 
 

@@ -38,6 +38,7 @@ class RunRecorder:
 
     log: MeasurementLog
     rows: list[FrameRow] = field(default_factory=list)
+    tracked_poses: list[FloatArray] = field(default_factory=list)
     online_poses: list[FloatArray] = field(default_factory=list)
     online_covariances: list[FloatArray] = field(default_factory=list)
     stage_ms: list[FloatArray] = field(default_factory=list)
@@ -49,6 +50,7 @@ class RunRecorder:
         """Books one frame."""
         self.log.append(report.increment)
         self.rows.append(_row(report, stereo_precision))
+        self.tracked_poses.append(report.tracking.wTc)
         self.online_poses.append(report.stats.wTc)
         self.online_covariances.append(report.stats.covariance)
         beside = {
@@ -66,6 +68,7 @@ class RunRecorder:
     def state(self) -> StateArrays:
         """All but the log, as arrays."""
         out: StateArrays = {name: self.column(name) for name in FrameRow._fields}
+        out["tracked_poses"] = np.array(self.tracked_poses).reshape(-1, 4, 4)
         out["online_poses"] = np.array(self.online_poses).reshape(-1, 4, 4)
         out["online_covariances"] = np.array(self.online_covariances).reshape(-1, 6, 6)
         out["stage_ms"] = np.array(self.stage_ms).reshape(-1, len(STAGES))
@@ -75,6 +78,7 @@ class RunRecorder:
         """Continues from :meth:`state` and the log of as many frames."""
         columns = [state[name].tolist() for name in FrameRow._fields]
         self.rows = [FrameRow(*values) for values in zip(*columns, strict=True)]
+        self.tracked_poses = list(state["tracked_poses"])
         self.online_poses = list(state["online_poses"])
         self.online_covariances = list(state["online_covariances"])
         self.stage_ms = list(state["stage_ms"])

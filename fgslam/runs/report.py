@@ -21,10 +21,11 @@ from fgslam.evaluation.trajectory import (
 from fgslam.export.atomic import RUN_MARKER
 from fgslam.export.metrics import read_metrics
 from fgslam.export.point_cloud import MapPoints, read_ply
-from fgslam.export.report import EstimatorReport, ReportData, write_report
+from fgslam.export.report import Comparison, EstimatorReport, ReportData, write_report
 from fgslam.export.trajectories import read_covariances, read_tum
 from fgslam.measurement_log import MeasurementLog
 from fgslam.runs.checkpoint import LOG_FILE
+from fgslam.runs.places import LOOPS_FILE, read_closures
 from fgslam.runs.report_parts import comparison_table, sample_pictures
 from fgslam.types import FloatArray, IntArray, LandmarkMap, Trajectory
 
@@ -54,24 +55,26 @@ def report_from_folder(folder: Path, run: Path | None = None) -> Path:
 
 def load_report(folder: Path, run: Path | None = None) -> ReportData:
     """All that the page of a folder shows; arguments and errors as :func:`report_from_folder`."""
-    places = _places(folder, run)
+    folders = _places(folder, run)
     metrics = read_metrics(folder / "metrics.json")
-    config_text = _text(_find(places, RUN_MARKER))
+    config_text = _text(_find(folders, RUN_MARKER))
     config = _mapping(config_text)
     if "task" in config:
         raise DatasetError(
             f"{folder}: is a homing run ({config['task']}), and this needs one of SLAM; open its "
             "report.html, or give it to `fgslam compare`"
         )
-    truth_file = _find(places, "ground_truth.tum")
+    truth_file = _find(folders, "ground_truth.tum")
     truth = None if truth_file is None else read_tum(truth_file)
     live = _live_title(config)
-    timing = _live_times(_find(places, "timing.csv")) if folder == places[-1] else {}
+    timing = _live_times(_find(folders, "timing.csv")) if folder == folders[-1] else {}
     estimators = tuple(
         _estimator(folder / title, values or {}, truth, timing if title == live else {})
         for title, values in metrics["estimators"].items()
     )
-    pictures = next((p for p in places if (p / "pictures").is_dir()), folder) / "pictures"
+    pictures = next((p for p in folders if (p / "pictures").is_dir()), folder) / "pictures"
+    loops = _find(folders, LOOPS_FILE)
+    places, closures = (Comparison(), []) if loops is None else read_closures(loops)
     return ReportData(
         title=str(metrics.get("name") or config.get("name") or folder.name),
         subtitle=_subtitle(metrics, config),
@@ -79,10 +82,12 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
         truth=_truth_in_their_world(estimators, truth),
         notes=_notes(metrics),
         comparison=comparison_table(metrics["estimators"]),
+        places=places,
+        closures=tuple(closures),
         pictures=tuple(sample_pictures(pictures)),
         config_yaml=config_text,
         versions=_versions(config),
-        up=_up(_find(places, LOG_FILE)),
+        up=_up(_find(folders, LOG_FILE)),
         alignment="after SE3 alignment",
     )
 

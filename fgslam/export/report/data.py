@@ -145,6 +145,8 @@ class ReportData:
         truth: true poses in the estimates' world; None where there are none.
         estimators: one or more, in the order of the table; their colours follow it.
         comparison: the table.
+        places: the loops that were closed, a row each; without columns where none were looked for.
+        closures: pairs of frames (closing, returned to), counted in the first estimator's poses.
         pictures: of the run.
         config_yaml: the resolved configuration, as text.
         versions: of the program and its libraries; None where one is not installed.
@@ -158,6 +160,8 @@ class ReportData:
     truth: Trajectory | None = None
     notes: tuple[str, ...] = ()
     comparison: Comparison = field(default_factory=Comparison)
+    places: Comparison = field(default_factory=Comparison)
+    closures: tuple[tuple[int, int], ...] = ()
     pictures: tuple[Picture, ...] = ()
     config_yaml: str = ""
     versions: Mapping[str, str | None] = field(default_factory=dict)

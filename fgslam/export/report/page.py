@@ -42,6 +42,7 @@ def render(data: ReportData) -> str:
     body = [
         *frame.header(data.title, data.subtitle, headline(data), data.notes),
         *_comparison(data),
+        *_places(data.places),
         _toolbar(data),
         *(_figure(figure, data) for figure in figures),
         *frame.gallery(*embed(data.pictures)),
@@ -59,20 +60,34 @@ def _comparison(data: ReportData) -> Iterator[str]:
     table = data.comparison
     yield '<section aria-labelledby="comparison"><h2 id="comparison">Comparison</h2>'
     if table.rows:
-        yield '<div class="scroll" role="region" aria-labelledby="comparison" tabindex="0"><table>'
-        yield f'<thead><tr><th scope="col">estimator</th>{_headings(table.columns)}</tr></thead>'
-        yield "<tbody>"
-        yield from _rows(table, data.estimators)
-        yield f'</tbody></table></div>\n<p class="note">- : {NOT_KNOWN}</p>'
-        yield "<details><summary>What the columns mean</summary><dl>"
-        yield from (
-            f"<dt>{escape(column.name)}</dt><dd>{escape(column.meaning)}</dd>"
-            for column in table.columns
-        )
-        yield "</dl></details>"
+        yield from _table("comparison", "estimator", table, _rows(table, data.estimators))
     else:
         yield f"<p>The numbers of this run are {NOT_KNOWN}.</p>"
     yield "</section>"
+
+
+def _places(table: Comparison) -> Iterator[str]:
+    """The loops closed, where there are any: what they mended, before and after."""
+    if not table.rows:
+        return
+    yield '<section aria-labelledby="places"><h2 id="places">Places recognised</h2>'
+    yield from _table("places", "closed at", table, _rows(table, ()))
+    yield "</section>"
+
+
+def _table(key: str, first: str, table: Comparison, rows: Iterable[str]) -> Iterator[str]:
+    """A table that scrolls by itself, and what its columns mean."""
+    yield f'<div class="scroll" role="region" aria-labelledby="{key}" tabindex="0"><table>'
+    yield f'<thead><tr><th scope="col">{first}</th>{_headings(table.columns)}</tr></thead>'
+    yield "<tbody>"
+    yield from rows
+    yield f'</tbody></table></div>\n<p class="note">- : {NOT_KNOWN}</p>'
+    yield "<details><summary>What the columns mean</summary><dl>"
+    yield from (
+        f"<dt>{escape(column.name)}</dt><dd>{escape(column.meaning)}</dd>"
+        for column in table.columns
+    )
+    yield "</dl></details>"
 
 
 def _headings(columns: Iterable[Column]) -> str:

@@ -74,7 +74,7 @@ def drive_from_above(data: ReportData) -> Figure:
         "Solid: the path as known at the end. Dotted: each pose as first estimated. Dashed: the "
         f"truth. An ellipse reaches {SIGMAS:.0f} standard deviations of the position as the "
         "estimator claims it. Grey dots: landmarks of the estimator chosen.",
-        (*_dots_above(data, level), *_paths(data, level[:2]), *ellipses),
+        (*_dots_above(data, level), *_paths(data, level[:2]), *ellipses, *_returns(data, level)),
         layout,
         (
             Switch("truth", "truth"),
@@ -82,6 +82,7 @@ def drive_from_above(data: ReportData) -> Figure:
             Switch("online", "path as first estimated", on=False),
             *of_ellipses,
             Switch("landmarks", "landmarks"),
+            *([Switch("returns", "loops closed")] if data.closures else []),
         ),
         selects=True,
         note=_thinning_note(data, MAX_DOTS_ABOVE),
@@ -167,6 +168,17 @@ def _paths(data: ReportData, level: FloatArray) -> Iterator[Trace]:
         owner = Owner("truth", None, ("truth",), paint="truth")
         times = data.truth.timestamps - data.start
         yield _path(owner, times, data.truth.poses, level, {"dash": "dash", "width": 2})
+
+
+def _returns(data: ReportData, level: FloatArray) -> Iterator[Trace]:
+    """A line from each frame that closed a loop to the one whose place it recognised."""
+    if data.closures:
+        pairs = np.array(data.closures)
+        ends = data.estimators[0].final_poses[pairs, :3, 3] @ level[:2].T
+        x, y = joined(ends).T
+        owner = Owner("loop closed", 0, ("returns",), paint="grey")
+        axes = {"x": x, "y": y}
+        yield trace(owner, axes, mode="lines+markers", line={"width": 1.5}, hoverinfo="name")
 
 
 def _path(

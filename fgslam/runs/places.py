@@ -1,0 +1,95 @@
+"""What place recognition did in a run: loops.csv, its numbers, its table in the report."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import astuple, fields
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.errors import DatasetError
+from fgslam.evaluation.closures import JudgedClosure, judge_closures
+from fgslam.export.metrics import JsonValue
+from fgslam.export.report import Column, Comparison
+from fgslam.export.tables import Cell, write_csv
+from fgslam.runs.recorder import RunRecorder
+from fgslam.types import Trajectory
+
+LOOPS_FILE = "loops.csv"
+_NAMES = ("frame", "returned_to", *(f.name for f in fields(JudgedClosure)), "false")
+_COLUMNS = (
+    Column("returned to", "number of the frame whose place was recognised"),
+    Column("matches", "landmarks of that place seen again"),
+    Column("made one", "landmarks of the return found to be earlier ones"),
+    Column("correction (cm)", "how far closing the loop moved the pose"),
+    Column("error before (cm)", "of the position just before, in the world of the first pose"),
+    Column("error after (cm)", "of the position just after"),
+    Column("closure's error (cm)", "of the relative position that the closure measured"),
+    Column("closure's error (deg)", "of the relative heading that the closure measured"),
+)
+
+
+def closures_of(recorder: RunRecorder, truth: Trajectory | None) -> list[JudgedClosure]:
+    """The loops that a run closed, judged by the truth where there is one."""
+    closures = [(k, loop) for k, step in enumerate(recorder.log) for loop in step.loops]
+    if not closures:
+        return []
+    stamps = np.array([increment.timestamp for increment in recorder.log], np.float64)
+    online = Trajectory(stamps, np.array(recorder.online_poses).reshape(-1, 4, 4))
+    tracked = np.array(recorder.tracked_poses).reshape(-1, 4, 4)
+    return judge_closures(closures, tracked, online, truth)
+
+
+def place_numbers(recorder: RunRecorder, closures: list[JudgedClosure]) -> dict[str, JsonValue]:
+    """For metrics.json: how many loops and relocalisations, and how many of the loops are none."""
+    known = [closure.false for closure in closures if closure.false is not None]
+    return {
+        "closures": len(closures),
+        "false_closures": sum(known) if len(known) == len(closures) else None,
+        "relocalised": sum(increment.relocalised for increment in recorder.log),
+    }
+
+
+def write_closures(folder: Path, recorder: RunRecorder, closures: list[JudgedClosure]) -> None:
+    """loops.csv, one line a closure; no file where none was closed."""
+    if not closures:
+        return
+    numbers = [increment.index for increment in recorder.log]
+    rows: list[tuple[Cell, ...]] = [
+        (numbers[one.at], numbers[one.to], *astuple(one), one.false) for one in closures
+    ]
+    write_csv(folder / LOOPS_FILE, _NAMES, rows)
+
+
+def read_closures(path: Path) -> tuple[Comparison, list[tuple[int, int]]]:
+    """The report's table of a loops.csv, and the pairs of positions (closing, returned to)."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        rows = list(csv.DictReader(io.StringIO(text)))
+        lines = tuple((_title(row), _values(row)) for row in rows)
+        return Comparison(_COLUMNS, lines), [(int(row["at"]), int(row["to"])) for row in rows]
+    except (OSError, UnicodeDecodeError, KeyError, ValueError, TypeError) as error:
+        raise DatasetError(
+            f"{path}: not a table of closed loops ({error}); run the experiment again"
+        ) from None
+
+
+def _title(row: dict[str, str]) -> str:
+    return f"frame {row['frame']}" + (" (false)" if row["false"] == "true" else "")
+
+
+def _values(row: dict[str, str]) -> tuple[str, ...]:
+    lengths = ("correction_m", "before_m", "after_m", "error_m")
+    return (
+        row["returned_to"],
+        row["matches"],
+        row["merged"],
+        *(_text(row[name], 100.0, ".1f") for name in lengths),
+        _text(row["error_deg"], 1.0, ".2f"),
+    )
+
+
+def _text(value: str, scale: float, spec: str) -> str:
+    return format(scale * float(value), spec) if value else "-"
