@@ -15,14 +15,15 @@ import numpy as np
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.homing.avoidance import NoAvoidance, ObstacleAvoider
 from fgslam.homing.closed_loop import Driver, follow
+from fgslam.homing.eyes import Sighting
 from fgslam.homing.path_following import PathFollower
 from fgslam.homing.record import DriveRecord
+from fgslam.homing.soundness import parallax
 from fgslam.homing.steering import Steering
 from fgslam.homing_types import (
     BearingMatches,
     ColumnSegments,
     HomingStart,
-    HomingVector,
     OmniFeatures,
     Refusal,
     RefusalReason,
@@ -138,13 +139,16 @@ class SimulatedEyes:
         self._points, self._ids = points[rows], start.local_map.ids
         return start
 
-    def look(self, image: ByteArray, target: OmniFeatures) -> HomingVector | Refusal:
+    def look(self, image: ByteArray, target: OmniFeatures) -> Sighting | Refusal:
         """Matches in the same way, by a chance of its own."""
         pose, rng = self.world.true_pose, self.look_rng
         seen = landmark_features(self.world.points, pose, self.reach, self.sigma, rng)
         matches, _ = match_landmarks(seen, target, self.wrong, rng)
         begun = start_from_matches(0.0, matches, self.settings, rng)
-        return begun if isinstance(begun, Refusal) else begun[0].vector
+        if isinstance(begun, Refusal):
+            return begun
+        start, _ = begun
+        return Sighting(start.vector, parallax(start.matches, start.vector.rotation))
 
     def track(self, image: ByteArray, time: float) -> TrackedBearings:
         """True bearings with noise; what is beyond reach is lost."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from fgslam.errors import EstimatorError
 from fgslam.homing.command import Command, HomingState
-from fgslam.homing.eyes import HomingEyes
+from fgslam.homing.eyes import HomingEyes, Sighting
 from fgslam.homing.underway import EstimatorMaker, Fault, HomingUnderWay
 from fgslam.homing_types import HomingVector, OmniFeatures, Refusal, RefusalReason
 from fgslam.planar import wrap
@@ -144,9 +144,9 @@ class HomingController:
             return None
         self._next_look = time + self._settings.retry_s
         answer = self._eyes.look(image, self._target)
-        if isinstance(answer, HomingVector):
-            if homing.contradicts(answer):
-                return self._doubt(time, "near the target it is seen elsewhere", answer)
+        if isinstance(answer, Sighting):
+            if homing.contradicts(answer.vector):
+                return self._seen_elsewhere(homing, answer, time)
             self._recognised = True
         elif answer.reason is RefusalReason.AT_TARGET:
             return self._end(time, HomingState.ARRIVED, answer.details)
@@ -154,16 +154,30 @@ class HomingController:
             return self._doubt(time, f"target not seen where it is believed: {answer.details}")
         return None
 
-    def _doubt(self, time: float, why: str, vector: HomingVector | None = None) -> Command:
-        """The estimate is given up, and the leg begins anew where the robot stands.
+    def _seen_elsewhere(self, homing: HomingUnderWay, seen: Sighting, time: float) -> Command:
+        """At the target itself directions mean little: how near it is tells an error from that."""
+        left = homing.part_left(seen.parallax)
+        behind = abs(seen.vector.direction) > np.pi / 2 and self._was_ahead
+        if left <= self._settings.switch_fraction or (
+            behind and left <= self._settings.pass_fraction
+        ):
+            self.remaining = left
+            return self._end(time, HomingState.ARRIVED, f"passed: seen at {left:.2f} of the leg")
+        return self._doubt(time, "near the target it is seen elsewhere", seen.vector, left)
+
+    def _doubt(
+        self, time: float, why: str, vector: HomingVector | None = None, left: float = 1.0
+    ) -> Command:
+        """The estimate is given up, and homing begins anew where the robot stands.
 
         Args:
             time: now.
             why: for the record.
             vector: what contradicts the estimate; it must be confirmed itself.
+            left: part of the leg, as far as that is known.
         """
         self.underway, self._pending, self._next_try = None, vector, time
-        self.remaining, self._was_ahead, self._obstacle = 1.0, False, why
+        self.remaining, self._was_ahead, self._obstacle = left, False, why
         self._progress.begin_anew(time)
         if self._progress.stalls >= self._settings.max_stalls:
             return self._refuse(time, Refusal(RefusalReason.LOST, why))

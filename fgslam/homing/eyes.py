@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 from fgslam.homing_types import (
@@ -12,6 +13,19 @@ from fgslam.homing_types import (
     TrackedBearings,
 )
 from fgslam.types import ByteArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """A target seen by the side, without tracks of its features.
+
+    Attributes:
+        vector: the homing vector.
+        parallax: median of its inliers, radians, see :func:`fgslam.homing.soundness.parallax`.
+    """
+
+    vector: HomingVector
+    parallax: float
 
 
 class HomingEyes(Protocol):
@@ -32,7 +46,7 @@ class HomingEyes(Protocol):
         """
         ...
 
-    def look(self, image: ByteArray, target: OmniFeatures) -> HomingVector | Refusal:
+    def look(self, image: ByteArray, target: OmniFeatures) -> Sighting | Refusal:
         """Matches the image with a target, and leaves all tracks alone."""
         ...
 

@@ -12,6 +12,8 @@ from fgslam.frontend.omni.local_map import make_local_map, triangulable
 from fgslam.frontend.omni.matching import joined, match_features
 from fgslam.frontend.omni.trackable import move_to_trackable
 from fgslam.frontend.omni.tracking import BearingTracker
+from fgslam.homing.eyes import Sighting
+from fgslam.homing.soundness import parallax
 from fgslam.homing_types import (
     BearingMatches,
     HomingStart,
@@ -75,14 +77,17 @@ class ImageEyes:
             return vector
         return self._started(image, time, vector, matches, (present, target))
 
-    def look(self, image: ByteArray, target: OmniFeatures) -> HomingVector | Refusal:
-        """The homing vector alone."""
+    def look(self, image: ByteArray, target: OmniFeatures) -> Sighting | Refusal:
+        """The homing vector alone, and how near the target is."""
         present = self.describe(image)
         refusal = _unusable(image, present)
         if refusal is not None:
             return refusal
         matches = self._matches(present, target)
-        return estimate_homing_vector(matches, self._settings.homing_vector, self._rng)
+        vector = estimate_homing_vector(matches, self._settings.homing_vector, self._rng)
+        if isinstance(vector, Refusal):
+            return vector
+        return Sighting(vector, parallax(matches.taken(vector.inliers), vector.rotation))
 
     def track(self, image: ByteArray, time: float) -> TrackedBearings:
         """The features in the next image. Raises as :meth:`BearingTracker.track`."""

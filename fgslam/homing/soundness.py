@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.homing_types import HomingEstimate, HomingStart, TrackedBearings
+from fgslam.homing_types import BearingMatches, HomingEstimate, HomingStart, TrackedBearings
 from fgslam.planar import bearings, wrap
 from fgslam.types import FloatArray
 
@@ -40,6 +40,14 @@ def _misfit(pose: FloatArray, landmarks: FloatArray, seen: FloatArray) -> float:
         return float("nan")
     residuals = wrap(seen[known] - bearings(pose, landmarks[known]))
     return float(np.median(np.abs(residuals)))
+
+
+def parallax(matches: BearingMatches, rotation: float) -> float:
+    """Median absolute parallax of matches (n), n > 0, radians: what the turn does not explain.
+
+    It falls to zero at the target, and needs no direction: a measure of how near the target is.
+    """
+    return float(np.median(np.abs(wrap(matches.bearing_a - matches.bearing_b - rotation))))
 
 
 def common_turn(before: TrackedBearings, now: TrackedBearings) -> float:

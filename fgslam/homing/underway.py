@@ -10,7 +10,7 @@ import numpy as np
 
 from fgslam.backend.homing.protocol import HomingEstimator
 from fgslam.errors import EstimatorError
-from fgslam.homing.soundness import common_turn, target_misfit, tracked_misfit
+from fgslam.homing.soundness import common_turn, parallax, target_misfit, tracked_misfit
 from fgslam.homing_types import (
     HomeVector,
     HomingStart,
@@ -144,6 +144,14 @@ class HomingUnderWay:
         if np.isfinite(across) and across > s.max_across:
             return Fault(f"target uncertain by {across:.2f} legs across", True)
         return None
+
+    def part_left(self, seen: float) -> float:
+        """Part of the leg that is left by the parallax (radians) the target is seen under; rough.
+
+        As the present one is to that at the start; 1 at most.
+        """
+        before = parallax(self.start.matches, self.start.vector.rotation)
+        return min(1.0, self.unit * seen / before) if before > 0.0 else 1.0
 
     def contradicts(self, vector: HomingVector) -> bool:
         """Whether a new homing vector from the present place cannot be true if the estimate is."""

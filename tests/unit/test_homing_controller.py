@@ -12,6 +12,8 @@ from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.errors import EstimatorError
 from fgslam.homing.command import Command, HomingState
 from fgslam.homing.controller import HomingController
+from fgslam.homing.eyes import Sighting
+from fgslam.homing.soundness import parallax
 from fgslam.homing.underway import HomingUnderWay
 from fgslam.homing_types import (
     HomingEstimate,
@@ -92,7 +94,7 @@ class ScriptedEyes:
     tracks: int = 20
     turned: float = 0.0
     begun: list[float] = field(default_factory=list)
-    looks: list[HomingVector | Refusal] = field(default_factory=list)
+    looks: list[Sighting | Refusal] = field(default_factory=list)
     looked: int = 0
     home: FloatArray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
 
@@ -109,13 +111,13 @@ class ScriptedEyes:
         self.home = np.array([*unit(np.array(answer.direction)), answer.rotation])
         return start_at(time, answer)
 
-    def look(self, image: ByteArray, target: OmniFeatures) -> HomingVector | Refusal:
+    def look(self, image: ByteArray, target: OmniFeatures) -> Sighting | Refusal:
         """From a list, the last one repeated; without one the truth since the last match."""
         self.looked += 1
         if self.looks:
             return self.looks.pop(0) if len(self.looks) > 1 else self.looks[0]
         way = between(self.robot, self.home)
-        return vector_to(float(np.arctan2(way[1], way[0])), float(way[2]))
+        return Sighting(vector_to(float(np.arctan2(way[1], way[0])), float(way[2])), 0.1)
 
     def track(self, image: ByteArray, time: float) -> TrackedBearings:
         """Exact bearings."""
@@ -510,7 +512,7 @@ def test_near_the_target_one_look_confirms_it() -> None:
 def test_target_seen_elsewhere_begins_the_leg_anew() -> None:
     """A wrong vector that was sure of itself: two images that agree on another one win."""
     b = bench(vector_to(0.0), vector_to(1.5))
-    b.eyes.looks = [vector_to(1.4)]
+    b.eyes.looks = [Sighting(vector_to(1.4), 3.0)]
     b.step()
     b.at(0.8)
     doubt = b.step()
@@ -521,6 +523,31 @@ def test_target_seen_elsewhere_begins_the_leg_anew() -> None:
     assert anew.state is HomingState.DRIVE
     assert anew.heading == pytest.approx(1.5)
     assert anew.remaining == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("direction", "part", "state"),
+    [
+        (np.pi, 0.2, HomingState.ARRIVED),  # passed
+        (1.5, 0.05, HomingState.ARRIVED),  # beside it
+        (1.5, 0.2, HomingState.CONFIRM),  # ahead still
+        (np.pi, 0.9, HomingState.CONFIRM),  # driven the wrong way: parallaxes are as at the start
+    ],
+)
+def test_how_near_the_target_is_seen_decides(
+    direction: float, part: float, state: HomingState
+) -> None:
+    """Seen elsewhere than expected: at the target itself that is an arrival, else an error."""
+    b = bench(vector_to(0.0))
+    b.step()
+    start = b.controller.underway
+    assert start is not None
+    before = parallax(start.start.matches, 0.0)
+    b.eyes.looks = [Sighting(vector_to(direction), part * before)]
+    b.at(0.8)
+    command = b.step()
+    assert command.state is state
+    assert command.remaining == pytest.approx(part)
 
 
 def test_no_arrival_where_the_target_is_not_seen() -> None:
