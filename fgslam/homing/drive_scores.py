@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import t as student_t
 
 from fgslam.homing.record import DriveRecord
+from fgslam.planar import wrap
 from fgslam.types import FloatArray, IntArray
 
 ARRIVED_M = 0.5
@@ -66,6 +67,19 @@ def cross_track(record: DriveRecord) -> FloatArray:
     return out
 
 
+def corners(record: DriveRecord) -> FloatArray:
+    """(m,) how sharply each leg turns off the one before: the angle's sine, 1 beyond 90 degrees.
+
+    The robot turns off where the switch fraction of the leg before is left, and so begins the next
+    leg that part times this beside its line. The first leg begins on its line: 0.
+    """
+    ends = np.vstack([record.truth[0, :2], record.targets[:, :2]])
+    steps = np.diff(ends, axis=0)
+    angle = np.arctan2(steps[:, 1], steps[:, 0])
+    turns = np.abs(wrap(np.diff(angle, prepend=angle[:1])))
+    return np.asarray(np.sin(np.minimum(turns, 0.5 * np.pi)))
+
+
 @dataclass(frozen=True, slots=True)
 class Slope:
     """A straight line's slope with its confidence interval.
@@ -85,18 +99,26 @@ class Slope:
         return self.low <= 0.0 <= self.high
 
 
-def slope_by_leg(legs: IntArray, values: FloatArray) -> Slope:
+def slope_by_leg(legs: IntArray, values: FloatArray, known: FloatArray | None = None) -> Slope:
     """Whether values (n,), one a leg and run, grow with the leg's number (n,).
 
-    Values that are not finite are left out; with fewer than three there is no interval: NaN.
+    Values that are not finite are left out; with as few as there are unknowns there is no
+    interval: NaN.
+
+    Args:
+        legs: numbers.
+        values: what may grow.
+        known: (n,) another cause, whose share (linear, fitted along) is not counted as growth.
     """
-    kept = np.isfinite(values)
-    x, y = np.asarray(legs, dtype=np.float64)[kept], np.asarray(values)[kept]
-    spread = float(np.sum((x - x.mean()) ** 2)) if len(x) else 0.0
-    if len(x) < 3 or spread == 0.0:
+    kept = np.isfinite(values) if known is None else np.isfinite(values) & np.isfinite(known)
+    causes = [np.ones(len(legs)), np.asarray(legs, dtype=np.float64)]
+    columns = np.column_stack(causes if known is None else [*causes, known])[kept]
+    y, free = np.asarray(values)[kept], int(np.count_nonzero(kept)) - columns.shape[1]
+    if free < 1 or np.linalg.matrix_rank(columns) < columns.shape[1]:
         return Slope(float("nan"), float("nan"), float("nan"))
-    slope = float(np.sum((x - x.mean()) * (y - y.mean())) / spread)
-    residuals = y - y.mean() - slope * (x - x.mean())
-    sigma = float(np.sqrt(np.sum(residuals**2) / (len(x) - 2) / spread))
-    reach = float(student_t.ppf(0.975, len(x) - 2)) * sigma
+    fitted, *_ = np.linalg.lstsq(columns, y, rcond=None)
+    residuals = y - columns @ fitted
+    spread = np.linalg.inv(columns.T @ columns)[1, 1]
+    sigma = float(np.sqrt(residuals @ residuals / free * spread))
+    slope, reach = float(fitted[1]), float(student_t.ppf(0.975, free)) * sigma
     return Slope(slope, slope - reach, slope + reach)

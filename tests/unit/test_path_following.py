@@ -10,7 +10,7 @@ import pytest
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.errors import ConfigError, EstimatorError
 from fgslam.homing.command import HomingState
-from fgslam.homing.drive_scores import cross_track, pass_distances, slope_by_leg
+from fgslam.homing.drive_scores import corners, cross_track, pass_distances, slope_by_leg
 from fgslam.homing.path_following import PathFollower
 from fgslam.homing.record import STAGES, DriveRecord
 from fgslam.planar import between
@@ -184,6 +184,29 @@ def test_slope_knows_growth_from_noise() -> None:
     assert not growing.flat
     assert slope_by_leg(legs, noise).flat
     assert np.isnan(slope_by_leg(legs[:2], noise[:2]).value)
+
+
+def test_slope_beside_another_cause() -> None:
+    """Corners that happen to sharpen look like growth; fitted along, they do not."""
+    rng = np.random.default_rng(6)
+    legs = np.tile(np.arange(10), 20)
+    corner = 0.05 * legs + rng.uniform(0.0, 0.5, 200)
+    values = 0.05 * corner + rng.normal(0.0, 0.005, 200)
+    assert not slope_by_leg(legs, values).flat
+    assert slope_by_leg(legs, values, corner).flat
+    growing = slope_by_leg(legs, values + 0.002 * legs, corner)
+    assert growing.low < 0.002 < growing.high
+    assert not growing.flat
+    assert np.isnan(slope_by_leg(legs, values, np.ones(200)).value)
+
+
+def test_corners_are_those_of_the_targets_lines(record: DriveRecord) -> None:
+    """Straight on, a right angle, and back."""
+    places = np.array([[1.0, 0.0], [2.0, 0.0], [2.0, 1.0], [2.0, 0.2]])
+    drawn = replace(
+        record, truth=np.zeros((len(record), 3)), targets=np.column_stack([places, np.zeros(4)])
+    )
+    assert corners(drawn) == pytest.approx([0.0, 0.0, 1.0, 1.0])
 
 
 def test_scores_of_a_drive_that_one_can_draw(record: DriveRecord) -> None:

@@ -17,6 +17,7 @@ from fgslam.export.report.traces import Figure
 from fgslam.homing.drive_scores import (
     ARRIVED_M,
     Slope,
+    corners,
     cross_track,
     end_distance,
     pass_distances,
@@ -108,6 +109,7 @@ def drive_numbers(records: Sequence[DriveRecord], failed: int = 0) -> dict[str, 
         "pass_distance_slope": _slope([distances[:-1] for distances in passed]),
         "cross_track_median_m": _median(_finite(across)),
         "cross_track_slope": _slope(across),
+        "cross_track_slope_beside_corners": _slope(across, [corners(r) for r in records]),
         "duration_median_s": _median([float(r.time[-1] - r.time[0]) for r in records if len(r)]),
         "overridden": float(np.mean(np.concatenate([r.overridden for r in records])))
         if records
@@ -126,10 +128,13 @@ def _known(passed: Sequence[FloatArray]) -> int:
     return sum(int(np.count_nonzero(~np.isnan(distances))) for distances in passed)
 
 
-def _slope(values: Sequence[FloatArray]) -> dict[str, JsonValue]:
+def _slope(
+    values: Sequence[FloatArray], known: Sequence[FloatArray] | None = None
+) -> dict[str, JsonValue]:
     """Growth of values, one array a drive and one value a leg, with the leg's number."""
     legs = np.concatenate([np.empty(0, np.int64), *(np.arange(len(v)) + 1 for v in values)])
-    slope = slope_by_leg(legs, np.concatenate([np.empty(0), *values]))
+    beside = None if known is None else np.concatenate([np.empty(0), *known])
+    slope = slope_by_leg(legs, np.concatenate([np.empty(0), *values]), beside)
     return {**asdict(slope), "flat": _flat(slope)}
 
 
