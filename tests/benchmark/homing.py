@@ -95,6 +95,9 @@ class NotedEyes:
     def begin(self, image: Image, target: OmniFeatures, time: float) -> object:
         return self.inner.begin(image, target, time)
 
+    def look(self, image: Image, target: OmniFeatures) -> object:
+        return self.inner.look(image, target)
+
     def track(self, image: Image, time: float) -> TrackedBearings:
         self.seen.append(self.inner.track(image, time))
         return self.seen[-1]
