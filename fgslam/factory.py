@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from fgslam.arrival import Arrival, take_over
 from fgslam.backend.batch import BatchSmoother
 from fgslam.backend.dead_reckoning import DeadReckoning
 from fgslam.backend.ekf import FullEkf
@@ -23,7 +24,9 @@ from fgslam.errors import ConfigError
 from fgslam.floor import DegreesOfFreedom, Floor
 from fgslam.frontend.database import LandmarkDatabase
 from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.frontend.loops.recognition import PlaceRecognition, RecognitionParts
 from fgslam.frontend.map_matching import MapMatcher
+from fgslam.frontend.relocalisation.relocaliser import Relocaliser
 from fgslam.frontend.sift import SiftExtractor
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.stream import FeatureStream
@@ -95,6 +98,11 @@ def make_stream(sequence: Sequence, settings: FrontendSettings) -> FeatureStream
     """Features of the sequence's frames, found ahead of the loop."""
     extractor = SiftExtractor(settings.sift, settings.appearance.mode)
     return FeatureStream(sequence, extractor.extract)
+
+
+def make_stereo_matcher(rig: CameraRig, settings: FrontendSettings) -> StereoMatcher:
+    """What matches features over the rig."""
+    return StereoMatcher(rig, settings.stereo, settings.appearance)
 
 
 def make_tracker(rig: CameraRig, settings: FrontendSettings) -> LandmarkTracker:
@@ -176,23 +184,65 @@ def make_pipeline(
     frontend: FrontendSettings,
     odometry: OdometrySettings,
     estimator_settings: EstimatorSettings,
+    seed: int = 0,
+    arrival: Arrival | None = None,
 ) -> SlamPipeline:
-    """The whole system for one sequence."""
-    estimator = make_estimator(sequence.rig, estimator_settings, frontend.ego_motion)
-    require_support(estimator, measured_odometry=odometry.kind != "constant_velocity")
+    """The whole system for one sequence.
+
+    Args:
+        sequence: the recording.
+        frontend, odometry, estimator_settings: the configuration's.
+        seed: of place recognition's samples.
+        arrival: where the run begins in a saved map; None begins with an empty one.
+    """
+    prior = None if arrival is None else arrival.prior
+    estimator = make_estimator(sequence.rig, estimator_settings, frontend.ego_motion, prior)
+    measured_odometry = odometry.kind != "constant_velocity"
+    require_support(estimator, measured_odometry, loops=frontend.loops is not None)
+    tracker = make_tracker(sequence.rig, frontend)
+    if arrival is not None:
+        take_over(estimator, arrival)
+        tracker.database.load(arrival.saved)
+        tracker.keeps_map = not arrival.extends
     return SlamPipeline(
-        stereo=StereoMatcher(sequence.rig, frontend.stereo, frontend.appearance),
-        tracker=make_tracker(sequence.rig, frontend),
+        stereo=make_stereo_matcher(sequence.rig, frontend),
+        tracker=tracker,
         motion=make_motion(sequence, odometry),
         estimator=estimator,
+        places=make_places(sequence.rig, frontend, tracker, seed),
+        located=prior if arrival is not None and arrival.relocalised else None,
     )
 
 
-def require_support(estimator: Estimator, measured_odometry: bool) -> None:
+def make_places(
+    rig: CameraRig, settings: FrontendSettings, tracker: LandmarkTracker, seed: int
+) -> PlaceRecognition | None:
+    """What looks for returns and finds the lost camera; None where neither is wanted."""
+    if settings.loops is None and settings.lost is None:
+        return None
+    parts = RecognitionParts(
+        loops=settings.loops,
+        lost=settings.lost,
+        appearance=settings.appearance,
+        relocaliser=make_relocaliser(rig, settings),
+        seed=seed,
+    )
+    return PlaceRecognition(parts, tracker)
+
+
+def make_relocaliser(rig: CameraRig, settings: FrontendSettings) -> Relocaliser:
+    """What finds a frame in a map without a prior, for the poses that the ego-motion allows."""
+    floor = Floor.under(rig, settings.ego_motion.dof)
+    return Relocaliser(rig, floor, settings.relocalisation)
+
+
+def require_support(estimator: Estimator, measured_odometry: bool, loops: bool = False) -> None:
     """Refuses, before a run starts, an estimator that cannot use what the run will measure."""
     needed = {MeasurementType.STEREO}
     if measured_odometry:
         needed.add(MeasurementType.ODOMETRY)
+    if loops:
+        needed.add(MeasurementType.LOOP)
     lacking = sorted(kind.value for kind in needed - estimator.supports)
     if lacking:
         raise ConfigError(

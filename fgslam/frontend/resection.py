@@ -10,8 +10,8 @@ import dataclasses
 
 import numpy as np
 
-from fgslam.frontend.alignment import aligned_poses
 from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
+from fgslam.frontend.relocalisation.alignment import align, sample_size
 from fgslam.geometry import triangulate
 from fgslam.types import EgoMotion, EgoMotionStatus, FloatArray, Prediction
 
@@ -50,13 +50,13 @@ class Resection:
     def _start(self, problem: PoseProblem) -> FloatArray | None:
         """The pose from a few matches that most others agree with; None of too few."""
         floor = self._solver.floor
-        needed = 2 if floor.dof == 3 else 3
+        needed = sample_size(floor)
         if len(problem) < needed:
             return None
         rng = np.random.default_rng(len(problem))
         chosen = np.array([rng.choice(len(problem), needed, False) for _ in range(_SAMPLES)])
         local = triangulate(self._solver.sensor, problem.measurement)
-        poses = aligned_poses(local[chosen], problem.points[chosen], floor)
+        poses = align(local[chosen], problem.points[chosen], floor)
         agreeing = [self._agreeing(wTc, problem) for wTc in poses]
         return np.asarray(poses[int(np.argmax(agreeing))])
 

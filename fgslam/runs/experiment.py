@@ -81,7 +81,9 @@ def run_experiment(
     sequence = open_sequence(config, lambda done, total: progress("rendering", done, total))
     _require_odometry(config, sequence)
     create_run_folder(folder, existing)
-    pipeline = make_pipeline(sequence, config.frontend, config.odometry, config.estimator)
+    pipeline = make_pipeline(
+        sequence, config.frontend, config.odometry, config.estimator, config.seed
+    )
     recorder = RunRecorder(MeasurementLog(sequence.rig, pipeline.motion.description()))
     outputs = RunOutputs(folder, config, sequence, pipeline, recorder)
     if existing == "resume":

@@ -22,6 +22,7 @@ from fgslam.export.point_cloud import read_ply
 from fgslam.export.trajectories import read_covariances, read_tum
 from fgslam.measurement_log import MeasurementLog
 from fgslam.runs.experiment import RunResult, run_experiment
+from fgslam.runs.recorder import STAGES
 
 KIND = "landmark_kalman"
 SAME_BYTES = (
@@ -94,7 +95,7 @@ def assert_valid_results(folder: Path, frames: int | None = None, torn: int = 0)
     for length in (len(log), len(final), len(online), len(stamps)):
         assert length in allowed
     # Written after the metrics.
-    assert len(rows) in {1 + 7 * (count - k) for k in range(1 + torn)}
+    assert len(rows) in {1 + len(STAGES) * (count - k) for k in range(1 + torn)}
     assert np.isfinite(covariances).all()
     assert len(points) > 100
     assert torn or len(points) == metrics["estimators"][KIND]["landmarks"]

@@ -9,8 +9,6 @@ import pytest
 from simulated import RIG, assert_same_bits
 
 from fgslam import geometry as g
-from fgslam.floor import Floor
-from fgslam.frontend.alignment import aligned_poses
 from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.loops.closure import close_loop
 from fgslam.frontend.loops.confirmation import Confirmation, difference, drift_allows
@@ -165,27 +163,7 @@ def test_difference_in_metres_and_degrees() -> None:
     assert degrees == pytest.approx(15.0)
 
 
-# -- alignment and resection -----------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("dof", "points"), [(6, 3), (6, 12), (3, 2), (3, 7)])
-def test_alignment_is_exact_without_noise(dof: int, points: int) -> None:
-    rng = np.random.default_rng(3)
-    floor = Floor(dof, DOWN)
-    axis = rng.normal(size=3) if dof == 6 else rng.uniform(-3.0, 3.0) * DOWN
-    true = g.pose(g.so3_exp(axis), floor.constrain(g.pose(np.eye(3), rng.normal(size=3)))[:3, 3])
-    local = rng.normal(size=(40, points, 3))
-    found = aligned_poses(
-        local, g.transform_to_world(true, local.reshape(-1, 3)).reshape(local.shape), floor
-    )
-    np.testing.assert_allclose(found, np.tile(true, (40, 1, 1)), atol=1e-12)
-
-
-def test_alignment_never_reflects() -> None:
-    rng = np.random.default_rng(4)
-    local, world = rng.normal(size=(200, 3, 3)), rng.normal(size=(200, 3, 3))
-    rotations = aligned_poses(local, world, Floor(6, DOWN))[:, :3, :3]
-    np.testing.assert_allclose(np.linalg.det(rotations), 1.0, atol=1e-12)
+# -- resection -------------- -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dof", [6, 5, 3])
