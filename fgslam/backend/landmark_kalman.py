@@ -1,9 +1,13 @@
 """The paper's estimator: least-squares pose, one 3x3 Kalman filter per landmark.
 
 Se, Lowe and Little (2001), Sections 4.1 (averaging) and 6.4 (Kalman filters). The pose is that of
-the least squares against the landmarks (3.3); past poses are never revised, so the final
-trajectory is the online one. Correlations between landmarks, and between landmarks and pose,
-are dropped: that is what makes the filter cheap, and overconfident.
+the least squares against the landmarks (3.3). Correlations between landmarks, and between
+landmarks and pose, are dropped: that is what makes the filter cheap, and overconfident.
+
+Past poses are revised by loop closures alone (backward correction by submaps, design B4): the
+drive and the landmarks, each with the frame that it was made in, move to where a pose graph has
+them. The covariances of poses and landmarks stay what they are in this filter: how well a pose is
+known beside the map around it, and how well a landmark beside the poses that saw it.
 """
 
 from __future__ import annotations
@@ -13,9 +17,13 @@ from typing import ClassVar
 import numpy as np
 
 from fgslam.backend.filtered import FilteredTrajectory, moved
+from fgslam.backend.landmark_rows import LandmarkRows
+from fgslam.backend.loop_correction import DriveBook
+from fgslam.backend.submaps import changes, home_changes, rotated, transported
 from fgslam.geometry import (
     block_diagonal,
     congruence,
+    inverse,
     inverse_spd3,
     measurement_difference,
     point_pose_jacobian,
@@ -34,6 +42,7 @@ from fgslam.types import (
     Increment,
     IntArray,
     LandmarkMap,
+    LoopClosure,
     MeasurementType,
     Observations,
     Odometry,
@@ -48,9 +57,7 @@ class LandmarkKalman:
     """Estimator of kind ``landmark_kalman``, on :class:`fgslam.backend.protocol.Estimator`."""
 
     kind: ClassVar[str] = "landmark_kalman"
-    supports: ClassVar[frozenset[MeasurementType]] = frozenset(
-        {MeasurementType.ODOMETRY, MeasurementType.STEREO, MeasurementType.RANGE_BEARING}
-    )
+    supports: ClassVar[frozenset[MeasurementType]] = frozenset(MeasurementType)
 
     def __init__(self, rig: Sensor, settings: LandmarkKalmanSettings, prior: Prediction) -> None:
         """Starts at the prior pose with an empty map.
@@ -64,32 +71,50 @@ class LandmarkKalman:
         self._settings = settings
         self._current = prior
         self._past = FilteredTrajectory()
-        self._ids: IntArray = np.empty(0, np.int64)
-        self._positions: FloatArray = np.empty((0, 3))
-        self._covariances: FloatArray = np.empty((0, 3, 3))
-        self._counts: IntArray = np.empty(0, np.int64)
+        self._rows = LandmarkRows()
+        self._drive = DriveBook(settings.loops)
+        self._fixed = False
+
+    @property
+    def keeps_maps(self) -> bool:
+        """A pose is that of the least squares: it needs no landmark to move."""
+        return True
+
+    def begin_in(self, landmarks: LandmarkMap, hits: IntArray, fixed: bool) -> None:
+        """Takes a saved map over; no loop of this drive moves its landmarks."""
+        self._rows.load(landmarks, hits, np.full(len(landmarks), -1))
+        self._fixed = fixed
 
     def predict(self, odometry: Odometry | None) -> Prediction:
         """Pose after the camera moved by ``odometry``."""
         return moved(self._current, odometry)
 
     def landmarks(self) -> LandmarkMap:
-        """Current landmarks; the arrays are read only by agreement."""
-        return LandmarkMap(self._ids, self._positions, self._covariances)
+        """Current landmarks, until the next update; the arrays are read only by agreement."""
+        return self._rows.map()
 
     def update(
         self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
     ) -> UpdateStats:
-        """Pose from the tracking; matched landmarks filtered, missed ones grown, new ones added."""
+        """Pose from the tracking; matched landmarks filtered, missed ones grown, new ones added.
+
+        Then loops are closed: the pose told is the corrected one, with the covariance of the
+        closure, which is what it is known by beside the place returned to.
+        """
         self._past.require_later(increment)
-        self._current = Prediction(tracking.wTc, tracking.covariance)
+        before, self._current = self._current, Prediction(tracking.wTc, tracking.covariance)
         matched = increment.observations.select(~increment.observations.is_new)
-        nis, dof = self._update_matched(matched.select(tracking.inliers))
+        used = matched.select(tracking.inliers)
+        nis, dof = self._update_matched(used)
         self._grow(increment.missed_ids)
         self._add(increment.observations.select(increment.observations.is_new))
-        self._remove(increment.pruned_ids)
+        self._book(increment, tracking, motion, before, used.ids)
+        self._rows.remove(increment.pruned_ids)
         self._past.append(increment.timestamp, self._current)
-        return UpdateStats(tracking.wTc, tracking.covariance, len(self._ids), nis, dof)
+        for loop in increment.loops:
+            self._close(increment, loop)
+        current = self._current
+        return UpdateStats(current.wTc, current.covariance, len(self._rows), nis, dof)
 
     def correct(self, current: Prediction, ids: IntArray, positions: FloatArray) -> None:
         """Takes over a smoother's last pose and landmark positions (k, 3), between two frames.
@@ -98,25 +123,27 @@ class LandmarkKalman:
         stand for what is known of them given the poses.
         """
         self._current = current
-        self._positions[self.landmarks().rows(ids)] = positions
+        self._rows.positions[self._rows.rows(ids)] = positions
 
     def restart(self, observed: Observations) -> None:
         """Starts known landmarks anew from one observation each: they have moved."""
         if len(observed):
-            self._remove(observed.ids)
+            self._rows.remove(observed.ids)
             self._add(observed)
 
     def estimate(self) -> Estimate:
-        """Trajectory as filtered, and the map."""
+        """Trajectory as filtered, corrected by loops, and the map."""
+        rows = self._rows
         return Estimate(
             self._past.trajectory(),
             self._past.pose_covariances(),
-            LandmarkMap(self._ids, self._positions.copy(), self._covariances.copy()),
+            LandmarkMap(rows.ids.copy(), rows.positions.copy(), rows.covariances.copy()),
+            tuple(self._drive.remarks),
         )
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
         """Covariances (k, 3, 3) of the named landmarks."""
-        return self._covariances[self.landmarks().rows(ids)]
+        return self._rows.covariances[self._rows.rows(ids)]
 
     def joint_covariance(self, ids: IntArray) -> FloatArray:
         """Pose and landmarks as the filter sees them: independent (6.4)."""
@@ -124,44 +151,78 @@ class LandmarkKalman:
 
     def state(self) -> StateArrays:
         """Everything needed to continue; a snapshot, which later updates leave alone."""
-        return self._past.state() | {
+        names = ("ids", "positions", "covariances", "counts", "homes")
+        held = {name: a.copy() for name, a in zip(names, self._arrays(), strict=True)}
+        current = {
             "current_pose": self._current.wTc,
             "current_covariance": self._current.covariance,
-            "ids": self._ids,
-            "positions": self._positions.copy(),
-            "covariances": self._covariances.copy(),
-            "counts": self._counts.copy(),
         }
+        return self._past.state() | current | held | self._drive.state()
 
     def restore(self, state: StateArrays) -> None:
         """Continues from :meth:`state`."""
         self._past = FilteredTrajectory.restored(state)
         self._current = Prediction(state["current_pose"], state["current_covariance"])
-        self._ids = state["ids"]
-        self._positions = state["positions"].copy()
-        self._covariances = state["covariances"].copy()
-        self._counts = state["counts"].copy()
+        landmarks = LandmarkMap(state["ids"], state["positions"], state["covariances"])
+        self._rows.load(landmarks, state["counts"], state["homes"])
+        self._drive.restore(state)
 
     # ----------------------------------------------------------------------------------------
+
+    def _arrays(self) -> tuple[IntArray, FloatArray, FloatArray, IntArray, IntArray]:
+        rows = self._rows
+        return rows.ids, rows.positions, rows.covariances, rows.counts, rows.homes
+
+    def _book(
+        self,
+        increment: Increment,
+        tracking: EgoMotion,
+        motion: Odometry | None,
+        before: Prediction,
+        used: IntArray,
+    ) -> None:
+        """The step to this frame, for loops to come; and which old landmarks placed it."""
+        known = increment.odometry if increment.odometry is not None else motion
+        step = inverse(before.wTc) @ tracking.wTc if len(self._past) else tracking.wTc
+        self._drive.step(step, tracking, known, increment.relocalised)
+        homes = self._rows.homes[self._rows.rows(used)]
+        self._drive.tie(homes, self._past.poses, tracking, increment.relocalised)
+
+    def _close(self, increment: Increment, loop: LoopClosure) -> None:
+        """Moves the drive and the map to where the loop has them; or says why not."""
+        poses = self._drive.close(loop, f"frame {increment.index}")
+        if poses is None:
+            return
+        moved_by = changes(np.array(self._past.poses), poses)
+        self._past.poses[:] = list(poses)
+        self._current = Prediction(poses[-1], loop.covariance)
+        self._past.covariances[-1] = loop.covariance
+        by_landmark = home_changes(self._rows.homes, moved_by)
+        self._rows.positions[:] = transported(by_landmark, self._rows.positions)
+        self._rows.covariances[:] = rotated(by_landmark, self._rows.covariances)
 
     def _update_matched(self, observed: Observations) -> tuple[float, int]:
         """Type III landmarks, all at once; returns the innovation squared and its freedom."""
         if not len(observed):
             return float("nan"), 0
-        rows = self.landmarks().rows(observed.ids)
+        rows = self._rows.rows(observed.ids)
+        before = self._rows.positions[rows], self._rows.covariances[rows]
         if self._settings.update == "pixel":
             nis = self._pixel_update(rows, observed)
         elif self._settings.update == "world":
             nis = self._world_update(rows, observed)
         else:
             nis = self._average(rows, observed)
-        self._counts[rows] += 1
+        if self._fixed:
+            self._rows.positions[rows], self._rows.covariances[rows] = before
+        else:
+            self._rows.counts[rows] += 1
         return nis, 3 * len(rows)
 
     def _pixel_update(self, rows: IntArray, observed: Observations) -> float:
         """Kalman update on the measurement itself, linearised at the landmark, Joseph form."""
         wTc = self._current.wTc
-        points = transform_to_camera(wTc, self._positions[rows])
+        points = transform_to_camera(wTc, self._rows.positions[rows])
         jacobian = projection_jacobian(self._rig, points)
         noise = observed.covariance
         if self._settings.pose_covariance:
@@ -175,33 +236,33 @@ class LandmarkKalman:
         """Kalman fusion of the observed 3-D position with the landmark's (6.4)."""
         positions, noise = self._observed_positions(observed)
         identity = np.broadcast_to(np.eye(3), noise.shape)
-        return self._kalman(rows, identity, positions - self._positions[rows], noise)
+        return self._kalman(rows, identity, positions - self._rows.positions[rows], noise)
 
     def _kalman(
         self, rows: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
     ) -> float:
-        before = self._covariances[rows]
+        before = self._rows.covariances[rows]
         precision = inverse_spd3(congruence(jacobian, before) + noise)
         gain = before @ np.swapaxes(jacobian, 1, 2) @ precision
-        self._positions[rows] += np.einsum("kij,kj->ki", gain, innovation)
+        self._rows.positions[rows] += np.einsum("kij,kj->ki", gain, innovation)
         keep = np.eye(3) - gain @ jacobian
-        self._covariances[rows] = congruence(keep, before) + congruence(gain, noise)
+        self._rows.covariances[rows] = congruence(keep, before) + congruence(gain, noise)
         return float(np.einsum("ki,kij,kj->", innovation, precision, innovation))
 
     def _average(self, rows: IntArray, observed: Observations) -> float:
         """Averaging of 4.1: a running mean, or half old and half new (design E-S4)."""
         positions, noise = self._observed_positions(observed)
-        before = self._positions[rows]
+        before = self._rows.positions[rows]
         innovation = positions - before
-        precision = inverse_spd3(self._covariances[rows] + noise)
+        precision = inverse_spd3(self._rows.covariances[rows] + noise)
         if self._settings.update == "half":
             weight = np.full((len(rows), 1), 0.5)
         else:
-            weight = 1.0 / (self._counts[rows, None] + 1.0)
-        self._positions[rows] = before + weight * innovation
+            weight = 1.0 / (self._rows.counts[rows, None] + 1.0)
+        self._rows.positions[rows] = before + weight * innovation
         squared = (weight**2)[:, :, None]
         kept = ((1.0 - weight) ** 2)[:, :, None]
-        self._covariances[rows] = kept * self._covariances[rows] + squared * noise
+        self._rows.covariances[rows] = kept * self._rows.covariances[rows] + squared * noise
         return float(np.einsum("ki,kij,kj->", innovation, precision, innovation))
 
     def _observed_positions(self, observed: Observations) -> tuple[FloatArray, FloatArray]:
@@ -216,30 +277,12 @@ class LandmarkKalman:
     def _grow(self, ids: IntArray) -> None:
         """Type II landmarks: the ellipsoid expands (6.4)."""
         if len(ids):
-            rows = self.landmarks().rows(ids)
-            self._covariances[rows] += self._settings.miss_growth_m**2 * np.eye(3)
+            rows = self._rows.rows(ids)
+            self._rows.covariances[rows] += self._settings.miss_growth_m**2 * np.eye(3)
 
     def _add(self, observed: Observations) -> None:
         """Type IV landmarks."""
         if not len(observed):
             return
         positions, covariances = self._observed_positions(observed)
-        self._ids = np.concatenate([self._ids, observed.ids])
-        self._positions = np.concatenate([self._positions, positions])
-        self._covariances = np.concatenate([self._covariances, covariances])
-        self._counts = np.concatenate([self._counts, np.ones(len(observed), np.int64)])
-        if not (np.diff(self._ids) > 0).all():
-            self._select(np.argsort(self._ids, kind="stable"))
-
-    def _remove(self, ids: IntArray) -> None:
-        if not len(ids):
-            return
-        keep = np.ones(len(self._ids), np.bool_)
-        keep[self.landmarks().rows(ids)] = False
-        self._select(np.flatnonzero(keep))
-
-    def _select(self, rows: IntArray) -> None:
-        self._ids = self._ids[rows]
-        self._positions = self._positions[rows]
-        self._covariances = self._covariances[rows]
-        self._counts = self._counts[rows]
+        self._rows.add(observed.ids, positions, covariances, len(self._past))

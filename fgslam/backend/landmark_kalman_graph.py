@@ -48,7 +48,7 @@ class LandmarkKalmanGraph(LandmarkKalman):
 
     kind: ClassVar[str] = "landmark_kalman_graph"
     supports: ClassVar[frozenset[MeasurementType]] = frozenset(
-        {MeasurementType.ODOMETRY, MeasurementType.STEREO}
+        {MeasurementType.ODOMETRY, MeasurementType.STEREO, MeasurementType.LOOP}
     )
 
     def __init__(
@@ -75,6 +75,7 @@ class LandmarkKalmanGraph(LandmarkKalman):
             update=settings.update,
             pose_covariance=settings.pose_covariance,
             miss_growth_m=settings.miss_growth_m,
+            loops=settings.loops,
         )
         super().__init__(rig, closed_form, prior)
         self._pose_graph = FixedMapPose(rig, ego_motion)
@@ -105,14 +106,15 @@ class LandmarkKalmanGraph(LandmarkKalman):
 
     def _pixel_update(self, rows: IntArray, observed: Observations) -> float:
         """Stereo factor and prior of each landmark, linearised at the landmark."""
-        found = self._eliminated(self._positions[rows], self._covariances[rows], observed)
+        known = self._rows
+        found = self._eliminated(known.positions[rows], known.covariances[rows], observed)
         return self._apply(rows, found)
 
     def _world_update(self, rows: IntArray, observed: Observations) -> float:
         """Two priors on each landmark: what was known, and the position observed."""
         positions, noise = self._observed_positions(observed)
-        offsets = positions - self._positions[rows]
-        return self._apply(rows, fused(self._covariances[rows], offsets, noise))
+        offsets = positions - self._rows.positions[rows]
+        return self._apply(rows, fused(self._rows.covariances[rows], offsets, noise))
 
     def _observed_positions(self, observed: Observations) -> tuple[FloatArray, FloatArray]:
         """A stereo factor alone, eliminated where it is met exactly."""
@@ -137,8 +139,8 @@ class LandmarkKalmanGraph(LandmarkKalman):
         return LandmarkElimination(by_pose).observed(linear, priors)
 
     def _apply(self, rows: IntArray, found: Eliminated) -> float:
-        self._positions[rows] += found.steps
-        self._covariances[rows] = found.covariances
+        self._rows.positions[rows] += found.steps
+        self._rows.covariances[rows] = found.covariances
         return found.misfit
 
 

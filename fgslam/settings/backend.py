@@ -66,6 +66,36 @@ class NamedSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
+class LoopCorrectionSettings:
+    """What closing a loop does to the drive so far (design B4; docs/derivations/submaps.md)."""
+
+    submap_frames: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="frames to a submap, whose beginnings are the variables of the pose graph "
+            "that corrects the drive backwards; within one the change is spread",
+        ),
+    ] = 10
+    drift_factor: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="deviations of a frame's tracked pose are multiplied by this for the step "
+            "to it: the tracked pose's own covariance takes the landmarks as they are",
+        ),
+    ] = 1.0
+    gate_sigmas: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="a loop closure is refused where it raises the cost by more than the "
+            "square of this; 0: none is",
+        ),
+    ] = 10.0
+
+
+@dataclass(frozen=True, config=STRICT)
 class GraphSettings(NamedSettings):
     """What all smoothers share: how measurements become a graph that can be solved."""
 
@@ -122,6 +152,7 @@ class GraphSettings(NamedSettings):
             "landmark counts as moved and starts anew; 0: never",
         ),
     ] = 3
+    loops: LoopCorrectionSettings = LoopCorrectionSettings()
 
 
 # --------------------------------------------------------------------------------------------
@@ -160,6 +191,7 @@ class LandmarkKalmanSettings(NamedSettings):
             ge=0.0, description="standard deviation in metres added to a landmark on a miss (6.4)"
         ),
     ] = 0.0001
+    loops: LoopCorrectionSettings = LoopCorrectionSettings()
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -173,6 +205,7 @@ class LandmarkKalmanGraphSettings(NamedSettings):
     ] = "pixel"
     pose_covariance: Annotated[bool, Field(description="as landmark_kalman's")] = True
     miss_growth_m: Annotated[float, Field(ge=0.0, description="as landmark_kalman's")] = 0.0001
+    loops: LoopCorrectionSettings = LoopCorrectionSettings()
 
 
 @dataclass(frozen=True, config=STRICT)

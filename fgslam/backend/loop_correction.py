@@ -1,0 +1,118 @@
+"""What a filter keeps of its drive so that a loop can be closed, and whether it may be.
+
+The filter's own covariance of a pose says how well it is known beside the map around it, and never
+grows: drift is not in it. What drifts is the chain of steps, each as uncertain as its frame was
+tracked; where no landmark had a say, as uncertain as the odometry; where the robot was carried
+off, not known at all.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.backend.submaps import FREE, Chain, Constraint, Corrected
+from fgslam.errors import EstimatorError
+from fgslam.geometry import inverse
+from fgslam.settings.backend import LoopCorrectionSettings
+from fgslam.types import EgoMotion, FloatArray, IntArray, LoopClosure, Odometry, StateArrays
+
+_TIED_BY = 10  # landmarks of an old place that hold a frame there
+_OLD = 5  # submaps
+
+
+class DriveBook:
+    """The chain of steps of a drive, the constraints on it, and the verdicts on loops."""
+
+    def __init__(self, settings: LoopCorrectionSettings) -> None:
+        """An empty drive."""
+        self._settings = settings
+        self._chain = Chain()
+        self._tied = -1
+        self.remarks: list[str] = []
+
+    def step(
+        self, motion: FloatArray, tracking: EgoMotion, known: Odometry | None, free: bool
+    ) -> None:
+        """Books the step (4, 4) to a frame.
+
+        Args:
+            motion: the frame's pose as tracked, in the last one's.
+            tracking: how the frame was tracked.
+            known: what the frame was predicted with.
+            free: nobody knows the step: the frame was found without a prior.
+        """
+        if free:
+            covariance = FREE
+        elif tracking.status.measured or known is None:
+            covariance = self._settings.drift_factor**2 * tracking.covariance
+        else:
+            covariance = known.covariance
+        self._chain.append(motion, covariance)
+
+    def tie(
+        self, homes: IntArray, poses: list[FloatArray], tracking: EgoMotion, free: bool
+    ) -> None:
+        """Books that the last frame was placed by landmarks of an old part of the drive, if so.
+
+        Once a submap; a frame found without a prior hangs on nothing else.
+
+        Args:
+            homes: (k,) home frames of the landmarks that placed it; -1 of those that never move.
+            poses: of all frames before, as they are now.
+            tracking: how it was tracked.
+            free: it was found without a prior.
+        """
+        frame, every = len(self._chain) - 1, self._settings.submap_frames
+        homes = np.maximum(homes, 0)  # a saved map's landmarks stay, and so does the first pose
+        old = homes[homes < (frame if free else frame - _OLD * every)]
+        due = self._tied < 0 or frame - self._tied >= every
+        if len(old) < _TIED_BY or not (free or due):
+            return
+        self._tied = frame
+        home = int(np.sort(old)[len(old) // 2])
+        covariance = self._settings.drift_factor**2 * tracking.covariance
+        motion = inverse(poses[home]) @ tracking.wTc
+        self._chain.constraints.append(Constraint(home, frame, motion, covariance))
+
+    def close(self, loop: LoopClosure, where: str) -> FloatArray | None:
+        """All poses (n, 4, 4) with the loop closed; None, and a remark, where it is refused.
+
+        It is refused where it would cost more than the drive's own uncertainty explains: the rise
+        of the cost is chi-square with six degrees of freedom for a true one.
+        """
+        last = len(self._chain) - 1
+        what = f"{where}: loop closure to frame {loop.frame} of the log"
+        if not 0 <= loop.frame < last:
+            raise EstimatorError(f"{what}, which does not come before it; mend the log")
+        known = Constraint(loop.frame, last, loop.oTc, loop.covariance)
+        before = self._solved(self._chain.constraints)
+        found = self._solved([*self._chain.constraints, known])
+        rise, gate = found.cost - before.cost, self._settings.gate_sigmas
+        if gate > 0.0 and not rise <= gate**2:
+            self.remarks.append(
+                f"{what} refused: {np.sqrt(max(rise, 0.0)):.1f} standard deviations off, "
+                f"{gate:g} allowed"
+            )
+            return None
+        self._chain.constraints.append(known)
+        shift = found.poses[-1, :3, 3] - before.poses[-1, :3, 3]
+        self.remarks.append(
+            f"{what}: the camera moved by {np.linalg.norm(shift):.2f} m, the drive with it"
+        )
+        return found.poses
+
+    def state(self) -> StateArrays:
+        """All of it as plain arrays."""
+        return self._chain.state() | {
+            "chain_tied": np.array(self._tied),
+            "chain_remarks": np.array(self.remarks, np.str_),
+        }
+
+    def restore(self, state: StateArrays) -> None:
+        """Continues from :meth:`state`."""
+        self._chain = Chain.restored(state)
+        self._tied = int(state["chain_tied"])
+        self.remarks = [str(words) for words in state["chain_remarks"]]
+
+    def _solved(self, constraints: list[Constraint]) -> Corrected:
+        return self._chain.solve(constraints, self._settings.submap_frames)

@@ -1,0 +1,223 @@
+"""Backward correction by submaps (Se, Lowe and Little's later work; design B4).
+
+A drive is a chain of steps, each as uncertain as it was tracked. Closing a loop asks for the least
+weighted changes to the chain under which it meets itself: the minimum of a pose graph. Its
+variables are the poses at which submaps begin; within a submap the change is spread over the
+frames as their steps' uncertainty has it, so that nothing tears. Derivation:
+docs/derivations/submaps.md.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from fgslam.backend.graph_solution import poses_of_frame
+from fgslam.backend.outliers import solver_parameters
+from fgslam.factors.keys import pose_key
+from fgslam.factors.motion import odometry_factor, pose_prior
+from fgslam.geometry import (
+    adjoint,
+    congruence,
+    inverse,
+    reorthonormalise,
+    se3_exp,
+    se3_log,
+    skew,
+)
+from fgslam.types import FloatArray, IntArray, Odometry, Prediction, StateArrays
+
+_ITERATIONS = 100
+_TOLERANCE = 1e-12  # of the cost
+_EXACT_SIGMA = 1e-6  # radians and metres: a step's least deviation, for what a floor excludes
+_STILL = 1e-12  # of a change's tangent vector: what is not to be spread
+FREE_RAD, FREE_M = 3.0, 30.0
+"""Deviations of a step that nobody measured, as of a robot that was carried off: it pulls nothing
+(a frame's own landmarks know the pose a thousand times better), yet the graph stays solvable."""
+FREE = np.diag([FREE_RAD**2] * 3 + [FREE_M**2] * 3)
+"""(6, 6) covariance of such a step."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Constraint:
+    """A measured motion between two frames of the chain that are no neighbours.
+
+    Attributes:
+        before, after: frames.
+        motion: (4, 4) pose of ``after`` in ``before``.
+        covariance: (6, 6) in the tangent space at it.
+    """
+
+    before: int
+    after: int
+    motion: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corrected:
+    """The chain that meets all constraints as well as it can.
+
+    Attributes:
+        poses: (n, 4, 4).
+        cost: squared residuals, each in its own deviations, of all changes together.
+    """
+
+    poses: FloatArray
+    cost: float
+
+
+@dataclass(slots=True, eq=False)
+class Chain:
+    """A drive as it was tracked: never revised, so that corrections do not pile up.
+
+    Attributes:
+        poses: one (4, 4) a frame, each the last one's moved on by the step as tracked.
+        steps: (6, 6) covariance of the step to each frame, in the tangent space at its pose.
+        constraints: what else is known, in the order in which it came.
+    """
+
+    poses: list[FloatArray] = field(default_factory=list)
+    steps: list[FloatArray] = field(default_factory=list)
+    constraints: list[Constraint] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def append(self, motion: FloatArray, covariance: FloatArray) -> None:
+        """Adds a frame: its pose in the last one (of the first frame: in the world)."""
+        self.poses.append(self.poses[-1] @ motion if self.poses else motion)
+        self.steps.append(covariance)
+
+    def solve(self, constraints: list[Constraint], every: int) -> Corrected:
+        """The chain under these constraints, with a submap every so many frames."""
+        return corrected(np.array(self.poses), np.array(self.steps), constraints, every)
+
+    def state(self) -> StateArrays:
+        """All of it as plain arrays."""
+        n, known = len(self.poses), self.constraints
+        return {
+            "chain_poses": np.array(self.poses).reshape(n, 4, 4),
+            "chain_steps": np.array(self.steps).reshape(n, 6, 6),
+            "chain_between": np.array([(c.before, c.after) for c in known], np.int64).reshape(
+                -1, 2
+            ),
+            "chain_motions": np.array([c.motion for c in known]).reshape(-1, 4, 4),
+            "chain_covariances": np.array([c.covariance for c in known]).reshape(-1, 6, 6),
+        }
+
+    @staticmethod
+    def restored(state: StateArrays) -> Chain:
+        """Back from :meth:`state`."""
+        known = zip(
+            state["chain_between"].tolist(),
+            state["chain_motions"],
+            state["chain_covariances"],
+            strict=True,
+        )
+        constraints = [Constraint(a, b, motion, cov) for (a, b), motion, cov in known]
+        return Chain(list(state["chain_poses"]), list(state["chain_steps"]), constraints)
+
+
+def corrected(
+    poses: FloatArray, steps: FloatArray, constraints: list[Constraint], every: int
+) -> Corrected:
+    """Least weighted changes to a chain under which it meets its constraints.
+
+    Args:
+        poses: (n, 4, 4) the chain; its first pose stays.
+        steps: (n, 6, 6) covariances of the steps to each pose, in the tangent space at it; the
+            first one is not used.
+        constraints: between frames of the chain.
+        every: frames to a submap; frames with a constraint begin one, too.
+    """
+    errors = _as_motions_of_the_world(poses, steps)
+    begins = _beginnings(len(poses), constraints, every)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(pose_prior(pose_key(0), Prediction(poses[0], np.zeros((6, 6)))))
+    for frame in begins:
+        values.insert(pose_key(frame), gtsam.Pose3(poses[frame]))
+    for a, b in itertools.pairwise(begins):
+        whole = errors[a + 1 : b + 1].sum(axis=0)
+        motion = inverse(poses[a]) @ poses[b]
+        step = Odometry(motion, congruence(adjoint(inverse(poses[b])), whole))
+        graph.add(odometry_factor(pose_key(a), pose_key(b), step))
+    for known in constraints:
+        step = Odometry(known.motion, known.covariance)
+        graph.add(odometry_factor(pose_key(known.before), pose_key(known.after), step))
+    params = solver_parameters(_ITERATIONS, _TOLERANCE)
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+    at = {frame: reorthonormalise(poses_of_frame(found, frame)) for frame in begins}
+    out = poses.copy()
+    for a, b in itertools.pairwise(begins):
+        out[a : b + 1] = _between(poses[a : b + 1], errors[a : b + 1], at[a], at[b])
+    return Corrected(out, 2.0 * float(graph.error(found)))
+
+
+def rotated(transforms: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Covariances (n, 3, 3) of points that rigid motions (n, 4, 4) take along."""
+    return congruence(transforms[:, :3, :3], covariances)
+
+
+def transported(transforms: FloatArray, points: FloatArray) -> FloatArray:
+    """Points (n, 3), each moved by its own rigid motion (n, 4, 4)."""
+    moved = np.einsum("nij,nj->ni", transforms[:, :3, :3], points)
+    return np.asarray(moved + transforms[:, :3, 3])
+
+
+def changes(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Motions (n, 4, 4) of the world that take poses (n, 4, 4) ``before`` to those ``after``."""
+    return np.asarray(after @ np.array([inverse(pose) for pose in before]).reshape(-1, 4, 4))
+
+
+# --------------------------------------------------------------------------------------------
+
+
+def _beginnings(count: int, constraints: list[Constraint], every: int) -> list[int]:
+    ends = {frame for known in constraints for frame in (known.before, known.after)}
+    return sorted({*range(0, count, every), count - 1, *ends})
+
+
+def _as_motions_of_the_world(poses: FloatArray, steps: FloatArray) -> FloatArray:
+    """Covariances (n, 6, 6) of each step's error as a motion of the world.
+
+    The error ``xi`` of the step to pose T moves all that follows by ``Ad(T) xi``: to first order
+    these motions add up, and so do their covariances.
+    """
+    return congruence(_adjoints(poses), steps + _EXACT_SIGMA**2 * np.eye(6))
+
+
+def _adjoints(poses: FloatArray) -> FloatArray:
+    """Adjoints (n, 6, 6) of poses (n, 4, 4)."""
+    out = np.zeros((len(poses), 6, 6))
+    out[:, :3, :3] = out[:, 3:, 3:] = poses[:, :3, :3]
+    out[:, 3:, :3] = skew(poses[:, :3, 3]) @ poses[:, :3, :3]
+    return out
+
+
+def _between(
+    poses: FloatArray, errors: FloatArray, first: FloatArray, last: FloatArray
+) -> FloatArray:
+    """A submap's poses (m, 4, 4) when its ends have moved to ``first`` and ``last``.
+
+    Given the change of the whole, that of a part is the share of the part's covariance: the
+    conditional mean of a chain of independent steps.
+    """
+    begun = first @ inverse(poses[0])
+    change = se3_log(inverse(begun) @ last @ inverse(poses[-1]))
+    if np.abs(change).max() < _STILL:
+        out = begun @ poses
+    else:
+        spread = np.cumsum(errors[1:], axis=0)
+        shares = spread @ np.linalg.solve(spread[-1], change)
+        out = begun @ np.array([np.eye(4), *(se3_exp(share) for share in shares)]) @ poses
+    out[0], out[-1] = first, last
+    return np.asarray(out)
+
+
+def home_changes(homes: IntArray, moved: FloatArray) -> FloatArray:
+    """Motion (n, 4, 4) of each landmark: that of its home frame; none where that is -1."""
+    return np.asarray(np.concatenate([moved, np.eye(4)[None]])[homes])
