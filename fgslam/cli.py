@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from fgslam.export.atomic import ExistingFolder
     from fgslam.homing_config import HomingExperiment
     from fgslam.runs.baseline import Results
+    from fgslam.runs.beginning import Progress
     from fgslam.runs.choosing import Choice
     from fgslam.runs.comparison import Compared
-    from fgslam.runs.experiment import Progress
 
 EXIT_USER = 2
 EXIT_FAULT = 1
@@ -92,7 +92,8 @@ def _run_homing(settings: HomingExperiment, folder: Path, existing: ExistingFold
 def _run_images(settings: ExperimentConfig, folder: Path, existing: ExistingFolder) -> None:
     from fgslam.comparison_console import show_comparisons
     from fgslam.console import progress_bar, show_result
-    from fgslam.runs.experiment import resume_command, run_experiment
+    from fgslam.runs.beginning import resume_command
+    from fgslam.runs.experiment import run_experiment
 
     with _stop_flag() as stopped, progress_bar() as progress:
         result = run_experiment(settings, folder, existing, _stoppable(progress, stopped), stopped)

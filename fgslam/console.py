@@ -20,7 +20,7 @@ from rich.table import Table
 from fgslam.runs.summary import frame_problems, run_numbers
 
 if TYPE_CHECKING:
-    from fgslam.runs.experiment import Progress as Tell
+    from fgslam.runs.beginning import Progress as Tell
     from fgslam.runs.experiment import RunResult
 
 _PROBLEMS_SHOWN = 5

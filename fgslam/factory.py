@@ -191,7 +191,9 @@ def make_pipeline(
 
     Args:
         sequence: the recording.
-        frontend, odometry, estimator_settings: the configuration's.
+        frontend: the configuration's.
+        odometry: the configuration's.
+        estimator_settings: the configuration's.
         seed: of place recognition's samples.
         arrival: where the run begins in a saved map; None begins with an empty one.
     """

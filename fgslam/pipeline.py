@@ -72,13 +72,20 @@ class Stopwatch:
 
 @dataclass(slots=True, eq=False)
 class SlamPipeline:
-    """The parts of the system and the loop over them; places None where none are recognised."""
+    """The parts of the system and the loop over them.
+
+    Attributes:
+        places: None where none are recognised.
+        located: pose of the first frame, found in a saved map without a prior; None where it was
+            not.
+    """
 
     stereo: StereoMatcher
     tracker: LandmarkTracker
     motion: MotionModel
     estimator: Estimator
     places: PlaceRecognition | None = None
+    located: Prediction | None = None
 
     def process(self, found: FeatureFrame, index: int, timestamp: float) -> FrameReport:
         """One frame: Sections 2 to 4 of the paper in their order, then what 7 leaves to do."""
@@ -108,12 +115,16 @@ class SlamPipeline:
         landmarks = self.estimator.landmarks()
         tracked = self.tracker.track(prediction, landmarks, stereo)
         relocalised, maps_on = False, True
-        if self.places is not None and found.i > 0:
+        if found.i == 0 and self.located is not None:
+            anew = self.tracker.track_anew(self.located, landmarks, stereo)
+            relocalised = anew.ego_motion.status.measured
+            tracked = anew if relocalised else tracked
+        elif self.places is not None and found.i > 0:
             tracked, relocalised = self.places.recover(tracked, landmarks, stereo)
             maps_on = self.places.maps_on
         image = found.frame.images[0]
         association = self.tracker.associate(tracked, stereo, image, maps_on)
-        if found.i == 0:
+        if found.i == 0 and not len(landmarks):
             return _Seen(unmeasured(prediction, EgoMotionStatus.FIRST), association)
         return _Seen(tracked.ego_motion, association, relocalised=relocalised)
 
@@ -173,7 +184,7 @@ def replay_frame(
     prediction = estimator.predict(odometry)
     watch.lap("predict")
     matched = increment.observations.select(~increment.observations.is_new)
-    if k == 0:
+    if k == 0 and not len(estimator.landmarks()):
         tracking = unmeasured(prediction, EgoMotionStatus.FIRST)
     elif increment.relocalised:
         tracking = _relocated(estimator, ego_motion, prediction, matched)

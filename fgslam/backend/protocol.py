@@ -7,7 +7,7 @@ can steer the front-end and any log can be given to any estimator.
 
 from __future__ import annotations
 
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
 from fgslam.types import (
     EgoMotion,
@@ -84,4 +84,31 @@ class Estimator(Protocol):
 
     def restore(self, state: StateArrays) -> None:
         """Continue from what :meth:`state` gave."""
+        ...
+
+
+@runtime_checkable
+class MapUser(Protocol):
+    """An estimator that can begin in a saved map.
+
+    What a map holds of its landmarks' joint covariance are their own blocks: they are taken to be
+    independent of one another and of the first pose, as the paper's filter does (Se et al. 6.4).
+    """
+
+    @property
+    def keeps_maps(self) -> bool:
+        """Whether it can leave the map's landmarks as they are, and estimate poses alone."""
+        ...
+
+    def begin_in(self, landmarks: LandmarkMap, hits: IntArray, fixed: bool) -> None:
+        """Takes the map over, before the first update.
+
+        Args:
+            landmarks: in the world of the estimator's prior pose.
+            hits: (n,) frames in which each was seen so far.
+            fixed: positions and covariances stay as they are; only where :attr:`keeps_maps`.
+
+        Raises:
+            EstimatorError: it holds more than the estimator can.
+        """
         ...

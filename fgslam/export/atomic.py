@@ -48,6 +48,7 @@ _RESULT_FILES = (
     "trials_timing.csv",
     "report.html",
     "view.rrd",
+    "map.fgmap",
     # of homing runs
     "pairs.csv",
     "reference_pairs.csv",
@@ -69,7 +70,7 @@ _RESULT_FILES = (
 # What a run writes, and so all that overwriting one may delete; comparisons of it go along.
 _RUN_FILES = (
     *_RESULT_FILES,
-    *(f"{inner}/{name}" for inner in ("compare", "trials") for name in _RESULT_FILES),
+    *(f"{inner}/{name}" for inner in ("compare", "trials", "first") for name in _RESULT_FILES),
     "**/.*.partial*",
 )
 

@@ -78,7 +78,11 @@ class LandmarkTracker:
         matcher: MapMatcher,
         ego_motion: EgoMotionSolver,
     ) -> None:
-        """The database is shared with whoever shows or saves it."""
+        """The database is shared with whoever shows or saves it.
+
+        With ``keeps_map`` nothing is booked, started or pruned: the map is only localised in.
+        """
+        self.keeps_map = False
         self._rig = rig
         self.database = database
         self._matcher = matcher
@@ -150,6 +154,9 @@ class LandmarkTracker:
         expected, matches = tracked.expected, tracked.matches
         inliers = tracked.ego_motion.inliers
         matched = _matched(expected, matches, features)
+        if self.keeps_map:
+            none = np.empty(0, np.int64)
+            return Association(matched, ~inliers, none, none, matches.features)
         hit = np.zeros(len(expected), np.bool_)
         hit[matches.landmarks[inliers]] = True
         missed_ids = self.database.missing(expected, hit)

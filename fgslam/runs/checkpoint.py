@@ -20,6 +20,11 @@ LOG_FILE = "measurements.npz"
 
 def save(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
     """Writes the state. The log must have been written before: it may not lack a frame of it."""
+    write_arrays(folder / STATE_FILE, state_of(pipeline, recorder))
+
+
+def state_of(pipeline: SlamPipeline, recorder: RunRecorder) -> StateArrays:
+    """All that changes during a run but its log, as arrays named ``part/name``."""
     parts = {
         "database": pipeline.tracker.database.state(),
         "estimator": pipeline.estimator.state(),
@@ -28,14 +33,25 @@ def save(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
     }
     if pipeline.places is not None:
         parts["places"] = pipeline.places.state()
-    write_arrays(
-        folder / STATE_FILE,
-        {
-            f"{part}/{name}": array
-            for part, arrays in parts.items()
-            for name, array in arrays.items()
-        },
-    )
+    return {
+        f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()
+    }
+
+
+def restore(
+    state: StateArrays, log: MeasurementLog, pipeline: SlamPipeline, recorder: RunRecorder
+) -> None:
+    """Continues from :func:`state_of` and the log.
+
+    Raises:
+        KeyError, ValueError, IndexError: the state is another's.
+    """
+    pipeline.tracker.database.restore(_part(state, "database"))
+    pipeline.estimator.restore(_part(state, "estimator"))
+    pipeline.motion.restore(_part(state, "motion"))
+    recorder.restore(_part(state, "recorder"), log)
+    if pipeline.places is not None:
+        pipeline.places.restore(_part(state, "places"), recorder.log)
 
 
 def save_log(folder: Path, log: MeasurementLog) -> None:
@@ -43,9 +59,14 @@ def save_log(folder: Path, log: MeasurementLog) -> None:
     write_arrays(folder / LOG_FILE, log.to_arrays())
 
 
+def exists(folder: Path) -> bool:
+    """Whether there is a state to continue from."""
+    return (folder / STATE_FILE).is_file()
+
+
 def require(folder: Path) -> None:
     """Raises OutputError where there is nothing to continue from."""
-    if not (folder / STATE_FILE).is_file():
+    if not exists(folder):
         raise OutputError(
             f"{folder}: nothing to resume (no {STATE_FILE}): the run has finished, or never got "
             "to its first checkpoint; use --overwrite to run again"
@@ -63,12 +84,7 @@ def load(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
     state = load_arrays(folder / STATE_FILE)
     log = MeasurementLog.load(folder / LOG_FILE)
     try:
-        pipeline.tracker.database.restore(_part(state, "database"))
-        pipeline.estimator.restore(_part(state, "estimator"))
-        pipeline.motion.restore(_part(state, "motion"))
-        recorder.restore(_part(state, "recorder"), log)
-        if pipeline.places is not None:
-            pipeline.places.restore(_part(state, "places"), recorder.log)
+        restore(state, log, pipeline, recorder)
     except (KeyError, ValueError, IndexError) as error:
         raise OutputError(
             f"{folder / STATE_FILE}: not a state that this fgslam wrote ({error}); start again "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,29 +11,25 @@ from typing import Literal
 
 import numpy as np
 
-from fgslam.config import ExperimentConfig, load_config
-from fgslam.errors import ConfigError, DatasetError
-from fgslam.export.atomic import RUN_MARKER, ExistingFolder, create_run_folder
+from fgslam.config import ExperimentConfig
+from fgslam.errors import DatasetError
+from fgslam.export.atomic import ExistingFolder
 from fgslam.export.comparison_table import write_comparison_csv
 from fgslam.export.metrics import EstimatorMetrics
-from fgslam.factory import make_pipeline, make_stream, open_sequence
+from fgslam.factory import make_stream
 from fgslam.frontend.stream import FeatureFrame
-from fgslam.measurement_log import MeasurementLog
 from fgslam.pipeline import FrameReport
 from fgslam.recordings import Sequence
-from fgslam.runs import checkpoint
+from fgslam.runs import checkpoint, mapping
+from fgslam.runs.beginning import BegunRun, OpenedRun, Progress, begin, open_run
 from fgslam.runs.choosing import compared_with
 from fgslam.runs.comparison import COMPARISON_FILE, Compared, replay_apart, tasks_of
-from fgslam.runs.outputs import RunOutputs, versions
+from fgslam.runs.outputs import RunOutputs
 from fgslam.runs.pictures import draw_frame, draw_run, figures_of, frames_to_show
-from fgslam.runs.recorder import RunRecorder
 from fgslam.runs.rendered_truth import TrueDepth
 from fgslam.runs.report import report_from_folder
 from fgslam.runs.threads import one_blas_thread
 from fgslam.types import StereoFeatures
-
-Progress = Callable[[str, int, int], None]
-"""Called with what is under way, how much is done, and of how much."""
 
 _SAVING_SHARE = 10.0  # the loop runs at least this many times as long as it saves
 _PRECISION_EVERY = 10  # frames between checks of stereo matches against rendered depth
@@ -51,6 +46,7 @@ class RunResult:
     pictures: tuple[Path, ...]
     outputs: RunOutputs
     compared: Compared | None = None
+    about_map: str = ""
 
 
 @one_blas_thread()
@@ -73,28 +69,30 @@ def run_experiment(
     Raises:
         FgslamError: of any kind, with a message for the user.
     """
-    if existing == "resume" or (existing == "refuse" and folder.exists()):
-        create_run_folder(folder, existing)  # refuses now, not after minutes of rendering
-    if existing == "resume":
-        checkpoint.require(folder)
-        _require_same(config, folder)
-    sequence = open_sequence(config, lambda done, total: progress("rendering", done, total))
-    _require_odometry(config, sequence)
-    create_run_folder(folder, existing)
-    pipeline = make_pipeline(
-        sequence, config.frontend, config.odometry, config.estimator, config.seed
-    )
-    recorder = RunRecorder(MeasurementLog(sequence.rig, pipeline.motion.description()))
-    outputs = RunOutputs(folder, config, sequence, pipeline, recorder)
-    if existing == "resume":
-        _require_same_ground(sequence, folder)
-        checkpoint.load(folder, pipeline, recorder)
-    else:
-        outputs.write_config()
-    saved = _loop(outputs, progress, stopped)
+    run = open_run(config, folder, existing, progress)
+    ended = _drive_first(run, existing, progress, stopped)
+    if ended is not None:
+        return ended
+    begun = begin(run, progress)
+    saved = _loop(begun.outputs, progress, stopped)
     if saved is not None:
-        return RunResult(folder, "interrupted", saved, (), outputs)
-    return _finish(outputs, progress, stopped)
+        return RunResult(folder, "interrupted", saved, (), begun.outputs)
+    return _finish(begun, progress, stopped)
+
+
+def _drive_first(
+    run: OpenedRun, existing: ExistingFolder, progress: Progress, stopped: Callable[[], bool]
+) -> RunResult | None:
+    """Makes the run's own map, where it asks for that; how it ended if that was early."""
+    folder = run.folder / mapping.FIRST_FOLDER
+    config = mapping.first_config(run.config, folder)
+    if config is None or (existing == "resume" and (folder / mapping.MAP_FILE).is_file()):
+        return None
+    resumable = existing == "resume" and checkpoint.exists(folder)
+    result = run_experiment(
+        config, folder, "resume" if resumable else "overwrite", progress, stopped
+    )
+    return result if result.status == "interrupted" else None
 
 
 def _loop(
@@ -150,21 +148,22 @@ def save_progress(outputs: RunOutputs) -> EstimatorMetrics:
 def _process(outputs: RunOutputs, found: FeatureFrame) -> FrameReport:
     timestamp = float(outputs.sequence.timestamps[found.i])
     # A frame without images has a number, too: the one that the selection gives it.
-    dataset = outputs.config.dataset
-    index = dataset.start + found.i * dataset.stride
+    index = outputs.first_frame + found.i * outputs.config.dataset.stride
     return outputs.pipeline.process(found, index, timestamp)
 
 
-def _finish(outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]) -> RunResult:
+def _finish(begun: BegunRun, progress: Progress, stopped: Callable[[], bool]) -> RunResult:
+    outputs = begun.outputs
     pictures: tuple[Path, ...] = ()
     metrics = outputs.write_results("finished")
+    about_map = mapping.save(outputs, begun.given)
     if outputs.config.output.pictures:
         pictures = tuple(draw_run(outputs.folder, figures_of(outputs)))
     checkpoint.remove(outputs.folder)
     compared = _compare(outputs, metrics, progress, stopped)
     if outputs.config.output.report:
         report_from_folder(outputs.folder)
-    return RunResult(outputs.folder, "finished", metrics, pictures, outputs, compared)
+    return RunResult(outputs.folder, "finished", metrics, pictures, outputs, compared, about_map)
 
 
 def _compare(
@@ -202,49 +201,3 @@ def _stereo_precision(sequence: Sequence, i: int, stereo: StereoFeatures) -> flo
     true = rig.fx * rig.baseline / depth[rows, columns]
     error = np.abs(true - stereo.measurement[:, 2:]).min(axis=1)
     return float(np.mean(error <= _PRECISION_PX))
-
-
-def _require_odometry(config: ExperimentConfig, sequence: Sequence) -> None:
-    """Says before the start, not at frame 1, that a recording lacks odometry."""
-    if config.odometry.kind != "recorded" or len(sequence) < 2:
-        return
-    if all(sequence.odometry(i) is None for i in range(1, len(sequence))):
-        raise DatasetError(
-            f"{sequence.name} has no odometry; set odometry.kind to constant_velocity, or to "
-            "synthetic where there is ground truth"
-        )
-
-
-def _require_same(config: ExperimentConfig, folder: Path) -> None:
-    """A run resumes only with the configuration that it was started with."""
-    path = folder / RUN_MARKER
-    if load_config(path).as_values() != config.as_values():
-        raise ConfigError(
-            f"{path}: differs from the configuration given; resume with the same one "
-            f"({resume_command(folder)}) or start again with --overwrite"
-        )
-
-
-def _require_same_ground(sequence: Sequence, folder: Path) -> None:
-    """A run resumes to the same bytes only on its own recording and with its own packages."""
-    path = folder / RUN_MARKER
-    provenance = load_config(path).provenance or {}
-    if (provenance.get("dataset") or {}).get("identity") != sequence.identity:
-        raise DatasetError(
-            f"{sequence.name}: the recording has changed since {path} was written; restore it, or "
-            "start again with --overwrite"
-        )
-    before, now = provenance.get("versions") or {}, versions()
-    differing = [name for name in now if name in before and before[name] != now[name]]
-    changed = [f"{name} {before[name]} -> {now[name]}" for name in differing]
-    if changed:
-        raise ConfigError(
-            f"{path}: started with other versions ({', '.join(changed)}), which would not give the "
-            "same bytes; restore them, or start again with --overwrite"
-        )
-
-
-def resume_command(folder: Path) -> str:
-    """What to type to continue the run in ``folder``, whatever overrides it was started with."""
-    run = shlex.quote(str(folder))
-    return f"fgslam run {shlex.quote(str(folder / RUN_MARKER))} --out {run} --resume"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -45,13 +46,20 @@ _VERSIONS_OF = ("numpy", "scipy", "opencv-python-headless", "gtsam", "open3d")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunOutputs:
-    """The run folder of one run."""
+    """The run folder of one run.
+
+    Attributes:
+        first_frame: number in the recording of the sequence's frame 0.
+        notes: what is to be said of the run, besides the recording's own.
+    """
 
     folder: Path
     config: ExperimentConfig
     sequence: Sequence
     pipeline: SlamPipeline
     recorder: RunRecorder
+    first_frame: int = 0
+    notes: tuple[str, ...] = ()
 
     @property
     def title(self) -> str:
@@ -62,11 +70,6 @@ class RunOutputs:
     def remark(self) -> str:
         """Marks results whose odometry was made from ground truth; empty otherwise."""
         return remark_of(self.config)
-
-    def write_config(self) -> None:
-        """The resolved configuration with what it takes to repeat the run."""
-        recording = {"name": self.sequence.name, "identity": self.sequence.identity}
-        write_config(self.folder, self.config, {"dataset": recording})
 
     def write_results(self, status: str) -> EstimatorMetrics:
         """Log, trajectories, covariances, map, metrics and timing of the frames so far."""
@@ -128,6 +131,7 @@ class RunOutputs:
                     strict=True,
                 )
                 for stage, milliseconds in zip(STAGES, row, strict=True)
+                if not math.isnan(milliseconds)  # of a session before
             ],
         )
 
@@ -139,7 +143,7 @@ class RunOutputs:
             "odometry": self.config.odometry.kind,
             "landmarks_permanent": int(self.pipeline.tracker.database.permanent.sum()),
             "remark": self.remark or None,
-            "notes": list(self.sequence.notes),
+            "notes": [*self.sequence.notes, *self.notes],
         }
 
 

@@ -65,6 +65,11 @@ class RunRecorder:
         """One number of all frames."""
         return np.array([getattr(row, name) for row in self.rows])
 
+    def known_times(self) -> FloatArray:
+        """(n, stages) milliseconds, without the frames of a session before: NaN there."""
+        times = np.array(self.stage_ms).reshape(-1, len(STAGES))
+        return times[np.isfinite(times).all(axis=1)]
+
     def state(self) -> StateArrays:
         """All but the log, as arrays."""
         out: StateArrays = {name: self.column(name) for name in FrameRow._fields}

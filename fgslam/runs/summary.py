@@ -19,7 +19,7 @@ _LOOP_STAGES = ("predict", "stereo", "track", "places", "update")
 
 def estimator_metrics(estimate: Estimate, truth: Truth, recorder: RunRecorder) -> EstimatorMetrics:
     """Accuracy, consistency, time and memory of the live estimator, as of a replayed one."""
-    times = np.array(recorder.stage_ms).reshape(-1, len(STAGES))
+    times = recorder.known_times()
     stamps = np.array([increment.timestamp for increment in recorder.log], np.float64)
     online = Trajectory(stamps, np.array(recorder.online_poses).reshape(-1, 4, 4))
     answer = Answer(
@@ -36,7 +36,7 @@ def estimator_metrics(estimate: Estimate, truth: Truth, recorder: RunRecorder) -
 
 def run_numbers(recorder: RunRecorder) -> dict[str, JsonValue]:
     """Counts over the frames that do not depend on truth."""
-    times = np.array(recorder.stage_ms).reshape(-1, len(STAGES))
+    times = recorder.known_times()
     return {
         "status_counts": dict(sorted(Counter(recorder.column("status").tolist()).items())),
         "features": spread(recorder.column("features")),

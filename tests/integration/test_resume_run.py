@@ -36,7 +36,7 @@ from fgslam.errors import (
 )
 from fgslam.measurement_log import load_arrays
 from fgslam.runs.checkpoint import write_arrays
-from fgslam.runs.experiment import resume_command
+from fgslam.runs.beginning import resume_command
 from fgslam.settings.datasets import ImageFolderSettings
 from fgslam.types import Odometry
 
