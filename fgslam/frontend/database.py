@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.frontend.landmark_table import LandmarkTable
-from fgslam.frontend.permanence import clearly_absent, is_blind, reliable
+from fgslam.frontend.permanence import is_blind, reliable, seen_past
 from fgslam.frontend.views import Views
 from fgslam.frontend.visibility import ExpectedLandmarks, FieldOfView, directions_to
 from fgslam.settings.frontend import DatabaseSettings, PermanenceSettings
@@ -113,27 +113,26 @@ class LandmarkDatabase(LandmarkTable):
         expected: ExpectedLandmarks,
         missing: IntArray,
         rejected: IntArray,
-        seen: tuple[FloatArray, BoolArray],
+        seen: FloatArray,
     ) -> None:
         """What a located frame says against permanent landmarks: too often, and one is demoted.
 
         It contradicts those missing whose match was rejected as an outlier, and those whose place
-        it sees clearly (:func:`fgslam.frontend.permanence.clearly_absent`). What merely hides
-        them says nothing.
+        it sees past (:func:`fgslam.frontend.permanence.seen_past`). What hides them says nothing.
 
         Args:
             expected: landmarks expected in view.
             missing: identities of those missed.
             rejected: identities of those matched and rejected.
-            seen: the frame's (column, row, disparity) (f, 3), and which of them (f,) are hits.
+            seen: (f, 3) the frame's stereo features, (column, row, disparity).
         """
         permanence = self._settings.permanence
         if permanence is None or permanence.contradicted_after is None:
             return
         ids = missing[self.permanent[self.rows(missing)]]
         places = expected.measurement[np.searchsorted(expected.ids, ids)]
-        against = clearly_absent(places, *seen, permanence.near_px)
-        ids = ids[against | np.isin(ids, rejected)]
+        against = seen_past(places, seen, permanence) | np.isin(ids, rejected)
+        ids = ids[against]
         rows = self.rows(ids)
         self.contradicted[rows] += 1
         self.demote(ids[self.contradicted[rows] >= permanence.contradicted_after])

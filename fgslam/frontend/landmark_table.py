@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.errors import MapError
 from fgslam.frontend.columns import GrowingColumns
 from fgslam.frontend.views import Places, ViewPool, Views
 from fgslam.map_file import SavedMap
@@ -156,9 +157,14 @@ class LandmarkTable:
 
         Misses in a row and contradictions start at zero; new identities follow the map's last. A
         landmark with more views than the settings allow keeps those matched last.
+
+        Raises:
+            MapError: a landmark of the map has no view.
         """
         appearances, ids = saved.appearances, saved.landmarks.ids
-        counts = np.diff(np.searchsorted(appearances.ids, np.append(ids, np.iinfo(np.int64).max)))
+        owners, counts = np.unique(appearances.ids, return_counts=True)
+        if not np.array_equal(owners, ids):
+            raise MapError("the map has landmarks without a view; make the map again")
         zeros = np.zeros(len(ids), np.int64)
         # The order of a landmark's views is that of their last use; they are older than any now.
         last = np.repeat(np.cumsum(counts), counts)

@@ -165,10 +165,8 @@ class LandmarkTracker:
         self.database.record_hits(matched.ids[inliers], features, seen, directions[seen])
         self.database.record_misses(missed_ids)
         if tracked.ego_motion.status.measured:
-            known = np.zeros(len(features), np.bool_)
-            known[seen] = True
             rejected = matched.ids[~inliers]
-            self.database.weigh(expected, missed_ids, rejected, (features.measurement, known))
+            self.database.weigh(expected, missed_ids, rejected, features.measurement)
         fresh = np.flatnonzero(~matches.had_candidates & start_new)
         colour = _grey_values(image, features, fresh)
         new_ids = self.database.add(features, fresh, colour, directions[fresh])

@@ -183,14 +183,18 @@ class PermanenceSettings:
         Field(
             ge=1,
             description="frames that contradict a permanent landmark (rejected as an outlier, or "
-            "missed where the view is clear), no hit between them, until it is an ordinary one "
-            "again; null: never",
+            "missed where the cameras see past its place), no hit between them, until it is an "
+            "ordinary one again; null: never",
         ),
     ] = 20
     near_px: Annotated[
         float,
-        Field(gt=0.0, description="what tells whether a place is clear is seen this near to it"),
-    ] = 20.0
+        Field(gt=0.0, description="what is seen past a place is this near to it in the image"),
+    ] = 40.0
+    apart_px: Annotated[
+        float,
+        Field(gt=0.0, description="before or behind it: a disparity that differs by more"),
+    ] = 2.0
 
 
 @dataclass(frozen=True, config=STRICT)
