@@ -19,8 +19,9 @@ from fgslam.errors import ConfigError, FrameError
 from fgslam.settings.lab import LabSettings
 from fgslam.simulation import wheel_odometry
 from fgslam.simulation.image_effects import apply_effects, is_blocked
-from fgslam.simulation.paths import Drive, plan_drive
+from fgslam.simulation.paths import PosesInTime
 from fgslam.simulation.person import Stance, make_walk
+from fgslam.simulation.places import PlaceChoice, first_pose, plan_in_place
 from fgslam.simulation.render_cache import RenderCache, content_hash
 from fgslam.simulation.renderer import Layer
 from fgslam.simulation.world import World, camera_offsets, make_rig, open_room
@@ -29,15 +30,17 @@ from fgslam.types import CameraRig, FloatArray, Frame, Image, IntArray, Odometry
 RENDER_VERSION = 7
 """Part of the cache's key: raised whenever the same settings give other pixels."""
 
+_SHAPING_KEYS = ("rig", "drive", "room_seed", "visit", "place", "posters")
 _THREADS = 2
 _CLEARANCE_M = 0.12
 Progress = Callable[[int, int], None]
 
 
 class RenderedLabSequence:
-    """A drive through the rendered lab; implements :class:`fgslam.recordings.Sequence`.
+    """A drive through a rendered place; implements :class:`fgslam.recordings.Sequence`.
 
-    The world frame of the ground truth is the reference camera's pose at the drive's first frame.
+    The world frame of the ground truth is the reference camera's pose at the first frame of the
+    drive, or of the drive that ``drive.world_from`` names: then truths of several drives agree.
     """
 
     def __init__(
@@ -67,9 +70,15 @@ class RenderedLabSequence:
         self._settings = settings
         self._seed = seed
         self._rig = make_rig(settings.rig)
-        self._drive = plan_drive(settings.drive)
+        self._place = PlaceChoice(
+            settings.place, settings.room_seed, settings.visit, settings.posters == "identical"
+        )
+        self._drive = plan_in_place(self._place, settings.drive, self._rig)
         self._indices = _selection(len(self._drive.timestamps), start, stop, stride)
         self._body = self._drive.body_poses(self._drive.timestamps)
+        self._world_body = self._body[0]
+        if settings.drive.world_from is not None or settings.drive.path == "random_poses":
+            self._world_body = first_pose(settings.place, settings.drive)
         self._odometry = wheel_odometry.simulate(
             settings.odometry, self._body, np.random.default_rng([seed, 1])
         )
@@ -86,7 +95,7 @@ class RenderedLabSequence:
     @property
     def name(self) -> str:
         """Short name for titles."""
-        return f"rendered lab, {self._settings.drive.path.replace('_', ' ')}"
+        return f"rendered {self._place.name}, {self._settings.drive.path.replace('_', ' ')}"
 
     @property
     def rig(self) -> CameraRig:
@@ -101,9 +110,10 @@ class RenderedLabSequence:
     @property
     def identity(self) -> str:
         """SHA-256 of all settings, the seed and the renderer's version."""
-        return content_hash(
-            {"settings": asdict(self._settings), "seed": self._seed, "render": RENDER_VERSION}
-        )
+        settings = _without_later_keys(self._settings)
+        if self._settings.drive.world_from is not None:
+            settings["world_from"] = self._settings.drive.world_from
+        return content_hash({"settings": settings, "seed": self._seed, "render": RENDER_VERSION})
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -136,12 +146,16 @@ class RenderedLabSequence:
     def odometry(self, i: int) -> Odometry | None:
         """Wheel odometry from selected frame ``i - 1`` to ``i``; None for the first.
 
-        With a stride the increments between are composed, and so are their covariances.
+        With a stride the increments between are composed, and so are their covariances. None too
+        where the robot was carried.
         """
         last = self._index(i)
         if i == 0:
             return None
-        return geometry.compose_odometry(self._odometry[self._index(i - 1) : last])
+        first = self._index(i - 1)
+        if not self._drive.driven[first:last].all():
+            return None
+        return geometry.compose_odometry(self._odometry[first:last])
 
     @property
     def ground_truth(self) -> Trajectory:
@@ -154,7 +168,7 @@ class RenderedLabSequence:
     @property
     def room_from_world(self) -> FloatArray:
         """(4, 4) from the trajectory's world to the room (origin on the floor, z up)."""
-        return np.asarray(self._body[0] @ self._rig.bTc)
+        return np.asarray(self._world_body @ self._rig.bTc)
 
     def room_from_camera(self, seconds: FloatArray) -> FloatArray:
         """(n, 4, 4) poses of the reference camera in the room at any times of the drive."""
@@ -194,8 +208,7 @@ class RenderedLabSequence:
     def _open_world(self) -> World:
         with self._world_lock:
             if self._world is None:
-                room = open_room(self._settings.room_seed, self._settings.visit)
-                self._world = World(self._rig, room)
+                self._world = World(self._rig, open_room(self._place))
                 _check_clearance(self._drive, self._world, self._rig)
             return self._world
 
@@ -273,24 +286,37 @@ def _selection(count: int, start: int, stop: int | None, stride: int) -> IntArra
 
 def _render_description(settings: LabSettings) -> dict[str, Any]:
     """Exactly what shapes the clean images: neither noise, gain, cover, odometry nor seed."""
-    everything = asdict(settings)
+    everything = _without_later_keys(settings)
+    shaping = {key: everything[key] for key in _SHAPING_KEYS if key in everything}
     effects = everything["effects"]
-    return {
+    return shaping | {
         "render_version": RENDER_VERSION,
-        "rig": everything["rig"],
-        "drive": everything["drive"],
-        "room_seed": everything["room_seed"],
-        "visit": everything["visit"],
         "motion_blur": effects["motion_blur"],
         "person": effects["person"],
     }
 
 
-def _check_clearance(drive: Drive, world: World, rig: CameraRig) -> None:
+def _without_later_keys(settings: LabSettings) -> dict[str, Any]:
+    """Settings as plain values, without those of other places where this is the plain lab.
+
+    So what was rendered before there were other places keeps its name.
+    """
+    out = asdict(settings)
+    del out["drive"]["world_from"]
+    if settings.drive.path != "random_poses":
+        del out["drive"]["random_poses"]
+    if settings.place == "lab":
+        del out["place"]
+    if settings.posters == "different":
+        del out["posters"]
+    return out
+
+
+def _check_clearance(drive: PosesInTime, world: World, rig: CameraRig) -> None:
     """Refuses a drive whose cameras come too near to a surface."""
     cameras = drive.body_poses(drive.timestamps) @ rig.bTc
-    distance = world.room.caster.distance(cameras[:, :3, 3])
-    outside = np.any(np.abs(cameras[:, :2, 3]) > 5.0, axis=1)
+    distance, xy = world.room.caster.distance(cameras[:, :3, 3]), cameras[:, :2, 3]
+    outside = np.any((xy < world.room.low) | (xy > world.room.high), axis=1)
     bad = np.flatnonzero((distance < _CLEARANCE_M) | outside)
     if len(bad):
         x, y = cameras[bad[0], :2, 3]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -11,6 +11,8 @@ from fgslam.settings.base import STRICT
 
 PositiveFloat = Annotated[float, Field(gt=0.0)]
 NonNegativeFloat = Annotated[float, Field(ge=0.0)]
+PlaceName: TypeAlias = Literal["lab", "rooms", "corridors"]
+PathName: TypeAlias = Literal["paper_loop", "laps", "waypoints", "tour", "one_way", "random_poses"]
 FrameRange = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
 
 
@@ -47,21 +49,40 @@ class LabRigSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
+class RandomPosesSettings:
+    """Poses all over the free floor, in any heading: those of a robot that was carried away."""
+
+    seed: Annotated[int, Field(ge=0, description="of the poses; not the run's seed")] = 0
+    burst: Annotated[
+        int, Field(ge=1, le=100, description="consecutive frames from each pose on, straight ahead")
+    ] = 1
+    step_m: Annotated[
+        float, Field(gt=0.0, le=0.5, description="way between the frames of a burst, metres")
+    ] = 0.1
+    clearance_m: Annotated[
+        float,
+        Field(ge=0.15, le=2.0, description="of robot and camera from walls and furniture, metres"),
+    ] = 0.4
+
+
+@dataclass(frozen=True, config=STRICT)
 class LabDriveSettings:
     """The robot's path and speed (S31, S32)."""
 
     path: Annotated[
-        Literal["paper_loop", "laps", "waypoints"],
+        PathName,
         Field(
-            description="`paper_loop` once around the chair and back to the start; `laps` around "
-            "the room; `waypoints` a smooth curve through the given points"
+            description="in the lab `paper_loop` once around the chair and back to the start, or "
+            "`laps` around the room; in the rooms `tour`, in the corridors `tour` or `one_way`, "
+            "which never returns; anywhere `waypoints` a smooth curve through the given points, "
+            "or `random_poses` with nothing between them"
         ),
     ] = "paper_loop"
     frames: Annotated[
         Annotated[int, Field(ge=2, le=100_000)] | None,
         Field(
             description="exact number of frames (the speed is scaled down to fit); null drives at "
-            "nine tenths of the speed limits"
+            "nine tenths of the speed limits; of `random_poses` null makes 200 poses"
         ),
     ] = 249
     frame_rate_hz: Annotated[float, Field(gt=0.0, le=120.0, description="frames a second")] = 2.0
@@ -74,7 +95,10 @@ class LabDriveSettings:
     max_acceleration_m_s2: Annotated[
         float, Field(gt=0.0, le=10.0, description="limit, metres a second squared")
     ] = 0.30
-    laps: Annotated[int, Field(ge=1, le=1000, description="times around the room, for `laps`")] = 1
+    laps: Annotated[
+        int,
+        Field(ge=1, le=1000, description="times around the room, for `laps`; rounds of a `tour`"),
+    ] = 1
     waypoints_m: Annotated[
         tuple[tuple[float, float], ...],
         Field(description="(x, y) in the room, metres from its centre, for `waypoints`"),
@@ -82,6 +106,17 @@ class LabDriveSettings:
     closed: Annotated[
         bool, Field(description="for `waypoints`: return to the first point and heading")
     ] = False
+    random_poses: Annotated[
+        RandomPosesSettings, Field(description="for `random_poses`: how they are drawn")
+    ] = RandomPosesSettings()
+    world_from: Annotated[
+        Literal["paper_loop", "laps", "waypoints", "tour", "one_way"] | None,
+        Field(
+            description="drive of this place whose first camera frame is the world of the ground "
+            "truth, so that truths of several drives agree; null: this drive's own, of "
+            "`random_poses` that of the place's first drive"
+        ),
+    ] = None
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -174,8 +209,15 @@ class LabEffectsSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class LabSettings:
-    """The rendered lab: a furnished room of 10 m x 10 m, the robot's drive, cameras, odometry."""
+    """The rendered lab, or another place: the robot's drive in it, its cameras and odometry."""
 
+    place: Annotated[
+        PlaceName,
+        Field(
+            description="`lab` a furnished room of 10 m x 10 m; `rooms` an office building of "
+            "36 m x 24 m; `corridors` a square ring of 24 m whose sections all look alike"
+        ),
+    ] = "lab"
     rig: LabRigSettings = LabRigSettings()
     drive: LabDriveSettings = LabDriveSettings()
     odometry: WheelOdometrySettings = WheelOdometrySettings()
@@ -186,6 +228,10 @@ class LabSettings:
     visit: Annotated[
         Literal[1, 2], Field(description="2: some furniture has been moved since the first visit")
     ] = 1
+    posters: Annotated[
+        Literal["different", "identical"],
+        Field(description="`identical`: two posters on different walls of the lab are the same"),
+    ] = "different"
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -21,14 +21,19 @@ HEIGHT = 3.0
 _WALLS = {"north": 0.0, "east": -90.0, "south": 180.0, "west": 90.0}
 
 
-def build_lab(rng: np.random.Generator, visit: int) -> tuple[Thing, ...]:
+def build_lab(
+    rng: np.random.Generator, visit: int, identical_posters: bool = False
+) -> tuple[Thing, ...]:
     """All things of the room; the second visit finds some of them elsewhere.
 
     Args:
         rng: for the small things: which books, which posters, at what angles.
         visit: 1 or 2. Both draw the same random numbers, so that what has not moved is the same.
+        identical_posters: two posters on different walls show the same and are equally large.
     """
     things = [*_shell(), *_along_walls(rng), *_on_walls(rng), *_islands(rng)]
+    if identical_posters:
+        things = _with_twins(things)
     things += _loose_things(rng, moved=visit == 2)
     return tuple(things)
 
@@ -130,10 +135,24 @@ _POSTER_PLACES = (
     ("west", 2.2, 1.35, 1.1, 1.1), ("west", -4.4, 1.5, 0.7, 0.9), ("west", -0.3, 1.95, 1.0, 0.8),
 )  # fmt: skip
 
+_TWINS = (1, 7)
+"""Of the places above: a poster 1.0 m x 1.2 m of the north wall, and where its copy hangs."""
+
 _PINBOARD_PLACES = (
     ("east", 1.03, 0.8, 0.6, 0.5), ("east", -1.65, 0.8, 0.6, 0.5), ("east", 2.55, 1.3, 0.6, 0.8),
     ("west", 1.55, 0.8, 0.6, 0.6), ("west", -2.75, 0.8, 0.6, 0.5),
 )  # fmt: skip
+
+
+def _with_twins(things: list[Thing]) -> list[Thing]:
+    """The things with one poster replaced by a copy of another, on the next wall."""
+    names = [f"poster_{1 + k}" for k in _TWINS]
+    shown = next(thing.patches[0].surface for thing in things if thing.name == names[0])
+    _, _, z, width, height = _POSTER_PLACES[_TWINS[0]]
+    wall, along, *_ = _POSTER_PLACES[_TWINS[1]]
+    board = furniture.hanging(width, height, shown)
+    copy = Thing(names[1], tuple(_against(board, wall, along, 0.0, z)))
+    return [copy if thing.name == copy.name else thing for thing in things]
 
 
 def _islands(rng: np.random.Generator) -> list[Thing]:

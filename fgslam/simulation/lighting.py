@@ -17,7 +17,7 @@ from fgslam.types import FloatArray, IntArray
 
 Float32 = npt.NDArray[np.float32]
 
-_SPACING_M = 0.09
+LIGHT_SPACING_M = 0.09
 _MAX_CELLS = 120
 _AMBIENT = 0.42
 _CORNER_REACH_M = 0.7
@@ -58,7 +58,8 @@ def bake(
     caster: RayCaster,
     lamps: FloatArray,
     rng: np.random.Generator,
-    spacing_m: float = _SPACING_M,
+    spacing_m: float = LIGHT_SPACING_M,
+    reach_m: float | None = None,
 ) -> LightMaps:
     """Irradiance of all patches.
 
@@ -68,6 +69,8 @@ def bake(
         lamps: (k, 3, 3) corner and two edges of each rectangular lamp, shining down, metres.
         rng: for the directions of the sky light and the points on the lamps.
         spacing_m: greatest distance of the grid's points, but for very large patches, metres.
+        reach_m: how far a lamp shines, its light fading smoothly to nothing; None for any
+            distance. Where walls hide most lamps from most places this saves most of the work.
     """
     columns = _grid_size(np.linalg.norm(patches.edge_u, axis=1), spacing_m)
     rows = _grid_size(np.linalg.norm(patches.edge_v, axis=1), spacing_m)
@@ -77,7 +80,10 @@ def bake(
     points = _grid_points(patches, columns, patch, offset, rows)
     normals = patches.normal[patch]
     light = _AMBIENT * _openness(caster, points, normals, rng)
-    light += _lamp_light(caster, points, normals, lamps, rng)
+    if reach_m is None:
+        light += _lamp_light(caster, points, normals, lamps, rng)
+    else:
+        light += _lamp_light_within(reach_m, caster, points, normals, lamps, rng)
     glow = np.array([surface.glow for surface in patches.surfaces])[patch]
     values = np.where(glow > 0.0, glow, light)
     return LightMaps(values.astype(np.float32), offset, columns, rows)
@@ -133,3 +139,22 @@ def _lamp_light(
             lit[lit] = ~caster.blocked(points[lit], offset[lit], 0.995)
             light[lit] += facing[lit] / (1.0 + far2[lit])
     return np.asarray(light * (_LAMP_POWER / _LAMP_SAMPLES))
+
+
+def _lamp_light_within(
+    reach_m: float,
+    caster: RayCaster,
+    points: FloatArray,
+    normals: FloatArray,
+    lamps: FloatArray,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """(n,) light of all lamps on what is less than ``reach_m`` from the middle of each."""
+    light = np.zeros(len(points))
+    for lamp in lamps:
+        middle = lamp[0] + 0.5 * (lamp[1] + lamp[2])
+        far2 = np.sum(np.square(points - middle), axis=1)
+        near = np.flatnonzero(far2 < reach_m**2)
+        window = np.square(1.0 - far2[near] / reach_m**2)
+        light[near] += window * _lamp_light(caster, points[near], normals[near], lamp[None], rng)
+    return light

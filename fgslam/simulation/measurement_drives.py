@@ -12,7 +12,13 @@ import numpy as np
 from fgslam.errors import ConfigError
 from fgslam.settings.lab import LabDriveSettings
 from fgslam.settings.measurements import MeasurementDriveSettings
-from fgslam.simulation.paths import PlanarPath, drive_along, plan_path, straights_and_turns
+from fgslam.simulation.paths import (
+    PlanarPath,
+    drive_along,
+    plan_path,
+    planar_poses,
+    straights_and_turns,
+)
 from fgslam.types import FloatArray
 
 CORRIDOR_WIDTH_M = 2.4
@@ -59,7 +65,7 @@ def plan_measured_drive(settings: MeasurementDriveSettings, place: str) -> Plann
         )
     if settings.path == "sharp_turns":
         planar = _sharp_turns(settings)
-        return PlannedDrive(_stamps(len(planar), settings), _body_poses(planar), None)
+        return PlannedDrive(_stamps(len(planar), settings), planar_poses(planar), None)
     lab = _lab_settings(settings)
     if place == "room":
         path, corners = plan_path(lab), None
@@ -84,16 +90,6 @@ def _lab_settings(settings: MeasurementDriveSettings) -> LabDriveSettings:
 
 def _stamps(count: int, settings: MeasurementDriveSettings) -> FloatArray:
     return np.asarray(np.arange(count) / settings.frame_rate_hz)
-
-
-def _body_poses(planar: FloatArray) -> FloatArray:
-    """(n, 4, 4) on the floor from (n, 3) x, y, heading."""
-    out = np.tile(np.eye(4), (len(planar), 1, 1))
-    cosine, sine = np.cos(planar[:, 2]), np.sin(planar[:, 2])
-    out[:, 0, 0] = out[:, 1, 1] = cosine
-    out[:, 0, 1], out[:, 1, 0] = -sine, sine
-    out[:, :2, 3] = planar[:, :2]
-    return out
 
 
 # --------------------------------------------------------------------------------------------

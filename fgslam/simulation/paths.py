@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence as Seq
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from fgslam.errors import ConfigError
 from fgslam.settings.lab import LabDriveSettings
-from fgslam.types import FloatArray
+from fgslam.types import BoolArray, FloatArray
 
 _STEP_M = 0.004
 # Waypoints must not ask for tighter turns: the curve's heading would jump between its samples.
@@ -62,6 +63,25 @@ class TimeLaw:
         return float(self.seconds[-1])
 
 
+class PosesInTime(Protocol):
+    """Where a robot is when: a drive, or poses without one.
+
+    Attributes:
+        timestamps: (n,) seconds of the frames, from 0.
+    """
+
+    timestamps: FloatArray
+
+    @property
+    def driven(self) -> BoolArray:
+        """(n - 1,) whether the robot drove from a frame to the next."""
+        ...
+
+    def body_poses(self, seconds: FloatArray) -> FloatArray:
+        """(n, 4, 4) ``wTb`` in the room's frame: body x forward, y left, z up, on the floor."""
+        ...
+
+
 class Drive:
     """A path driven by a time law, asked for poses at any time."""
 
@@ -84,14 +104,23 @@ class Drive:
 
     def body_poses(self, seconds: FloatArray) -> FloatArray:
         """(n, 4, 4) ``wTb`` in the room's frame: body x forward, y left, z up, on the floor."""
-        planar = self.planar(seconds)
-        out = np.zeros((len(planar), 4, 4))
-        cosine, sine = np.cos(planar[:, 2]), np.sin(planar[:, 2])
-        out[:, 0, 0] = out[:, 1, 1] = cosine
-        out[:, 0, 1], out[:, 1, 0] = -sine, sine
-        out[:, 2, 2] = out[:, 3, 3] = 1.0
-        out[:, :2, 3] = planar[:, :2]
-        return out
+        return planar_poses(self.planar(seconds))
+
+    @property
+    def driven(self) -> BoolArray:
+        """(n - 1,) whether the robot drove from a frame to the next: always."""
+        return np.ones(len(self.timestamps) - 1, np.bool_)
+
+
+def planar_poses(planar: FloatArray) -> FloatArray:
+    """(n, 4, 4) poses on the floor from (n, 3) x, y, heading."""
+    out = np.zeros((len(planar), 4, 4))
+    cosine, sine = np.cos(planar[:, 2]), np.sin(planar[:, 2])
+    out[:, 0, 0] = out[:, 1, 1] = cosine
+    out[:, 0, 1], out[:, 1, 0] = -sine, sine
+    out[:, 2, 2] = out[:, 3, 3] = 1.0
+    out[:, :2, 3] = planar[:, :2]
+    return out
 
 
 # --------------------------------------------------------------------------------------------
@@ -189,6 +218,46 @@ def _refuse_tight_turns(xy: FloatArray, heading: FloatArray, curvature: FloatArr
         )
 
 
+def round_corners(corners: FloatArray, bend_m: float) -> PlanarPath:
+    """Straight from corner to corner (n, 2), each but the ends rounded by a smooth bend.
+
+    Closed where the last corner is the first and the drive arrives there in its first heading.
+
+    Args:
+        corners: metres; at the ends the path begins and stops.
+        bend_m: way over which a quarter turn is driven; other turns in proportion.
+
+    Raises:
+        ValueError: two corners are too near to each other for their bends.
+    """
+    edges = np.diff(corners, axis=0)
+    heading = np.arctan2(edges[:, 1], edges[:, 0])
+    turns = (np.diff(heading) + np.pi) % (2.0 * np.pi) - np.pi
+    way = bend_m * np.abs(turns) / (0.5 * np.pi)
+    cut = np.array([_bend_cut(w, t) for w, t in zip(way, turns, strict=True)])
+    straight = np.linalg.norm(edges, axis=1)
+    straight[1:] -= cut
+    straight[:-1] -= cut
+    if np.any(straight < 0.0):
+        raise ValueError(f"corners {int(np.argmin(straight))} and the next are too near")
+    segments = [(float(straight[0]), 0.0)]
+    for k in range(len(turns)):
+        bend = [(float(way[k]), float(turns[k]))] if way[k] > 0.0 else []
+        segments += [*bend, (float(straight[k + 1]), 0.0)]
+    back = np.exp(1j * heading[-1]), np.exp(1j * heading[0])
+    closed = bool(np.allclose(corners[0], corners[-1]) and np.isclose(*back))
+    start = (float(corners[0, 0]), float(corners[0, 1]), float(heading[0]))
+    return straights_and_turns(start, [s for s in segments if s[0] > 0.0], closed)
+
+
+def _bend_cut(way: float, turn: float) -> float:
+    """How far before and after its corner a bend begins and ends, metres."""
+    if way == 0.0:
+        return 0.0
+    bend = straights_and_turns((0.0, 0.0, 0.0), [(way, turn)], closed=False)
+    return float(np.linalg.norm(bend.xy[-1]) / (2.0 * np.cos(0.5 * turn)))
+
+
 def paper_loop() -> PlanarPath:
     """Out along one side of the chair, around it and back to the start pose (S31), 17.6 m.
 
@@ -234,7 +303,11 @@ def fastest_law(
 
 
 def plan_path(settings: LabDriveSettings) -> PlanarPath:
-    """The curve that the settings name. Raises ConfigError when the waypoints make none."""
+    """The curve in the lab that the settings name; :func:`places.place_path` knows those elsewhere.
+
+    Raises:
+        ConfigError: the waypoints make none.
+    """
     if settings.path == "paper_loop":
         return paper_loop()
     if settings.path == "laps":

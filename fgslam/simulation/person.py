@@ -9,7 +9,7 @@ import numpy as np
 from fgslam.errors import ConfigError
 from fgslam.settings.lab import LabPersonSettings, LabSettings
 from fgslam.simulation.patches import Patch, Surface, Thing, box, placed, prism
-from fgslam.simulation.paths import Drive
+from fgslam.simulation.paths import PosesInTime
 from fgslam.types import CameraRig, FloatArray
 
 _STRIDE_M = 1.3
@@ -49,7 +49,7 @@ class Walk:
         return Stance(float(x), float(y), float(np.arctan2(step[1], step[0])), part * length)
 
 
-def make_walk(settings: LabSettings, drive: Drive, rig: CameraRig) -> Walk | None:
+def make_walk(settings: LabSettings, drive: PosesInTime, rig: CameraRig) -> Walk | None:
     """The walk across the view that the settings ask for, or None.
 
     Raises:
@@ -68,7 +68,7 @@ def make_walk(settings: LabSettings, drive: Drive, rig: CameraRig) -> Walk | Non
 
 
 def across_view(
-    settings: LabPersonSettings, drive: Drive, rig: CameraRig, frame_rate: float
+    settings: LabPersonSettings, drive: PosesInTime, rig: CameraRig, frame_rate: float
 ) -> Walk:
     """From the right of the view at the middle of the walk to its left, square to its axis."""
     begins = settings.first_frame / frame_rate

@@ -33,21 +33,19 @@ def build_library(rng: np.random.Generator) -> dict[str, Grey]:
     """Every texture of the lab, by name; sides are powers of two."""
     out = _materials(rng)
     for i in range(BOOK_ROWS):
-        out[f"books_{i}"] = _muted(textures.book_row(rng, 256, 1024), 0.42)
+        out[f"books_{i}"] = faded(textures.book_row(rng, 256, 1024), 0.42)
     for i in range(BINDER_ROWS):
-        out[f"binders_{i}"] = _muted(textures.binder_row(rng, 256, 1024), 0.7)
+        out[f"binders_{i}"] = faded(textures.binder_row(rng, 256, 1024), 0.7)
     for i in range(POSTERS):
-        out[f"poster_{i}"] = _muted(textures.poster(rng, 512, 512), 0.42)
+        out[f"poster_{i}"] = faded(textures.poster(rng, 512, 512), 0.42)
     for i in range(PINBOARDS):
-        out[f"pinboard_{i}"] = _muted(textures.pinboard(rng, 256), 0.45)
+        out[f"pinboard_{i}"] = faded(textures.pinboard(rng, 256), 0.45)
     for i in range(SCREENS):
-        out[f"screen_{i}"] = _muted(textures.screen(rng, 256, 256), 0.5)
+        out[f"screen_{i}"] = faded(textures.screen(rng, 256, 256), 0.5)
     for i in range(CARTONS):
-        out[f"carton_{i}"] = _muted(
-            textures.carton(rng, 256, float(rng.uniform(95.0, 165.0))), 0.55
-        )
+        out[f"carton_{i}"] = faded(textures.carton(rng, 256, float(rng.uniform(95.0, 165.0))), 0.55)
     for name in PHOTOGRAPHS:
-        out[f"photo_{name}"] = _muted(photograph(name, 512), 0.55)
+        out[f"photo_{name}"] = faded(photograph(name, 512), 0.55)
     return out
 
 
@@ -58,16 +56,16 @@ def _materials(rng: np.random.Generator) -> dict[str, Grey]:
         "bricks": textures.bricks(rng, 1024, 30),
         "floor": textures.carpet(rng, 2048),
         "ceiling": textures.ceiling(rng, 1024),
-        "wood_light": _muted(textures.wood(rng, 512, 150.0), 0.6),
+        "wood_light": faded(textures.wood(rng, 512, 150.0), 0.6),
         "wood_dark": textures.wood(rng, 512, 88.0),
-        "wood_desk": _muted(textures.wood(rng, 512, 145.0), 0.5),
-        "metal": _muted(textures.metal(rng, 512, 150.0), 0.6),
+        "wood_desk": faded(textures.wood(rng, 512, 145.0), 0.5),
+        "metal": faded(textures.metal(rng, 512, 150.0), 0.6),
         "metal_dark": textures.metal(rng, 512, 92.0),
         "keyboard": textures.keyboard(rng, 64, 128),
         "cloth": textures.cloth(rng, 256, 95.0),
         "shirt": textures.cloth(rng, 256, 150.0),
-        "trousers": _muted(textures.cloth(rng, 256, 60.0), 0.3),
-        "skin": _muted(textures.plaster(rng, 64, 165.0), 0.25),
+        "trousers": faded(textures.cloth(rng, 256, 60.0), 0.3),
+        "skin": faded(textures.plaster(rng, 64, 165.0), 0.25),
         "window": textures.window_view(rng, 512, 512),
         "door": textures.panelled(rng, 512, 256, 125.0),
         "plain_dark": textures.plaster(rng, 256, 42.0),
@@ -96,7 +94,7 @@ def _picture(name: str) -> npt.NDArray[np.generic]:
     return np.asarray(picture[0] if isinstance(picture, tuple) else picture)
 
 
-def _muted(image: Grey, contrast: float) -> Grey:
+def faded(image: Grey, contrast: float) -> Grey:
     """Less contrast about the mean: prints fade, and a lab is no chessboard."""
     mean = float(image.mean())
     return np.asarray(mean + contrast * (image - mean), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""The rendered world: lab, light, cameras, and the person, put together from the settings."""
+"""The rendered world: place, light, cameras, and the person, put together from the settings."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ import numpy as np
 
 from fgslam import geometry
 from fgslam.settings.lab import LabRigSettings
-from fgslam.simulation.lab import build_lab, lamps
 from fgslam.simulation.lighting import bake, flat_light
 from fgslam.simulation.mipmap import TextureBank
 from fgslam.simulation.patches import stack
 from fgslam.simulation.person import Stance, person
+from fgslam.simulation.places import PlaceChoice, build_place, build_textures
 from fgslam.simulation.raycaster import RayCaster
 from fgslam.simulation.renderer import Layer, Pinhole, Renderer
-from fgslam.simulation.texture_library import build_library
 from fgslam.types import CameraRig, FloatArray
 
 
@@ -49,30 +48,39 @@ def camera_offsets(rig: CameraRig) -> list[FloatArray]:
 
 
 class Room:
-    """The furnished room with its light and textures, as at one visit; the same for every rig.
+    """A furnished place with its light and textures, as at one visit; the same for every rig.
 
     Attributes:
+        low, high: (2,) corners of the floor, metres.
         things: name of each object identity; the person's is the last.
         caster: of the room without the person.
         bank: all textures, the person's among them.
         layer: the room, ready to be shaded.
     """
 
-    def __init__(self, room_seed: int, visit: int) -> None:
-        """Builds textures, furniture and light. Raises MissingDependencyError without Open3D."""
-        things = build_lab(np.random.default_rng([room_seed, 2]), visit)
-        patches = stack(things)
-        self.things = (*(thing.name for thing in things), "person")
+    def __init__(self, choice: PlaceChoice) -> None:
+        """Builds textures, furniture and light.
+
+        Raises:
+            ConfigError: there is no such place.
+            MissingDependencyError: Open3D is absent.
+        """
+        place = build_place(choice)
+        patches = stack(place.things)
+        self.low, self.high = place.low, place.high
+        self.things = (*(thing.name for thing in place.things), "person")
         self.caster = RayCaster(patches)
-        self.bank = TextureBank(build_library(np.random.default_rng([room_seed, 1])))
-        light = bake(patches, self.caster, lamps(), np.random.default_rng([room_seed, 3]))
+        self.bank = TextureBank(build_textures(choice))
+        rng = np.random.default_rng([choice.seed, 3])
+        spacing, reach = place.light_spacing_m, place.light_reach_m
+        light = bake(patches, self.caster, place.lamps, rng, spacing, reach)
         self.layer = Layer(patches, self.caster, light, self.bank)
 
 
 @lru_cache(maxsize=2)
-def open_room(room_seed: int, visit: int) -> Room:
-    """The room, kept for the next sequence that is rendered in it (some 70 MB each)."""
-    return Room(room_seed, visit)
+def open_room(choice: PlaceChoice) -> Room:
+    """The place, kept for the next sequence that is rendered in it (some 70 MB each)."""
+    return Room(choice)
 
 
 class World:

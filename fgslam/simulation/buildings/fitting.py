@@ -56,6 +56,11 @@ class RoomFitter:
         self._out: list[Thing] = []
         self._pictures = list(pictures)
 
+    @property
+    def pictures_left(self) -> tuple[str, ...]:
+        """Pictures that have not been hung yet."""
+        return tuple(self._pictures)
+
     def things(self) -> list[Thing]:
         """All pieces along the walls and all pictures on them."""
         for wall in _WALLS:

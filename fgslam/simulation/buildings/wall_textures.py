@@ -1,0 +1,45 @@
+"""Grey textures of the buildings, beside the lab's: a cover for each room, and many pictures.
+
+The lab has a dozen pictures; a building whose rooms are to be told apart by what hangs in them
+needs a different one for every place.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.simulation import textures
+from fgslam.simulation.texture_library import build_library, faded
+from fgslam.simulation.textures import Grey
+
+PICTURES = 200
+FLOORS = ("floor", "floor_1", "floor_2", "floor_3")
+WALLS = (
+    "wall_0", "wall_1", "wall_2", "wall_3", "wall_4", "wall_5", "paper_0", "paper_1", "paper_2",
+    "bricks", "bricks_dark",
+)  # fmt: skip
+
+
+def building_library(rng: np.random.Generator) -> dict[str, Grey]:
+    """Every texture of the office building and the corridors, by name."""
+    out = build_library(rng)
+    for i, base in enumerate((185.0, 150.0, 170.0, 132.0, 195.0, 160.0)):
+        out[f"wall_{i}"] = textures.plaster(rng, 1024, base, scuffs=220)
+    for i, base in enumerate((165.0, 140.0, 182.0)):
+        out[f"paper_{i}"] = faded(textures.wallpaper(rng, 1024, base), 0.8)
+    out["bricks_dark"] = textures.bricks(rng, 1024, 21) - np.float32(28.0)
+    for name in FLOORS[1:]:
+        out[name] = textures.carpet(rng, 1024)
+    for i in range(PICTURES):
+        out[f"picture_{i}"] = _picture(rng, i)
+    return out
+
+
+def _picture(rng: np.random.Generator, number: int) -> Grey:
+    """Prints, pinboards and paintings in turn, as contrasty as the lab's."""
+    kind = number % 5
+    if kind < 2:
+        return faded(textures.poster(rng, 256, 256), 0.42)
+    if kind == 2:
+        return faded(textures.pinboard(rng, 256), 0.45)
+    return faded(textures.abstract(rng, 256), 0.5)
