@@ -74,6 +74,20 @@ class FullEkf:
         self._past = FilteredTrajectory()
         self._matched = self._gated = self._skipped = 0
         self._map: LandmarkMap | None = None
+        self._fixed = False
+
+    @property
+    def keeps_maps(self) -> bool:
+        """As Schmidt's filter: landmarks are uncertain, but no measurement changes them."""
+        return True
+
+    def begin_in(self, landmarks: LandmarkMap, hits: IntArray, fixed: bool) -> None:
+        """Takes a saved map over. Raises EstimatorError beyond `max_landmarks`."""
+        self._require_space("the saved map", len(landmarks))
+        self._covariance.append_independent(landmarks.covariances)
+        self._ids, self._positions = landmarks.ids, landmarks.positions
+        self._fixed = fixed
+        self._map = None
 
     def predict(self, odometry: Odometry | None) -> Prediction:
         """Pose after the camera moved by ``odometry``, on the floor if that is hard."""
@@ -103,6 +117,7 @@ class FullEkf:
         self._require_finite(increment, motion)
         wTc, front = self._moved(motion)
         found = self._correction(increment, wTc, front)
+        found = found.of_the_pose_alone() if self._fixed else found
         # Nothing below can fail.
         self._take_over(found, wTc, front)
         used = found.matched + len(first.points)
@@ -170,11 +185,13 @@ class FullEkf:
 
     def _require_room(self, increment: Increment, new: int) -> None:
         leaving = int(np.isin(self._ids, increment.pruned_ids).sum())
-        count = len(self._ids) - leaving + new
+        self._require_space(f"frame {increment.index}", len(self._ids) - leaving + new)
+
+    def _require_space(self, where: str, count: int) -> None:
         if count > self._settings.max_landmarks:
             size = (FRONT + BLOCK * count) ** 2 * 8 / 1e9
             raise EstimatorError(
-                f"frame {increment.index}: {count} landmarks exceed max_landmarks "
+                f"{where}: {count} landmarks exceed max_landmarks "
                 f"{self._settings.max_landmarks} of the ekf (their joint covariance takes "
                 f"{size:.2g} GB and each update time in proportion); raise it, prune earlier, or "
                 "use isam2"
@@ -183,7 +200,7 @@ class FullEkf:
             self._covariance.reserve(count)
         except MemoryError:
             raise EstimatorError(
-                f"frame {increment.index}: no memory for the joint covariance of {count} "
+                f"{where}: no memory for the joint covariance of {count} "
                 "landmarks; lower max_landmarks, prune earlier, or use isam2"
             ) from None
 

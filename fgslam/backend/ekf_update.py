@@ -6,7 +6,7 @@ measurement the gain costs ``n m^2``, the covariance's update ``n^2 m``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
@@ -130,6 +130,19 @@ class Correction:
     nis: float
     nis_dof: int
     matched: int
+
+    def of_the_pose_alone(self) -> Correction:
+        """The same for landmarks that are not to change (Schmidt's filter).
+
+        With the landmarks' rows of K zero, ``K S`` keeps the pose's rows alone. Since K is that of
+        the least variance, ``K S = P H^T`` and ``half = P H^T / 2``: the landmarks' rows of the new
+        half are the whole ``P H^T``. Their uncertainty still counts, and so does what the pose has
+        in common with it.
+        """
+        step, gain, half = self.step.copy(), self.gain.copy(), self.half.copy()
+        step[FRONT:], gain[FRONT:] = 0.0, 0.0
+        half[FRONT:] *= 2.0
+        return replace(self, step=step, gain=gain, half=half)
 
 
 class DivergedError(Exception):

@@ -90,6 +90,15 @@ class GrowingCovariance:
         self._buffer[n : n + k, n : n + k] = square
         self._size = n + k
 
+    def append_independent(self, blocks: FloatArray) -> None:
+        """Adds landmarks (k, 3, 3) that hang together with nothing."""
+        n, k = self._size, BLOCK * len(blocks)
+        self.reserve((n + k - FRONT) // BLOCK)
+        self._buffer[n : n + k, : n + k] = 0.0
+        at = n + BLOCK * np.arange(len(blocks))[:, None] + np.arange(BLOCK)
+        self._buffer[at[:, :, None], at[:, None, :]] = blocks
+        self._size = n + k
+
     def drop(self, blocks: IntArray) -> IntArray:
         """Removes landmarks; the last ones move into their places.
 
