@@ -134,12 +134,14 @@ class HomingGraphSettings(NamedSettings):
 
     kind: Literal["homing_graph"] = "homing_graph"
     solver: Annotated[
-        Literal["isam2", "fixed_lag", "batch"],
+        Literal["schur", "isam2", "fixed_lag", "batch"],
         Field(
-            description="`isam2` incremental over the whole homing; `fixed_lag` over the last "
-            "images, older ones marginalised; `batch` Levenberg-Marquardt anew with every image"
+            description="`schur` the whole homing anew with every image, in plain arrays: exact "
+            "and fastest; `isam2` GTSAM's, incremental over the whole homing; `fixed_lag` the same "
+            "over the last images, older ones marginalised; `batch` GTSAM's Levenberg-Marquardt "
+            "anew with every image"
         ),
-    ] = "isam2"
+    ] = "schur"
     kernel: KernelSettings = KernelSettings("cauchy", 2.0)
     elevations: Annotated[
         Literal["none", "two_views", "all"],
@@ -180,8 +182,28 @@ class HomingGraphSettings(NamedSettings):
     ] = 1.0
     relinearize_threshold: Annotated[
         float,
-        Field(gt=0.0, description="change (legs, radians) that relinearises a variable"),
+        Field(
+            gt=0.0,
+            description="isam2, fixed_lag: change (legs, radians) that relinearises a variable",
+        ),
     ] = 0.01
+    max_steps: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="schur: most Gauss-Newton steps with an image; what is left, 0.3 "
+            "deviations over all variables together, is gone with the next one",
+        ),
+    ] = 1
+    match_limit: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="schur: what the target saw of a landmark is dropped where everything else "
+            "contradicts it by more than this squared Mahalanobis distance, chi-square of two "
+            "degrees of freedom where the match is right (13.8: one in a thousand). 0: never",
+        ),
+    ] = 13.8
     trust_radius: Annotated[
         float,
         Field(gt=0.0, description="isam2, fixed_lag: first trust region of Powell's dog leg"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,8 +9,6 @@ import numpy as np
 from fgslam.backend.homing.graph_problem import HomingProblem, Motion
 from fgslam.backend.homing.graph_solvers import make_solver
 from fgslam.backend.homing.inputs import TrackedFeatures
-from fgslam.factors.bearing import tangent_to_pose
-from fgslam.factors.keys import landmark_key, pose_key, target_key, velocity_key
 from fgslam.homing_types import HomingEstimate, HomingStart, TrackedBearings
 from fgslam.settings.homing_estimators import HomingGraphSettings
 from fgslam.types import FloatArray
@@ -43,31 +40,26 @@ class HomingGraph:
         """Takes in one image; see the protocol."""
         before = self._motion()
         _, taken = self._features.take(tracked)
-        points = self._points(self._entered())
+        points = self._solver.points(self._entered())
+        new = self._problem.image(tracked, taken, before, points)
         self._covariance = None
         self._image += 1
-        self._solver.add(self._problem.image(tracked, taken, before, points), tracked.time)
-        collapsed = self._problem.collapsed(self._points(self._entered()))
+        self._solver.add(new, tracked.time)
+        collapsed = self._problem.collapsed(self._solver.points(self._entered()))
         if collapsed:
             self._solver.move(collapsed, tracked.time)
 
     def estimate(self, landmarks: bool = True) -> HomingEstimate:
         """The present state; see the protocol."""
-        values = self._solver.values
-        robot = _pose(values, pose_key(self._image))
-        target = _pose(values, target_key())
         ids, rows = self._alive()
         covariance = self._joint(rows if landmarks else [])
-        turn = np.eye(len(covariance))
-        turn[:3, :3], turn[3:6, 3:6] = tangent_to_pose(robot), tangent_to_pose(target)
-        covariance = turn @ covariance @ turn.T
         return HomingEstimate(
             time=self._features.time,
-            robot=robot,
-            target=target,
+            robot=self._solver.pose(self._image),
+            target=self._solver.target(),
             covariance=covariance[:6, :6],
             ids=ids,
-            landmarks=self._points(rows),
+            landmarks=self._solver.points(rows),
             landmark_covariances=_blocks(covariance[6:, 6:], len(ids)),
         )
 
@@ -81,31 +73,20 @@ class HomingGraph:
         numbers: list[int] = self._problem.variables(self._problem.entered).tolist()
         return numbers
 
-    def _points(self, rows: list[int]) -> FloatArray:
-        points = [self._solver.values.atPoint2(landmark_key(row)) for row in rows]
-        return np.array(points, np.float64).reshape(len(rows), 2)
-
     def _joint(self, rows: list[int]) -> FloatArray:
-        """Covariance of robot, target and landmarks, in GTSAM's tangent spaces."""
+        """Covariance of robot, target and landmarks."""
         size = 6 + 2 * len(rows)
         if self._covariance is None or len(self._covariance) < size:
-            keys = [pose_key(self._image), target_key(), *(landmark_key(row) for row in rows)]
-            self._covariance = self._solver.joint_covariance(keys)
+            self._covariance = self._solver.covariance(rows)
         return self._covariance[:size, :size]
 
     def _motion(self) -> Motion:
-        values = self._solver.values
-        key = pose_key(self._image)
-        pose = _pose(values, key)
-        velocity = values.atVector(velocity_key(self._image))
-        variances = partial(self._variances, self._image)
-        return Motion(self._image, self._features.time, pose, velocity, variances)
+        pose, velocity = self._solver.pose(self._image), self._solver.velocity(self._image)
+        return Motion(self._image, self._features.time, pose, velocity, self._variances)
 
-    def _variances(self, image: int) -> FloatArray:
-        """Of the robot's (x, y, psi) at an image."""
-        key = pose_key(image)
-        turn = tangent_to_pose(_pose(self._solver.values, key))
-        return np.asarray(np.diagonal(turn @ self._solver.joint_covariance([key]) @ turn.T))
+    def _variances(self) -> FloatArray:
+        """Of the robot's (x, y, psi) at the last image that the solver knows."""
+        return np.asarray(np.diagonal(self._joint([]))[:3])
 
 
 def _blocks(covariance: FloatArray, count: int) -> FloatArray:
@@ -114,8 +95,3 @@ def _blocks(covariance: FloatArray, count: int) -> FloatArray:
         return np.full((count, 2, 2), np.nan)
     every = np.arange(count)
     return np.asarray(covariance.reshape(count, 2, count, 2)[every, :, every, :])
-
-
-def _pose(values: Any, key: int) -> FloatArray:
-    at = values.atPose2(key)
-    return np.array([at.x(), at.y(), at.theta()])

@@ -1,4 +1,4 @@
-"""The homing problem as a growing graph: factors and first guesses of each image, no solver.
+"""The homing problem as a growing graph: what each image measures, and first guesses; no solver.
 
 Start, target and every image on the way are planar poses, landmarks points. The start's and the
 target's bearings enter once, with the landmark; scale is the leg from start to target.
@@ -8,30 +8,18 @@ Derivation: docs/derivations/homing_graph.md.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
+from fgslam.backend.homing.graph_parts import TARGET, Beginning, NewPart, Pair, Sight
 from fgslam.backend.homing.resection import resected
-from fgslam.factors.bearing import (
-    BearingFactors,
-    leg_factor,
-    motion_factor,
-    start_prior,
-    vector_factor,
-    velocity_prior,
-    weak_height_prior,
-    weak_landmark_prior,
-)
 from fgslam.factors.bearing_residuals import (
     bearing,
     bearing_jacobians,
     polar_points,
     triangulated,
 )
-from fgslam.factors.keys import height_key, landmark_key, pose_key, target_key, velocity_key
 from fgslam.homing_types import HomingStart, TrackedBearings
 from fgslam.planar import compose, unit, wrap
 from fgslam.settings.homing_estimators import GraphMotionSettings, HomingGraphSettings
@@ -43,15 +31,6 @@ _JUMPED = 4  # misses in a row after which a track follows something else
 _WIDER = 10.0  # deviations of the initialisation's answer where its elevations enter themselves
 _SEEN_SIGMAS = 3.0  # of the target's bearing against the place where a feature is to enter
 _LEAST_SIGMA = 1e-3  # radians: of the initialisation's direction and rotation, stated smaller
-
-
-@dataclass
-class NewPart:
-    """What one image adds: factors, first guesses, and the variables that it touches."""
-
-    graph: Any = field(default_factory=gtsam.NonlinearFactorGraph)
-    values: Any = field(default_factory=gtsam.Values)
-    keys: set[int] = field(default_factory=set)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,15 +48,11 @@ class Motion:
 
 
 class HomingProblem:
-    """Turns a homing start and images into factors."""
+    """Turns a homing start and images into parts of the graph."""
 
     def __init__(self, start: HomingStart, settings: HomingGraphSettings) -> None:
         """Nothing is in the graph yet; see :meth:`first`."""
         self._start, self._settings = start, settings
-        self._robust = BearingFactors(settings.kernel.name, settings.kernel.width)
-        motion = settings.motion
-        turning = float(np.deg2rad(motion.turning_deg))
-        self._density = np.array([motion.forward, motion.sideways, turning]) ** 2
         self._ids = start.local_map.ids
         self._entered = np.zeros(len(self._ids), np.bool_)
         self._tall = np.zeros(len(self._ids), np.bool_)  # their height is a variable
@@ -96,7 +71,7 @@ class HomingProblem:
         return np.asarray(np.searchsorted(self._ids, ids))
 
     def collapsed(self, points: FloatArray) -> dict[int, FloatArray]:
-        """Landmarks that fell upon the start, with their first guesses (2,) by key.
+        """Landmarks that fell upon the start, with their first guesses (2,) by row.
 
         A long step may carry a landmark with few good bearings across the start, where any
         bearing is as good as another; from there it does not come back, and its derivatives grow
@@ -109,25 +84,17 @@ class HomingProblem:
         guesses = self._guesses[rows]
         nearer = np.linalg.norm(points, axis=1) / np.linalg.norm(guesses, axis=1)
         fell = np.flatnonzero(~(nearer > _COLLAPSED))
-        return {landmark_key(int(rows[k])): guesses[k] for k in fell}
+        return {int(rows[k]): guesses[k] for k in fell}
 
     def first(self) -> NewPart:
         """Start, target and the features that both views triangulate well."""
-        new = NewPart()
-        start, vector, motion = self._start, self._start.vector, self._settings.motion
-        new.values.insert(pose_key(0), gtsam.Pose2())
-        at = unit(np.array(vector.direction))
-        new.values.insert(target_key(), gtsam.Pose2(at[0], at[1], vector.rotation))
-        new.values.insert(velocity_key(0), np.zeros(3))
-        turning = np.deg2rad(motion.initial_turning_deg)
-        sigmas = np.array([motion.initial_speed, motion.sideways, turning])
-        new.graph.add(start_prior(pose_key(0)))
-        new.graph.add(velocity_prior(velocity_key(0), np.zeros(3), sigmas))
-        new.graph.add(leg_factor(pose_key(0), target_key()))
+        start, vector = self._start, self._start.vector
         wider = 1.0 if self._settings.elevations == "none" else _WIDER
         covariance = 0.5 * wider**2 * (vector.covariance + vector.covariance.T)
         covariance = covariance + _LEAST_SIGMA**2 * np.eye(2)
-        new.graph.add(vector_factor(target_key(), vector.direction, vector.rotation, covariance))
+        target = np.append(unit(np.array(vector.direction)), vector.rotation)
+        beginning = Beginning(target, vector, covariance)
+        new = NewPart(0, np.zeros(3), np.zeros(3), (start.time, start.time), beginning)
         chart = start.local_map
         spread = np.sqrt(chart.covariance[:, 0, 0])
         good = self._good(chart.distance, spread)
@@ -146,19 +113,13 @@ class HomingProblem:
             before: the robot at the last image.
             points: (n, 2) the present landmarks of :attr:`entered`.
         """
-        new = NewPart()
         image = before.image + 1
         rows = np.searchsorted(self._ids, tracked.ids)
         pose, fits = self._resected(tracked, taken & self._entered[rows], before, points)
-        new.values.insert(pose_key(image), gtsam.Pose2(*pose))
-        new.values.insert(velocity_key(image), before.velocity)
-        earlier = (pose_key(before.image), velocity_key(before.image), before.time)
-        now = (pose_key(image), velocity_key(image), tracked.time)
-        new.graph.add(motion_factor(earlier, now, self._density))
+        new = NewPart(image, pose, before.velocity, (before.time, tracked.time))
         entering = self._enter_seen(new, rows, tracked, taken & ~self._entered[rows], before)
         for k in np.flatnonzero(fits | entering).tolist():
-            self._see(new, pose_key(image), int(rows[k]), tracked, k)
-        new.keys |= {pose_key(image), velocity_key(image)}
+            self._see(new, int(rows[k]), tracked, k)
         return new
 
     def _resected(
@@ -184,15 +145,12 @@ class HomingProblem:
         fits[seen] = ~misses & (self._missed[numbers] == 0)
         return pose, fits
 
-    def _see(self, new: NewPart, pose: int, row: int, tracked: TrackedBearings, k: int) -> None:
-        landmark = landmark_key(row)
-        new.keys.add(landmark)
-        sigma = float(tracked.sigma_bearing[k])
-        new.graph.add(self._robust.bearing(pose, landmark, float(tracked.bearing[k]), sigma))
+    def _see(self, new: NewPart, row: int, tracked: TrackedBearings, k: int) -> None:
+        measured, sigma = float(tracked.bearing[k]), float(tracked.sigma_bearing[k])
+        new.bearings.append(Sight(new.image, row, measured, sigma))
         if self._tall[row] and np.isfinite(tracked.elevation[k]):
-            new.keys.add(height_key(row))
             measured, sigma = float(tracked.elevation[k]), float(tracked.sigma_elevation[k])
-            new.graph.add(self._robust.elevation(pose, landmark, height_key(row), measured, sigma))
+            new.elevations.append(Sight(new.image, row, measured, sigma))
 
     # ----------------------------------------------------------------------------------------
     # Landmarks
@@ -206,25 +164,21 @@ class HomingProblem:
     def _enter(self, new: NewPart, row: int, point: FloatArray, distance: float) -> None:
         """A landmark with its bearings from start and target."""
         settings, matches = self._settings, self._start.matches
-        landmark = landmark_key(row)
-        new.values.insert(landmark, point)
-        new.keys.add(landmark)
-        spread = settings.prior_distances * distance
-        new.graph.add(weak_landmark_prior(landmark, point, spread))
+        new.points[row] = (point, settings.prior_distances * distance)
         from_start, _, from_target, _ = matches.sigma[row].tolist()
-        at_start, at_target = float(matches.bearing_a[row]), float(matches.bearing_b[row])
-        new.graph.add(self._robust.bearing(pose_key(0), landmark, at_start, from_start))
-        new.graph.add(self._robust.bearing(target_key(), landmark, at_target, from_target))
+        new.bearings += [
+            Sight(0, row, float(matches.bearing_a[row]), from_start),
+            Sight(TARGET, row, float(matches.bearing_b[row]), from_target),
+        ]
         known = bool(np.isfinite(self._elevations(row)).all())
         if settings.elevations == "all" and known:
             self._enter_height(new, row, distance)
         elif settings.elevations == "two_views" and known:
             vector = self._start.vector
             at = unit(np.array(vector.direction))
-            both = self._elevations(row)
             first = np.array([*at, vector.rotation, *point])
             sigmas = matches.sigma[row, [1, 3]]
-            new.graph.add(self._robust.elevation_pair(target_key(), landmark, both, sigmas, first))
+            new.pairs.append(Pair(row, self._elevations(row), sigmas, first))
         self._entered[row], self._guesses[row] = True, point
 
     def _elevations(self, row: int) -> FloatArray:
@@ -233,18 +187,13 @@ class HomingProblem:
 
     def _enter_height(self, new: NewPart, row: int, distance: float) -> None:
         """Its height, with its elevations from start and target."""
-        matches, height, landmark = self._start.matches, height_key(row), landmark_key(row)
-        up, up_target = float(matches.elevation_a[row]), float(matches.elevation_b[row])
+        matches = self._start.matches
+        up, up_target = self._elevations(row).tolist()
         _, sigma, _, sigma_target = matches.sigma[row].tolist()
-        tall = distance * float(np.tan(up))
         self._tall[row] = True
-        new.values.insert(height, tall)
-        new.keys.add(height)
-        new.graph.add(weak_height_prior(height, tall, self._settings.prior_distances * distance))
-        new.graph.add(self._robust.elevation(pose_key(0), landmark, height, up, sigma))
-        new.graph.add(
-            self._robust.elevation(target_key(), landmark, height, up_target, sigma_target)
-        )
+        tall = distance * float(np.tan(up))
+        new.heights[row] = (tall, self._settings.prior_distances * distance)
+        new.elevations += [Sight(0, row, up, sigma), Sight(TARGET, row, up_target, sigma_target)]
 
     def _enter_seen(
         self,

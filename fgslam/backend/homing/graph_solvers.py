@@ -11,9 +11,11 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.graph_builder import without_gaps
-from fgslam.backend.homing.graph_problem import NewPart
+from fgslam.backend.homing.graph_parts import GtsamParts, NewPart
+from fgslam.backend.homing.schur_solver import SchurSolver
 from fgslam.errors import EstimatorError
-from fgslam.factors.keys import is_pose, target_key
+from fgslam.factors.bearing import BearingFactors, tangent_to_pose
+from fgslam.factors.keys import is_pose, landmark_key, pose_key, target_key, velocity_key
 from fgslam.settings.homing_estimators import HomingGraphSettings
 from fgslam.types import FloatArray
 
@@ -21,27 +23,91 @@ _RELATIVE_TOLERANCE = 1e-5  # of the cost: the estimate then moves by far less t
 
 
 class Solver(Protocol):
-    """Takes the graph in, part by part."""
-
-    values: Any
+    """Takes the graph in, part by part. Poses are (x, y, psi) in the start frame."""
 
     def add(self, new: NewPart, time: float) -> None:
         """Brings an image in. Raises EstimatorError where the graph cannot be solved."""
         ...
 
     def move(self, points: dict[int, FloatArray], time: float) -> None:
-        """Puts landmarks, by key, back to places (2,) and goes on from there."""
+        """Puts landmarks, by row, back to places (2,) and goes on from there."""
         ...
 
-    def joint_covariance(self, keys: list[int]) -> FloatArray:
-        """Joint covariance of variables in the order given, in GTSAM's tangent spaces.
+    def pose(self, image: int) -> FloatArray:
+        """(3,) the robot at an image."""
+        ...
+
+    def velocity(self, image: int) -> FloatArray:
+        """(3,) in the robot's axes: forward, left, turning."""
+        ...
+
+    def target(self) -> FloatArray:
+        """(3,)."""
+        ...
+
+    def points(self, rows: list[int]) -> FloatArray:
+        """(k, 2) landmarks of rows of the matches."""
+        ...
+
+    def covariance(self, rows: list[int]) -> FloatArray:
+        """Joint covariance (6 + 2 k) of the robot at the last image, the target, and landmarks.
 
         NaN where the linearised graph does not determine them.
         """
         ...
 
 
-class Isam2Solver:
+class GtsamSolver:
+    """What GTSAM's solvers share: parts become factors, values are looked up by key."""
+
+    def __init__(self, settings: HomingGraphSettings) -> None:
+        """Empty."""
+        self._settings = settings
+        robust = BearingFactors(settings.kernel.name, settings.kernel.width)
+        self._parts = GtsamParts(robust, settings.motion)
+        self._image = 0
+        self.values = gtsam.Values()
+
+    def pose(self, image: int) -> FloatArray:
+        """See :class:`Solver`."""
+        return _pose(self.values, pose_key(image))
+
+    def velocity(self, image: int) -> FloatArray:
+        """See :class:`Solver`."""
+        return np.asarray(self.values.atVector(velocity_key(image)))
+
+    def target(self) -> FloatArray:
+        """See :class:`Solver`."""
+        return _pose(self.values, target_key())
+
+    def points(self, rows: list[int]) -> FloatArray:
+        """See :class:`Solver`."""
+        points = [self.values.atPoint2(landmark_key(row)) for row in rows]
+        return np.array(points, np.float64).reshape(len(rows), 2)
+
+    def covariance(self, rows: list[int]) -> FloatArray:
+        """See :class:`Solver`."""
+        keys = [pose_key(self._image), target_key(), *(landmark_key(row) for row in rows)]
+        covariance = self._joint(keys)
+        turn = np.eye(len(covariance))
+        turn[:3, :3] = tangent_to_pose(self.pose(self._image))
+        turn[3:6, 3:6] = tangent_to_pose(self.target())
+        return turn @ covariance @ turn.T
+
+    def _joint(self, keys: list[int]) -> FloatArray:
+        """Joint covariance of variables in the order given, in GTSAM's tangent spaces."""
+        raise NotImplementedError
+
+    def _taken(self, new: NewPart) -> tuple[Any, Any, set[int]]:
+        self._image = new.image
+        return self._parts.of(new)
+
+    def _put_back(self, points: dict[int, FloatArray]) -> None:
+        for row, point in points.items():
+            self.values.update(landmark_key(row), point)
+
+
+class Isam2Solver(GtsamSolver):
     """iSAM2 with Powell's dog leg over the whole homing.
 
     After an exception an ISAM2 object is corrupt: it is built anew from the solver's own graph,
@@ -50,24 +116,24 @@ class Isam2Solver:
 
     def __init__(self, settings: HomingGraphSettings) -> None:
         """Empty."""
-        self._settings = settings
+        super().__init__(settings)
         self._graph = gtsam.NonlinearFactorGraph()
         self._isam = gtsam.ISAM2(isam2_parameters(settings))
-        self.values = gtsam.Values()
 
     def add(self, new: NewPart, time: float) -> None:
         """See :class:`Solver`."""
-        self._graph.push_back(new.graph)
+        graph, values, keys = self._taken(new)
+        self._graph.push_back(graph)
         try:
-            self._isam.update(new.graph, new.values, [], _last(new))
+            self._isam.update(graph, values, [], _last(keys))
             self.values = self._isam.calculateEstimate()
         except RuntimeError:
-            self.values.insert(new.values)
+            self.values.insert(values)
             self._rebuild()
 
     def move(self, points: dict[int, FloatArray], time: float) -> None:
         """See :class:`Solver`."""
-        put_back(self.values, points)
+        self._put_back(points)
         self._restart()
 
     def _rebuild(self) -> None:
@@ -82,20 +148,18 @@ class Isam2Solver:
         except RuntimeError as error:
             raise _failed(error) from None
 
-    def joint_covariance(self, keys: list[int]) -> FloatArray:
-        """See :class:`Solver`."""
+    def _joint(self, keys: list[int]) -> FloatArray:
         return joint_of(self._isam, keys)
 
 
-class FixedLagSolver:
+class FixedLagSolver(GtsamSolver):
     """iSAM2 over the last seconds: older poses are marginalised, start, target and map stay."""
 
     def __init__(self, settings: HomingGraphSettings) -> None:
         """Empty."""
-        self._settings = settings
+        super().__init__(settings)
         self._stamps: dict[int, float] = {}
         self._smoother = self._new()
-        self.values = gtsam.Values()
 
     def _new(self) -> Any:
         params = isam2_parameters(self._settings)
@@ -104,18 +168,22 @@ class FixedLagSolver:
 
     def add(self, new: NewPart, time: float) -> None:
         """See :class:`Solver`."""
-        self._stamps |= dict.fromkeys(list(new.values.keys()), time)
+        graph, values, _ = self._taken(new)
+        self._stamps |= dict.fromkeys(list(values.keys()), time)
         self._stamps |= {key: time for key in self._stamps if not is_passing(key)}
         before = self._smoother.getFactors()
         try:
-            self._smoother.update(new.graph, new.values, self._recent(time))
+            self._smoother.update(graph, values, self._recent(time))
             self.values = self._smoother.calculateEstimate()
         except RuntimeError:
-            self._rebuild(before, new, time)
+            self.values.insert(values)
+            whole = without_gaps(before)
+            whole.push_back(graph)
+            self._rebuild(whole, time)
 
     def move(self, points: dict[int, FloatArray], time: float) -> None:
         """See :class:`Solver`."""
-        put_back(self.values, points)
+        self._put_back(points)
         self._restart(without_gaps(self._smoother.getFactors()), time)
 
     def _recent(self, time: float) -> dict[int, float]:
@@ -124,10 +192,7 @@ class FixedLagSolver:
         self._stamps = {k: t for k, t in stamps.items() if t >= time - self._settings.lag_s}
         return stamps
 
-    def _rebuild(self, before: Any, new: NewPart, time: float) -> None:
-        graph = without_gaps(before)
-        graph.push_back(new.graph)
-        self.values.insert(new.values)
+    def _rebuild(self, graph: Any, time: float) -> None:
         self.values = minimised(graph, self.values, self._settings.max_iterations)
         self._restart(graph, time)
 
@@ -140,32 +205,30 @@ class FixedLagSolver:
         except RuntimeError as error:
             raise _failed(error) from None
 
-    def joint_covariance(self, keys: list[int]) -> FloatArray:
-        """See :class:`Solver`."""
+    def _joint(self, keys: list[int]) -> FloatArray:
         return joint_of(self._smoother.getISAM2(), keys)
 
 
-class BatchSolver:
+class BatchSolver(GtsamSolver):
     """Levenberg-Marquardt over the whole graph with every image, from the last solution."""
 
     def __init__(self, settings: HomingGraphSettings) -> None:
         """Empty."""
-        self._settings = settings
+        super().__init__(settings)
         self._graph = gtsam.NonlinearFactorGraph()
-        self.values = gtsam.Values()
 
     def add(self, new: NewPart, time: float) -> None:
         """See :class:`Solver`."""
-        self._graph.push_back(new.graph)
-        self.values.insert(new.values)
+        graph, values, _ = self._taken(new)
+        self._graph.push_back(graph)
+        self.values.insert(values)
         self.values = minimised(self._graph, self.values, self._settings.max_iterations)
 
     def move(self, points: dict[int, FloatArray], time: float) -> None:
         """See :class:`Solver`."""
-        put_back(self.values, points)
+        self._put_back(points)
 
-    def joint_covariance(self, keys: list[int]) -> FloatArray:
-        """See :class:`Solver`."""
+    def _joint(self, keys: list[int]) -> FloatArray:
         try:
             marginals = gtsam.Marginals(self._graph, self.values)
         except RuntimeError:
@@ -176,6 +239,8 @@ class BatchSolver:
 def make_solver(settings: HomingGraphSettings) -> Solver:
     """The one of the settings."""
     match settings.solver:
+        case "schur":
+            return SchurSolver(settings)
         case "isam2":
             return Isam2Solver(settings)
         case "fixed_lag":
@@ -207,13 +272,13 @@ def minimised(graph: Any, values: Any, iterations: int) -> Any:
         raise _failed(error) from None
 
 
-def _last(new: NewPart) -> Any:
+def _last(keys: set[int]) -> Any:
     """Elimination order: what the image sees and the target go last, to the root of the tree.
 
     There their joint covariance is had at once; from elsewhere it costs more than the update.
     """
     groups = gtsam.KeyGroupMap()
-    for key in new.keys | {target_key()}:
+    for key in keys | {target_key()}:
         groups.insert2(key, 1)
     return groups
 
@@ -222,12 +287,6 @@ def is_passing(key: int) -> bool:
     """Whether a variable belongs to an image on the way, a pose or a velocity."""
     symbol = gtsam.Symbol(key)
     return symbol.index() > 0 and (is_pose(key) or symbol.chr() == ord("v"))
-
-
-def put_back(values: Any, points: dict[int, FloatArray]) -> None:
-    """Gives landmarks, by key, other values (2,)."""
-    for key, point in points.items():
-        values.update(key, point)
 
 
 def joint_of(source: Any, keys: list[int]) -> FloatArray:
@@ -244,6 +303,11 @@ def undetermined(keys: list[int]) -> FloatArray:
     poses = sum(is_pose(key) or key == target_key() for key in keys)
     size = 2 * len(keys) + poses
     return np.full((size, size), np.nan)
+
+
+def _pose(values: Any, key: int) -> FloatArray:
+    at = values.atPose2(key)
+    return np.array([at.x(), at.y(), at.theta()])
 
 
 def _failed(error: Exception) -> EstimatorError:

@@ -22,8 +22,8 @@ class ReplayedHoming:
     Attributes:
         title, kind: which estimator.
         estimates: one after each image.
-        update_ms: (k,) time of each update, and of the estimate that a robot drives by: without
-            covariances of landmarks; milliseconds.
+        update_ms: (k,) processor time of each update, and of the estimate that a robot drives by:
+            without covariances of landmarks; milliseconds.
         failure: why it ended early; empty where it did not.
     """
 
@@ -50,10 +50,10 @@ def replay_homing(
     try:
         estimator = make_homing_estimator(start, settings)
         for tracked in tracks:
-            began = time.perf_counter()
+            began = time.process_time()
             estimator.update(tracked)
             estimate = estimator.estimate(landmarks=False)
-            times.append(1e3 * (time.perf_counter() - began))
+            times.append(1e3 * (time.process_time() - began))
             estimates.append(estimator.estimate() if landmarks else estimate)
     except EstimatorError as error:
         failure = f"image {len(estimates)}: {error}"

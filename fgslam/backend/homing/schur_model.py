@@ -1,0 +1,427 @@
+"""The homing graph in plain arrays: variables, measurements, costs and normal equations.
+
+The same cost as that of :mod:`fgslam.backend.homing.graph_parts` in GTSAM's factors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.backend.homing.graph_parts import (
+    NewPart,
+    Pair,
+    Sight,
+    first_speeds,
+    motion_densities,
+)
+from fgslam.backend.homing.schur_system import STATE, NormalEquations
+from fgslam.factors.bearing import STIFF
+from fgslam.factors.bearing_residuals import direction_and_turn, elevation_pair
+from fgslam.factors.kernels import kernel_losses, kernel_weights
+from fgslam.factors.motion_residuals import constant_velocities, motion_informations
+from fgslam.planar import wrap
+from fgslam.settings.homing_estimators import HomingGraphSettings
+from fgslam.types import FloatArray
+
+_ROUNDING = 1e-9
+_SPARE = 16  # views and landmarks that tables have room for beyond those that are there
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Values of all variables.
+
+    Attributes:
+        chain: (n, 6) pose (x, y, psi) and velocity of start and images.
+        target: (3,).
+        points: (m, 2) landmarks, or (m, 3) with their heights.
+    """
+
+    chain: FloatArray
+    target: FloatArray
+    points: FloatArray
+
+    def moved(self, chain: FloatArray, border: FloatArray) -> State:
+        """After a step (n, 6) and (3 + 2 m,) or (3 + 3 m,)."""
+        points = self.points + border[3:].reshape(self.points.shape)
+        return State(self.chain + chain, self.target + border[:3], points)
+
+    def views(self) -> FloatArray:
+        """(1 + n, 3) poses, the target first."""
+        return np.vstack([self.target, self.chain[:, :3]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """Everything measured, seen from one state.
+
+    Attributes:
+        state: where.
+        cost: half the robust sum of squares.
+        sights: residuals (v, m) and weighed informations of bearings, and of elevations, if any.
+        pairs: residuals (k,), weighed informations, derivatives by target (k, 3), points (k, 2).
+        motion: residuals (n, 6), derivatives (n, 6, 6) by the image before and after.
+        initial: residual (2,) of the initialisation, and its derivative (2, 3) by the target.
+    """
+
+    state: State
+    cost: float
+    sights: list[tuple[FloatArray, FloatArray]]
+    pairs: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+    motion: tuple[FloatArray, FloatArray, FloatArray]
+    initial: tuple[FloatArray, FloatArray]
+
+
+class Sights:
+    """Bearings or elevations, a table of views by landmarks; information 0 where there is none."""
+
+    def __init__(self) -> None:
+        """Empty."""
+        self._table = np.zeros((2, 0, 0))
+        self.any = False
+
+    def put(self, view: int, landmark: int, measured: float, sigma: float) -> None:
+        """Notes one; ``view`` 0 is the target, 1 the start."""
+        self._reach(view + 1, landmark + 1)
+        self._table[:, view, landmark] = measured, sigma**-2.0
+        self.any = True
+
+    def drop(self, view: int, landmark: int) -> None:
+        """Forgets one."""
+        self._table[1, view, landmark] = 0.0
+
+    def first(self, views: int, landmarks: int) -> FloatArray:
+        """(2, views, landmarks) measured values and informations, of the first ones."""
+        self._reach(views, landmarks)
+        return self._table[:, :views, :landmarks]
+
+    def _reach(self, views: int, landmarks: int) -> None:
+        _, had, known = self._table.shape
+        if views > had or landmarks > known:
+            table = np.zeros((2, max(had, views + _SPARE), max(known, landmarks + _SPARE)))
+            table[:, :had, :known] = self._table
+            self._table = table
+
+
+class Pairs:
+    """Elevations of landmarks from start and target, as :class:`Pair` has them."""
+
+    def __init__(self) -> None:
+        """Empty."""
+        self.landmarks = np.empty(0, np.int64)
+        self._numbers = np.empty((0, 3))  # tangent from the start, elevation, information
+
+    def put(self, landmark: int, pair: Pair) -> None:
+        """Notes one."""
+        by = elevation_pair(pair.first[:3], pair.first[3:], pair.measured)[3]
+        information = float(np.sum((by * pair.sigmas) ** 2)) ** -1.0
+        numbers = [np.tan(pair.measured[0]), pair.measured[1], information]
+        self._numbers = np.vstack([self._numbers, numbers])
+        self.landmarks = np.append(self.landmarks, landmark)
+
+    @property
+    def informations(self) -> FloatArray:
+        """(k,) without any kernel."""
+        return self._numbers[:, 2]
+
+    def drop(self, landmark: int) -> None:
+        """Forgets those of a landmark."""
+        self._numbers[self.landmarks == landmark, 2] = 0.0
+
+    def residuals(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """(k,) residuals and informations, derivatives by target (k, 3) and points (k, 2)."""
+        tangent, up, information = self._numbers.T
+        points = state.points[self.landmarks, :2]
+        offset = points - state.target[:2]
+        near, far = np.hypot(*offset.T), np.hypot(*points.T)
+        height = tangent * far
+        squared = near**2 + height**2
+        by_target = np.zeros((len(points), 3))
+        by_target[:, :2] = (height / (squared * near))[:, None] * offset
+        by_point = (near / squared * tangent / far)[:, None] * points - by_target[:, :2]
+        return np.arctan2(height, near) - up, information, by_target, by_point
+
+
+class SchurModel:
+    """All measurements so far, and what they say at a state."""
+
+    def __init__(self, settings: HomingGraphSettings) -> None:
+        """Nothing is measured yet."""
+        self._kernel = settings.kernel
+        self._density = motion_densities(settings.motion)
+        self._speeds = first_speeds(settings.motion) ** -2.0
+        self.numbers = 3 if settings.elevations == "all" else 2  # of a landmark
+        self.landmarks: dict[int, int] = {}  # numbers of the variables, by row
+        self._steps = np.empty(0)
+        self._motions = np.empty((0, STATE, STATE))  # informations
+        self._bearings, self._elevations, self._pairs = Sights(), Sights(), Pairs()
+        self._vector = (0.0, 0.0)
+        self._initial: FloatArray = np.eye(2)  # information
+        self._places = np.empty((0, self.numbers))  # the weak priors
+        self._place_informations = np.empty((0, self.numbers))
+
+    def take(self, new: NewPart, state: State) -> State:
+        """Notes what is new; answers the state with first guesses of the new variables."""
+        if new.beginning is not None:
+            target, vector, covariance = new.beginning
+            self._vector = (vector.direction, vector.rotation)
+            self._initial = np.linalg.inv(covariance).astype(np.float64)
+            state = State(state.chain, target, state.points)
+        else:
+            step = np.array([new.times[1] - new.times[0]])
+            self._steps = np.append(self._steps, step)
+            information = motion_informations(step, self._density)
+            self._motions = np.concatenate([self._motions, information])
+        for row in new.points:
+            self._enter(row, new)
+        for sight in new.bearings:
+            self._note(self._bearings, sight)
+        for sight in new.elevations:
+            self._note(self._elevations, sight)
+        for pair in new.pairs:
+            self._pairs.put(self.landmarks[pair.row], pair)
+        chain = np.vstack([state.chain, np.append(new.pose, new.velocity)])
+        points = np.vstack([state.points, self._places[len(state.points) :]])
+        return State(chain, state.target, points)
+
+    def _enter(self, row: int, new: NewPart) -> None:
+        point, spread = new.points[row]
+        height, tall_spread = new.heights.get(row, (0.0, 1.0))
+        place = np.append(point, height)[: self.numbers]
+        information = np.array([spread, spread, tall_spread])[: self.numbers] ** -2.0
+        self.landmarks[row] = len(self._places)
+        self._places = np.vstack([self._places, place])
+        self._place_informations = np.vstack([self._place_informations, information])
+
+    def _note(self, sights: Sights, sight: Sight) -> None:
+        sights.put(sight.view + 1, self.landmarks[sight.row], sight.measured, sight.sigma)
+
+    # ----------------------------------------------------------------------------------------
+    # Residuals and cost
+
+    def look(self, state: State) -> Look:
+        """Residuals, robust weights and cost at a state."""
+        total = self._fixed_cost(state)
+        initial = direction_and_turn(state.target, *self._vector)
+        total += 0.5 * float(initial[0] @ self._initial @ initial[0])
+        motion = constant_velocities(state.chain[:, :3], state.chain[:, 3:], self._steps)
+        carried = (self._motions @ motion[0][..., None])[..., 0]
+        total += 0.5 * float(np.vdot(motion[0], carried))
+        sights = []
+        for residual, information in self._seen(state):
+            weighed, loss = self._robust(residual, information)
+            sights.append((residual, weighed))
+            total += loss
+        residual, information, *by = self._pairs.residuals(state)
+        weighed, loss = self._robust(residual, information)
+        pairs = (residual, weighed, by[0], by[1])
+        return Look(state, total + loss, sights, pairs, motion, initial)
+
+    def _robust(self, residual: FloatArray, information: FloatArray) -> tuple[FloatArray, float]:
+        """Weighed informations, and the loss of all."""
+        squared, kernel = information * residual**2, self._kernel
+        weighed = information * kernel_weights(kernel.name, kernel.width, squared)
+        return weighed, float(kernel_losses(kernel.name, kernel.width, squared).sum())
+
+    def _seen(self, state: State) -> list[tuple[FloatArray, FloatArray]]:
+        views = state.views()
+        size = (len(views), len(state.points))
+        dx, dy = _offsets(views, state.points)
+        measured, information = self._bearings.first(*size)
+        found = [(wrap(np.arctan2(dy, dx) - views[:, 2:] - measured), information)]
+        if self._elevations.any:
+            measured, information = self._elevations.first(*size)
+            up = np.arctan2(state.points[:, 2], np.hypot(dx, dy))
+            found.append((up - measured, information))
+        return found
+
+    def _fixed_cost(self, state: State) -> float:
+        """Of start, leg, first velocity and weak priors."""
+        start, speed = state.chain[0, :3], state.chain[0, 3:]
+        leg = np.hypot(*(state.target[:2] - start[:2])) - 1.0
+        total = (start @ start + leg**2) / STIFF**2 + speed @ (self._speeds * speed)
+        total += np.sum(self._place_informations * (state.points - self._places) ** 2)
+        return float(0.5 * total)
+
+    # ----------------------------------------------------------------------------------------
+    # Normal equations
+
+    def normal(self, look: Look) -> NormalEquations:
+        """Linearised at a state, robust weights as they are there."""
+        state = look.state
+        count, landmarks = len(state.chain), len(state.points)
+        size = 3 + self.numbers * landmarks
+        e = NormalEquations(
+            np.zeros((count, STATE, STATE)),
+            np.zeros((count - 1, STATE, STATE)),
+            np.zeros((count, STATE, size)),
+            np.zeros((size, size)),
+            np.zeros((count, STATE)),
+            np.zeros(size),
+        )
+        blocks = np.zeros((landmarks, self.numbers, self.numbers))
+        every = np.arange(self.numbers)
+        blocks[:, every, every] = self._place_informations
+        e.border_gradient[3:] = (self._place_informations * (state.points - self._places)).ravel()
+        self._add_fixed(e, look)
+        self._add_motion(e, look)
+        self._add_sights(e, blocks, look)
+        self._add_pairs(e, blocks, look)
+        inner = e.border[3:, 3:].reshape(landmarks, self.numbers, landmarks, self.numbers)
+        number = np.arange(landmarks)
+        inner[number, :, number, :] = blocks
+        e.border[3:, :3] = e.border[:3, 3:].T
+        return e
+
+    def _add_fixed(self, e: NormalEquations, look: Look) -> None:
+        """Start, unit leg, first velocity, initialisation."""
+        state, (residual, by) = look.state, look.initial
+        every, stiff = np.arange(3), STIFF**-2.0
+        start, speed = state.chain[0, :3], state.chain[0, 3:]
+        offset = state.target[:2] - start[:2]
+        leg = np.hypot(*offset)
+        along = np.append(offset / leg, 0.0)
+        outer = stiff * np.outer(along, along)
+        pull = stiff * (leg - 1.0) * along
+        e.diagonal[0, every, every] += stiff
+        e.diagonal[0, 3 + every, 3 + every] += self._speeds
+        e.diagonal[0, :3, :3] += outer
+        e.cross[0, :3, :3] -= outer
+        e.chain_gradient[0, :3] += stiff * start - pull
+        e.chain_gradient[0, 3:] += self._speeds * speed
+        known = by.T @ self._initial
+        e.border[:3, :3] += outer + known @ by
+        e.border_gradient[:3] += pull + known @ residual
+
+    def _add_motion(self, e: NormalEquations, look: Look) -> None:
+        residual, before, after = look.motion
+        known_before = before.transpose(0, 2, 1) @ self._motions
+        known_after = after.transpose(0, 2, 1) @ self._motions
+        e.diagonal[:-1] += known_before @ before
+        e.diagonal[1:] += known_after @ after
+        e.below[:] = known_after @ before
+        e.chain_gradient[:-1] += (known_before @ residual[..., None])[..., 0]
+        e.chain_gradient[1:] += (known_after @ residual[..., None])[..., 0]
+
+    def _add_sights(self, e: NormalEquations, blocks: FloatArray, look: Look) -> None:
+        state = look.state
+        views = state.views()
+        dx, dy = _offsets(views, state.points)
+        squared = dx**2 + dy**2
+        derivatives = [_by_bearing(dx, dy, squared, self.numbers)]
+        if len(look.sights) > 1:
+            derivatives.append(_by_elevation(dx, dy, squared, state.points[:, 2]))
+        for (residual, weighed), (by_pose, by_point) in zip(look.sights, derivatives, strict=True):
+            known = weighed[..., None] * by_pose
+            of_pose = known.transpose(0, 2, 1) @ by_pose
+            pull = np.einsum("vli,vl->vi", known, residual)
+            cross = known.transpose(0, 2, 1)[..., None] * by_point[:, None]
+            cross = cross.reshape(len(views), 3, -1)
+            e.diagonal[:, :3, :3] += of_pose[1:]
+            e.cross[:, :3, 3:] += cross[1:]
+            e.chain_gradient[:, :3] += pull[1:]
+            e.border[:3, :3] += of_pose[0]
+            e.border[:3, 3:] += cross[0]
+            e.border_gradient[:3] += pull[0]
+            known = weighed[..., None] * by_point
+            blocks += known.transpose(1, 2, 0) @ by_point.transpose(1, 0, 2)
+            e.border_gradient[3:] += np.einsum("vli,vl->li", known, residual).ravel()
+
+    def _add_pairs(self, e: NormalEquations, blocks: FloatArray, look: Look) -> None:
+        residual, weighed, by_target, by_point = look.pairs
+        rows = self._pairs.landmarks
+        known = weighed[:, None] * by_point
+        blocks[rows, :2, :2] += known[:, :, None] * by_point[:, None]
+        columns = 3 + self.numbers * rows[:, None] + np.arange(2)
+        e.border_gradient[columns] += known * residual[:, None]
+        e.border[:3, columns] += np.einsum("ki,kj->ikj", by_target, known)
+        e.border[:3, :3] += (weighed[:, None] * by_target).T @ by_target
+        e.border_gradient[:3] += by_target.T @ (weighed * residual)
+
+    # ----------------------------------------------------------------------------------------
+    # Doubts
+
+    def contradictions(self, look: Look, covariance: FloatArray) -> FloatArray:
+        """How much each landmark's match contradicts everything else.
+
+        Squared Mahalanobis distances (m,), chi-square of two degrees of freedom where the match
+        is right, of the target's bearing and the elevation pair from what they would be without
+        them: data snooping (Baarda 1968) of both together. A robust kernel sees the residual
+        *after* the fit alone, and a wrong match of a near point bends the fit to itself.
+
+        Args:
+            look: the solution.
+            covariance: of target and landmarks there, all of the border.
+        """
+        rows, residual, known = self._match_rows(look)
+        places = np.zeros((len(rows), 5), np.int64)
+        places[:, :3] = np.arange(3)
+        places[:, 3:] = 3 + self.numbers * np.arange(len(rows))[:, None] + np.arange(2)
+        joint = covariance[places[:, :, None], places[:, None, :]]
+        root = np.sqrt(known)
+        rows = rows * root[..., None]
+        # In weighed deviations the residual is (1 - H) times the error of a fit without the match,
+        # whose covariance is (1 - H)^-1 - 1 and the noise, which no kernel weighs.
+        one = np.eye(2)
+        without = np.linalg.inv((1.0 + _ROUNDING) * one - rows @ joint @ rows.transpose(0, 2, 1))
+        error = without @ (root * residual)[..., None]
+        noise = np.where(known > 0.0, known / self._unweighed(len(rows)), 1.0)
+        spread = without - one + noise[..., None] * one
+        return np.asarray((error * np.linalg.solve(spread, error)).sum(axis=(1, 2)))
+
+    def _match_rows(self, look: Look) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Target bearing and elevation pair of each landmark, zero where there is none.
+
+        Derivatives (m, 2, 5) by target and point, residuals (m, 2) and weighed informations.
+        """
+        count = len(look.state.points)
+        rows, residual, known = np.zeros((count, 2, 5)), np.zeros((count, 2)), np.zeros((count, 2))
+        dx, dy = _offsets(look.state.target[None], look.state.points)
+        by_target, by_point = _by_bearing(dx, dy, dx**2 + dy**2, 2)
+        rows[:, 0, :3], rows[:, 0, 3:] = by_target[0], by_point[0]
+        residual[:, 0], known[:, 0] = look.sights[0][0][0], look.sights[0][1][0]
+        of = self._pairs.landmarks
+        residual[of, 1], known[of, 1], rows[of, 1, :3], rows[of, 1, 3:] = look.pairs
+        return rows, residual, known
+
+    def _unweighed(self, count: int) -> FloatArray:
+        """(m, 2) informations of target bearings and pairs, without kernel; 1 for none."""
+        out = np.ones((count, 2))
+        out[:, 0] = self._bearings.first(1, count)[1, 0]
+        out[self._pairs.landmarks, 1] = self._pairs.informations
+        return np.where(out > 0.0, out, 1.0)
+
+    def drop_match(self, landmark: int) -> None:
+        """What the target saw is not this landmark."""
+        self._bearings.drop(0, landmark)
+        self._pairs.drop(landmark)
+
+
+def _offsets(views: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(v, m) of points from views, along x and y."""
+    return points[:, 0] - views[:, :1], points[:, 1] - views[:, 1:2]
+
+
+def _by_bearing(
+    dx: FloatArray, dy: FloatArray, squared: FloatArray, numbers: int
+) -> tuple[FloatArray, FloatArray]:
+    """(v, m, 3) and (v, m, 2 or 3) derivatives of bearings by poses and points."""
+    by_pose, by_point = np.empty((*dx.shape, 3)), np.zeros((*dx.shape, numbers))
+    by_point[..., 0], by_point[..., 1] = -dy / squared, dx / squared
+    by_pose[..., :2], by_pose[..., 2] = -by_point[..., :2], -1.0
+    return by_pose, by_point
+
+
+def _by_elevation(
+    dx: FloatArray, dy: FloatArray, squared: FloatArray, heights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The same of elevations of points at heights (m,)."""
+    distance = np.sqrt(squared)
+    whole = squared + heights**2
+    by_pose, by_point = np.zeros((*dx.shape, 3)), np.empty((*dx.shape, 3))
+    down = heights / (whole * distance)
+    by_pose[..., 0], by_pose[..., 1] = down * dx, down * dy
+    by_point[..., :2], by_point[..., 2] = -by_pose[..., :2], distance / whole
+    return by_pose, by_point

@@ -1,0 +1,122 @@
+"""The whole homing solved anew with every image, in plain arrays: exact, and the fastest.
+
+Gauss-Newton with reweighting from the last solution; steps that raise the cost are damped. Every
+few images the match that everything else contradicts most is put to the test.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.linalg import LinAlgError
+
+from fgslam.backend.homing.graph_parts import NewPart
+from fgslam.backend.homing.schur_model import Look, SchurModel, State
+from fgslam.backend.homing.schur_system import Factored
+from fgslam.settings.homing_estimators import HomingGraphSettings
+from fgslam.types import FloatArray, IntArray
+
+_STILL = 0.3  # deviations, of all variables together: a shorter step ends the iteration
+_FIRST_DAMPING, _MORE, _MOST = 1e-3, 10.0, 1e6
+_ROUNDING = 1e-9
+_EVERY = 4  # images: a doubt costs half as much as an update
+_FIRST_STEPS = 20  # with start and target alone, whose first guess is the initialisation's
+
+
+class SchurSolver:
+    """On :class:`fgslam.backend.homing.graph_solvers.Solver`."""
+
+    def __init__(self, settings: HomingGraphSettings) -> None:
+        """Empty."""
+        self._steps = settings.max_steps
+        self._limit = settings.match_limit
+        self._model = SchurModel(settings)
+        numbers = self._model.numbers
+        self._state = State(np.empty((0, 6)), np.zeros(3), np.empty((0, numbers)))
+        self._factored: Factored | None = None
+
+    def add(self, new: NewPart, time: float) -> None:
+        """See :class:`Solver`."""
+        self._state = self._model.take(new, self._state)
+        look = self._go_on(_FIRST_STEPS if new.image == 0 else self._steps)
+        if new.image % _EVERY == 0 and self._limit > 0.0:
+            self._doubt(look)
+
+    def move(self, points: dict[int, FloatArray], time: float) -> None:
+        """See :class:`Solver`."""
+        places = self._state.points.copy()
+        for row, point in points.items():
+            places[self._model.landmarks[row], :2] = point
+        self._state = State(self._state.chain, self._state.target, places)
+        self._factored = None
+
+    def pose(self, image: int) -> FloatArray:
+        """See :class:`Solver`."""
+        return self._state.chain[image, :3].copy()
+
+    def velocity(self, image: int) -> FloatArray:
+        """See :class:`Solver`."""
+        return self._state.chain[image, 3:].copy()
+
+    def target(self) -> FloatArray:
+        """See :class:`Solver`."""
+        return self._state.target.copy()
+
+    def points(self, rows: list[int]) -> FloatArray:
+        """See :class:`Solver`."""
+        return self._state.points[self._numbers(rows), :2]
+
+    def covariance(self, rows: list[int]) -> FloatArray:
+        """See :class:`Solver`."""
+        first = 3 + self._model.numbers * self._numbers(rows)
+        columns = np.concatenate([np.arange(3), (first[:, None] + np.arange(2)).ravel()])
+        try:
+            if self._factored is None:
+                self._factored = Factored(self._model.normal(self._model.look(self._state)))
+        except LinAlgError:
+            return np.full((3 + len(columns), 3 + len(columns)), np.nan)
+        return self._factored.covariance(columns)
+
+    def _numbers(self, rows: list[int]) -> IntArray:
+        return np.array([self._model.landmarks[row] for row in rows], np.int64)
+
+    def _doubt(self, look: Look) -> None:
+        """Goes on without the match that contradicts the solution most, if one does too much."""
+        if self._factored is None or not self._model.landmarks:
+            return
+        far = self._model.contradictions(look, self._factored.border_covariance())
+        worst = int(np.argmax(far))
+        if far[worst] > self._limit:
+            self._model.drop_match(worst)
+            self._go_on(self._steps)
+
+    def _go_on(self, steps: int) -> Look:
+        """Up to so many steps; what is left of the way is gone with the next image."""
+        look = self._model.look(self._state)
+        damping = 0.0
+        self._factored = None
+        for _ in range(steps):
+            tried = self._step(look, damping)
+            if tried is None:
+                break
+            look, factored, damping = tried
+            self._state = look.state
+            self._factored = factored if damping == 0.0 else None
+            if damping == 0.0 and factored.decrement < _STILL:
+                break
+            damping = damping / _MORE if damping > _FIRST_DAMPING else 0.0
+        return look
+
+    def _step(self, look: Look, damping: float) -> tuple[Look, Factored, float] | None:
+        """One that does not raise the cost, damped as much as that needs; none where none does."""
+        equations = self._model.normal(look)
+        while damping < _MOST:
+            try:
+                factored = Factored(equations, damping)
+            except LinAlgError:
+                pass
+            else:
+                ahead = self._model.look(look.state.moved(factored.chain, factored.border))
+                if ahead.cost <= look.cost * (1.0 + _ROUNDING):
+                    return ahead, factored, damping
+            damping = max(_MORE * damping, _FIRST_DAMPING)
+        return None

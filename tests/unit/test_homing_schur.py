@@ -1,0 +1,141 @@
+"""The homing graph in plain arrays beside the same graph in GTSAM's factors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from homings import Trial, trial
+
+from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.backend.homing.schur_model import SchurModel, State
+from fgslam.backend.homing.schur_solver import SchurSolver
+from fgslam.backend.homing.schur_system import Factored
+from fgslam.homing_types import HomingEstimate
+from fgslam.settings.backend import KernelSettings
+from fgslam.settings.homing_estimators import HomingGraphSettings
+from fgslam.settings.simulated_bearings import SimulatedBearingsSettings
+from fgslam.types import FloatArray
+
+NONE, CAUCHY, HUBER = (
+    KernelSettings("none"),
+    KernelSettings("cauchy", 2.0),
+    KernelSettings("huber", 1.0),
+)
+EXACT = HomingGraphSettings(max_steps=30, match_limit=0.0)
+
+
+@cache
+def case(images_per_s: float = 1.5) -> Trial:
+    settings = SimulatedBearingsSettings(
+        images_per_s=images_per_s, part=0.4, lost_per_s=0.1, tracked_elevations=True
+    )
+    return trial(4, settings)
+
+
+def estimated(settings: HomingGraphSettings) -> HomingEstimate:
+    given = case()
+    estimator = make_homing_estimator(given.start, settings)
+    for image in given.tracks:
+        estimator.update(image)
+    return estimator.estimate()
+
+
+@pytest.mark.parametrize(
+    ("kernel", "elevations"),
+    [(NONE, "two_views"), (CAUCHY, "two_views"), (HUBER, "none"), (CAUCHY, "all")],
+)
+def test_the_same_optimum_and_covariance_as_gtsams_batch(
+    kernel: KernelSettings, elevations: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both driven to convergence, which reweighting reaches slowly: hundredths of a deviation."""
+    monkeypatch.setattr("fgslam.backend.homing.schur_solver._STILL", 1e-7)
+    monkeypatch.setattr("fgslam.backend.homing.graph_solvers._RELATIVE_TOLERANCE", 1e-14)
+    settings = replace(EXACT, kernel=kernel, elevations=elevations)  # type: ignore[arg-type]
+    own = estimated(settings)
+    batch = estimated(replace(settings, solver="batch", max_iterations=200))
+    deviations = np.sqrt(np.diagonal(batch.covariance))
+    np.testing.assert_array_less(np.abs(own.robot - batch.robot), 1e-2 * deviations[:3])
+    np.testing.assert_array_less(np.abs(own.target - batch.target), 1e-2 * deviations[3:])
+    np.testing.assert_array_equal(own.ids, batch.ids)
+    spread = np.sqrt(np.diagonal(batch.landmark_covariances, axis1=1, axis2=2))
+    np.testing.assert_array_less(np.abs(own.landmarks - batch.landmarks), 1e-2 * spread)
+    scale = np.outer(deviations, deviations)
+    np.testing.assert_allclose(own.covariance / scale, batch.covariance / scale, atol=1e-2)
+    assert len(own.ids) > 10
+
+
+def solver_of(given: Trial, settings: HomingGraphSettings) -> SchurSolver:
+    estimator = make_homing_estimator(given.start, settings)
+    for image in given.tracks:
+        estimator.update(image)
+    solver = estimator._solver  # type: ignore[attr-defined]
+    assert isinstance(solver, SchurSolver)
+    return solver
+
+
+def test_gradient_is_that_of_the_cost() -> None:
+    solver = solver_of(case(), replace(EXACT, elevations="all"))
+    model: SchurModel = solver._model
+    rng = np.random.default_rng(0)
+    state = solver._state
+    state = State(*(part + 0.01 * rng.standard_normal(part.shape) for part in parts(state)))
+    equations = model.normal(model.look(state))
+    gradient = np.append(equations.chain_gradient.ravel(), equations.border_gradient)
+    for k in rng.permutation(len(gradient))[:40]:
+        step = np.zeros(len(gradient))
+        step[k] = 1e-6
+        ahead, behind = (model.look(moved(state, s * step)).cost for s in (1.0, -1.0))
+        assert (ahead - behind) / 2e-6 == pytest.approx(gradient[k], rel=1e-4, abs=1e-2)
+
+
+def test_the_factored_system_is_solved() -> None:
+    """Step and covariance against the whole matrix, inverted."""
+    solver = solver_of(case(), EXACT)
+    e = solver._model.normal(solver._model.look(solver._state))
+    count, m = len(e.diagonal), len(e.border)
+    n = 6 * count
+    whole = np.zeros((n + m, n + m))
+    for k in range(count):
+        at = slice(6 * k, 6 * k + 6)
+        whole[at, at] = e.diagonal[k]
+        if k + 1 < count:
+            whole[6 * k + 6 : 6 * k + 12, at] = e.below[k]
+            whole[at, 6 * k + 6 : 6 * k + 12] = e.below[k].T
+    whole[:n, n:] = e.cross.reshape(n, m)
+    whole[n:, :n] = whole[:n, n:].T
+    whole[n:, n:] = e.border
+    inverse = np.linalg.inv(whole)
+    factored = Factored(e)
+    chosen = np.concatenate([np.arange(n - 6, n - 3), n + np.array([0, 2, 5])])
+    found = factored.covariance(np.array([0, 2, 5]))
+    np.testing.assert_allclose(found, inverse[np.ix_(chosen, chosen)], rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(factored.border_covariance(), inverse[n:, n:], rtol=1e-5, atol=1e-12)
+
+
+def test_wrong_matches_are_found_by_what_contradicts_them() -> None:
+    """A wrong match that RANSAC let pass, and that no kernel tells from the others."""
+    settings = SimulatedBearingsSettings(images_per_s=5.0, part=0.6, wrong_matches=0.3)
+    given = trial(3, settings)
+    wrong = np.flatnonzero(~given.correct)
+    assert len(wrong) == 1
+    assert without_target(solver_of(given, EXACT)) == []
+    assert without_target(solver_of(given, HomingGraphSettings())) == wrong.tolist()
+
+
+def without_target(solver: SchurSolver) -> list[int]:
+    """Rows of landmarks whose bearing from the target was dropped."""
+    model = solver._model
+    information = model._bearings.first(1, len(model.landmarks))[1, 0]
+    return [row for row, number in model.landmarks.items() if information[number] == 0.0]
+
+
+def parts(state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return state.chain, state.target, state.points
+
+
+def moved(state: State, step: FloatArray) -> State:
+    chain = step[: state.chain.size].reshape(state.chain.shape)
+    return state.moved(chain, step[state.chain.size :])
