@@ -181,8 +181,9 @@ def mixed_with_wrong(
 
 
 def _unusable(image: ByteArray, present: OmniFeatures) -> Refusal | None:
-    lit = image[np.any(image > 0, axis=2)]
-    brightness = float(np.mean(lit)) if len(lit) else 0.0
+    # What is black is not seen, and adds nothing to the sum.
+    lit = int(np.count_nonzero(image[..., 0] | image[..., 1] | image[..., 2]))
+    brightness = float(np.sum(image)) / (3.0 * max(lit, 1))
     if brightness < _DARK:
         return Refusal(RefusalReason.TOO_DARK, f"mean grey value {brightness:.1f} of 255")
     if not len(present.sift) and not len(present.columns):

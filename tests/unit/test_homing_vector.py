@@ -178,7 +178,8 @@ def test_refinement_covariance_is_that_of_monte_carlo() -> None:
             angles + rng.normal(0.0, np.deg2rad(0.2), angles.shape), np.deg2rad(0.2)
         )
         prior = RefinementPrior(1e-6, 1e-6)
-        refined = HomingRefinement(noisy, prior, 5.0, 0.05).refine(views.direction, views.rotation)
+        start = np.array([[views.direction], [views.rotation]])
+        refined = HomingRefinement(noisy, prior, 5.0, 0.05).refine(*start)[0]
         found.append(
             (
                 *(refined.parameters[:2] - [views.direction, views.rotation]),

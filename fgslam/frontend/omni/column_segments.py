@@ -202,8 +202,7 @@ class _ColumnSums:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         luminance: Float32Array = grey.astype(np.float32)
         self._colours = len(parts)
-        self._stride = image.shape[1]
-        self._tables = [_summed_down(part) for part in [*parts, luminance, luminance * luminance]]
+        self._sums = _summed_down([*parts, luminance, luminance * luminance])
 
     def means(
         self, column: IntArray, top: FloatArray, bottom: FloatArray
@@ -212,8 +211,8 @@ class _ColumnSums:
         # The rows whose centres lie within; ``lower`` is the first beyond.
         upper, lower = (np.floor(end).astype(np.int64) + 1 for end in (top, bottom))
         count = (lower - upper).astype(np.float64)
-        start, end = upper * self._stride + column, lower * self._stride + column
-        means = np.column_stack([(t[end] - t[start]) / count for t in self._tables])
+        sums = self._sums[lower, :, column] - self._sums[upper, :, column]
+        means = sums / count[:, None]
         colours, light, squared = np.split(means, [self._colours, self._colours + 1], axis=1)
         return colours, np.sqrt(np.maximum(squared - light**2, 0.0))[:, 0]
 
@@ -222,19 +221,21 @@ class _ColumnSums:
         parts = np.linspace(0.0, 1.0, PROFILE_SAMPLES + 1)
         rows = bottom[:, None] + (top - bottom)[:, None] * parts + 0.5
         whole = np.floor(rows).astype(np.int64)
-        table = self._tables[self._colours]
-        index = whole * self._stride + column[:, None]
-        below = table[index]
-        beyond = table[np.minimum(index + self._stride, len(table) - 1)]
+        table = self._sums[:, self._colours]
+        below = table[whole, column[:, None]]
+        beyond = table[np.minimum(whole + 1, len(table) - 1), column[:, None]]
         total = below + (rows - whole) * (beyond - below)
         return np.asarray(np.diff(total, axis=1) / np.diff(rows, axis=1))
 
 
-def _summed_down(part: Float32Array) -> FloatArray:
-    """((h + 1) * w,) sums of the rows above each row, flat."""
-    out = np.zeros((part.shape[0] + 1, part.shape[1]))
-    np.cumsum(part, axis=0, out=out[1:])
-    return out.ravel()
+def _summed_down(parts: list[Float32Array]) -> FloatArray:
+    """(h + 1, k, w) sums of the rows above each row, of k images (h, w)."""
+    rows = np.stack(parts, axis=1)
+    out = np.zeros((len(rows) + 1, *rows.shape[1:]))
+    # Row by row, as each lies in one piece: `cumsum` goes down column by column.
+    for k, row in enumerate(rows):
+        np.add(out[k], row, out=out[k + 1])
+    return out
 
 
 def _summit(before: Float32Array, middle: Float32Array, after: Float32Array) -> FloatArray:

@@ -178,7 +178,8 @@ class _Search:
 
     def refined(self, candidates: list[_Candidate]) -> list[Refined]:
         """The candidates after least squares, the best score first, each solution once."""
-        found = [self._refinement.refine(c.direction, c.rotation) for c in candidates]
+        starts = np.array([(c.direction, c.rotation) for c in candidates])
+        found = self._refinement.refine(starts[:, 0], starts[:, 1])
         found.sort(key=lambda r: -self._score_of(r))
         out: list[Refined] = []
         for solution in found:

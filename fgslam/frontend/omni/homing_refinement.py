@@ -17,7 +17,6 @@ from fgslam.frontend.omni.epipolar import in_front, ray_derivatives
 from fgslam.frontend.omni.match_odds import COMMON_CHANCE, gain, right_probability
 from fgslam.homing_types import BearingMatches
 from fgslam.omni_cameras.bearing_measurement import unit_rays
-from fgslam.planar import rotation as planar_rotation
 from fgslam.planar import wrap
 from fgslam.types import BoolArray, FloatArray
 
@@ -88,36 +87,52 @@ class HomingRefinement:
         self._sigmas = inlier_sigmas
         self._least_parallax = least_parallax
 
-    def refine(self, direction: float, rotation: float) -> Refined:
-        """Gauss-Newton from a hypothesis; inliers are chosen anew in each iteration."""
-        parameters = np.zeros(7)
-        parameters[:2] = direction, rotation
+    def refine(self, directions: FloatArray, rotations: FloatArray) -> list[Refined]:
+        """Gauss-Newton from hypotheses (c,), side by side; inliers are chosen anew each time."""
+        parameters = np.zeros((len(directions), 7))
+        parameters[:, 0], parameters[:, 1] = directions, rotations
+        going = np.arange(len(parameters))
         for k in range(_ITERATIONS):
-            residuals, jacobian = self._linearised(parameters)
             widened = _WIDENED[k] if k < len(_WIDENED) else 1.0
-            weights = self._weights(parameters, residuals, widened)
-            information = (jacobian * weights[:, None]).T @ jacobian + np.diag(self._prior)
-            gradient = jacobian.T @ (weights * residuals) + self._prior * parameters
-            step = np.linalg.solve(information + _DAMPING * np.eye(7), -gradient)
-            parameters = parameters + np.clip(step, -0.3, 0.3)
-            if k >= len(_WIDENED) and np.max(np.abs(step)) < _CONVERGED:
+            step = self._step(parameters[going], widened)
+            parameters[going] += np.clip(step, -0.3, 0.3)
+            if k >= len(_WIDENED):
+                going = going[np.max(np.abs(step), axis=1) >= _CONVERGED]
+            if not len(going):
                 break
-        parameters[:2] = wrap(parameters[:2])
+        parameters[:, :2] = wrap(parameters[:, :2])
         return self._finished(parameters)
 
-    def _finished(self, parameters: FloatArray) -> Refined:
+    def _step(self, parameters: FloatArray, widened: float) -> FloatArray:
+        """(c, 7) the damped Gauss-Newton step from (c, 7)."""
+        residuals, jacobian = self._linearised(parameters)
+        weights = self._weights(parameters, residuals, widened)
+        information = self._information(jacobian, weights) + _DAMPING * np.eye(7)
+        gradient = (jacobian @ (weights * residuals)[:, :, None])[:, :, 0]
+        gradient += self._prior * parameters
+        return np.asarray(np.linalg.solve(information, -gradient[:, :, None])[:, :, 0])
+
+    def _information(self, jacobian: FloatArray, weights: FloatArray) -> FloatArray:
+        """(c, 7, 7) of Jacobians (c, 7, n) and weights (c, n), with the prior's."""
+        weighted = jacobian * weights[:, None]
+        return np.asarray(weighted @ jacobian.transpose(0, 2, 1) + np.diag(self._prior))
+
+    def _finished(self, parameters: FloatArray) -> list[Refined]:
         residuals, jacobian = self._linearised(parameters)
         inliers = self._inliers(parameters, residuals)
-        weights = self._weights(parameters, residuals)
-        information = (jacobian * weights[:, None]).T @ jacobian + np.diag(self._prior)
-        spread = _MAD_TO_SIGMA * float(np.median(np.abs(residuals[inliers]))) if any(inliers) else 1
-        covariance = np.linalg.pinv(information) * max(1.0, spread) ** 2
-        return Refined(parameters, np.asarray(covariance, dtype=np.float64), residuals, inliers)
+        information = self._information(jacobian, self._weights(parameters, residuals))
+        covariances = np.linalg.pinv(information, hermitian=True)
+        return [
+            Refined(p, covariance * max(1.0, _scatter(r[kept])) ** 2, r, kept)
+            for p, covariance, r, kept in zip(
+                parameters, covariances, residuals, inliers, strict=True
+            )
+        ]
 
     def _weights(
         self, parameters: FloatArray, residuals: FloatArray, widened: float = 1.0
     ) -> FloatArray:
-        """(n,) probability that each match is right, given how it fits."""
+        """(c, n) probability that each match is right, given how it fits."""
         inliers = self._inliers(parameters, residuals, widened)
         likely = self._odds * gain(residuals / widened, self._sigmas, COMMON_CHANCE)
         return inliers * likely / (1.0 + likely)
@@ -125,18 +140,26 @@ class HomingRefinement:
     def _inliers(
         self, parameters: FloatArray, residuals: FloatArray, widened: float = 1.0
     ) -> BoolArray:
-        theta, psi = parameters[:1], parameters[1:2]
-        ahead = in_front(self._bearings, theta, psi, self._least_parallax)[:, 0]
+        """(c, n), of (c, n) residuals."""
+        theta, psi = parameters[:, 0], parameters[:, 1]
+        ahead = in_front(self._bearings, theta, psi, self._least_parallax).T
         return np.asarray((np.abs(residuals) < widened * self._sigmas) & ahead)
 
-    def _linearised(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n,) normalised residuals and their (n, 7) Jacobian, noise held at the estimate."""
-        essential, derivatives = _essential(p)
-        residual = self._outer @ essential.ravel()
-        by = self._outer @ derivatives.reshape(7, 9).T
-        noise = (self._noisy @ essential.ravel()).reshape(4, -1)
-        sigma = np.sqrt(np.maximum(np.sum(noise**2, axis=0), 1e-24))
+    def _linearised(self, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(c, n) normalised residuals, their (c, 7, n) Jacobians, noise held at the estimate."""
+        essential, derivatives = _essential(parameters)
+        count = len(parameters)
+        flat = essential.reshape(count, 9)
+        residual = flat @ self._outer.T
+        by = (derivatives.reshape(-1, 9) @ self._outer.T).reshape(count, 7, -1)
+        noise = (flat @ self._noisy.T).reshape(count, 4, -1)
+        sigma = np.sqrt(np.maximum(np.einsum("ckn,ckn->cn", noise, noise), 1e-24))
         return residual / sigma, by / sigma[:, None]
+
+
+def _scatter(residuals: FloatArray) -> float:
+    """Robust standard deviation of inliers' residuals; 1 where there are none."""
+    return _MAD_TO_SIGMA * float(np.median(np.abs(residuals))) if len(residuals) else 1.0
 
 
 def _outer(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -145,49 +168,53 @@ def _outer(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _essential(p: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """E (3, 3) with a^T E b = 0, and its (7, 3, 3) derivatives.
+    """E (c, 3, 3) of parameters (c, 7), with a^T E b = 0, and its (c, 7, 3, 3) derivatives.
 
     E = A^T [t]x Rz(psi) B, with tilts A and B. Their derivatives are taken as if by a further small
     tilt, exact where the tilt itself vanishes.
     """
-    c, s = np.cos(p[0]), np.sin(p[0])
-    tilt_a, tilt_b, turn = _tilt(p[2], p[3]).T, _tilt(p[4], p[5]), _turn(p[1])
-    right = turn @ tilt_b
-    left = tilt_a @ _skew(c, s, p[6])
-    middle = _skew(c, s, p[6]) @ right
+    c, s, none = np.cos(p[:, 0]), np.sin(p[:, 0]), np.zeros(len(p))
+    tilt_a, tilt_b = _tilt(p[:, 2:4]).transpose(0, 2, 1), _tilt(p[:, 4:6])
+    turn = _turn(p[:, 1])
+    skew = _skew(np.column_stack([c, s, p[:, 6]]))
+    right, left = turn @ tilt_b, tilt_a @ skew
+    middle, turned = skew @ right, left @ turn
     derivatives = np.stack(
         [
-            tilt_a @ _skew(-s, c, 0.0) @ right,
-            left @ turn @ _AXES[2] @ tilt_b,
+            tilt_a @ _skew(np.column_stack([-s, c, none])) @ right,
+            turned @ _AXES[2] @ tilt_b,
             -tilt_a @ _AXES[0] @ middle,
             -tilt_a @ _AXES[1] @ middle,
-            left @ turn @ _AXES[0] @ tilt_b,
-            left @ turn @ _AXES[1] @ tilt_b,
+            turned @ _AXES[0] @ tilt_b,
+            turned @ _AXES[1] @ tilt_b,
             tilt_a @ _AXES[2] @ right,
-        ]
+        ],
+        axis=1,
     )
     return left @ right, derivatives
 
 
-def _skew(x: float, y: float, z: float) -> FloatArray:
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+def _skew(v: FloatArray) -> FloatArray:
+    """(c, 3, 3) matrices of the cross product with (c, 3)."""
+    return np.asarray((v @ _CROSS).reshape(-1, 3, 3))
 
 
-_AXES = (_skew(1.0, 0.0, 0.0), _skew(0.0, 1.0, 0.0), _skew(0.0, 0.0, 1.0))
+# The matrices of the axes, row by row: they are added up by a vector's coordinates.
+_CROSS = np.array([[0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0],
+                   [0, -1, 0, 1, 0, 0, 0, 0, 0]])  # fmt: skip
+_AXES = _skew(np.eye(3))
 
 
-def _turn(angle: float) -> FloatArray:
-    turned: FloatArray = np.eye(3)
-    turned[:2, :2] = planar_rotation(angle)
-    return turned
+def _turn(angle: FloatArray) -> FloatArray:
+    """(c, 3, 3) rotations about the vertical."""
+    c, s = np.cos(angle)[:, None, None], np.sin(angle)[:, None, None]
+    return np.asarray(np.eye(3) + s * _AXES[2] + (1.0 - c) * (_AXES[2] @ _AXES[2]))
 
 
-def _tilt(roll: float, pitch: float) -> FloatArray:
-    """Rotation by a small vector (roll, pitch, 0): Rodrigues' formula."""
-    angle = float(np.hypot(roll, pitch))
-    cross = _skew(roll, pitch, 0.0)
-    if angle < 1e-12:
-        return np.eye(3) + cross
-    axis = cross / angle
-    turned = np.eye(3) + np.sin(angle) * axis + (1.0 - np.cos(angle)) * axis @ axis
-    return np.asarray(turned, dtype=np.float64)
+def _tilt(vector: FloatArray) -> FloatArray:
+    """(c, 3, 3) rotations by small vectors (roll, pitch, 0), (c, 2): Rodrigues' formula."""
+    angle = np.hypot(vector[:, 0], vector[:, 1])[:, None, None]
+    cross = _skew(np.column_stack([vector, np.zeros(len(vector))]))
+    # sin(x) / x and (1 - cos(x)) / x^2, also where x vanishes.
+    first, half = np.sinc(angle / np.pi), np.sinc(0.5 * angle / np.pi)
+    return np.asarray(np.eye(3) + first * cross + 0.5 * half**2 * (cross @ cross))

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from fgslam.frontend.omni.column_whitening import whitened
 from fgslam.homing_types import (
@@ -105,13 +104,12 @@ def _forbid_impossible(
     """Sets distances of candidates to infinity that no planar motion explains."""
     margin = np.deg2rad(settings.horizon_margin_deg)
     side_a, side_b = _side(a.elevation, margin), _side(b.elevation, margin)
-    opposite = side_a[:, None] * side_b < 0
-    size_a, size_b = _height_in_sizes(a, margin), _height_in_sizes(b, margin)
-    limit = np.float32(np.log(settings.max_scale_ratio))
+    apart = _height_in_sizes(a, margin)[:, None] - _height_in_sizes(b, margin)
+    impossible = np.abs(apart, out=apart) > np.float32(np.log(settings.max_scale_ratio))
     # Near the horizon in both views the elevations tell nothing about the sizes.
-    telling = (side_a != 0)[:, None] | (side_b != 0)
-    unequal = np.abs(size_a[:, None] - size_b) > limit
-    squared[opposite | (unequal & telling)] = np.inf
+    impossible &= (side_a != 0)[:, None] | (side_b != 0)
+    impossible |= side_a[:, None] * side_b < 0
+    np.putmask(squared, impossible, np.inf)
 
 
 def _side(elevation: FloatArray, margin: float) -> npt.NDArray[np.int8]:
@@ -179,19 +177,26 @@ def match_columns(
 def nearest_segments(
     a: FloatArray, b: FloatArray
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """Mutual nearest of vectors (n, k) and (m, k), n and m at least 2, by kd-trees.
+    """Mutual nearest of vectors (n, k) and (m, k), n and m at least 2.
 
     Returns:
         Indices (k,) into ``a``, ascending, and into ``b``, the distance, and its ratio to that of
         the second nearest in ``b``.
     """
-    distance, nearest = cKDTree(b).query(a, k=2)
-    back = cKDTree(a).query(b, k=1)[1]
-    i = np.flatnonzero(back[nearest[:, 0]] == np.arange(len(a)))
+    # In as many dimensions as segments have elements a product of matrices outruns any tree. It
+    # finds who is near; how near, down to no distance at all, is then taken from the vectors.
+    squared = np.einsum("ij,ij->i", b, b) - 2.0 * (a @ b.T)
+    i = np.arange(len(a))
+    j = squared.argmin(axis=1)
+    back = (squared + np.einsum("ij,ij->i", a, a)[:, None]).argmin(axis=0)
+    squared[i, j] = np.inf
+    other = squared.argmin(axis=1)
+    i = np.flatnonzero(back[j] == i)
+    best, second = (np.linalg.norm(a[i] - b[k[i]], axis=1) for k in (j, other))
     # A second one just as near, be it at no distance at all, is a full rival.
     ratio = np.ones(len(i))
-    np.divide(distance[i, 0], distance[i, 1], out=ratio, where=distance[i, 1] > 0.0)
-    return i, nearest[i, 0].astype(np.int64), distance[i, 0], ratio
+    np.divide(best, second, out=ratio, where=second > best)
+    return i, j[i], best, ratio
 
 
 def _column_matches(

@@ -156,9 +156,13 @@ class UprightSift:
         if self._period is None:
             return image[first:last], self._mask[first:last], np.array([0.0, first])
         margin = max(self._period // _MARGIN_PART // 16, 1) * 16
-        columns = np.arange(-margin, self._period + margin) % self._period
         offset = np.array([-margin, first], dtype=np.float64)
-        return image[first:last][:, columns], self._mask[first:last][:, columns], offset
+        continued = (
+            np.asarray(cv2.copyMakeBorder(part, 0, 0, margin, margin, cv2.BORDER_WRAP), np.uint8)
+            for part in (image[first:last, : self._period], self._mask[first:last, : self._period])
+        )
+        colour, mask = continued
+        return colour, mask, offset
 
     def _chosen(self, pixels: FloatArray, table: FloatArray) -> IntArray:
         """Rows of the key points to keep: each feature once, the strongest first."""

@@ -106,13 +106,13 @@ def _best_near(
 
 def _distinct(points: FloatArray, strength: FloatArray, apart: float) -> BoolArray:
     """(n,) the strongest of each cluster of points; of equals the first."""
-    order = np.argsort(-strength, kind="stable")
     kept = np.zeros(len(points), dtype=np.bool_)
-    chosen = np.empty((0, 2))
-    for k in order:
-        if not len(chosen) or np.min(np.hypot(*(chosen - points[k]).T)) >= apart:
+    free = np.ones(len(points), dtype=np.bool_)
+    near = np.hypot(*(points[:, None] - points).transpose(2, 0, 1)) < apart
+    for k in np.argsort(-strength, kind="stable"):
+        if free[k]:
             kept[k] = True
-            chosen = np.vstack([chosen, points[k]])
+            free &= ~near[k]
     return kept
 
 
