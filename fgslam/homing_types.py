@@ -17,6 +17,17 @@ import numpy as np
 from fgslam.planar import between, rotation, wrap
 from fgslam.types import BoolArray, ByteArray, FloatArray, IntArray
 
+
+def among(ids: IntArray, others: IntArray) -> BoolArray:
+    """(n,) which identities are among others, both ascending.
+
+    With every image some dozens are looked up; what sorts them first takes ten times as long.
+    """
+    if not len(others):
+        return np.zeros(len(ids), np.bool_)
+    return np.asarray(others[np.minimum(np.searchsorted(others, ids), len(others) - 1)] == ids)
+
+
 # --------------------------------------------------------------------------------------------
 # Features of one image, and matches between two
 

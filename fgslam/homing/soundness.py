@@ -8,7 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.homing_types import BearingMatches, HomingEstimate, HomingStart, TrackedBearings
+from fgslam.homing_types import (
+    BearingMatches,
+    HomingEstimate,
+    HomingStart,
+    TrackedBearings,
+    among,
+)
 from fgslam.planar import bearings, wrap
 from fgslam.types import FloatArray
 
@@ -20,17 +26,14 @@ def tracked_misfit(estimate: HomingEstimate, tracked: TrackedBearings) -> float:
 
     NaN where fewer than three features are both tracked and in the map.
     """
-    _, mine, other = np.intersect1d(
-        estimate.ids, tracked.ids, assume_unique=True, return_indices=True
-    )
+    mine, other = among(estimate.ids, tracked.ids), among(tracked.ids, estimate.ids)
     return _misfit(estimate.robot, estimate.landmarks[mine], tracked.bearing[other])
 
 
 def target_misfit(estimate: HomingEstimate, start: HomingStart) -> float:
     """The same of the bearings from the target, predicted from where the target is estimated."""
-    _, mine, other = np.intersect1d(
-        estimate.ids, start.local_map.ids, assume_unique=True, return_indices=True
-    )
+    ids = start.local_map.ids
+    mine, other = among(estimate.ids, ids), among(ids, estimate.ids)
     return _misfit(estimate.target, estimate.landmarks[mine], start.matches.bearing_b[other])
 
 
@@ -56,8 +59,8 @@ def common_turn(before: TrackedBearings, now: TrackedBearings) -> float:
     The circular median of the bearings' changes, the other way round: translation moves bearings,
     too, but to both sides.
     """
-    _, mine, other = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
-    if len(mine) == 0:
+    mine, other = among(before.ids, now.ids), among(now.ids, before.ids)
+    if not mine.any():
         return float("nan")
     change = wrap(before.bearing[mine] - now.bearing[other])
     return circular_median(change)

@@ -23,7 +23,7 @@ from fgslam.factors.bearing_residuals import (
     target_jacobian,
     target_pose,
 )
-from fgslam.homing_types import HomingEstimate, HomingStart, TrackedBearings
+from fgslam.homing_types import HomingEstimate, HomingStart, TrackedBearings, among
 from fgslam.planar import wrap
 from fgslam.settings.homing_estimators import HomingEkfSettings
 from fgslam.types import BoolArray, FloatArray
@@ -60,9 +60,9 @@ class HomingEkf:
                 was before then.
         """
         step, taken = self._features.take(tracked)
-        state = self._state.keeping(np.isin(self._state.ids, self._features.alive))
+        state = self._state.keeping(among(self._state.ids, self._features.alive))
         state = predicted(state, step, self._settings.motion)
-        rows = taken & np.isin(tracked.ids, state.ids)
+        rows = taken & among(tracked.ids, state.ids)
         seen = seen_from_robot(state, tracked.bearing[rows], tracked.sigma_bearing[rows])
         try:
             state = updated(state, seen, self._settings.gate_sigmas)
@@ -96,10 +96,6 @@ class HomingEkf:
         rows = np.array([0, 1, 2, 4, 5, 6])
         jacobian = np.eye(6)
         jacobian[3:, 3:] = target_jacobian(target)
-        by_polar = polar_jacobians(state.polar)
-        n = len(state.ids)
-        every = np.arange(n)
-        blocks = state.covariance[7:, 7:].reshape(n, 2, n, 2)[every, :, every, :]
         return HomingEstimate(
             time=self._features.time,
             robot=_wrapped(state.mean[:3]),
@@ -107,7 +103,7 @@ class HomingEkf:
             covariance=jacobian @ state.covariance[np.ix_(rows, rows)] @ jacobian.T,
             ids=state.ids,
             landmarks=polar_points(state.polar),
-            landmark_covariances=by_polar @ blocks @ np.swapaxes(by_polar, 1, 2),
+            landmark_covariances=_landmark_covariances(state, landmarks),
         )
 
 
@@ -122,27 +118,40 @@ def updated(
         gate_sigmas: innovations beyond so many of their own deviations are left out; 0: none.
         extra: (m, m) covariance of the measurement besides its own variances.
     """
-    rows = _within_gate(state, seen, gate_sigmas, extra)
-    jacobian, noise = seen.jacobian[rows], np.diag(seen.variance[rows])
-    if extra is not None:
-        noise = noise + extra[np.ix_(rows, rows)]
+    noise = np.diag(seen.variance) if extra is None else np.diag(seen.variance) + extra
+    jacobian, innovation = seen.jacobian, seen.innovation
+    finite = np.asarray(np.isfinite(jacobian).all(axis=1))
+    if not finite.all():
+        jacobian, innovation, noise = _rows(finite, jacobian, innovation, noise)
     crossed = state.covariance @ jacobian.T
-    gain = np.linalg.solve(jacobian @ crossed + noise, crossed.T).T
-    kept = np.eye(len(state.mean)) - gain @ jacobian
-    covariance = kept @ state.covariance @ kept.T + gain @ noise @ gain.T
-    mean = state.mean + gain @ seen.innovation[rows]
+    expected = jacobian @ crossed + noise
+    near = np.asarray(innovation**2 <= gate_sigmas**2 * np.diagonal(expected))
+    if gate_sigmas > 0.0 and not near.all():
+        jacobian, innovation, noise = _rows(near, jacobian, innovation, noise)
+        crossed, expected = crossed[:, near], expected[np.ix_(near, near)]
+    gain = np.linalg.solve(expected, crossed.T).T
+    # Joseph's (1 - K H) P (1 - K H)^T + K R K^T without products of two matrices of P's size.
+    left = state.covariance - gain @ crossed.T
+    covariance = left - (left @ jacobian.T - gain @ noise) @ gain.T
+    mean = state.mean + gain @ innovation
     return FilterState(state.ids, mean, 0.5 * (covariance + covariance.T))
 
 
-def _within_gate(
-    state: FilterState, seen: Measured, sigmas: float, extra: FloatArray | None
-) -> BoolArray:
-    finite = np.isfinite(seen.jacobian).all(axis=1)
-    if sigmas == 0.0:
-        return np.asarray(finite)
-    variance = ((seen.jacobian @ state.covariance) * seen.jacobian).sum(axis=1)
-    variance = variance + seen.variance + (0.0 if extra is None else np.diagonal(extra))
-    return np.asarray(finite & (seen.innovation**2 <= sigmas**2 * variance))
+def _rows(
+    which: BoolArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The measurement without the others."""
+    return jacobian[which], innovation[which], noise[np.ix_(which, which)]
+
+
+def _landmark_covariances(state: FilterState, wanted: bool) -> FloatArray:
+    """(n, 2, 2) of the points; NaN unless wanted."""
+    n = len(state.ids)
+    if not wanted:
+        return np.full((n, 2, 2), np.nan)
+    by_polar, every = polar_jacobians(state.polar), np.arange(n)
+    blocks = state.covariance[7:, 7:].reshape(n, 2, n, 2)[every, :, every, :]
+    return np.asarray(by_polar @ blocks @ np.swapaxes(by_polar, 1, 2))
 
 
 def _wrapped(pose: FloatArray) -> FloatArray:

@@ -52,6 +52,8 @@ class FilterState:
         Rows and columns are deleted (G28), which *is* marginalisation: all that the lost features
         taught about the others stays.
         """
+        if which.all():
+            return self
         rows = np.concatenate([np.ones(_FIRST, np.bool_), np.repeat(which, 2)])
         return FilterState(
             self.ids[which], self.mean[rows], self.covariance[np.ix_(rows, rows)].copy()
@@ -211,7 +213,7 @@ def _seen(
     polar = state.polar
     points = polar_points(polar)
     by_pose, by_point = bearing_jacobians(pose, points)
-    by_polar = np.einsum("ij,ijk->ik", by_point, polar_jacobians(polar))
+    by_polar = (by_point[:, None] @ polar_jacobians(polar))[:, 0]
     return by_pose, by_polar, -bearing(pose, points, measured)
 
 

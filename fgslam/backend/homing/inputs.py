@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.errors import EstimatorError
-from fgslam.homing_types import HomingStart, TrackedBearings
+from fgslam.homing_types import HomingStart, TrackedBearings, among
 from fgslam.types import BoolArray, IntArray
 
 
@@ -45,14 +45,14 @@ class TrackedFeatures:
             )
         self._require_sound(tracked)
         self.time = tracked.time
-        self.alive = self.alive[np.isin(self.alive, tracked.ids)]
-        return float(step), np.isin(tracked.ids, self.alive)
+        self.alive = self.alive[among(self.alive, tracked.ids)]
+        return float(step), among(tracked.ids, self.alive)
 
     def _require_sound(self, tracked: TrackedBearings) -> None:
-        unknown = np.setdiff1d(tracked.ids, self._known)
+        unknown = tracked.ids[~among(tracked.ids, self._known)]
         if len(unknown):
             raise EstimatorError(
-                f"image at {tracked.time:.3f} s: feature {unknown[0]} is not in the local map; "
+                f"image at {tracked.time:.3f} s: feature {unknown.min()} is not in the local map; "
                 "track the map's features only"
             )
         if not _ascend(tracked.ids):

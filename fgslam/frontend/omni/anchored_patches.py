@@ -52,6 +52,8 @@ class AnchoredPatches:
 
     def taken(self, which: BoolArray) -> AnchoredPatches:
         """Those alone."""
+        if which.all():
+            return self
         return AnchoredPatches(
             self.size,
             self.first[which],

@@ -137,13 +137,15 @@ def _period_maps(camera: OmniCamera, view: Equirectangular) -> tuple[Float32, Fl
 
 def _spectra(grey: Image) -> npt.NDArray[np.complex128]:
     """(bands, frequencies) spectra of the mean rows of bands, without their own means."""
-    edges = np.linspace(0, len(grey), min(_BANDS, len(grey)) + 1).astype(int)
+    bands = min(_BANDS, len(grey))
+    edges = [len(grey) * k // bands for k in range(bands + 1)]
     means = [
         cv2.reduce(grey[low:high], 0, cv2.REDUCE_AVG, dtype=cv2.CV_32F)
-        for low, high in pairwise(edges.tolist())
+        for low, high in pairwise(edges)
     ]
-    rows = np.concatenate(means).astype(np.float64)
-    return np.asarray(np.fft.rfft(rows - rows.mean(axis=1, keepdims=True), axis=1))
+    spectra = np.fft.rfft(np.concatenate(means).astype(np.float64), axis=1)
+    spectra[:, 0] = 0.0
+    return np.asarray(spectra)
 
 
 def _common_shift(
