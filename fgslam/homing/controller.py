@@ -155,7 +155,12 @@ class HomingController:
         return None
 
     def _seen_elsewhere(self, homing: HomingUnderWay, seen: Sighting, time: float) -> Command:
-        """At the target itself directions mean little: how near it is tells an error from that."""
+        """At the target itself directions mean little: how near it is tells an error from that.
+
+        Not so rotations: if they contradict, the parallaxes are of another place.
+        """
+        if homing.turned_otherwise(seen.vector):
+            return self._doubt(time, "near the target it is seen elsewhere", seen.vector)
         left = homing.part_left(seen.parallax)
         behind = abs(seen.vector.direction) > np.pi / 2 and self._was_ahead
         if left <= self._settings.switch_fraction or (

@@ -19,6 +19,7 @@ from fgslam.homing_types import (
 )
 from fgslam.planar import wrap
 from fgslam.settings.homing_behaviour import HomingControlSettings
+from fgslam.types import BoolArray
 
 EstimatorMaker: TypeAlias = Callable[[HomingStart], HomingEstimator]
 
@@ -155,12 +156,20 @@ class HomingUnderWay:
 
     def contradicts(self, vector: HomingVector) -> bool:
         """Whether a new homing vector from the present place cannot be true if the estimate is."""
+        return bool(self._contradictions(vector).any())
+
+    def turned_otherwise(self, vector: HomingVector) -> bool:
+        """Whether that is so of its rotation."""
+        return bool(self._contradictions(vector)[1])
+
+    def _contradictions(self, vector: HomingVector) -> BoolArray:
+        """(2,) of direction and rotation."""
         home = self.home
         turns = [vector.direction - home.direction, vector.rotation - home.rotation]
         variance = np.diag(vector.covariance) + np.nan_to_num(np.diag(home.covariance)[1:])
         limit = np.deg2rad(self._settings.contradiction_deg)
         allowed = np.maximum(limit, _SIGMAS * np.sqrt(variance))
-        return bool((np.abs(wrap(np.array(turns))) > allowed).any())
+        return np.abs(wrap(np.array(turns))) > allowed
 
 
 def _seen_at(start: HomingStart) -> TrackedBearings:

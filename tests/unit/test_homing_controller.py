@@ -526,16 +526,17 @@ def test_target_seen_elsewhere_begins_the_leg_anew() -> None:
 
 
 @pytest.mark.parametrize(
-    ("direction", "part", "state"),
+    ("vector", "part", "state"),
     [
-        (np.pi, 0.2, HomingState.ARRIVED),  # passed
-        (1.5, 0.05, HomingState.ARRIVED),  # beside it
-        (1.5, 0.2, HomingState.CONFIRM),  # ahead still
-        (np.pi, 0.9, HomingState.CONFIRM),  # driven the wrong way: parallaxes are as at the start
+        (vector_to(np.pi), 0.2, HomingState.ARRIVED),  # passed
+        (vector_to(1.5), 0.05, HomingState.ARRIVED),  # beside it
+        (vector_to(1.5), 0.2, HomingState.CONFIRM),  # ahead still
+        (vector_to(np.pi), 0.9, HomingState.CONFIRM),  # driven the wrong way: as at the start
+        (vector_to(np.pi, 3.0), 0.05, HomingState.CONFIRM),  # turned: another place
     ],
 )
 def test_how_near_the_target_is_seen_decides(
-    direction: float, part: float, state: HomingState
+    vector: HomingVector, part: float, state: HomingState
 ) -> None:
     """Seen elsewhere than expected: at the target itself that is an arrival, else an error."""
     b = bench(vector_to(0.0))
@@ -543,11 +544,11 @@ def test_how_near_the_target_is_seen_decides(
     start = b.controller.underway
     assert start is not None
     before = parallax(start.start.matches, 0.0)
-    b.eyes.looks = [Sighting(vector_to(direction), part * before)]
+    b.eyes.looks = [Sighting(vector, part * before)]
     b.at(0.8)
     command = b.step()
     assert command.state is state
-    assert command.remaining == pytest.approx(part)
+    assert command.remaining == pytest.approx(1.0 if vector.rotation else part)
 
 
 def test_no_arrival_where_the_target_is_not_seen() -> None:
