@@ -54,10 +54,15 @@ class LandmarkDatabase(LandmarkTable):
     def expected(self, landmarks: LandmarkMap, wTc: FloatArray) -> ExpectedLandmarks:
         """Landmarks of the map that should or may be in view from ``wTc`` (4.4)."""
         found = self._field_of_view.select(wTc, landmarks.positions)
-        ids = landmarks.ids[found.rows]
-        views, known = self._views_from(self.rows(ids), directions_to(wTc, found.points))
+        rows = self.rows(landmarks.ids[found.rows])
+        least = self._settings.least_scale_px
+        if least is not None:
+            large = self._largest_sizes(rows) >= least * found.points[:, 2]
+            found, rows = found.select(large), rows[large]
+        directions = directions_to(wTc, found.points) if self._pool.several else None
+        views, known = self._views_from(rows, directions)
         return ExpectedLandmarks(
-            ids=ids,
+            ids=landmarks.ids[found.rows],
             rows=found.rows,
             measurement=found.measurement,
             scale=views.size / found.points[:, 2],

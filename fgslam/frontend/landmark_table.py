@@ -234,13 +234,20 @@ class LandmarkTable:
     def _places(self) -> Places:
         return self._columns[_PLACES]
 
-    def _views_from(self, rows: IntArray, directions: FloatArray) -> tuple[Views, BoolArray]:
-        """The view of each row (k,) nearest to a direction (k, 3), and whether it is near (6.3)."""
+    def _views_from(self, rows: IntArray, directions: FloatArray | None) -> tuple[Views, BoolArray]:
+        """The view of each row (k,) nearest to a direction (k, 3), and whether it is near (6.3).
+
+        Without directions the first view, as near.
+        """
         places = self._places[rows]
-        if not self._pool.several:
+        if directions is None:
             return self._pool.at(places[:, 0]), np.ones(len(rows), np.bool_)
         column, known = self._pool.nearest(places, directions.astype(np.float32))
         return self._pool.at(places[np.arange(len(rows)), column]), known
+
+    def _largest_sizes(self, rows: IntArray) -> FloatArray:
+        """Largest size (k,) of any view of each row."""
+        return self._pool.largest_sizes(self._places[rows])
 
     def _refresh(self, rows: IntArray, seen: Views) -> None:
         """The rows (k,) were matched and looked like this: their nearest view, or a further one."""

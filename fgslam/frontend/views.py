@@ -123,6 +123,10 @@ class ViewPool:
             self._used[places],
         )
 
+    def largest_sizes(self, places: Places) -> FloatArray:
+        """Largest size (v,) of the views of each landmark."""
+        return np.asarray(np.where(places >= 0, self._size[places], 0.0).max(axis=1))
+
     def nearest(self, places: Places, directions: Directions) -> tuple[IntArray, BoolArray]:
         """The view of each landmark nearest to a direction, and whether it is near enough.
 
@@ -134,9 +138,10 @@ class ViewPool:
             Column (v,) of the nearest view in ``places``, and True (v,) where its angle is below
             the threshold. A view from an unknown direction is taken to be just near enough.
         """
-        cosine = np.einsum("vkj,vj->vk", self._direction[places], directions)
-        cosine[np.isnan(cosine)] = self._nearest_cosine
-        cosine[places < 0] = -np.inf
+        cosine = np.full(places.shape, -np.inf, np.float32)
+        row, column = np.nonzero(places >= 0)
+        each = (self._direction[places[row, column]] * directions[row]).sum(axis=1)
+        cosine[row, column] = np.where(np.isnan(each), self._nearest_cosine, each)
         column = np.argmax(cosine, axis=1)
         return column, cosine[np.arange(len(column)), column] >= self._nearest_cosine
 

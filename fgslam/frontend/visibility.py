@@ -65,6 +65,12 @@ class InView:
     measurement: FloatArray
     certain: BoolArray
 
+    def select(self, keep: BoolArray) -> InView:
+        """Only some of them."""
+        return InView(
+            self.rows[keep], self.points[keep], self.measurement[keep], self.certain[keep]
+        )
+
 
 class FieldOfView:
     """The cameras' common field of view, as the settings draw it."""
@@ -89,7 +95,7 @@ class FieldOfView:
             possible = self._in_images(measurement, -self._border)
             certain = self._in_images(measurement, self._border)
         keep = possible & (measurement[:, 2] <= self._max_disparity)
-        return InView(rows[keep], points[keep], measurement[keep], certain[keep])
+        return InView(rows, points, measurement, certain).select(keep)
 
     def _roughly(self, points: FloatArray) -> IntArray:
         """Rows (k,) of all points (n, 3) in view and few others: no division, few points a test.

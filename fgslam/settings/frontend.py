@@ -155,13 +155,13 @@ class PermanenceSettings:
             ge=0.0,
             lt=1.0,
             description="a landmark becomes permanent when hits / (hits + misses) exceeds this; "
-            "unstated in 6.2",
+            "unstated in 6.2, chosen by measurement (docs/map_results.md)",
         ),
-    ] = 0.5
+    ] = 0.3
     hits: Annotated[
         int,
         Field(ge=1, description="and when it has at least so many hits, and valid_hits (6.1)"),
-    ] = 3
+    ] = 5
     when: Annotated[
         Literal["running", "saved"],
         Field(
@@ -177,7 +177,7 @@ class PermanenceSettings:
             description="a frame that matches less than this share of the landmarks expected well "
             "in view is blocked or lost: it tells of no landmark that it is gone; 0 believes all",
         ),
-    ] = 0.1
+    ] = 0.05
     contradicted_after: Annotated[
         int | None,
         Field(
@@ -251,6 +251,15 @@ class DatabaseSettings:
             description="this near to an image's edge a landmark may be matched but is not missed",
         ),
     ] = 8.0
+    least_scale_px: Annotated[
+        float | None,
+        Field(
+            gt=0.0,
+            description="landmarks that would look smaller than this are not expected: SIFT's "
+            "finest scale over matching.scale_ratio, 0.8 where base_sigma_px is 2, loses no match "
+            "and keeps large maps fast; null expects them at any distance",
+        ),
+    ] = None
     permanence: Annotated[
         PermanenceSettings | None,
         Field(description="permanent landmarks (6.2); null: none but those of a map loaded"),
