@@ -130,14 +130,8 @@ def _lamp_light(
     """(n,) light of all lamps; each is sampled at a few points, which softens its shadows."""
     light = np.zeros(len(points))
     for lamp in lamps:
-        for s, t in rng.random((_LAMP_SAMPLES, 2)):
-            offset = lamp[0] + s * lamp[1] + t * lamp[2] - points
-            far2 = np.sum(offset * offset, axis=1)
-            towards = offset / np.sqrt(far2)[:, None]
-            facing = np.sum(normals * towards, axis=1) * np.maximum(towards[:, 2], 0.0)
-            lit = facing > 1e-3
-            lit[lit] = ~caster.blocked(points[lit], offset[lit], 0.995)
-            light[lit] += facing[lit] / (1.0 + far2[lit])
+        samples = rng.random((_LAMP_SAMPLES, 2))
+        _add_light(light, lamp, samples, caster, (points, normals))
     return np.asarray(light * (_LAMP_POWER / _LAMP_SAMPLES))
 
 
@@ -149,12 +143,37 @@ def _lamp_light_within(
     lamps: FloatArray,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """(n,) light of all lamps on what is less than ``reach_m`` from the middle of each."""
+    """(n,) light of all lamps on what is less than ``reach_m`` from the middle of each.
+
+    All are sampled at the same points of their surfaces: lamps that are alike shine alike.
+    """
     light = np.zeros(len(points))
+    samples = rng.random((_LAMP_SAMPLES, 2))
     for lamp in lamps:
         middle = lamp[0] + 0.5 * (lamp[1] + lamp[2])
         far2 = np.sum(np.square(points - middle), axis=1)
         near = np.flatnonzero(far2 < reach_m**2)
         window = np.square(1.0 - far2[near] / reach_m**2)
-        light[near] += window * _lamp_light(caster, points[near], normals[near], lamp[None], rng)
-    return light
+        here = np.zeros(len(near))
+        _add_light(here, lamp, samples, caster, (points[near], normals[near]))
+        light[near] += window * here
+    return np.asarray(light * (_LAMP_POWER / _LAMP_SAMPLES))
+
+
+def _add_light(
+    light: FloatArray,
+    lamp: FloatArray,
+    samples: FloatArray,
+    caster: RayCaster,
+    surface: tuple[FloatArray, FloatArray],
+) -> None:
+    """Adds one lamp's light, not yet scaled, from samples (k, 2) of it, to points and normals."""
+    points, normals = surface
+    for s, t in samples:
+        offset = lamp[0] + s * lamp[1] + t * lamp[2] - points
+        far2 = np.sum(offset * offset, axis=1)
+        towards = offset / np.sqrt(far2)[:, None]
+        facing = np.sum(normals * towards, axis=1) * np.maximum(towards[:, 2], 0.0)
+        lit = facing > 1e-3
+        lit[lit] = ~caster.blocked(points[lit], offset[lit], 0.995)
+        light[lit] += facing[lit] / (1.0 + far2[lit])

@@ -14,7 +14,7 @@ from fgslam.errors import ConfigError
 from fgslam.settings.lab import LabDriveSettings, PathName, PlaceName
 from fgslam.simulation import lab
 from fgslam.simulation.buildings import alike, office
-from fgslam.simulation.buildings.wall_textures import building_library
+from fgslam.simulation.buildings.wall_textures import building_library, corridor_library
 from fgslam.simulation.floor_space import FloorSpace
 from fgslam.simulation.lighting import LIGHT_SPACING_M
 from fgslam.simulation.patches import Thing, stack
@@ -102,7 +102,8 @@ def build_place(choice: PlaceChoice) -> Place:
 def build_textures(choice: PlaceChoice) -> dict[str, Grey]:
     """The place's textures by name."""
     rng = np.random.default_rng([choice.seed, 1])
-    return build_library(rng) if choice.name == "lab" else building_library(rng)
+    libraries = {"lab": build_library, "rooms": building_library, "corridors": corridor_library}
+    return libraries[choice.name](rng)
 
 
 def place_path(name: PlaceName, settings: LabDriveSettings) -> PlanarPath:

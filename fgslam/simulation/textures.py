@@ -348,9 +348,9 @@ def panelled(rng: np.random.Generator, height: int, width: int, base: float) -> 
     return _soft(image)
 
 
-def wallpaper(rng: np.random.Generator, size: int, base: float) -> Grey:
+def wallpaper(rng: np.random.Generator, size: int, base: float, scuffs: int = 60) -> Grey:
     """Striped paper with small faded flowers, on top of plaster."""
-    image = plaster(rng, size, base)
+    image = plaster(rng, size, base, scuffs)
     x = np.arange(size) / size
     image += 7.0 * np.sign(np.sin(2 * np.pi * 16 * x)).astype(np.float32)[None, :]
     y, z = np.mgrid[0:size, 0:size] / size

@@ -76,7 +76,7 @@ def _leg(rng: np.random.Generator) -> list[Thing]:
     for k, lamp in enumerate(_lamps()):
         glowing = rectangle(lamp[0] - [0, 0, 0.003], lamp[1], lamp[2], Surface("lamp", None, 1.0))
         out.append(Thing(f"lamp_{k}", (glowing,)))
-    board = placed(furniture.hanging(1.5, 1.1, Surface("picture_7")), -0.1, 0.005 - w, 1.1, 180.0)
+    board = placed(furniture.hanging(1.5, 1.1, Surface("picture_1")), -0.1, 0.005 - w, 1.1, 180.0)
     out.append(Thing("corner_board", tuple(board)))
     section = _section(rng)
     for k in range(SECTIONS):
@@ -97,13 +97,13 @@ def _section(rng: np.random.Generator) -> list[tuple[str, list[Patch]]]:
         out.append((name, placed(patches, x, -HALF_WIDTH + 0.005, z, 180.0)))
 
     metal = Surface("metal", 0.9)
-    north("door", _door(), -1.6)
+    north("door", _door(), -1.1)
     north("poster_1", furniture.hanging(0.9, 0.9, Surface("picture_0")), 0.0, 1.15)
-    north("poster_2", furniture.hanging(0.8, 1.0, Surface("picture_3")), 1.3, 1.1)
+    north("poster_2", furniture.hanging(0.8, 1.0, Surface("picture_4")), 1.3, 1.1)
     south("poster_3", furniture.hanging(1.0, 0.8, Surface("picture_2")), -1.5, 1.2)
     south("door", _door(), 0.3)
     south("shelf", furniture.shelf(rng, 1.1, 1.7, 0.3), 1.75)
-    north("cabinet", furniture.cabinet(0.7, 0.95, 0.3, metal), 1.3 - 0.9)
+    north("cabinet", furniture.cabinet(0.7, 0.95, 0.3, metal), 0.4)
     return out
 
 

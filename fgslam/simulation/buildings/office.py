@@ -26,7 +26,7 @@ from fgslam.types import FloatArray
 
 WIDTH, DEPTH = 36.0, 24.0
 _DOOR_WIDTH, _FIRE_DOOR_WIDTH = 1.3, 1.9
-_LAMP_SPACING = 3.2
+_LAMP_SPACING = 2.0
 
 _ROOMS = (
     Room("south_1", 0.0, 0.0, 9.0, 7.0, "wall_0", "floor"),
@@ -57,7 +57,7 @@ _DOORS = (
     *(Opening(x, y, _FIRE_DOOR_WIDTH, True) for y in (9.4, 14.6) for x in (1.2, 34.8)),
     *(Opening(x, y, _DOOR_WIDTH, False) for y in (3.5, 20.5) for x in (9.0, 18.0, 27.0)),
 )
-PLAN = FloorPlan(_ROOMS, _LINES, _DOORS, WIDTH, DEPTH, "wall_0", wall_tile_m=6.4, floor_tile_m=9.0)
+PLAN = FloorPlan(_ROOMS, _LINES, _DOORS, WIDTH, DEPTH, "wall_0", wall_tile_m=6.4, floor_tile_m=6.0)
 
 _ROOMY = FittingStyle(("shelf", "shelf", "desk", "cabinet", "sofa", "gap", "gap"))
 _NARROW = FittingStyle(("gap", "cabinet", "shelf"), (0.7, 0.15, 0.15), cabinet_depth=0.3)

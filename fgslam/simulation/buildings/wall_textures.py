@@ -12,7 +12,8 @@ from fgslam.simulation import textures
 from fgslam.simulation.texture_library import build_library, faded
 from fgslam.simulation.textures import Grey
 
-PICTURES = 200
+PICTURES, CORRIDOR_PICTURES = 240, 5
+_SCUFFS = 800  # on 41 square metres
 FLOORS = ("floor", "floor_1", "floor_2", "floor_3")
 WALLS = (
     "wall_0", "wall_1", "wall_2", "wall_3", "wall_4", "wall_5", "paper_0", "paper_1", "paper_2",
@@ -21,12 +22,12 @@ WALLS = (
 
 
 def building_library(rng: np.random.Generator) -> dict[str, Grey]:
-    """Every texture of the office building and the corridors, by name."""
+    """Every texture of the office building, by name."""
     out = build_library(rng)
     for i, base in enumerate((185.0, 150.0, 170.0, 132.0, 195.0, 160.0)):
-        out[f"wall_{i}"] = textures.plaster(rng, 1024, base, scuffs=220)
+        out[f"wall_{i}"] = textures.plaster(rng, 1024, base, scuffs=_SCUFFS)
     for i, base in enumerate((165.0, 140.0, 182.0)):
-        out[f"paper_{i}"] = faded(textures.wallpaper(rng, 1024, base), 0.8)
+        out[f"paper_{i}"] = textures.wallpaper(rng, 1024, base, scuffs=_SCUFFS)
     out["bricks_dark"] = textures.bricks(rng, 1024, 21) - np.float32(28.0)
     for name in FLOORS[1:]:
         out[name] = textures.carpet(rng, 1024)
@@ -35,11 +36,21 @@ def building_library(rng: np.random.Generator) -> dict[str, Grey]:
     return out
 
 
+def corridor_library(rng: np.random.Generator) -> dict[str, Grey]:
+    """Every texture of the corridors that look alike, by name."""
+    out = build_library(rng)
+    out["wall_0"] = textures.plaster(rng, 1024, 185.0, scuffs=_SCUFFS)
+    out["floor_1"] = textures.carpet(rng, 1024)
+    for i in range(CORRIDOR_PICTURES):
+        out[f"picture_{i}"] = _picture(rng, i)
+    return out
+
+
 def _picture(rng: np.random.Generator, number: int) -> Grey:
-    """Prints, pinboards and paintings in turn, as contrasty as the lab's."""
+    """Prints, pinboards and paintings in turn, with more contrast than the lab's."""
     kind = number % 5
-    if kind < 2:
-        return faded(textures.poster(rng, 256, 256), 0.42)
-    if kind == 2:
-        return faded(textures.pinboard(rng, 256), 0.45)
-    return faded(textures.abstract(rng, 256), 0.5)
+    if kind in (0, 2):
+        return faded(textures.poster(rng, 256, 256), 0.75)
+    if kind in (1, 3):
+        return faded(textures.pinboard(rng, 256), 0.8)
+    return faded(textures.abstract(rng, 256), 0.8)

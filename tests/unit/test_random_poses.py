@@ -1,0 +1,158 @@
+"""Random poses of the kidnapped robot: seeded, clear of everything, carried between."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fgslam import geometry
+from fgslam.datasets import rendered_lab
+from fgslam.datasets.rendered_lab import RenderedLabSequence
+from fgslam.errors import ConfigError
+from fgslam.settings.lab import (
+    LabDriveSettings,
+    LabRigSettings,
+    LabSettings,
+    RandomPosesSettings,
+    RenderedLabSettings,
+)
+from fgslam.simulation.floor_space import FloorSpace
+from fgslam.simulation.patches import stack
+from fgslam.simulation.places import PlaceChoice, build_place, plan_in_place
+from fgslam.simulation.render_cache import content_hash
+from fgslam.simulation.world import make_rig
+
+RIG = make_rig(LabRigSettings(width=32, height=24))
+LAB = PlaceChoice("lab", 0, 1, identical_posters=False)
+
+
+def drive(frames: int | None, **keys: float) -> LabDriveSettings:
+    drawn = RandomPosesSettings(**keys)  # type: ignore[arg-type]
+    return LabDriveSettings(path="random_poses", frames=frames, random_poses=drawn)
+
+
+def body(settings: LabDriveSettings, place: PlaceChoice = LAB) -> np.ndarray:
+    drawn = plan_in_place(place, settings, RIG)
+    return drawn.body_poses(drawn.timestamps)
+
+
+def test_robot_and_camera_keep_clear_in_all_headings_all_over_the_room() -> None:
+    poses = body(drive(200, clearance_m=0.35))
+    place = build_place(LAB)
+    space = FloorSpace(stack(place.things), place.low, place.high)
+    for points in (poses, poses @ RIG.bTc):
+        assert space.clearance(points[:, :2, 3]).min() >= 0.35
+    heading = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+    assert np.histogram(heading, bins=4, range=(-np.pi, np.pi))[0].min() > 25
+    assert (np.ptp(poses[:, :2, 3], axis=0) > 7.0).all()
+
+
+def test_each_pose_is_its_own() -> None:
+    """How many poses there are changes none of them, another seed all."""
+    many, few = body(drive(40)), body(drive(10))
+    np.testing.assert_array_equal(many[:10], few)
+    other = body(drive(10, seed=1))
+    assert np.linalg.norm(other[:, :2, 3] - few[:, :2, 3], axis=1).min() > 1e-3
+
+
+def test_without_frames_there_are_two_hundred_poses() -> None:
+    assert len(body(drive(None))) == 200
+    assert len(body(drive(None, burst=3))) == 600
+
+
+def test_bursts_go_straight_ahead() -> None:
+    poses = body(drive(30, burst=3, step_m=0.08))
+    steps = geometry.inverse(poses[:-1]) @ poses[1:]
+    within = np.arange(1, 30) % 3 != 0
+    ahead = np.tile(np.eye(4), (int(within.sum()), 1, 1))
+    ahead[:, 0, 3] = 0.08
+    np.testing.assert_allclose(steps[within], ahead, atol=1e-12)
+    assert (np.linalg.norm(steps[~within, :3, 3], axis=1) > 0.2).all()
+
+
+def test_places_that_cannot_be_driven_to_are_not_drawn() -> None:
+    """The ring's inner square is empty floor behind walls."""
+    poses = body(drive(150), PlaceChoice("corridors", 0, 1, identical_posters=False))
+    inside = np.all((poses[:, :2, 3] > 1.2) & (poses[:, :2, 3] < 22.8), axis=1)
+    assert not inside.any()
+
+
+@pytest.mark.parametrize(
+    ("bad", "why"),
+    [
+        (drive(10, burst=3), "no multiple"),
+        (drive(10, clearance_m=1.9), "leaves no room|no place"),
+    ],
+)
+def test_poses_that_do_not_exist_are_refused(bad: LabDriveSettings, why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        body(bad)
+
+
+# ---------------------------------------------------------------- as a recording
+
+
+@pytest.fixture
+def _unrendered(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The geometry of a recording without its images."""
+    monkeypatch.setenv("FGSLAM_CACHE", str(tmp_path))
+    monkeypatch.setattr(RenderedLabSequence, "_render_missing", lambda *_: None)
+
+
+@pytest.mark.usefixtures("_unrendered")
+def test_truth_is_in_the_world_of_the_mapping_drive() -> None:
+    mapping = RenderedLabSequence(LabSettings(), 0)
+    carried = RenderedLabSequence(LabSettings(drive=drive(6)), 0)
+    np.testing.assert_array_equal(carried.room_from_world, mapping.room_from_world)
+    np.testing.assert_allclose(mapping.ground_truth.poses[0], np.eye(4), atol=1e-12)
+    room = carried.room_from_world @ carried.ground_truth.poses
+    np.testing.assert_allclose(room, carried.room_from_camera(carried.timestamps), atol=1e-12)
+    laps = replace(drive(6), world_from="laps")
+    other = RenderedLabSequence(LabSettings(drive=laps), 0)
+    start = RenderedLabSequence(LabSettings(drive=LabDriveSettings(path="laps", frames=None)), 0)
+    np.testing.assert_array_equal(other.room_from_world, start.room_from_world)
+    assert other.identity != carried.identity
+
+
+@pytest.mark.usefixtures("_unrendered")
+def test_wheels_know_of_no_carrying() -> None:
+    carried = RenderedLabSequence(LabSettings(drive=drive(9, burst=3)), 0)
+    known = [carried.odometry(i) is not None for i in range(9)]
+    assert known == [False, True, True] * 3
+    step = carried.odometry(1)
+    assert step is not None
+    assert step.motion[0, 3] == pytest.approx(0.1, abs=0.05)
+    strided = RenderedLabSequence(LabSettings(drive=drive(9, burst=3)), 0, stride=2)
+    assert [strided.odometry(i) is not None for i in range(5)] == [False, True, False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("settings", "key"),
+    [
+        (LabSettings(), "23b8a10e304c4be44dc4"),
+        (RenderedLabSettings(start=3, stop=9, stride=2), "23b8a10e304c4be44dc4"),
+        (LabSettings(drive=LabDriveSettings(world_from="laps")), "23b8a10e304c4be44dc4"),
+        (LabSettings(visit=2), "31858c82fd4d4a0de238"),
+    ],
+    ids=["paper", "selection", "world", "visit"],
+)
+def test_what_was_rendered_before_there_were_other_places_keeps_its_name(
+    settings: LabSettings, key: str
+) -> None:
+    assert content_hash(rendered_lab._render_description(settings))[:20] == key
+
+
+def test_other_places_and_posters_are_rendered_apart() -> None:
+    drives = {"rooms": LabDriveSettings(path="tour"), "corridors": LabDriveSettings(path="tour")}
+    keys = [
+        content_hash(rendered_lab._render_description(settings))
+        for settings in (
+            LabSettings(),
+            LabSettings(posters="identical"),
+            *(LabSettings(place=name, drive=d) for name, d in drives.items()),  # type: ignore[arg-type]
+            LabSettings(drive=drive(9)),
+            LabSettings(drive=drive(9, seed=1)),
+        )
+    ]
+    assert len(set(keys)) == len(keys)
