@@ -78,6 +78,28 @@ class RelocalisationSettings:
     refined: Annotated[
         int, Field(ge=2, description="distinct best poses that are refined and compared")
     ] = 4
+    view_sigma_px: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="added to a feature's noise: seen from elsewhere it is found elsewhere, pixels",
+        ),
+    ] = 0.3
+    map_sigma_m: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="added to a landmark's: what the map's drift hides from its covariances",
+        ),
+    ] = 0.02
+    piece_m: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="landmarks in one cube of this side drift together, and belong to one thing "
+            "that may stand elsewhere, too, metres",
+        ),
+    ] = 0.5
     gate_sigmas: Annotated[
         float,
         Field(gt=0.0, description="largest normalised residual (three numbers) of an inlier"),

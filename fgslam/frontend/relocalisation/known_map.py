@@ -31,11 +31,18 @@ class KnownMap:
     index: AppearanceIndex
 
     @staticmethod
-    def of(landmarks: LandmarkMap, appearances: LandmarkAppearances) -> KnownMap:
-        """Landmarks without a view, and views without a landmark, are left out."""
+    def of(
+        landmarks: LandmarkMap, appearances: LandmarkAppearances, map_sigma_m: float = 0.0
+    ) -> KnownMap:
+        """Landmarks without a view, and views without a landmark, are left out.
+
+        ``map_sigma_m`` is added to the landmarks' noise.
+        """
         seen = np.isin(landmarks.ids, appearances.ids)
         kept = LandmarkMap(
-            landmarks.ids[seen], landmarks.positions[seen], landmarks.covariances[seen]
+            landmarks.ids[seen],
+            landmarks.positions[seen],
+            landmarks.covariances[seen] + map_sigma_m**2 * np.eye(3),
         )
         views = appearances.of(kept.ids)
         index = AppearanceIndex()

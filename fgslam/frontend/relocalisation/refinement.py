@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -69,9 +69,10 @@ class Refiner:
         least = 2 if self.floor.rigid_dof == 3 else 3
         chosen = tentative.features[:0], tentative.landmarks[:0]
         for guided in (False, True):
+            candidates = self._around(wTc) if guided else self._proposed()
             for _ in range(_ROUNDS):
                 before = chosen
-                chosen = self._choose(wTc, covariance, guided)
+                chosen = self._choose(wTc, covariance, candidates)
                 if len(chosen[0]) < least:
                     return None
                 wTc, covariance = self._solve(wTc, chosen)
@@ -82,17 +83,22 @@ class Refiner:
         return self._finish(wTc, covariance, chosen)
 
     def _choose(
-        self, wTc: FloatArray, covariance: FloatArray, guided: bool
+        self,
+        wTc: FloatArray,
+        covariance: FloatArray,
+        candidates: tuple[IntArray, IntArray, FloatArray],
     ) -> tuple[IntArray, IntArray]:
         """One-to-one matches (features, landmarks) that agree with the pose."""
-        tentative = self.evidence.tentative
-        i, j, cost = tentative.features, tentative.landmarks, tentative.distances
-        if guided:
-            i, j, cost = self._around(wTc)
+        i, j, cost = candidates
         pairs = Pairs.of(self.seen, i, self.known.landmarks, j)
         squared = squared_distances(residuals(self.rig, wTc, pairs), covariance)
         near = squared <= self.settings.gate_sigmas**2
         return _one_to_one(i[near], j[near], cost[near])
+
+    def _proposed(self) -> tuple[IntArray, IntArray, FloatArray]:
+        """The tentative matches: features, landmarks, distances."""
+        tentative = self.evidence.tentative
+        return tentative.features, tentative.landmarks, tentative.distances
 
     def _around(self, wTc: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
         """Pairs of features and landmarks in view that look alike, with their distances."""
@@ -105,17 +111,20 @@ class Refiner:
         cost, v = distance[i, column], views[column]
         looks = (self.known.views, self.known.owners)
         keep = gated(self.features, (i, v), self.known.landmarks, looks, self.floor, self.settings)
-        tentative = self.evidence.tentative
-        return (
-            np.concatenate([i[keep], tentative.features]),
-            np.concatenate([self.known.owners[v[keep]], tentative.landmarks]),
-            np.concatenate([cost[keep], tentative.distances]),
+        found = i[keep], self.known.owners[v[keep]], cost[keep]
+        features, landmarks, distances = map(
+            np.concatenate, zip(found, self._proposed(), strict=True)
         )
+        return features, landmarks, distances
 
     def _solve(
         self, wTc: FloatArray, chosen: tuple[IntArray, IntArray]
     ) -> tuple[FloatArray, FloatArray]:
+        """Least squares; landmarks of one piece of the map err together and share their say."""
         pairs = Pairs.of(self.seen, chosen[0], self.known.landmarks, chosen[1])
+        others = crowd(pairs.points, self.settings.piece_m) - 1
+        drift = others[:, None, None] * self.settings.map_sigma_m**2 * np.eye(3)
+        pairs = replace(pairs, point_covariances=pairs.point_covariances + drift)
         rows = np.zeros(len(pairs), np.int64)
         poses, covariances = refine(
             self.rig, self.floor, wTc[None], pairs, rows, _STEPS, _KERNEL_WIDTH
@@ -134,6 +143,18 @@ class Refiner:
         tentative = np.unique(self.evidence.tentative.features)
         proposed = int(np.isin(tentative, chosen[0]).sum())
         return Refined(wTc, covariance, chosen[0], chosen[1], rms, proposed, expected)
+
+
+def pieces(positions: FloatArray, side: float) -> IntArray:
+    """Number (n,) of the cube that each of the positions (n, 3) lies in, from 0."""
+    cubes = np.floor(positions / side).astype(np.int64)
+    return np.asarray(np.unique(cubes, axis=0, return_inverse=True)[1].ravel())
+
+
+def crowd(positions: FloatArray, side: float) -> IntArray:
+    """How many of the positions (n, 3) lie in the same cube as each."""
+    of = pieces(positions, side)
+    return np.asarray(np.bincount(of)[of])
 
 
 def _distances(a: ByteArray, b: ByteArray) -> FloatArray:

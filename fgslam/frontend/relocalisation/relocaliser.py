@@ -41,7 +41,7 @@ class Relocaliser:
 
     def learn(self, landmarks: LandmarkMap, appearances: LandmarkAppearances) -> None:
         """Replaces the map; landmarks without a stored view cannot be recognised: left out."""
-        self._known = KnownMap.of(landmarks, appearances)
+        self._known = KnownMap.of(landmarks, appearances, self._settings.map_sigma_m)
 
     def locate(self, features: StereoFeatures, rng: np.random.Generator) -> Relocalisation:
         """The frame's pose, or why there is none to be believed.
@@ -52,7 +52,7 @@ class Relocaliser:
             rng: draws the samples.
         """
         tentative = self.tentative(features)
-        seen = SeenPoints.of(features, self._rig)
+        seen = SeenPoints.of(features, self._rig, self._settings.view_sigma_px)
         evidence = self._evidence(seen, tentative)
         proposals = ransac.propose(evidence, self._floor, self._settings, rng)
         refined = self._refine(features, seen, evidence, proposals)

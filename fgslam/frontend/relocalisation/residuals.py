@@ -53,8 +53,12 @@ class SeenPoints:
         return len(self.in_image)
 
     @staticmethod
-    def of(features: StereoFeatures, rig: CameraRig) -> SeenPoints:
-        """The features of a frame, or of a submap in its last camera's frame."""
+    def of(features: StereoFeatures, rig: CameraRig, view_sigma_px: float = 0.0) -> SeenPoints:
+        """The features of a frame, or of a submap in its last camera's frame.
+
+        ``view_sigma_px`` is added to the noise of columns and rows: a corner seen from elsewhere is
+        found elsewhere. It is so by the same in all images of the rig: disparities keep theirs.
+        """
         column, row, disparity = features.measurement.T
         inside = (column >= -0.5) & (column <= rig.width - 0.5)
         inside &= (row >= -0.5) & (row <= rig.height - 0.5)
@@ -64,7 +68,9 @@ class SeenPoints:
             in_image=inside,
             value=np.where(inside[:, None], features.measurement, features.position),
             covariance=np.where(
-                pick, features.measurement_covariance, features.position_covariance
+                pick,
+                features.measurement_covariance + view_sigma_px**2 * np.diag([1.0, 1.0, 0.0]),
+                features.position_covariance,
             ),
             position=features.position,
             position_covariance=features.position_covariance,
