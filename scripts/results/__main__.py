@@ -8,7 +8,17 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from fgslam.errors import FgslamError
-from scripts.results import chess, noise, paper_loop, paper_views, person, real, seeds, variants
+from scripts.results import (
+    chess,
+    lasting,
+    noise,
+    paper_loop,
+    paper_views,
+    person,
+    real,
+    seeds,
+    variants,
+)
 from scripts.results.report import Table, write_json
 from scripts.results.runs import DATA, say
 
@@ -21,6 +31,7 @@ WHAT: dict[str, Callable[[Path], Iterable[Table]]] = {
     "paired": lambda data: [variants.paired_table()],
     "real": lambda data: [real.table(data)],
     "noise": lambda data: noise.tables(),
+    "lasting": lambda data: lasting.tables(),
 }
 
 
