@@ -35,14 +35,24 @@ def take_over(estimator: Estimator, arrival: Arrival) -> None:
         ConfigError: it cannot begin in a saved map, or cannot leave one as it is.
         EstimatorError: the map is too large for it.
     """
+    user = require_map_user(estimator, arrival.extends)
+    user.begin_in(arrival.saved.landmarks, arrival.saved.hits, fixed=not arrival.extends)
+
+
+def require_map_user(estimator: Estimator, extends: bool) -> MapUser:
+    """The estimator, if it can begin in a saved map, and leave it as it is unless it ``extends``.
+
+    Raises:
+        ConfigError: it cannot.
+    """
     if not isinstance(estimator, MapUser):
         raise ConfigError(
             f"estimator.kind {estimator.kind} cannot begin in a saved map; use landmark_kalman, "
             "ekf, isam2 or batch"
         )
-    if not arrival.extends and not estimator.keeps_maps:
+    if not extends and not estimator.keeps_maps:
         raise ConfigError(
             f"estimator.kind {estimator.kind} cannot leave a map as it is; use landmark_kalman or "
             "ekf, or map.extend true"
         )
-    estimator.begin_in(arrival.saved.landmarks, arrival.saved.hits, fixed=not arrival.extends)
+    return estimator

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -57,8 +58,18 @@ def run(
     resume: Annotated[
         bool, typer.Option("--resume", help="continue an interrupted run to the same bytes")
     ] = False,
+    map_in: Annotated[
+        Path | None,
+        typer.Option("--map-in", metavar="MAP", help="saved map to go on with; sets map.load"),
+    ] = None,
+    map_out: Annotated[
+        Path | None,
+        typer.Option("--map-out", metavar="MAP", help="where to save the map; sets map.save"),
+    ] = None,
 ) -> None:
     """Run an experiment: images in, run folder out; measurements without images, homing, too.
+
+    With --map-in it begins in a saved map: map.start says where, map.extend whether it changes it.
 
     Ctrl-C ends it early with all files valid; --resume goes on from there.
     """
@@ -68,7 +79,9 @@ def run(
 
     if overwrite and resume:
         raise ConfigError("--overwrite and --resume exclude each other; give one of them")
-    settings = load_experiment(config, overrides or ())
+    maps = {"load": map_in, "save": map_out}
+    given = [f"map.{key}={json.dumps(str(path))}" for key, path in maps.items() if path]
+    settings = load_experiment(config, [*(overrides or ()), *given])
     folder = out or Path("runs") / settings.name
     existing: ExistingFolder = "resume" if resume else "overwrite" if overwrite else "refuse"
     if isinstance(settings, HomingExperiment):
@@ -299,7 +312,9 @@ def _check_baseline(expected: dict[str, Any], results: Results) -> bool:
 
 @app.command()
 def export(
-    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="a run folder")],
+    run_folder: Annotated[
+        Path, typer.Argument(metavar="RUN|MAP", help="a run folder, or a saved map")
+    ],
     map_file: Annotated[
         Path | None, typer.Option("--map", help="landmarks as .ply, .pcd or .off (Geomview)")
     ] = None,
@@ -315,7 +330,10 @@ def export(
         bool, typer.Option("--valid-only", help="landmarks seen in at least three frames")
     ] = False,
 ) -> None:
-    """Hand a run's map, trajectory and measurements to other tools."""
+    """Hand a run's map, trajectory and measurements to other tools; or those of a saved map.
+
+    Of a saved map alone it says what is in it.
+    """
     from fgslam.runs.exporting import export_run
 
     for line in export_run(run_folder, map_file, trajectory, estimator, valid_only, graph):

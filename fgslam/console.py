@@ -64,6 +64,8 @@ def show_result(result: RunResult, resume: str) -> None:
     # Paths are printed plain, so that they can be copied whatever the terminal's width.
     console.out(f"trajectory  {folder / title / 'final.tum'}")
     console.out(f"map         {folder / title / 'map.ply'}")
+    if result.about_map:
+        console.out(f"saved map   {result.about_map}")
     if result.pictures:
         console.out(f"pictures    {result.pictures[0].parent}{'/'}")
     console.out(f"metrics     {folder / 'metrics.json'}")
@@ -101,7 +103,8 @@ def _table(result: RunResult) -> Table:
 def _remarks(result: RunResult) -> list[str]:
     """What was tolerated: notes on the recording, and frames that could not be used."""
     problems = frame_problems(result.outputs.recorder)
-    lines = [*result.outputs.sequence.notes, *problems[:_PROBLEMS_SHOWN]]
+    outputs = result.outputs
+    lines = [*outputs.sequence.notes, *outputs.notes, *problems[:_PROBLEMS_SHOWN]]
     if len(problems) > _PROBLEMS_SHOWN:
         lines.append(f"and {len(problems) - _PROBLEMS_SHOWN} more such frames, see metrics.json")
     if not result.metrics.landmarks:

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fgslam.arrival import require_map_user
 from fgslam.config import ExperimentConfig, load_config
 from fgslam.errors import ConfigError, DatasetError, MapError
 from fgslam.export.atomic import RUN_MARKER, ExistingFolder, create_run_folder
-from fgslam.factory import make_pipeline, open_sequence
+from fgslam.factory import make_estimator, make_pipeline, open_sequence
 from fgslam.measurement_log import MeasurementLog
 from fgslam.recordings import Sequence
 from fgslam.runs import checkpoint, mapping
@@ -31,6 +32,7 @@ class OpenedRun:
     Attributes:
         config: as given; ``opened`` is what its recording was opened with.
         given: the map to go on with; None without one, or while it is still to be made.
+        entry: how the run enters it; None where it does not, or that is not yet known.
         resumed: the folder holds a state to go on from.
     """
 
@@ -39,6 +41,7 @@ class OpenedRun:
     folder: Path
     sequence: Sequence
     given: GivenMap | None
+    entry: Entry | None
     resumed: bool
 
     @property
@@ -76,14 +79,17 @@ def open_run(
         opened = mapping.window(config, given)
     sequence = open_sequence(opened, lambda done, total: progress("rendering", done, total))
     _require_odometry(config, sequence)
+    if config.map.given and config.map.start != "continue":
+        estimator = make_estimator(sequence.rig, config.estimator, config.frontend.ego_motion)
+        require_map_user(estimator, config.map.extend)
+    resumed = existing == "resume" and checkpoint.exists(folder)
+    run = OpenedRun(config, opened, folder, sequence, given, None, resumed)
+    run = dataclasses.replace(run, entry=_entry(run, given))
     create_run_folder(folder, existing)
-    run = OpenedRun(
-        config, opened, folder, sequence, given, existing == "resume" and checkpoint.exists(folder)
-    )
     if existing == "resume":
         _require_same_ground(sequence, folder)
     else:
-        _write_config(run, None)
+        _write_config(run)
     return run
 
 
@@ -93,41 +99,45 @@ def begin(run: OpenedRun, progress: Progress) -> BegunRun:
     Raises:
         FgslamError: of any kind, with a message for the user.
     """
-    path = mapping.map_path(run.config.map, run.folder)
-    given = run.given if path is None or run.given is not None else mapping.open_map(path)
-    entry = None if given is None or run.goes_on else _entry(run, given)
-    opened, sequence = run.opened, run.sequence
+    config = run.config
+    if config.map.made_from is not None:
+        made = mapping.open_map(run.folder / mapping.FIRST_FOLDER / mapping.MAP_FILE)
+        run = dataclasses.replace(run, given=made, entry=_entry(run, made))
+        _write_config(run)
+    given, entry, sequence, opened = run.given, run.entry, run.sequence, run.opened
     if entry is not None and entry.frames_before:
         opened = _later(opened, entry.frames_before)
         sequence = open_sequence(opened, lambda done, total: progress("rendering", done, total))
-    arrival = None if entry is None or given is None else entry.arrival(given, run.config.map)
-    config = run.config
+    arrival, notes = None, tuple[str, ...]()
+    if entry is not None and given is not None:
+        arrival, notes = entry.arrival(given, config.map), entry.notes(given, config.map)
     pipeline = make_pipeline(
         sequence, config.frontend, config.odometry, config.estimator, config.seed, arrival
     )
     recorder = RunRecorder(MeasurementLog(sequence.rig, pipeline.motion.description()))
-    notes = () if entry is None or given is None else entry.notes(given, config.map)
     first_frame = opened.dataset.start
     outputs = RunOutputs(run.folder, config, sequence, pipeline, recorder, first_frame, notes)
     if run.resumed:
         checkpoint.load(run.folder, pipeline, recorder)
     elif given is not None and run.goes_on:
-        mapping.go_on(given, sequence, pipeline, recorder)
+        mapping.go_on(given, pipeline, recorder)
     return BegunRun(outputs, given)
 
 
-def _entry(run: OpenedRun, given: GivenMap) -> Entry:
+def _entry(run: OpenedRun, given: GivenMap | None) -> Entry | None:
     """How the run enters the map; on resuming, how it did."""
+    if given is None:
+        return None
+    if run.goes_on:
+        mapping.require_continuable(given, run.sequence)
+        return None
     known = mapping.entry_of(run.folder) if run.resumed else None
     if known is not None and known.identity != given.identity:
         raise MapError(
             f"{given.path}: the map has changed since the run began; restore it, or start again "
             "with --overwrite"
         )
-    entry = known or mapping.enter(run.config, given, run.sequence)
-    if known is None:
-        _write_config(run, entry)
-    return entry
+    return known or mapping.enter(run.config, given, run.sequence)
 
 
 def _later(config: ExperimentConfig, frames: int) -> ExperimentConfig:
@@ -136,13 +146,13 @@ def _later(config: ExperimentConfig, frames: int) -> ExperimentConfig:
     return config.model_copy(update={"dataset": dataclasses.replace(config.dataset, start=start)})
 
 
-def _write_config(run: OpenedRun, entry: Entry | None) -> None:
+def _write_config(run: OpenedRun) -> None:
     """The resolved configuration with what it takes to repeat the run."""
     provenance: dict[str, Any] = {
         "dataset": {"name": run.sequence.name, "identity": run.sequence.identity}
     }
-    if entry is not None:
-        provenance["map"] = entry.as_values()
+    if run.entry is not None:
+        provenance["map"] = run.entry.as_values()
     write_config(run.folder, run.config, provenance)
 
 

@@ -12,6 +12,7 @@ from fgslam.export.trajectories import read_tum, write_trajectory
 from fgslam.homing_config import is_homing
 from fgslam.runs.checkpoint import LOG_FILE
 from fgslam.runs.graph_export import export_graph
+from fgslam.runs.map_export import export_map
 
 
 def export_run(
@@ -24,9 +25,18 @@ def export_run(
 ) -> list[str]:
     """Writes what was asked for; returns a line about each file.
 
+    Of a saved map in place of a run, it says what is in it where nothing is asked for.
+
     Raises:
         FgslamError: nothing asked for, no run there, or an ending that is not known.
     """
+    if run.is_file():
+        if estimator is not None or graph_file is not None:
+            raise ConfigError(
+                f"{run}: a saved map has landmarks and a trajectory, no other estimators and no "
+                "graph; give --map or --trajectory, or a run folder"
+            )
+        return export_map(run, map_file, trajectory_file, valid_only)
     targets = (map_file, trajectory_file, graph_file)
     if targets == (None, None, None):
         raise ConfigError(

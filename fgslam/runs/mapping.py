@@ -13,8 +13,8 @@ import numpy as np
 
 from fgslam import __version__
 from fgslam.arrival import Arrival
-from fgslam.config import ExperimentConfig, load_config
-from fgslam.errors import MapError, MeasurementLogError
+from fgslam.config import ExperimentConfig, load_config, parse_config
+from fgslam.errors import ConfigError, MapError, MeasurementLogError
 from fgslam.export.atomic import RUN_MARKER, is_run_folder
 from fgslam.factory import make_relocaliser, make_stereo_matcher, make_stream
 from fgslam.map_file import SavedMap, load_map, require_rig, save_map
@@ -125,13 +125,6 @@ def first_config(config: ExperimentConfig, folder: Path) -> ExperimentConfig | N
     )
 
 
-def map_path(settings: MapSettings, run: Path) -> Path | None:
-    """File of the map that a run in folder ``run`` is given; None where it starts without."""
-    if settings.made_from is not None:
-        return run / FIRST_FOLDER / MAP_FILE
-    return None if settings.load is None else Path(settings.load)
-
-
 def open_map(path: Path) -> GivenMap:
     """Reads a map. Raises MapError where it is not one."""
     saved = load_map(path)
@@ -240,7 +233,7 @@ def window(config: ExperimentConfig, given: GivenMap) -> ExperimentConfig:
             f"{where}: was saved without its session, so no run can go on with it; save with "
             "map.session true, or use map.start last"
         )
-    now, then = config.as_values(), drive["settings"]
+    now, then = config.as_values(), _settings_of(drive, where)
     for name in _SAME_SETTINGS:
         if now[name] != then[name]:
             raise MapError(
@@ -264,18 +257,18 @@ def window(config: ExperimentConfig, given: GivenMap) -> ExperimentConfig:
     return config.model_copy(update={"dataset": dataset})
 
 
-def go_on(
-    given: GivenMap, sequence: Sequence, pipeline: SlamPipeline, recorder: RunRecorder
-) -> None:
-    """Takes the session up where it stopped.
+def require_continuable(given: GivenMap, sequence: Sequence) -> None:
+    """Refuses a session of another recording, of another fgslam, or with nothing left to do.
 
     Raises:
-        MapError: the recording or the packages are not those of the session.
+        MapError: which it is.
     """
-    saved, where = given.saved, str(given.path)
+    saved, where, drive = given.saved, str(given.path), _last_drive(given.saved)
     require_rig(saved, sequence.rig, where)
-    drive = _last_drive(saved)
-    if drive["recording"]["identity"] != sequence.identity:
+    done = drive["frames"]
+    same = drive["recording"]["identity"] == sequence.identity
+    stamps = saved.session.get(f"{_LOG}timestamp", np.empty(0))
+    if not same or not np.array_equal(sequence.timestamps[:done], stamps):
         raise MapError(
             f"{where}: was made of another recording than {sequence.name}, or it has changed; "
             "map.start continue needs the same one, map.start last does not"
@@ -285,26 +278,35 @@ def go_on(
             f"{where}: its session is of fgslam {drive['fgslam']}, this is {__version__}; use "
             "that one, or map.start last"
         )
-    state = {name: a for name, a in saved.session.items() if not name.startswith(_LOG)}
-    logged = {
-        name.removeprefix(_LOG): a for name, a in saved.session.items() if name.startswith(_LOG)
-    }
-    try:
-        log = MeasurementLog.from_arrays(logged, where)
-        checkpoint.restore(state, log, pipeline, recorder)
-    except (KeyError, ValueError, IndexError, MeasurementLogError) as error:
-        raise MapError(
-            f"{where}: its session is not one that this fgslam wrote ({error}); use map.start last"
-        ) from None
-    done = len(recorder)
-    stamps = np.array([increment.timestamp for increment in recorder.log])
-    if not np.array_equal(sequence.timestamps[:done], stamps):
-        raise MapError(f"{where}: its frames are not the first ones of {sequence.name}")
     if done >= len(sequence):
         raise MapError(
             f"{where}: its run had all {done} frames up to dataset.stop already; nothing is left "
             "to go on with"
         )
+
+
+def go_on(given: GivenMap, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
+    """Takes the session up where it stopped. Raises MapError where its arrays do not fit."""
+    session, where = given.saved.session, str(given.path)
+    logged = {n.removeprefix(_LOG): a for n, a in session.items() if n.startswith(_LOG)}
+    try:
+        log = MeasurementLog.from_arrays(logged, where)
+        checkpoint.restore(session, log, pipeline, recorder)
+    except (KeyError, ValueError, IndexError, MeasurementLogError) as error:
+        raise MapError(
+            f"{where}: its session is not one that this fgslam wrote ({error}); use map.start last"
+        ) from None
+
+
+def _settings_of(drive: dict[str, Any], where: str) -> dict[str, Any]:
+    """A drive's settings, with the defaults of keys that are newer than it."""
+    try:
+        return parse_config({"name": drive["name"], **drive["settings"]}, where).as_values()
+    except ConfigError as error:
+        raise MapError(
+            f"{where}: its run had settings that this fgslam does not know ({error}); use "
+            "map.start last"
+        ) from None
 
 
 def _last_drive(saved: SavedMap) -> dict[str, Any]:
@@ -366,6 +368,7 @@ def _drive(outputs: RunOutputs, estimate: Estimate) -> dict[str, Any]:
         "frames": len(outputs.recorder),
         "estimator": outputs.pipeline.estimator.kind,
         "valid_hits": config.frontend.database.valid_hits,
+        "remark": outputs.remark,
         "remarks": list(estimate.remarks),
         "settings": settings,
     }
