@@ -154,9 +154,9 @@ class _Book:
         off = np.eye(4) if lie is None else g.se3_exp(np.array(lie))
         which = np.flatnonzero(again)
         sigma = np.array(self._drive.sigma_px)
-        fresh = g.project(
-            self._drive.rig, g.transform_to_camera(self._poses[k], self._points[which])
-        )
+        local = g.transform_to_camera(self._poses[frame] @ true @ off, self._points[which])
+        which, local = which[local[:, 2] > 0.2], local[local[:, 2] > 0.2]
+        fresh = g.project(self._drive.rig, local)
         fresh = fresh + self._drive.noise * sigma * rng.standard_normal(fresh.shape)
         old = observations(self._old_id[which], fresh, sigma, np.zeros(len(which), np.bool_))
         merged = np.column_stack([self._id[which], self._old_id[which]])

@@ -6,20 +6,25 @@ import dataclasses
 from typing import Any, ClassVar
 
 import gtsam
+import numpy as np
 
-from fgslam.backend.graph_solution import Solution, solution
-from fgslam.backend.outliers import graduated, solver_parameters, trimmed
+from fgslam.backend.graph_solution import Solution, allowed_parts, poses_of_frame, solution
+from fgslam.backend.loop_closing import solved
+from fgslam.backend.outliers import graduated, solver_parameters, trimmed, with_kernel
 from fgslam.backend.refinement import Refined, refine
 from fgslam.backend.segments import TrackedFrame
-from fgslam.backend.smoother import Smoother
+from fgslam.backend.submaps import Constraint
+from fgslam.backend.whole_graph import WholeGraphSmoother
+from fgslam.factors.keys import pose_key
 from fgslam.floor import Floor
+from fgslam.geometry import reorthonormalise
 from fgslam.settings.backend import BatchSettings, KernelSettings
 from fgslam.types import Prediction, Sensor
 
 _RELATIVE_TOLERANCE = 1e-9  # of the cost; the estimate then moves by less than a micrometre
 
 
-class BatchSmoother(Smoother):
+class BatchSmoother(WholeGraphSmoother):
     """Estimator of kind ``batch``, on :class:`fgslam.backend.protocol.Estimator`."""
 
     kind: ClassVar[str] = "batch"
@@ -44,6 +49,27 @@ class BatchSmoother(Smoother):
             self._values.update(self._refined_graph().values)
             last = Prediction(answer.poses[-1], answer.pose_covariances[-1])
             self._take_over(self._values, last)
+
+    def _loop_graph(self) -> Any:
+        graph = super()._loop_graph()
+        return with_kernel(graph) if self._settings.method == "gnc" else graph
+
+    def _values_now(self) -> Any:
+        return self._values
+
+    def _solved_before(self, graph: Any) -> Any:
+        return solved(graph, self._values)
+
+    def _join(self, known: Constraint, found: Any | None) -> None:
+        """Tracks on from the solution; where nothing moves, the next one takes the loop in."""
+        if found is None:
+            return
+        self._values = found
+        last, graph = self._builder.frames[-1], self._loop_graph()
+        here = reorthonormalise(poses_of_frame(found, last))
+        covariance = np.asarray(gtsam.Marginals(graph, found).marginalCovariance(pose_key(last)))
+        covariance = allowed_parts(self._floor, here[None], covariance[None])[0]
+        self._take_over(found, Prediction(here, covariance), whole=True)
 
     def _solve(self) -> Solution:
         return solution(self._refined_graph(), self._builder.frames, self._floor)

@@ -10,13 +10,16 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
+from scipy.stats import chi2
 
 from fgslam.backend.ekf_update import (
     Correction,
     DivergedError,
     FloorMeasurement,
     Matches,
+    Sightings,
     correct,
+    correct_anew,
 )
 from fgslam.backend.filtered import FilteredTrajectory, FirstSights
 from fgslam.backend.growing_covariance import BLOCK, FRONT, GrowingCovariance, rows_of
@@ -41,13 +44,18 @@ from fgslam.types import (
     Increment,
     IntArray,
     LandmarkMap,
+    LoopClosure,
     MeasurementType,
+    Observations,
     Odometry,
     Prediction,
     Sensor,
     StateArrays,
     UpdateStats,
 )
+
+_UNKNOWN = 100.0  # by which a pose found without a prior is less certain before its landmarks count
+_ADMITTED = 0.999  # quantile of an innovation squared beyond which the covariance is contradicted
 
 
 class FullEkf:
@@ -73,6 +81,7 @@ class FullEkf:
         self._positions: FloatArray = np.empty((0, 3))
         self._past = FilteredTrajectory()
         self._matched = self._gated = self._skipped = 0
+        self._remarks: list[str] = []
         self._map: LandmarkMap | None = None
         self._fixed = False
 
@@ -107,21 +116,33 @@ class FullEkf:
     ) -> UpdateStats:
         """Predicts, corrects by all matches at once, drops the pruned, adds the new.
 
-        ``tracking`` is not used. Raises EstimatorError where time does not increase, the map
-        outgrows `max_landmarks`, a number is not finite, or the covariance loses its
-        definiteness; the state is then as before.
+        ``tracking`` is used only of a frame that was found without a prior: it says where to
+        linearise, and which matches hold. A loop closure is a further correction, by the old
+        landmarks that the frame sees; correlations take the map along, past poses stay. Raises
+        EstimatorError where time does not increase, the map outgrows `max_landmarks`, a number is
+        not finite, or the covariance loses its definiteness; the state is then as before.
         """
-        motion = self._past.motion_to(increment, motion)
+        if increment.relocalised:
+            self._past.require_later(increment)
+        else:
+            motion = self._past.motion_to(increment, motion)
         first = self._first_sights(increment)
         self._require_room(increment, len(first.points))
         self._require_finite(increment, motion)
-        wTc, front = self._moved(motion)
-        found = self._correction(increment, wTc, front)
+        seen = increment.observations
+        if increment.relocalised:
+            wTc, front = self._set_down(tracking)
+            seen = seen.select(np.flatnonzero(~seen.is_new)[tracking.inliers])
+        else:
+            wTc, front = self._moved(motion)
+        found = self._correction(increment, seen, wTc, front)
         found = found.of_the_pose_alone() if self._fixed else found
         # Nothing below can fail.
         self._take_over(found, wTc, front)
         used = found.matched + len(first.points)
         self._skipped += len(increment.observations) - used
+        for loop in increment.loops:
+            self._close(increment, loop)
         self._drop(increment)
         self._add(first)
         current = Prediction(self._wTc, self._covariance.front()[:FRONT])
@@ -146,7 +167,7 @@ class FullEkf:
             self._past.trajectory(),
             self._past.pose_covariances(),
             self.landmarks(),
-            tuple(remarks),
+            (*remarks, *self._remarks),
         )
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
@@ -166,6 +187,7 @@ class FullEkf:
             "ids": self._ids,
             "positions": self._positions,
             "counts": np.array([self._matched, self._gated, self._skipped]),
+            "remarks": np.array(self._remarks, np.str_),
         }
 
     def restore(self, state: StateArrays) -> None:
@@ -175,6 +197,7 @@ class FullEkf:
         self._covariance = GrowingCovariance.unpacked(state["covariance"])
         self._ids, self._positions = state["ids"], state["positions"]
         self._matched, self._gated, self._skipped = state["counts"].tolist()
+        self._remarks = [str(words) for words in state["remarks"]]
         self._map = None
 
     # -- what may fail, before anything is changed ---------------------------------------------
@@ -231,8 +254,17 @@ class FullEkf:
         front[:FRONT] = congruence(transition, front[:FRONT]) + 0.5 * (noise + noise.T)
         return wTc, front
 
-    def _correction(self, increment: Increment, wTc: FloatArray, front: FloatArray) -> Correction:
-        seen = increment.observations
+    def _set_down(self, tracking: EgoMotion) -> tuple[FloatArray, FloatArray]:
+        """The pose where tracking found it, all but unknown: neither odometry nor past know it."""
+        wTc = self._floor.constrain(tracking.wTc) if self._floor.rigid_dof < 6 else tracking.wTc
+        front = np.zeros_like(self._covariance.front())
+        unknown = _UNKNOWN**2 * tracking.covariance
+        front[:FRONT] = self._floor.allowed_part(wTc, 0.5 * (unknown + unknown.T))
+        return wTc, front
+
+    def _correction(
+        self, increment: Increment, seen: Observations, wTc: FloatArray, front: FloatArray
+    ) -> Correction:
         seen = seen.select(np.isin(seen.ids, self._ids))
         blocks = self._blocks(seen.ids)
         matches = Matches.of(self._sensor, wTc, blocks, self._positions[blocks], seen)
@@ -245,9 +277,38 @@ class FullEkf:
                 "linearises anew, or state the odometry's and the measurements' noise larger"
             ) from None
 
+    def _close(self, increment: Increment, loop: LoopClosure) -> None:
+        """Corrects by the old landmarks seen again; refused where the covariance rules it out."""
+        what = f"frame {increment.index}: loop closure to frame {loop.frame} of the log"
+        seen = loop.observations.select(np.isin(loop.observations.ids, self._ids))
+        if not len(seen):
+            self._remarks.append(f"{what} left out: none of its landmarks is held any more")
+            return
+        blocks, at = self._blocks(seen.ids), self._positions
+        again = Sightings(self._sensor, blocks, at[blocks], seen, self._retracted, self._fixed)
+        try:
+            found = correct_anew(self._covariance, self._wTc, again)
+        except DivergedError as cause:
+            self._remarks.append(f"{what} left out: {cause}")
+            return
+        excess, gate = found.nis - found.nis_dof, self._settings.loop_gate_sigmas
+        said = f"(innovation squared {found.nis:.0f}, {found.nis_dof} expected)"
+        if gate > 0.0 and not excess <= gate**2:
+            self._remarks.append(f"{what} refused: the covariance does not admit it {said}")
+            return
+        admitted = found.nis <= chi2.ppf(_ADMITTED, found.nis_dof)
+        though = "" if admitted else ", though the covariance does not admit it"
+        self._remarks.append(f"{what} taken{though} {said}")
+        self._apply(found, self._wTc, self._covariance.front())
+
     # -- the change itself ---------------------------------------------------------------------
 
     def _take_over(self, found: Correction, wTc: FloatArray, front: FloatArray) -> None:
+        self._apply(found, wTc, front)
+        self._matched += found.matched
+        self._gated += found.matched - found.nis_dof // BLOCK
+
+    def _apply(self, found: Correction, wTc: FloatArray, front: FloatArray) -> None:
         self._covariance.set_front(front)
         if found.gain.shape[1]:
             self._covariance.subtract(found.gain, found.half)
@@ -255,21 +316,25 @@ class FullEkf:
             wTc = self._retract(wTc, found.step[:FRONT])
         self._wTc = reorthonormalise(wTc)
         self._map = None
-        self._matched += found.matched
-        self._gated += found.matched - found.nis_dof // BLOCK
 
     def _retract(self, wTc: FloatArray, step: FloatArray) -> FloatArray:
         """The corrected pose; on a hard floor the errors' horizontal and vertical stay such."""
+        moved = self._retracted(wTc, step)
         if self._floor.rigid_dof == 6:
-            return wTc @ se3_exp(step)
-        moved = pose(wTc[:3, :3] @ so3_exp(step[:3]), wTc[:3, 3] + wTc[:3, :3] @ step[3:])
-        moved = self._floor.constrain(moved)
+            return moved
         carry = self._floor.basis(moved) @ self._floor.basis(wTc).T
         front = self._covariance.front()
         front[FRONT:] = front[FRONT:] @ carry.T
         front[:FRONT] = congruence(carry, front[:FRONT])
         self._covariance.set_front(front)
         return moved
+
+    def _retracted(self, wTc: FloatArray, step: FloatArray) -> FloatArray:
+        """The pose moved by a step (6,), on a hard floor."""
+        if self._floor.rigid_dof == 6:
+            return wTc @ se3_exp(step)
+        moved = pose(wTc[:3, :3] @ so3_exp(step[:3]), wTc[:3, 3] + wTc[:3, :3] @ step[3:])
+        return self._floor.constrain(moved)
 
     def _drop(self, increment: Increment) -> None:
         gone = np.flatnonzero(np.isin(self._ids, increment.pruned_ids))

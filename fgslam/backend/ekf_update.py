@@ -6,6 +6,7 @@ measurement the gain costs ``n m^2``, the covariance's update ``n^2 m``.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +26,8 @@ from fgslam.geometry import (
 )
 from fgslam.types import BoolArray, FloatArray, IntArray, Observations, Sensor
 
+_ITERATIONS = 30
+_SETTLED = 1e-5  # radians and metres: far below what any measurement tells
 _NEGATIVE = 1e-10  # of the largest variance: rounding of a pose covariance that is singular
 
 
@@ -185,6 +188,64 @@ def correct(
     )
     nis = float(whitened @ whitened) if count else float("nan")
     return Correction(step, gain, half, nis, count, len(matches))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """Known landmarks as one frame measures them, and how a step moves the pose.
+
+    Attributes:
+        sensor: that measured.
+        blocks: (k,) landmark blocks of the covariance.
+        positions: (k, 3) of the landmarks, before the correction.
+        observed: their measurements.
+        retract: from a pose and a step (6,) to the pose moved by it.
+        fixed: landmarks are not to change.
+    """
+
+    sensor: Sensor
+    blocks: IntArray
+    positions: FloatArray
+    observed: Observations
+    retract: Callable[[FloatArray, FloatArray], FloatArray]
+    fixed: bool
+
+    def matches(self, wTc: FloatArray, step: FloatArray) -> Matches:
+        """Linearised where ``step`` (n,) leads, the innovation as of the state before it."""
+        moved = step[FRONT:].reshape(-1, 3)[self.blocks]
+        there = self.retract(wTc, step[:FRONT])
+        found = Matches.of(
+            self.sensor, there, np.arange(len(moved)), self.positions + moved, self.observed
+        )
+        since = found.by_pose @ step[:FRONT]
+        since += np.einsum("kij,kj->ki", found.by_landmark, moved[found.blocks])
+        blocks = self.blocks[found.blocks]
+        return replace(found, blocks=blocks, innovation=found.innovation + since)
+
+
+def correct_anew(
+    covariance: GrowingCovariance, wTc: FloatArray, sightings: Sightings
+) -> Correction:
+    """One correction by all sightings, linearised at its own result: the innovation is large.
+
+    The iterated Kalman filter (Bell and Cathey 1993), Gauss-Newton on state and measurement at
+    once; without gate and floor.
+
+    Raises:
+        DivergedError: as :func:`correct`, or it does not settle.
+    """
+    front = covariance.front()
+    step = np.zeros(len(front))
+    nowhere = FloorMeasurement(np.empty(0), np.empty((0, FRONT)), np.empty(0))
+    for _ in range(_ITERATIONS):
+        found = correct(covariance, front, sightings.matches(wTc, step), nowhere, gate_sigmas=0.0)
+        if sightings.fixed:
+            found = found.of_the_pose_alone()
+        change = float(np.abs(found.step - step).max())
+        if change < _SETTLED:
+            return found
+        step = found.step
+    raise DivergedError(f"the correction does not settle ({change:.2g} after {_ITERATIONS} steps)")
 
 
 def _with_landmarks(

@@ -22,16 +22,28 @@ from fgslam.backend.graph_solution import (
     poses_of_frame,
     suspect,
 )
+from fgslam.backend.loop_closing import loop_factor
 from fgslam.backend.marginals import DenseMarginals, UndeterminedError
 from fgslam.backend.segments import TrackedFrame
 from fgslam.backend.smoother import Smoother
+from fgslam.backend.submaps import Constraint, nearest_positive
 from fgslam.errors import EstimatorError
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 from fgslam.factors.motion import pose_prior
 from fgslam.floor import Floor
-from fgslam.geometry import congruence, point_pose_jacobian, transform_to_camera
+from fgslam.geometry import (
+    adjoint,
+    congruence,
+    inverse,
+    point_pose_jacobian,
+    reorthonormalise,
+    se3_exp,
+    se3_log,
+    transform_to_camera,
+    transform_to_world,
+)
 from fgslam.settings.backend import FixedLagSettings
-from fgslam.types import FloatArray, Prediction, Sensor
+from fgslam.types import FloatArray, LoopClosure, Prediction, Sensor
 
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
 
@@ -54,6 +66,7 @@ class FixedLagSmoother(Smoother):
         super().__init__(sensor, settings, floor, prior, remember=False)
         self._in_seconds = settings.lag_frames is None
         self._lag = float(settings.lag_frames or settings.lag_s or 0.0)
+        self._loop_gate = settings.loops.gate_sigmas
         self._relinearize = settings.relinearize_threshold
         self._solver = self._new_solver()
         self._values = gtsam.Values()
@@ -77,6 +90,66 @@ class FixedLagSmoother(Smoother):
         for frame in {self._oldest, new.frame}:  # the one that leaves next, and the last one
             self._covariances[frame] = self._covariance(marginals, frame)
         self._take_over(self._values, Prediction(self._poses[-1], self._covariances[-1]))
+
+    def _close(self, loop: LoopClosure, where: str) -> None:
+        """Moves the window as a whole to where the loop has the last pose; the past stays.
+
+        The earlier frame's pose is known as it was when it left. What the last pose is less certain
+        by than that one is drift, and the loop measures the drift: a Kalman correction of one pose,
+        after which the window is solved anew from there.
+        """
+        known = self._between(loop)
+        if known.before >= self._oldest:  # both poses are variables
+            self._recent[-1].graph.add(loop_factor(known))
+            self._rebuild(gtsam.Values(self._values))
+        else:
+            moved = self._drift_undone(known, f"{where}: loop closure to frame {loop.frame}")
+            if moved is None:
+                return
+            self._move_all(moved)
+        last, marginals = known.after, self._marginals()
+        for frame in range(self._oldest, last + 1):
+            self._poses[frame] = poses_of_frame(self._values, frame)
+        self._covariances[last] = self._covariance(marginals, last)
+        self._take_over(self._values, Prediction(self._poses[last], self._covariances[last]))
+
+    def _drift_undone(self, known: Constraint, what: str) -> Prediction | None:
+        """The last pose by the loop; None, and a remark, where the loop is refused."""
+        wTo, wTc = self._poses[known.before], self._poses[known.after]
+        carried = adjoint(inverse(known.motion))
+        shared = congruence(carried, self._covariances[known.before])
+        drift = nearest_positive(self._covariances[known.after] - shared)
+        off = se3_log(inverse(wTc) @ wTo @ known.motion)
+        innovation = drift + known.covariance
+        gain = np.linalg.solve(innovation, drift).T
+        squared, gate = float(off @ np.linalg.solve(innovation, off)), self._loop_gate
+        if gate > 0.0 and not squared <= gate**2:
+            self._remarks.append(
+                f"{what} of the log refused: {np.sqrt(squared):.1f} standard deviations off, "
+                f"{gate:g} allowed"
+            )
+            return None
+        target = self._floor.constrain(wTc @ se3_exp(gain @ off))
+        covariance = shared + nearest_positive(drift - gain @ drift)
+        shift = float(np.linalg.norm(target[:3, 3] - wTc[:3, 3]))
+        self._remarks.append(
+            f"{what} of the log: the camera moved by {shift:.2f} m, and what lies within the lag"
+        )
+        return Prediction(target, self._floor.allowed_part(target, covariance))
+
+    def _move_all(self, last: Prediction) -> None:
+        """Takes the window along with its last pose, as it is, and starts from there."""
+        moved, values = last.wTc @ inverse(self._poses[-1]), gtsam.Values(self._values)
+        for key in list(values.keys()):
+            if is_pose(key):
+                pose = reorthonormalise(moved @ poses_of_frame(values, number(key)))
+                values.update(key, gtsam.Pose3(pose))
+                self._poses[number(key)] = pose
+            else:
+                values.update(key, transform_to_world(moved, values.atPoint3(key)[None])[0])
+        to_oldest = adjoint(inverse(self._poses[self._oldest]) @ last.wTc)
+        self._covariances[self._oldest] = congruence(to_oldest, last.covariance)
+        self._rebuild(values)
 
     def _solve(self) -> Solution:
         marginals = self._marginals()
@@ -141,7 +214,7 @@ class FixedLagSmoother(Smoother):
         for identity, row in zip(left, rows.tolist(), strict=True):
             frame = self._builder.tracks[identity].last.frame
             self._frozen[identity] = (
-                known.positions[row],
+                known.positions[row].copy(),
                 self._with_pose(frame, known.positions[row], known.covariances[row]),
             )
 

@@ -259,6 +259,17 @@ class GraphBuilder:
             track.variable = -1
         return left
 
+    def first_frames(self) -> IntArray:
+        """(variables,) the first frame that saw each landmark variable; 0 where none is kept."""
+        first = np.full(self.variables, np.iinfo(np.int64).max)
+        np.minimum.at(first, self._seen_variable, self._seen_frame)
+        return np.where(first < np.iinfo(np.int64).max, first, 0)
+
+    def add_factor(self, factor: Any) -> int:
+        """Adds a factor between variables of the graph, as of a loop; returns its row."""
+        self.graph.add(factor)
+        return int(self.graph.size()) - 1
+
     def in_graph(self, variable: int) -> bool:
         """Whether a landmark variable still has its factors."""
         return variable in self._rows

@@ -15,10 +15,12 @@ from fgslam.backend.graph_solution import (
     solution,
     suspect,
 )
+from fgslam.backend.loop_closing import loop_factor
 from fgslam.backend.outliers import solver_parameters, trimmed
 from fgslam.backend.refinement import Refined, refine
 from fgslam.backend.segments import Segments, TrackedFrame
-from fgslam.backend.smoother import Smoother
+from fgslam.backend.submaps import Constraint
+from fgslam.backend.whole_graph import WholeGraphSmoother
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 from fgslam.floor import Floor
 from fgslam.geometry import adjoint, congruence, inverse, reorthonormalise
@@ -29,7 +31,7 @@ _RELATIVE_TOLERANCE = 1e-9  # of the cost
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
 
 
-class Isam2Smoother(Smoother):
+class Isam2Smoother(WholeGraphSmoother):
     """Estimator of kind ``isam2``, on :class:`fgslam.backend.protocol.Estimator`.
 
     Updates come every few frames; in between the tracker answers. The last poses are kept at the
@@ -53,16 +55,45 @@ class Isam2Smoother(Smoother):
         self._updated = 0
 
     def _absorb(self, tracked: TrackedFrame) -> None:
-        entering = self._segments.take(tracked, self._tracker.landmarks())
-        if entering is None:
+        if self._inputs.increments[-1].loops:  # they need the frame's own pose
+            for entering in self._segments.take_at_once(tracked, self._tracker.landmarks()):
+                self._bring_in(entering)
             return
-        new = self._enter(entering)
-        self._graph.push_back(new.graph)
-        self._new_values.insert(new.values)
+        entering_now = self._segments.take(tracked, self._tracker.landmarks())
+        if entering_now is None:
+            return
+        self._bring_in(entering_now)
         if tracked.frame == 0 or tracked.frame - self._updated >= self._settings.update_every:
             self._updated = tracked.frame
             self._flush()
-            self._take_over(self._values, self._moved_on(entering, tracked))
+            self._take_over(self._values, self._moved_on(entering_now, tracked))
+
+    def _bring_in(self, entering: TrackedFrame) -> None:
+        new = self._enter(entering)
+        self._graph.push_back(new.graph)
+        self._new_values.insert(new.values)
+
+    def _values_now(self) -> Any:
+        self._updated = self._builder.frames[-1]
+        self._flush()
+        return self._values
+
+    def _solved_before(self, graph: Any) -> Any:
+        return self._values
+
+    def _join(self, known: Constraint, found: Any | None) -> None:
+        if found is None:
+            graph = gtsam.NonlinearFactorGraph()
+            graph.add(loop_factor(known))
+            self._update(graph, gtsam.Values())
+        else:
+            try:
+                self._rebuild(found)
+            except RuntimeError as error:
+                self._repair(found, error)
+        last = self._builder.frames[-1]
+        here = reorthonormalise(poses_of_frame(self._values, last))
+        self._take_over(self._values, Prediction(here, self._covariance(last)), whole=True)
 
     def _moved_on(self, entered: TrackedFrame, tracked: TrackedFrame) -> Prediction:
         """The last frame's pose, as far from the one that entered last as it was tracked."""

@@ -19,7 +19,7 @@ import numpy as np
 from fgslam.backend.filtered import FilteredTrajectory, moved
 from fgslam.backend.landmark_rows import LandmarkRows
 from fgslam.backend.loop_correction import DriveBook
-from fgslam.backend.submaps import changes, home_changes, rotated, transported
+from fgslam.backend.submaps import Chain, changes, home_changes, rotated, transported
 from fgslam.geometry import (
     block_diagonal,
     congruence,
@@ -115,6 +115,11 @@ class LandmarkKalman:
             self._close(increment, loop)
         current = self._current
         return UpdateStats(current.wTc, current.covariance, len(self._rows), nis, dof)
+
+    @property
+    def chain(self) -> Chain:
+        """The drive as tracked, with the uncertainty of its steps."""
+        return self._drive.chain
 
     def correct(self, current: Prediction, ids: IntArray, positions: FloatArray) -> None:
         """Takes over a smoother's last pose and landmark positions (k, 3), between two frames.

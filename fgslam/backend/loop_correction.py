@@ -30,6 +30,11 @@ class DriveBook:
         self._tied = -1
         self.remarks: list[str] = []
 
+    @property
+    def chain(self) -> Chain:
+        """The steps, and what else holds the drive together."""
+        return self._chain
+
     def step(
         self, motion: FloatArray, tracking: EgoMotion, known: Odometry | None, free: bool
     ) -> None:

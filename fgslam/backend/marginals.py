@@ -156,65 +156,75 @@ class GraphMarginals:
 class ChainMarginals:
     """The same where poses are many and landmarks few: the chain of poses is eliminated first.
 
-    Poses are tied to their neighbours only, by odometry, so their block is a band, and its
-    Cholesky decomposition and the diagonal blocks of its inverse cost a constant a pose.
+    Poses are tied to their neighbours by odometry, so their block is a band, and its Cholesky
+    decomposition and the diagonal blocks of its inverse cost a constant a pose. The few poses to
+    which a loop leads back are kept with the landmarks instead: without them the rest is a chain.
 
     Attributes:
         pose_keys, landmark_keys: ascending.
-        own: (n, 6, 6) covariances of the poses given the landmarks.
-        gain: (6n, 3m) how the poses' mean follows the landmarks, negated.
-        landmark_covariance: (3m, 3m) joint of all landmarks.
+        own: (n, 6, 6) covariances of the poses given the landmarks and the poses kept with them.
+        gain: (6n, 3m + 6k) how the poses' mean follows those, negated.
+        kept_covariance: (3m + 6k, 3m + 6k) joint of all landmarks and the k poses kept.
     """
 
     pose_keys: IntArray
     landmark_keys: IntArray
     own: FloatArray
     gain: FloatArray
-    landmark_covariance: FloatArray
+    kept_covariance: FloatArray
 
     @staticmethod
     def of(system: LinearSystem) -> ChainMarginals:
         """Eliminates the poses.
 
         Raises:
-            EstimatorError: poses are not in a chain, or not determined.
+            EstimatorError: the poses are not determined.
         """
         columns, information = system.columns, system.information
-        band, size = _scaled_band(information[columns:, columns:])
+        apart = _led_back_to(information[columns:, columns:])
+        poses = columns + np.arange(6 * len(system.pose_keys)).reshape(-1, 6)
+        chain = np.delete(poses, apart, axis=0).ravel()
+        kept = np.concatenate([np.arange(columns), poses[apart].ravel()])
+        band, size = _scaled_band(information[chain][:, chain])
         try:
             factor = cholesky_banded(band, lower=True, check_finite=False)
         except np.linalg.LinAlgError:
             raise EstimatorError(_UNDETERMINED) from None
-        coupling = information[columns:, :columns].toarray() / size[:, None]
+        coupling = information[chain][:, kept].toarray() / size[:, None]
         gain = cho_solve_banded((factor, True), coupling, check_finite=False)
-        reduced = information[:columns, :columns].toarray() - coupling.T @ gain
+        reduced = information[kept][:, kept].toarray() - coupling.T @ gain
         covariance = np.empty((0, 0))
-        if columns:
+        if len(kept):
             covariance = _from_cholesky(*_scaled_cholesky(reduced))
         blocks = size.reshape(-1, 6)
-        own = _inverse_blocks(factor) / (blocks[:, :, None] * blocks[:, None, :])
-        return ChainMarginals(
-            system.pose_keys, system.landmark_keys, own, gain / size[:, None], covariance
+        own = np.zeros((len(poses), 6, 6))
+        own[np.delete(np.arange(len(poses)), apart)] = _inverse_blocks(factor) / (
+            blocks[:, :, None] * blocks[:, None, :]
         )
+        follows = np.zeros((6 * len(poses), len(kept)))
+        follows[chain - columns] = gain / size[:, None]
+        follows[poses[apart].ravel() - columns, np.arange(columns, len(kept))] = -1.0
+        return ChainMarginals(system.pose_keys, system.landmark_keys, own, follows, covariance)
 
     def poses(self) -> FloatArray:
         """(n, 6, 6) marginals, in the order of ``pose_keys``."""
         gain = self.gain.reshape(len(self.own), 6, -1)
-        return np.asarray(self.own + gain @ self.landmark_covariance @ np.swapaxes(gain, 1, 2))
+        return np.asarray(self.own + gain @ self.kept_covariance @ np.swapaxes(gain, 1, 2))
 
     def landmarks(self) -> FloatArray:
         """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
         m = len(self.landmark_keys)
         every = np.arange(m)
-        return np.asarray(self.landmark_covariance.reshape(m, 3, m, 3)[every, :, every, :])
+        among = self.kept_covariance[: 3 * m, : 3 * m]
+        return np.asarray(among.reshape(m, 3, m, 3)[every, :, every, :])
 
     def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
         """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by row of the key lists."""
         columns = (3 * landmarks[:, None] + np.arange(3)).ravel()
         gain = self.gain[6 * pose : 6 * pose + 6]
-        cross = -(gain @ self.landmark_covariance[:, columns])
-        own = self.own[pose] + gain @ self.landmark_covariance @ gain.T
-        among = self.landmark_covariance[np.ix_(columns, columns)]
+        cross = -(gain @ self.kept_covariance[:, columns])
+        own = self.own[pose] + gain @ self.kept_covariance @ gain.T
+        among = self.kept_covariance[np.ix_(columns, columns)]
         return np.block([[own, cross], [cross.T, among]])
 
 
@@ -269,12 +279,17 @@ class DenseMarginals:
         return np.asarray(half.T @ half)
 
 
+def _led_back_to(matrix: csr_matrix) -> IntArray:
+    """Poses that share a factor with one that is no neighbour: the earlier one of each pair."""
+    entries = matrix.tocoo()
+    one, other = entries.row // 6, entries.col // 6
+    return np.unique(np.minimum(one, other)[np.abs(one - other) > 1]).astype(np.int64)
+
+
 def _scaled_band(matrix: csr_matrix) -> tuple[FloatArray, FloatArray]:
     """Lower band (12, 6n) of a chain's information, scaled to a unit diagonal, and the scale."""
     entries = matrix.tocoo()
     distance = entries.row - entries.col
-    if len(distance) and np.abs(entries.row // 6 - entries.col // 6).max() > 1:
-        raise EstimatorError("poses depend on others than their neighbours; no elimination")
     size = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
     if not (size > 0.0).all():
         raise EstimatorError(_UNDETERMINED)

@@ -16,6 +16,7 @@ from fgslam.factors.keys import is_pose, number
 _GATE = float(chi2.ppf(0.999, 3))  # 16.3, of a landmark observation's three numbers
 _KEPT = 0.5  # weights end at 0 or 1
 _ROUNDS = 10  # trims until the observations that fit do not change any more
+_QUICK_WIDTH = 3.0  # deviations, as the kernels' default
 _ROUGH = 1e-4  # of the cost: the minimum with the kernel only chooses what fits
 
 
@@ -90,6 +91,19 @@ def trimmed(graph: Any, values: Any, params: Any, noise_factor: float = 1.0) -> 
                 kept.add(factor)
         values = gtsam.LevenbergMarquardtOptimizer(kept, values, rough).optimize()
     return gtsam.LevenbergMarquardtOptimizer(kept, values, params).optimize(), kept
+
+
+def with_kernel(graph: Any) -> Any:
+    """The graph with Cauchy's kernel around its landmark observations, for a quick solution."""
+    kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(_QUICK_WIDTH)
+    out = gtsam.NonlinearFactorGraph()
+    for row in range(graph.size()):
+        factor = graph.at(row)
+        if _landmark(factor) is not None:
+            model = gtsam.noiseModel.Robust.Create(kernel, factor.noiseModel())
+            factor = factor.cloneWithNewNoiseModel(model)
+        out.add(factor)
+    return out
 
 
 def _squared(factor: Any, values: Any) -> float:

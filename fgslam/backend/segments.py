@@ -153,13 +153,24 @@ class Segments:
         self.between.append(tracked)
         if (tracked.frame + 1) % self._every:
             return None
+        return self._block_entering(tracked.frame, landmarks)
+
+    def take_at_once(self, tracked: TrackedFrame, landmarks: LandmarkMap) -> list[TrackedFrame]:
+        """Takes the next frame as a keyframe out of turn; what is open enters before it."""
+        if tracked.motion is not None:
+            self._motions.append(tracked.motion)
+        before = [self._block_entering(tracked.frame, landmarks)] if self._block else []
+        return [*before, self._entering(tracked, tracked.accepted, 0)]
+
+    def _block_entering(self, last: int, landmarks: LandmarkMap) -> TrackedFrame:
+        """The open block as one frame; ``last`` is the frame to which motions are known."""
         block, self._block = self._block, []
         held = [_held(frame, landmarks) for frame in block]
         middle = _middle(held)
         self.between = [frame for frame in self.between if frame.frame != middle.frame]
         placed = [frame for frame in held if frame is middle or _is_placed(frame)]
         fused = summarise(self._sensor, placed, middle, landmarks)
-        return self._entering(middle, fused, tracked.frame - middle.frame)
+        return self._entering(middle, fused, last - middle.frame)
 
     def forget(self, identities: list[int]) -> None:
         """Landmarks that start anew: what the open block saw of them is not the same landmark."""

@@ -8,6 +8,7 @@ or once, and the front-end never waits for it.
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
@@ -17,8 +18,10 @@ from fgslam.backend.graph_builder import GraphBuilder, NewFactors, Sighting
 from fgslam.backend.graph_solution import Solution, joint_of, poses_of_frame
 from fgslam.backend.inputs import RecordedInputs, require_finite
 from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.backend.loop_closing import carried_to
 from fgslam.backend.refinement import Refined
 from fgslam.backend.segments import TrackedFrame
+from fgslam.backend.submaps import FREE, Constraint
 from fgslam.errors import EstimatorError
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.floor import Floor
@@ -41,6 +44,7 @@ from fgslam.types import (
     Increment,
     IntArray,
     LandmarkMap,
+    LoopClosure,
     MeasurementType,
     Observations,
     Odometry,
@@ -72,7 +76,7 @@ class Smoother(ABC):
         self._sensor = sensor
         self._floor = floor
         self._gate_px = settings.gate_px
-        self._tracker = LandmarkKalman(sensor, LandmarkKalmanSettings(), prior)
+        self._tracker = LandmarkKalman(sensor, LandmarkKalmanSettings(loops=settings.loops), prior)
         self._builder = GraphBuilder(sensor, settings, floor, prior, remember)
         self._inputs = RecordedInputs()
         self._smoothed = prior
@@ -81,6 +85,10 @@ class Smoother(ABC):
         self._refined: Refined | None = None
         self._anchors: dict[int, FloatArray] = {}
         self._frozen: dict[int, tuple[FloatArray, FloatArray]] = {}
+        self._loop_settings = settings.loops
+        self._loops: list[Constraint] = []
+        self._takeovers = 0
+        self._eras: list[int] = []
 
     # -- the protocol ------------------------------------------------------------------------
 
@@ -102,11 +110,16 @@ class Smoother(ABC):
                 before. Or the solver failed beyond mending; the estimator is then at its end.
         """
         motion = increment.odometry if increment.odometry is not None else motion
+        if increment.relocalised and self._inputs.increments:
+            motion = self._unknown_step(tracking)
         require_finite(increment, tracking, motion)
-        stats = self._tracker.update(increment, tracking)
+        stats = self._tracker.update(dataclasses.replace(increment, loops=()), tracking, motion)
         self._inputs.append(increment, tracking, motion)
+        self._eras.append(self._takeovers)
         self._answer = self._refined = None
         self._absorb(self._sorted_out(increment, tracking, motion))
+        for loop in increment.loops:
+            self._close(loop, f"frame {increment.index}")
         current = self._current(tracking)
         return UpdateStats(
             current.wTc, current.covariance, stats.landmarks, stats.nis, stats.nis_dof
@@ -159,6 +172,10 @@ class Smoother(ABC):
     @abstractmethod
     def _absorb(self, tracked: TrackedFrame) -> None:
         """Takes a frame in; solves when it is time to."""
+
+    @abstractmethod
+    def _close(self, loop: LoopClosure, where: str) -> None:
+        """Closes a loop of the frame just taken in; ``where`` names it."""
 
     @abstractmethod
     def _solve(self) -> Solution:
@@ -226,21 +243,54 @@ class Smoother(ABC):
         for identity in moved.ids.tolist():
             self._frozen.pop(identity, None)
 
+    def _unknown_step(self, tracking: EgoMotion) -> Odometry:
+        """The step to a frame found without a prior: as found, and free to be any other."""
+        before = self._tracker.predict(None).wTc
+        return Odometry(inverse(before) @ tracking.wTc, FREE)
+
     def _enter(self, tracked: TrackedFrame) -> NewFactors:
         """Enters a frame into the graph."""
         self._anchors[tracked.frame] = tracked.wTc
         return self._builder.add(tracked, self._tracker.landmarks())
 
-    def _take_over(self, values: Any, current: Prediction) -> None:
-        """Lets the tracker go on from smoothed values."""
+    def _take_over(self, values: Any, current: Prediction, whole: bool = False) -> None:
+        """Lets the tracker go on from smoothed values.
+
+        Landmarks that the graph knows nothing of stay; after a loop (``whole``) they move along
+        with the last pose, near which they are.
+        """
         ids, positions = self._positions(values)
         waiting_ids, waiting_positions = self._waiting(values)
+        ids = np.concatenate([ids, waiting_ids])
+        positions = np.concatenate([positions, waiting_positions])
+        if whole:
+            known, moved = self._tracker.landmarks(), self._tracker.predict(None).wTc
+            rest = np.flatnonzero(~np.isin(known.ids, ids))
+            moved = current.wTc @ inverse(moved)
+            ids = np.concatenate([ids, known.ids[rest]])
+            positions = np.concatenate(
+                [positions, transform_to_world(moved, known.positions[rest])]
+            )
         self._smoothed = current
-        self._tracker.correct(
-            current,
-            np.concatenate([ids, waiting_ids]),
-            np.concatenate([positions, waiting_positions]),
-        )
+        self._takeovers += 1
+        self._tracker.correct(current, ids, positions)
+
+    def _between(self, loop: LoopClosure) -> Constraint:
+        """A loop between poses of the graph, the last of which is the present frame's.
+
+        An earlier frame that has none gives way to the nearest one that was tracked on the same
+        map, since only among such do tracked poses tell the way.
+        """
+        last = len(self._inputs.increments) - 1
+        if not 0 <= loop.frame < last:
+            raise EstimatorError(
+                f"{self.kind}: a loop closure of frame {last} of the log leads to frame "
+                f"{loop.frame}, which does not come before it; mend the log"
+            )
+        era, frames = self._eras[loop.frame], self._builder.frames
+        fellows = [frame for frame in frames if self._eras[frame] == era] or frames
+        near = min(fellows, key=lambda frame: abs(frame - loop.frame))
+        return carried_to(near, loop, self._inputs.trackings, last)
 
     def _waiting(self, values: Any) -> tuple[IntArray, FloatArray]:
         """Landmarks outside the graph, moved along with the pose that saw them last."""

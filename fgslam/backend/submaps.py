@@ -96,6 +96,14 @@ class Chain:
         """The chain under these constraints, with a submap every so many frames."""
         return corrected(np.array(self.poses), np.array(self.steps), constraints, every)
 
+    def steps_between(self, frames: IntArray) -> FloatArray:
+        """(m, 6, 6) covariances of the steps to some frames, ascending, from the one before."""
+        poses = np.array(self.poses)
+        errors = _as_motions_of_the_world(poses, np.array(self.steps))
+        sums = [errors[a + 1 : b + 1].sum(axis=0) for a, b in itertools.pairwise([-1, *frames])]
+        here = np.array([inverse(pose) for pose in poses[frames]])
+        return congruence(_adjoints(here), np.array(sums))
+
     def state(self) -> StateArrays:
         """All of it as plain arrays."""
         n, known = len(self.poses), self.constraints
@@ -160,6 +168,12 @@ def corrected(
 def rotated(transforms: FloatArray, covariances: FloatArray) -> FloatArray:
     """Covariances (n, 3, 3) of points that rigid motions (n, 4, 4) take along."""
     return congruence(transforms[:, :3, :3], covariances)
+
+
+def nearest_positive(covariance: FloatArray) -> FloatArray:
+    """A symmetric matrix (n, n) without its negative part, as of differences of covariances."""
+    variances, directions = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    return np.asarray((directions * np.maximum(variances, 0.0)) @ directions.T)
 
 
 def transported(transforms: FloatArray, points: FloatArray) -> FloatArray:

@@ -222,6 +222,14 @@ class EkfSettings(NamedSettings):
             "deviations (Mahalanobis distance); 0: no gate",
         ),
     ] = 5.0
+    loop_gate_sigmas: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="a loop closure is refused where its innovation squared exceeds its "
+            "degrees of freedom by more than the square of this; 0: none is",
+        ),
+    ] = 10.0
     max_landmarks: Annotated[
         int,
         Field(

@@ -281,19 +281,25 @@ def test_landmarks_that_depend_on_each_other_are_refused(rng: np.random.Generato
         assert_same(dense[n], reference.marginalCovariance(key))
 
 
-def test_poses_that_close_a_loop_are_refused(rng: np.random.Generator) -> None:
-    """Only by the elimination of poses first; the other two take them."""
-    problem = Problem(rng)
-    loop = Odometry(g.se3_exp(0.02 * rng.standard_normal(6)), random_covariance(rng, 6, 0.05))
-    problem.graph.add(odometry_factor(problem.poses[0], problem.poses[3], loop))
-    with pytest.raises(EstimatorError, match="neighbours"):
-        whole(ChainMarginals, problem.graph, problem.values)
+@pytest.mark.parametrize("ends", [[(0, 3)], [(0, 2), (2, 4)], [(1, 4), (0, 4), (0, 2)]])
+def test_poses_that_close_loops(rng: np.random.Generator, ends: list[tuple[int, int]]) -> None:
+    """The elimination of poses first keeps those led back to for last."""
+    problem = Problem(rng, poses=6)
+    for before, after in ends:
+        loop = Odometry(g.se3_exp(0.02 * rng.standard_normal(6)), random_covariance(rng, 6, 0.05))
+        problem.graph.add(odometry_factor(problem.poses[before], problem.poses[after], loop))
     reference = problem.reference()
-    found = whole(GraphMarginals, problem.graph, problem.values).poses()
     dense = DenseMarginals(problem.graph, problem.values)
-    for k, key in enumerate(problem.poses):
-        assert_same(found[k], reference.marginalCovariance(key))
-        assert_same(dense.pose(key), reference.marginalCovariance(key))
+    for kind in BOTH:
+        found = whole(kind, problem.graph, problem.values)
+        for k, key in enumerate(problem.poses):
+            assert_same(found.poses()[k], reference.marginalCovariance(key))
+            assert_same(dense.pose(key), reference.marginalCovariance(key))
+        for n, key in enumerate(problem.landmarks):
+            assert_same(found.landmarks()[n], reference.marginalCovariance(key))
+        for pose in range(len(problem.poses)):
+            joint = dense.joint(problem.poses[pose], [problem.landmarks[2], problem.landmarks[0]])
+            assert_same(found.joint(pose, np.array([2, 0])), joint)
 
 
 def test_values_and_graph_are_left_alone(rng: np.random.Generator) -> None:

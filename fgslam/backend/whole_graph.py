@@ -1,0 +1,84 @@
+"""Smoothers that keep every pose: they close loops in the graph, and see what it costs."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from fgslam.backend.graph_solution import poses_of_frame
+from fgslam.backend.loop_closing import first_guess, loop_factor, misfit, solved
+from fgslam.backend.smoother import Smoother
+from fgslam.backend.submaps import Constraint
+from fgslam.types import LoopClosure
+
+_AGREES = float(chi2.ppf(0.99, 6))  # 16.8: a loop that the graph meets as it is
+
+
+class WholeGraphSmoother(Smoother):
+    """What iSAM2 and the batch share about loops."""
+
+    def _close(self, loop: LoopClosure, where: str) -> None:
+        """Closes a loop where the measurements allow it.
+
+        One that the graph meets anyway is a factor more. Otherwise the graph is solved with it, and
+        it is refused where that raises the cost by more than measurement noise explains: a true
+        loop's rise is chi-square with six degrees of freedom, whatever the drift.
+        """
+        known = self._between(loop)
+        what = f"{where}: loop closure to frame {loop.frame} of the log"
+        off = misfit(loop_factor(known), self._values_now())
+        if off <= _AGREES:
+            self._accept(known, None)
+            self._remarks.append(f"{what}: as expected, nothing moved")
+            return
+        rise, found, shift = self._bent(known)
+        gate = self._loop_settings.gate_sigmas
+        if gate > 0.0 and not rise <= gate**2:
+            self._remarks.append(
+                f"{what} refused: {np.sqrt(max(rise, 0.0)):.1f} standard deviations off, "
+                f"{gate:g} allowed"
+            )
+            return
+        self._accept(known, found)
+        self._remarks.append(f"{what}: the camera moved by {shift:.2f} m, the graph with it")
+
+    def _bent(self, known: Constraint) -> tuple[float, Any, float]:
+        """Rise of the cost with a loop closed, the values then, and how far the camera moves."""
+        graph = self._loop_graph()
+        try:
+            before = self._solved_before(graph)
+            cost, loops = float(graph.error(before)), [*self._loops, known]
+            every = self._loop_settings.submap_frames
+            chain = self._tracker.chain
+            guess = first_guess(self._builder, before, chain, loops, every)
+            graph.add(loop_factor(known))
+            found = solved(graph, guess)
+        except RuntimeError as error:
+            raise self._failed(error) from None
+        here = poses_of_frame(found, known.after)[:3, 3]
+        shift = float(np.linalg.norm(here - self._tracker.predict(None).wTc[:3, 3]))
+        return 2.0 * (float(graph.error(found)) - cost), found, shift
+
+    def _accept(self, known: Constraint, found: Any | None) -> None:
+        self._builder.add_factor(loop_factor(known))
+        self._loops.append(known)
+        self._join(known, found)
+
+    def _loop_graph(self) -> Any:
+        """The graph as it is to be solved when a loop is judged."""
+        return self._builder.kept_factors()
+
+    @abstractmethod
+    def _values_now(self) -> Any:
+        """Values of all poses so far and all landmarks of the graph."""
+
+    @abstractmethod
+    def _solved_before(self, graph: Any) -> Any:
+        """The same at the minimum of the graph so far."""
+
+    @abstractmethod
+    def _join(self, known: Constraint, found: Any | None) -> None:
+        """Goes on with the graph that has the loop; from these values where they are given."""
