@@ -11,13 +11,13 @@ from typing import Any
 
 from fgslam.arrival import require_map_user
 from fgslam.config import ExperimentConfig, load_config
-from fgslam.errors import ConfigError, DatasetError, MapError
+from fgslam.errors import ConfigError, DatasetError
 from fgslam.export.atomic import RUN_MARKER, ExistingFolder, create_run_folder
 from fgslam.factory import make_estimator, make_pipeline, open_sequence
 from fgslam.measurement_log import MeasurementLog
 from fgslam.recordings import Sequence
-from fgslam.runs import checkpoint, mapping
-from fgslam.runs.mapping import Entry, GivenMap
+from fgslam.runs import checkpoint, map_entry, mapping
+from fgslam.runs.map_entry import Entry, GivenMap
 from fgslam.runs.outputs import RunOutputs, versions, write_config
 from fgslam.runs.recorder import RunRecorder
 
@@ -73,7 +73,7 @@ def open_run(
             checkpoint.require(folder)
         _require_same(config, folder)
     mapping.require_savable(config.map)
-    given = None if config.map.load is None else mapping.open_map(Path(config.map.load))
+    given = None if config.map.load is None else map_entry.open_map(Path(config.map.load))
     opened = config
     if given is not None and config.map.start == "continue":
         opened = mapping.window(config, given)
@@ -101,7 +101,7 @@ def begin(run: OpenedRun, progress: Progress) -> BegunRun:
     """
     config = run.config
     if config.map.made_from is not None:
-        made = mapping.open_map(run.folder / mapping.FIRST_FOLDER / mapping.MAP_FILE)
+        made = map_entry.open_map(run.folder / map_entry.FIRST_FOLDER / map_entry.MAP_FILE)
         run = dataclasses.replace(run, given=made, entry=_entry(run, made))
         _write_config(run)
     given, entry, sequence, opened = run.given, run.entry, run.sequence, run.opened
@@ -131,13 +131,10 @@ def _entry(run: OpenedRun, given: GivenMap | None) -> Entry | None:
     if run.goes_on:
         mapping.require_continuable(given, run.sequence)
         return None
-    known = mapping.entry_of(run.folder) if run.resumed else None
-    if known is not None and known.identity != given.identity:
-        raise MapError(
-            f"{given.path}: the map has changed since the run began; restore it, or start again "
-            "with --overwrite"
-        )
-    return known or mapping.enter(run.config, given, run.sequence)
+    known = map_entry.entry_of(run.folder) if run.resumed else None
+    if known is not None:
+        known.require_same(given)
+    return known or map_entry.enter(run.config, given, run.sequence)
 
 
 def _later(config: ExperimentConfig, frames: int) -> ExperimentConfig:

@@ -19,6 +19,7 @@ from fgslam.measurement_log import MeasurementLog
 from fgslam.runs.checkpoint import LOG_FILE
 from fgslam.runs.estimator_files import write_replay
 from fgslam.runs.judging import Truth, judge_replay, seen_often
+from fgslam.runs.map_entry import arrival_of
 from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.runs.replay import replay
 from fgslam.settings.backend import EstimatorSettings
@@ -112,7 +113,7 @@ def perform(task: ReplayTask) -> EstimatorMetrics:
         FgslamError: the log or the truth cannot be read, or a file cannot be written.
     """
     log = MeasurementLog.load(task.run / LOG_FILE)
-    result = replay(log, task.settings, task.ego_motion)
+    result = replay(log, task.settings, task.ego_motion, arrival=arrival_of(task.run))
     write_replay(task.out, result, log, task.remark, _look(task.run))
     return judge_replay(result, load_truth(task.run, log)).metrics
 

@@ -20,7 +20,7 @@ from fgslam.factory import make_stream
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.pipeline import FrameReport
 from fgslam.recordings import Sequence
-from fgslam.runs import checkpoint, mapping
+from fgslam.runs import checkpoint, map_entry, mapping
 from fgslam.runs.beginning import BegunRun, OpenedRun, Progress, begin, open_run
 from fgslam.runs.choosing import compared_with
 from fgslam.runs.comparison import COMPARISON_FILE, Compared, replay_apart, tasks_of
@@ -84,9 +84,9 @@ def _drive_first(
     run: OpenedRun, existing: ExistingFolder, progress: Progress, stopped: Callable[[], bool]
 ) -> RunResult | None:
     """Makes the run's own map, where it asks for that; how it ended if that was early."""
-    folder = run.folder / mapping.FIRST_FOLDER
+    folder = run.folder / map_entry.FIRST_FOLDER
     config = mapping.first_config(run.config, folder)
-    if config is None or (existing == "resume" and (folder / mapping.MAP_FILE).is_file()):
+    if config is None or (existing == "resume" and (folder / map_entry.MAP_FILE).is_file()):
         return None
     resumable = existing == "resume" and checkpoint.exists(folder)
     result = run_experiment(

@@ -1,111 +1,31 @@
-"""Runs that begin in a saved map, go on where one stopped, and leave a map behind (S41)."""
+"""Runs that go on where one stopped, or leave a map behind (S41)."""
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fgslam import __version__
-from fgslam.arrival import Arrival
-from fgslam.config import ExperimentConfig, load_config, parse_config
+from fgslam.config import ExperimentConfig, parse_config
 from fgslam.errors import ConfigError, MapError, MeasurementLogError
-from fgslam.export.atomic import RUN_MARKER, is_run_folder
-from fgslam.factory import make_relocaliser, make_stereo_matcher, make_stream
-from fgslam.map_file import SavedMap, load_map, require_rig, save_map
-from fgslam.map_types import Relocalisation
+from fgslam.map_file import SavedMap, require_rig, save_map
 from fgslam.measurement_log import MeasurementLog
 from fgslam.pipeline import SlamPipeline
 from fgslam.recordings import Sequence
 from fgslam.runs import checkpoint
+from fgslam.runs.map_entry import FIRST_FOLDER, MAP_FILE, GivenMap
 from fgslam.runs.outputs import RunOutputs
 from fgslam.runs.recorder import RunRecorder
-from fgslam.settings.maps import MapSettings, MapStartSettings
-from fgslam.types import Estimate, FloatArray, LandmarkMap, Prediction, StateArrays
+from fgslam.settings.maps import MapSettings
+from fgslam.types import Estimate, StateArrays
 from fgslam.whole_files import require_writable
 
-FIRST_FOLDER = "first"
-MAP_FILE = "map.fgmap"
-
-_STREAM = 12  # of random numbers, beside those of the recording
 _LOG = "log/"
 _TIMES = "recorder/stage_ms"
 _SAME_SETTINGS = ("seed", "odometry", "frontend", "estimator")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GivenMap:
-    """The map that a run is given.
-
-    Attributes:
-        path: its file.
-        identity: SHA-256 of the file, hexadecimal.
-        saved: what is in it.
-    """
-
-    path: Path
-    identity: str
-    saved: SavedMap
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Entry:
-    """How a run entered a map: kept in its config.yaml, for those who resume or replay it.
-
-    Attributes:
-        identity: of the map's file.
-        frames_before: selected frames left out because they could not be located.
-        relocalised: the first pose was found without a prior.
-        prior: pose expected of the first frame.
-    """
-
-    identity: str
-    frames_before: int
-    relocalised: bool
-    prior: Prediction
-
-    def as_values(self) -> dict[str, Any]:
-        """Plain values for YAML, exact."""
-        return {
-            "sha256": self.identity,
-            "frames_before": self.frames_before,
-            "relocalised": self.relocalised,
-            "wTc": self.prior.wTc.tolist(),
-            "covariance": self.prior.covariance.tolist(),
-        }
-
-    @staticmethod
-    def of(values: Mapping[str, Any]) -> Entry:
-        """Back from :meth:`as_values`."""
-        prior = Prediction(np.array(values["wTc"]), np.array(values["covariance"]))
-        return Entry(values["sha256"], values["frames_before"], values["relocalised"], prior)
-
-    def arrival(self, given: GivenMap, settings: MapSettings) -> Arrival:
-        """Where a run's parts begin."""
-        return Arrival(given.saved, self.prior, self.relocalised, settings.extend)
-
-    def notes(self, given: GivenMap, settings: MapSettings) -> tuple[str, ...]:
-        """What is to be told about the entry."""
-        x, y, z = self.prior.wTc[:3, 3]
-        how = "located" if self.relocalised else f"put back at its {settings.start}"
-        use = "extended" if settings.extend else "left as it is"
-        told = (
-            f"map {given.path} of {len(given.saved)} landmarks, {use}: {how} at ({x:.2f}, "
-            f"{y:.2f}, {z:.2f}) m"
-        )
-        if not self.frames_before:
-            return (told,)
-        left_out = f"the first {self.frames_before} frames could not be located: left out"
-        return (told, left_out)
-
-
-# --------------------------------------------------------------------------------------------
-# The map that is given
 
 
 def first_config(config: ExperimentConfig, folder: Path) -> ExperimentConfig | None:
@@ -125,12 +45,6 @@ def first_config(config: ExperimentConfig, folder: Path) -> ExperimentConfig | N
     )
 
 
-def open_map(path: Path) -> GivenMap:
-    """Reads a map. Raises MapError where it is not one."""
-    saved = load_map(path)
-    return GivenMap(path, hashlib.sha256(path.read_bytes()).hexdigest(), saved)
-
-
 def require_savable(settings: MapSettings) -> None:
     """Refuses, before the drive, a map file that could not be written after it.
 
@@ -144,76 +58,6 @@ def require_savable(settings: MapSettings) -> None:
     if path.is_dir():
         raise MapError(f"{path}: is a folder; name the map's file, e.g. {path / MAP_FILE}")
     require_writable(path.parent)
-
-
-# --------------------------------------------------------------------------------------------
-# Entering it
-
-
-def enter(config: ExperimentConfig, given: GivenMap, sequence: Sequence) -> Entry:
-    """Where the recording begins in the map.
-
-    Raises:
-        MapError: another rig made the map, it is empty, or no frame could be located.
-    """
-    saved, settings = given.saved, config.map
-    require_rig(saved, sequence.rig, str(given.path))
-    if not len(saved):
-        raise MapError(f"{given.path}: holds no landmark; make the map anew")
-    if settings.start == "relocalise":
-        before, found = _locate(config, given, sequence)
-        return Entry(given.identity, before, True, _around(found.wTc, settings.begin))
-    pose = np.eye(4)
-    if settings.start == "last":
-        if not len(saved.trajectory):
-            raise MapError(f"{given.path}: knows no last pose; use map.start relocalise")
-        pose = saved.trajectory.poses[-1]
-    return Entry(given.identity, 0, False, _around(pose, settings.begin))
-
-
-def _around(wTc: FloatArray, settings: MapStartSettings) -> Prediction:
-    """A first pose that is known roughly: what is known better its landmarks will tell."""
-    sigma = np.repeat([np.deg2rad(settings.sigma_deg), settings.sigma_m], 3)
-    return Prediction(wTc, np.diag(sigma**2))
-
-
-def _locate(
-    config: ExperimentConfig, given: GivenMap, sequence: Sequence
-) -> tuple[int, Relocalisation]:
-    """The first frame that the map's landmarks place beyond doubt, and its number."""
-    saved, frontend = given.saved, config.frontend
-    relocaliser = make_relocaliser(sequence.rig, frontend)
-    relocaliser.learn(*_trusted(saved, frontend.database.valid_hits))
-    stereo = make_stereo_matcher(sequence.rig, frontend)
-    within, why = min(config.map.begin.within, len(sequence)), "no image could be read"
-    stream = make_stream(sequence, frontend)()
-    try:
-        for found in stream:
-            if found.i >= within:
-                break
-            if found.frame is None:
-                continue
-            rng = np.random.default_rng([config.seed, _STREAM, found.i])
-            located = relocaliser.locate(stereo.match(found.features), rng)
-            if located.found:
-                return found.i, located
-            why = located.why
-    finally:
-        stream.close()
-    raise MapError(
-        f"{given.path}: none of the first {within} frames of {sequence.name} could be located in "
-        f"the map ({why}); raise map.begin.within, or tell the place by map.start"
-    )
-
-
-def _trusted(saved: SavedMap, valid_hits: int) -> tuple[LandmarkMap, Any]:
-    """Landmarks seen often enough to be there (Se et al. 6.1), with their looks."""
-    trusted = saved.permanent | (saved.hits >= valid_hits)
-    every = saved.landmarks
-    landmarks = LandmarkMap(
-        every.ids[trusted], every.positions[trusted], every.covariances[trusted]
-    )
-    return landmarks, saved.appearances.of(landmarks.ids)
 
 
 # --------------------------------------------------------------------------------------------
@@ -380,15 +224,3 @@ def _session(outputs: RunOutputs) -> StateArrays:
     state = checkpoint.state_of(outputs.pipeline, outputs.recorder)
     state[_TIMES] = np.full_like(state[_TIMES], np.nan)
     return state | {f"{_LOG}{name}": array for name, array in log.items()}
-
-
-# --------------------------------------------------------------------------------------------
-# A run that is resumed or replayed
-
-
-def entry_of(run: Path) -> Entry | None:
-    """How the run in a folder entered its map; None where it had none."""
-    if not is_run_folder(run):
-        return None
-    values = (load_config(run / RUN_MARKER).provenance or {}).get("map")
-    return None if values is None else Entry.of(values)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.arrival import Arrival, take_over
 from fgslam.backend.protocol import Estimator
 from fgslam.errors import ConfigError, FgslamError, MeasurementLogError
 from fgslam.factory import make_estimator
@@ -104,6 +105,7 @@ def replay(
     settings: EstimatorSettings,
     ego_motion: EgoMotionSettings,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    arrival: Arrival | None = None,
 ) -> Replay:
     """Gives every frame of the log to a new estimator; its faults end the replay, not the program.
 
@@ -112,11 +114,15 @@ def replay(
         settings: of the estimator.
         ego_motion: of the least squares that finds each frame's pose against the estimator's map.
         progress: told frames done and of how many.
+        arrival: where the run began in a saved map; None began with an empty one.
     """
     before_mb = memory_mb("VmRSS")
     run = _Replaying(log, settings)
     try:
-        estimator = make_estimator(log.rig, settings, ego_motion)
+        prior = None if arrival is None else arrival.prior
+        estimator = make_estimator(log.rig, settings, ego_motion, prior)
+        if arrival is not None:
+            take_over(estimator, arrival)
         _require_support(estimator, log)
     except ESTIMATOR_FAULTS as error:
         return run.result(None, before_mb, f"could not start: {reason(error)}")

@@ -25,6 +25,7 @@ from fgslam.runs.choosing import EVERY, Choice, choose
 from fgslam.runs.comparison import Progress, load_truth
 from fgslam.runs.experiment import run_experiment
 from fgslam.runs.judging import judge_replay
+from fgslam.runs.map_entry import arrival_of
 from fgslam.runs.measured import holds_measurements, open_measured, write_recording
 from fgslam.runs.outputs import write_config
 from fgslam.runs.processes import WorkerEnded, run_apart
@@ -123,8 +124,9 @@ def perform_trial(task: TrialTask) -> Trial:
     """One trial, start to end, in a folder that is gone afterwards."""
     with tempfile.TemporaryDirectory(prefix="fgslam-trial-") as scratch:
         run = Path(scratch) / "run"
+        maps = dataclasses.replace(task.config.map, save=None)
         config = task.config.model_copy(
-            update={"seed": task.seed, "compare": (), "output": _OUTPUT}
+            update={"seed": task.seed, "compare": (), "map": maps, "output": _OUTPUT}
         )
         if holds_measurements(config):
             run.mkdir()
@@ -132,10 +134,11 @@ def perform_trial(task: TrialTask) -> Trial:
         else:
             run_experiment(config, run)
         log = MeasurementLog.load(run / LOG_FILE)
-        truth = load_truth(run, log)
+        truth, arrival = load_truth(run, log), arrival_of(run)
     metrics, nees = {}, {}
     for settings in task.estimators:
-        judged = judge_replay(replay(log, settings, config.frontend.ego_motion), truth)
+        answer = replay(log, settings, config.frontend.ego_motion, arrival=arrival)
+        judged = judge_replay(answer, truth)
         # A process of several estimators has no memory of each.
         metrics[settings.title] = dataclasses.replace(judged.metrics, peak_memory_mb=None)
         nees[settings.title] = judged.nees

@@ -1,0 +1,197 @@
+"""The map that a run is given, and how the run enters it (S41)."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fgslam.arrival import Arrival
+from fgslam.config import ExperimentConfig, load_config
+from fgslam.errors import MapError
+from fgslam.export.atomic import RUN_MARKER, is_run_folder
+from fgslam.factory import make_relocaliser, make_stereo_matcher, make_stream
+from fgslam.map_file import SavedMap, load_map, require_rig
+from fgslam.map_types import LandmarkAppearances, Relocalisation
+from fgslam.recordings import Sequence
+from fgslam.settings.maps import MapSettings, MapStartSettings
+from fgslam.types import FloatArray, LandmarkMap, Prediction
+
+FIRST_FOLDER = "first"
+MAP_FILE = "map.fgmap"
+
+_STREAM = 12  # of random numbers, beside those of the recording
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GivenMap:
+    """The map that a run is given.
+
+    Attributes:
+        path: its file.
+        identity: SHA-256 of the file, hexadecimal.
+        saved: what is in it.
+    """
+
+    path: Path
+    identity: str
+    saved: SavedMap
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Entry:
+    """How a run entered a map: kept in its config.yaml, for those who resume or replay it.
+
+    Attributes:
+        identity: of the map's file.
+        frames_before: selected frames left out because they could not be located.
+        relocalised: the first pose was found without a prior.
+        prior: pose expected of the first frame.
+    """
+
+    identity: str
+    frames_before: int
+    relocalised: bool
+    prior: Prediction
+
+    def as_values(self) -> dict[str, Any]:
+        """Plain values for YAML, exact."""
+        return {
+            "sha256": self.identity,
+            "frames_before": self.frames_before,
+            "relocalised": self.relocalised,
+            "wTc": self.prior.wTc.tolist(),
+            "covariance": self.prior.covariance.tolist(),
+        }
+
+    @staticmethod
+    def of(values: Mapping[str, Any]) -> Entry:
+        """Back from :meth:`as_values`."""
+        prior = Prediction(np.array(values["wTc"]), np.array(values["covariance"]))
+        return Entry(values["sha256"], values["frames_before"], values["relocalised"], prior)
+
+    def require_same(self, given: GivenMap) -> None:
+        """Refuses another map than the run entered. Raises MapError."""
+        if self.identity != given.identity:
+            raise MapError(
+                f"{given.path}: the map has changed since the run began; restore it, or run again "
+                "with --overwrite"
+            )
+
+    def arrival(self, given: GivenMap, settings: MapSettings) -> Arrival:
+        """Where a run's parts begin."""
+        return Arrival(given.saved, self.prior, self.relocalised, settings.extend)
+
+    def notes(self, given: GivenMap, settings: MapSettings) -> tuple[str, ...]:
+        """What is to be told about the entry."""
+        x, y, z = self.prior.wTc[:3, 3]
+        how = "located" if self.relocalised else f"put back at its {settings.start}"
+        use = "extended" if settings.extend else "left as it is"
+        told = (
+            f"map {given.path} of {len(given.saved)} landmarks, {use}: {how} at ({x:.2f}, "
+            f"{y:.2f}, {z:.2f}) m"
+        )
+        if not self.frames_before:
+            return (told,)
+        left_out = f"the first {self.frames_before} frames could not be located: left out"
+        return (told, left_out)
+
+
+def open_map(path: Path) -> GivenMap:
+    """Reads a map. Raises MapError where it is not one."""
+    saved = load_map(path)
+    return GivenMap(path, hashlib.sha256(path.read_bytes()).hexdigest(), saved)
+
+
+def enter(config: ExperimentConfig, given: GivenMap, sequence: Sequence) -> Entry:
+    """Where the recording begins in the map.
+
+    Raises:
+        MapError: another rig made the map, it is empty, or no frame could be located.
+    """
+    saved, settings = given.saved, config.map
+    require_rig(saved, sequence.rig, str(given.path))
+    if not len(saved):
+        raise MapError(f"{given.path}: holds no landmark; make the map anew")
+    if settings.start == "relocalise":
+        before, found = _locate(config, given, sequence)
+        return Entry(given.identity, before, True, _around(found.wTc, settings.begin))
+    pose = np.eye(4)
+    if settings.start == "last":
+        if not len(saved.trajectory):
+            raise MapError(f"{given.path}: knows no last pose; use map.start relocalise")
+        pose = saved.trajectory.poses[-1]
+    return Entry(given.identity, 0, False, _around(pose, settings.begin))
+
+
+def _around(wTc: FloatArray, settings: MapStartSettings) -> Prediction:
+    """A first pose that is known roughly: what is known better its landmarks will tell."""
+    sigma = np.repeat([np.deg2rad(settings.sigma_deg), settings.sigma_m], 3)
+    return Prediction(wTc, np.diag(sigma**2))
+
+
+def _locate(
+    config: ExperimentConfig, given: GivenMap, sequence: Sequence
+) -> tuple[int, Relocalisation]:
+    """The first frame that the map's landmarks place beyond doubt, and its number."""
+    saved, frontend = given.saved, config.frontend
+    relocaliser = make_relocaliser(sequence.rig, frontend)
+    relocaliser.learn(*_trusted(saved, frontend.database.valid_hits))
+    stereo = make_stereo_matcher(sequence.rig, frontend)
+    within, why = min(config.map.begin.within, len(sequence)), "no image could be read"
+    stream = make_stream(sequence, frontend)()
+    try:
+        for found in stream:
+            if found.i >= within:
+                break
+            if found.frame is None:
+                continue
+            rng = np.random.default_rng([config.seed, _STREAM, found.i])
+            located = relocaliser.locate(stereo.match(found.features), rng)
+            if located.found:
+                return found.i, located
+            why = located.why
+    finally:
+        stream.close()
+    raise MapError(
+        f"{given.path}: none of the first {within} frames of {sequence.name} could be located in "
+        f"the map ({why}); raise map.begin.within, or tell the place by map.start"
+    )
+
+
+def _trusted(saved: SavedMap, valid_hits: int) -> tuple[LandmarkMap, LandmarkAppearances]:
+    """Landmarks seen often enough to be there (Se et al. 6.1), with their looks."""
+    trusted = saved.permanent | (saved.hits >= valid_hits)
+    every = saved.landmarks
+    landmarks = LandmarkMap(
+        every.ids[trusted], every.positions[trusted], every.covariances[trusted]
+    )
+    return landmarks, saved.appearances.of(landmarks.ids)
+
+
+def arrival_of(run: Path) -> Arrival | None:
+    """Where the run in a folder began in its map, for those who replay it; None without one.
+
+    Raises:
+        MapError: the map is no longer there, or another one.
+    """
+    entry = entry_of(run)
+    if entry is None:
+        return None
+    settings = load_config(run / RUN_MARKER).map
+    first = run / FIRST_FOLDER / MAP_FILE
+    given = open_map(first if settings.load is None else Path(settings.load))
+    entry.require_same(given)
+    return entry.arrival(given, settings)
+
+
+def entry_of(run: Path) -> Entry | None:
+    """How the run in a folder entered its map; None where it had none."""
+    if not is_run_folder(run):
+        return None
+    values = (load_config(run / RUN_MARKER).provenance or {}).get("map")
+    return None if values is None else Entry.of(values)
