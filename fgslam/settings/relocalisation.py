@@ -82,7 +82,7 @@ class RelocalisationSettings:
         float,
         Field(
             ge=0.0,
-            description="added to a feature's noise: seen from elsewhere it is found elsewhere, pixels",
+            description="added to a feature's noise: from elsewhere it is found elsewhere, pixels",
         ),
     ] = 0.3
     map_sigma_m: Annotated[
@@ -91,12 +91,12 @@ class RelocalisationSettings:
             ge=0.0,
             description="added to a landmark's: what the map's drift hides from its covariances",
         ),
-    ] = 0.02
+    ] = 0.01
     piece_m: Annotated[
         float,
         Field(
             gt=0.0,
-            description="landmarks in one cube of this side drift together, and belong to one thing "
+            description="landmarks in one cube of this side drift together and belong to one thing "
             "that may stand elsewhere, too, metres",
         ),
     ] = 0.5
@@ -104,7 +104,14 @@ class RelocalisationSettings:
         float,
         Field(gt=0.0, description="largest normalised residual (three numbers) of an inlier"),
     ] = 4.0
-    min_inliers: Annotated[int, Field(ge=3, description="fewer inliers than this are no pose")] = 12
+    min_inliers: Annotated[
+        int,
+        Field(ge=3, description="fewer witnesses (inliers, four at most of a piece) are no pose"),
+    ] = 12
+    enough_witnesses: Annotated[
+        int,
+        Field(ge=3, description="with so many witnesses what is not seen no longer contradicts"),
+    ] = 20
     ambiguous_share: Annotated[
         float,
         Field(
@@ -113,6 +120,22 @@ class RelocalisationSettings:
             description="the second-best pose elsewhere may have this share of the best's inliers",
         ),
     ] = 0.5
+    view_deg: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            le=180.0,
+            description="a landmark is expected to be seen from within this angle of a stored view",
+        ),
+    ] = 20.0
+    least_covered: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            le=1.0,
+            description="of this share of the pieces expected in view something must be seen",
+        ),
+    ] = 0.15
     elsewhere_m: Annotated[
         float, Field(gt=0.0, description="poses farther apart than this are different places")
     ] = 0.5

@@ -63,13 +63,15 @@ class KnownMap:
         return rows[inside], points[inside]
 
     def recognisable(
-        self, wTc: FloatArray, rows: IntArray, max_angle: float, size_ratio: float
+        self, wTc: FloatArray, rows: IntArray, max_angle: float, scales: tuple[float, float]
     ) -> BoolArray:
-        """Which of the landmarks (m,) have a view near to that from ``wTc``.
+        """Which of the landmarks (m,) in front of ``wTc`` have a view near to that from there.
 
-        Near is a direction within ``max_angle`` (radians) of the stored one; unknown ones are near.
+        Near is a direction within ``max_angle`` (radians) of the stored one (unknown ones are
+        near), and a predicted scale within ``scales`` (pixels), which the frame's features have.
         """
         sight = self.landmarks.positions[rows] - wTc[:3, 3]
+        depth = np.maximum(sight @ wTc[:3, 2], _NEAREST_DEPTH_M)
         sight = sight / np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None]
         place = np.full(len(self.landmarks), -1)
         place[rows] = np.arange(len(rows))
@@ -77,6 +79,8 @@ class KnownMap:
         at = place[self.owners[views]]
         cosine = np.einsum("vi,vi->v", self.views.direction[views], sight[at])
         near = ~(cosine < np.cos(max_angle))  # so NaN is near
+        scale = self.views.size[views] / depth[at]
+        near &= (scale >= scales[0]) & (scale <= scales[1])
         out = np.zeros(len(rows), np.bool_)
         out[at[near]] = True
         return out

@@ -18,11 +18,13 @@ from fgslam.frontend.relocalisation.residuals import (
 )
 from fgslam.frontend.relocalisation.tentative import gated
 from fgslam.settings.relocalisation import RelocalisationSettings
-from fgslam.types import ByteArray, CameraRig, FloatArray, IntArray, StereoFeatures
+from fgslam.types import BoolArray, ByteArray, CameraRig, FloatArray, IntArray, StereoFeatures
 
 _ROUNDS = 4  # of choosing matches and solving; the choice rests after two or three
 _STEPS = 6
 _KERNEL_WIDTH = 2.0  # as the tracker's
+_VOTES = 4  # of one piece of the map
+_SEVERAL = 4  # landmarks expected in a piece, so that one should be seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +39,9 @@ class Refined:
         residual_px: root mean square of the image residuals.
         proposed: how many of the frame's tentatively matched features agree.
         expected: (m,) rows of landmarks that the pose should see.
+        witnesses: what the matches weigh: of one piece of the map at most four count, for a thing
+            that stands elsewhere, too, would match as a whole.
+        covered: share of the map's pieces expected in view of which something is seen.
     """
 
     wTc: FloatArray
@@ -46,9 +51,18 @@ class Refined:
     residual_px: float
     proposed: int
     expected: IntArray
+    witnesses: int
+    covered: float
 
     def __len__(self) -> int:
         return len(self.features)
+
+    def unshared(self, other: Refined, positions: FloatArray, side: float) -> int:
+        """Witnesses for this pose among the matches that the other does not have."""
+        count = int(max(self.landmarks.max(), other.landmarks.max())) + 1
+        own = self.features * count + self.landmarks
+        rest = ~np.isin(own, other.features * count + other.landmarks)
+        return witnesses(positions[self.landmarks[rest]], side)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,16 +153,50 @@ class Refiner:
         image = found.residual[pairs.seen.in_image][:, :2]
         rms = float(np.sqrt(np.mean(np.sum(image**2, axis=1)))) if len(image) else float("nan")
         rows, _ = self.known.in_view(self.rig, wTc)
-        expected = rows[self.known.recognisable(wTc, rows, np.deg2rad(30.0), 2.0)]
+        sizes = float(self.features.scale.min()), float(self.features.scale.max())
+        expected = rows[self.known.recognisable(wTc, rows, self._view_angle, sizes)]
         tentative = np.unique(self.evidence.tentative.features)
         proposed = int(np.isin(tentative, chosen[0]).sum())
-        return Refined(wTc, covariance, chosen[0], chosen[1], rms, proposed, expected)
+        positions, side = self.known.landmarks.positions, self.settings.piece_m
+        return Refined(
+            wTc=wTc,
+            covariance=covariance,
+            features=chosen[0],
+            landmarks=chosen[1],
+            residual_px=rms,
+            proposed=proposed,
+            expected=expected,
+            witnesses=witnesses(positions[chosen[1]], side),
+            covered=covered(positions[expected], np.isin(expected, chosen[1]), side),
+        )
+
+    @property
+    def _view_angle(self) -> float:
+        return float(np.deg2rad(self.settings.view_deg))
 
 
 def pieces(positions: FloatArray, side: float) -> IntArray:
     """Number (n,) of the cube that each of the positions (n, 3) lies in, from 0."""
     cubes = np.floor(positions / side).astype(np.int64)
     return np.asarray(np.unique(cubes, axis=0, return_inverse=True)[1].ravel())
+
+
+def witnesses(positions: FloatArray, side: float) -> int:
+    """How many of the positions (n, 3) count where each cube has at most four votes."""
+    return (
+        int(np.minimum(np.bincount(pieces(positions, side)), _VOTES).sum()) if len(positions) else 0
+    )
+
+
+def covered(positions: FloatArray, seen: BoolArray, side: float) -> float:
+    """Share of the cubes with several positions (n, 3) in which one at least is seen; 1 of none."""
+    if not len(positions):
+        return 1.0
+    of = pieces(positions, side)
+    several = np.bincount(of) >= _SEVERAL
+    if not several.any():
+        return 1.0
+    return float(np.mean(np.bincount(of, weights=seen)[several] > 0.0))
 
 
 def crowd(positions: FloatArray, side: float) -> IntArray:

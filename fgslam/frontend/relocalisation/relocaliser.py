@@ -84,7 +84,7 @@ class Relocaliser:
         evidence: Evidence,
         proposals: Proposals,
     ) -> list[Refined]:
-        """The best distinct poses refined, that with most matches first."""
+        """The best distinct poses refined, that with most witnesses first."""
         settings = self._settings
         limits = settings.elsewhere_m, float(np.deg2rad(settings.elsewhere_deg))
         refiner = Refiner(self._rig, self._floor, self._known, features, seen, evidence, settings)
@@ -93,7 +93,7 @@ class Relocaliser:
             found = refiner.refine(best.poses[k], best.covariances[k])
             if found is not None:
                 out.append(found)
-        out.sort(key=lambda r: -len(r))
+        out.sort(key=lambda found: (-found.witnesses, -len(found)))
         first: list[Refined] = []
         for candidate in out:
             if all(apart(candidate.wTc[None], other.wTc, *limits)[0] for other in first):

@@ -30,8 +30,10 @@ def judge(
             Verdict.TOO_FEW_INLIERS, len(tentative), f"{matched} features match, no two agree"
         )
     best = refined[0]
-    second = len(refined[1]) if len(refined) > 1 else 0
-    verdict, why = _verdict(best, second, matched, settings)
+    rivals = [(r.unshared(best, landmarks.positions, settings.piece_m), r) for r in refined[1:]]
+    votes, rival = max(rivals, key=lambda pair: pair[0], default=(0, None))
+    second = 0 if rival is None else len(rival)
+    verdict, why = _verdict(best, votes, matched, settings)
     return Relocalisation(
         verdict=verdict,
         wTc=best.wTc,
@@ -47,19 +49,23 @@ def judge(
 
 
 def _verdict(
-    best: Refined, second: int, matched: int, settings: RelocalisationSettings
+    best: Refined, rival: int, matched: int, settings: RelocalisationSettings
 ) -> tuple[Verdict, str]:
     n = len(best)
     sigma_m = float(np.sqrt(np.trace(best.covariance[3:, 3:])))
     sigma_deg = float(np.rad2deg(np.sqrt(np.trace(best.covariance[:3, :3]))))
     said = (
-        f"{n} matches agree ({best.proposed} of {matched} tentative), {len(best.expected)} "
-        f"landmarks expected, second-best pose {second}, sigma {sigma_m:.3f} m {sigma_deg:.2f} deg"
+        f"{n} matches agree ({best.proposed} of {matched} tentative), {best.witnesses} witnesses, "
+        f"elsewhere {rival}; {len(best.expected)} landmarks expected, {best.covered:.0%} of their "
+        f"places seen; sigma {sigma_m:.3f} m {sigma_deg:.2f} deg"
     )
-    if n < settings.min_inliers:
-        return Verdict.TOO_FEW_INLIERS, f"{said}; {settings.min_inliers} are needed"
-    if second >= settings.ambiguous_share * n:
+    if best.witnesses < settings.min_inliers:
+        return Verdict.TOO_FEW_INLIERS, f"{said}; {settings.min_inliers} witnesses are needed"
+    if rival >= settings.ambiguous_share * best.witnesses:
         return Verdict.AMBIGUOUS, f"{said}; another place explains the frame nearly as well"
+    alone = best.witnesses < settings.enough_witnesses
+    if alone and best.covered < settings.least_covered:
+        return Verdict.CONTRADICTED, f"{said}; what should be seen there is not"
     if sigma_m > settings.max_sigma_m or sigma_deg > settings.max_sigma_deg:
         return Verdict.INACCURATE, f"{said}; too uncertain"
     return Verdict.FOUND, said
