@@ -72,7 +72,7 @@ def open_run(
         if not _waits_for_first(config, folder):
             checkpoint.require(folder)
         _require_same(config, folder)
-    mapping.require_savable(config.map)
+    mapping.require_savable(config.map, folder)
     given = None if config.map.load is None else map_entry.open_map(Path(config.map.load))
     opened = config
     if given is not None and config.map.start == "continue":

@@ -45,8 +45,10 @@ def first_config(config: ExperimentConfig, folder: Path) -> ExperimentConfig | N
     )
 
 
-def require_savable(settings: MapSettings) -> None:
+def require_savable(settings: MapSettings, run: Path) -> None:
     """Refuses, before the drive, a map file that could not be written after it.
+
+    The folder ``run`` of the run itself is none of its business.
 
     Raises:
         MapError: the name is a folder's.
@@ -57,7 +59,8 @@ def require_savable(settings: MapSettings) -> None:
     path = Path(settings.save)
     if path.is_dir():
         raise MapError(f"{path}: is a folder; name the map's file, e.g. {path / MAP_FILE}")
-    require_writable(path.parent)
+    if path.parent.resolve() != run.resolve():
+        require_writable(path.parent)
 
 
 # --------------------------------------------------------------------------------------------
