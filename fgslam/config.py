@@ -90,6 +90,11 @@ def parse_config(values: Mapping[str, Any], where: str) -> ExperimentConfig:
 def _of_slam(values: _Values, where: str) -> _Values:
     """The values themselves, unless they are of a homing experiment."""
     task = values.get("task")
+    if task == "localisation":
+        raise ConfigError(
+            f"{where}: task localisation drives nothing, and this needs an experiment of SLAM; "
+            "`fgslam run` takes both"
+        )
     if task is not None:
         raise ConfigError(
             f"{where}: task {task} is a homing experiment, and this needs one of SLAM; `fgslam "

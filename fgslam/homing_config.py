@@ -274,6 +274,8 @@ def _reader(task: Any, where: str) -> Reader[HomingExperiment]:
     if model is None:
         close = get_close_matches(str(task), TASKS, n=1, cutoff=0.5)
         hint = f"did you mean {close[0]}?" if close else f"use one of {', '.join(TASKS)}"
+        if task == "localisation":  # a task, but no homing
+            hint = "fgslam run takes it, this does not"
         raise ConfigError(f"{where}: task is {task!r}; {hint} (SLAM has no key task)")
     return Reader(model, _GROUPS_OF_KINDS)
 

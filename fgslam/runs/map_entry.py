@@ -140,7 +140,7 @@ def _locate(
     """The first frame that the map's landmarks place beyond doubt, and its number."""
     saved, frontend = given.saved, config.frontend
     relocaliser = make_relocaliser(sequence.rig, frontend)
-    relocaliser.learn(*_trusted(saved, frontend.database.valid_hits))
+    relocaliser.learn(*trusted(saved, frontend.database.valid_hits))
     stereo = make_stereo_matcher(sequence.rig, frontend)
     within, why = min(config.map.begin.within, len(sequence)), "no image could be read"
     stream = make_stream(sequence, frontend)()
@@ -163,12 +163,12 @@ def _locate(
     )
 
 
-def _trusted(saved: SavedMap, valid_hits: int) -> tuple[LandmarkMap, LandmarkAppearances]:
+def trusted(saved: SavedMap, valid_hits: int) -> tuple[LandmarkMap, LandmarkAppearances]:
     """Landmarks seen often enough to be there (Se et al. 6.1), with their looks."""
-    trusted = saved.permanent | (saved.hits >= valid_hits)
+    sure = saved.permanent | (saved.hits >= valid_hits)
     every = saved.landmarks
     landmarks = LandmarkMap(
-        every.ids[trusted], every.positions[trusted], every.covariances[trusted]
+        every.ids[sure], every.positions[sure], every.covariances[sure]
     )
     return landmarks, saved.appearances.of(landmarks.ids)
 

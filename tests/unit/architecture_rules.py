@@ -65,6 +65,7 @@ STAGE_EXTRAS: dict[str, frozenset[str]] = {
     "config_reading": frozenset(),
     "config": frozenset({"config_reading"}),
     "homing_config": frozenset({"config_reading", "config"}),
+    "localisation_config": frozenset({"config_reading", "config", "homing_config"}),
 }
 
 THIRD_PARTY_HOMES: dict[str, frozenset[str]] = {

@@ -1,0 +1,172 @@
+"""How right poses are that were found in a map without a prior: errors, counts, covariances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from fgslam.evaluation.consistency import pose_nees
+from fgslam.evaluation.trajectory import rotation_angles
+from fgslam.geometry import inverse
+from fgslam.types import BoolArray, FloatArray, IntArray
+
+_HELD = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """What counts as right, and what as false: metres and radians.
+
+    Attributes:
+        within_m, within_rad: largest errors of a right pose.
+        wrong_m, wrong_rad: a pose farther off than either is false.
+        least_visible: poses from which fewer landmarks are visible are told apart.
+    """
+
+    within_m: float
+    within_rad: float
+    wrong_m: float
+    wrong_rad: float
+    least_visible: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answers:
+    """What was asked and answered, row by row.
+
+    Attributes:
+        accepted: (n,) whether the pose is to be believed.
+        poses: (n, 4, 4) ``wTc`` found; anything where it is not accepted.
+        covariances: (n, 6, 6) in the tangent space at them.
+        truth: (n, 4, 4) true poses in the map's world; NaN where unknown.
+        visible: (n,) landmarks truly visible; -1 where unknown.
+    """
+
+    accepted: BoolArray
+    poses: FloatArray
+    covariances: FloatArray
+    truth: FloatArray
+    visible: IntArray
+
+    def __len__(self) -> int:
+        return len(self.accepted)
+
+    def select(self, keep: BoolArray) -> Answers:
+        """The chosen rows."""
+        return Answers(
+            self.accepted[keep],
+            self.poses[keep],
+            self.covariances[keep],
+            self.truth[keep],
+            self.visible[keep],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalisationErrors:
+    """Errors of the accepted poses; NaN where one is refused or its truth unknown.
+
+    Attributes:
+        metres, radians: (n,) distance and angle from the truth.
+        nees: (n,) normalised error squared.
+        dof: (n,) its degrees of freedom, 0 where unknown.
+    """
+
+    metres: FloatArray
+    radians: FloatArray
+    nees: FloatArray
+    dof: IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Median, 95th percentile and largest of some errors; None where there are none."""
+
+    median: float | None
+    p95: float | None
+    largest: float | None
+
+    @staticmethod
+    def of(values: FloatArray) -> Spread:
+        """Of the values that are known."""
+        known = values[np.isfinite(values)]
+        if not len(known):
+            return Spread(None, None, None)
+        return Spread(*(float(np.percentile(known, q)) for q in (50.0, 95.0, 100.0)))
+
+
+@dataclass(frozen=True, slots=True)
+class LocalisationScore:
+    """Counts over some queries.
+
+    Attributes:
+        queries: how many.
+        accepted: poses that were believed.
+        known: how many of the queries have a truth; the rest of the counts is over these.
+        right: accepted and within the bounds.
+        inexact: accepted, neither right nor false.
+        false: accepted, and somewhere else.
+        metres, degrees: errors of those accepted.
+        nees_per_dof: mean of them; None where unknown.
+        held: share of the true poses inside the 95 % region of the covariance; None where unknown.
+    """
+
+    queries: int
+    accepted: int
+    known: int
+    right: int
+    inexact: int
+    false: int
+    metres: Spread
+    degrees: Spread
+    nees_per_dof: float | None
+    held: float | None
+
+    @property
+    def share_right(self) -> float | None:
+        """Right ones of all with a truth; None where no truth is known."""
+        return self.right / self.known if self.known else None
+
+
+def localisation_errors(answers: Answers) -> LocalisationErrors:
+    """Errors of the accepted poses against the truth."""
+    known = answers.accepted & np.isfinite(answers.truth).all(axis=(1, 2))
+    metres, radians, nees = (np.full(len(answers), np.nan) for _ in range(3))
+    dof = np.zeros(len(answers), np.int64)
+    if known.any():
+        poses, truth = answers.poses[known], answers.truth[known]
+        difference = inverse(poses) @ truth
+        metres[known] = np.linalg.norm(difference[:, :3, 3], axis=1)
+        radians[known] = rotation_angles(difference[:, :3, :3])
+        found = pose_nees(poses, answers.covariances[known], truth)
+        nees[known], dof[known] = found.values, found.dof
+    return LocalisationErrors(metres, radians, nees, dof)
+
+
+def score(answers: Answers, bounds: Bounds) -> LocalisationScore:
+    """Counts the answers."""
+    errors = localisation_errors(answers)
+    judged = np.isfinite(errors.metres)
+    right = judged & (errors.metres <= bounds.within_m) & (errors.radians <= bounds.within_rad)
+    false = judged & ((errors.metres > bounds.wrong_m) | (errors.radians > bounds.wrong_rad))
+    sure = judged & (errors.dof > 0)
+    held = errors.nees[sure] <= chi2.ppf(_HELD, errors.dof[sure])
+    return LocalisationScore(
+        queries=len(answers),
+        accepted=int(answers.accepted.sum()),
+        known=int(np.isfinite(answers.truth).all(axis=(1, 2)).sum()),
+        right=int(right.sum()),
+        inexact=int((judged & ~right & ~false).sum()),
+        false=int(false.sum()),
+        metres=Spread.of(errors.metres),
+        degrees=Spread.of(np.rad2deg(errors.radians)),
+        nees_per_dof=float(errors.nees[sure].sum() / errors.dof[sure].sum()) if sure.any() else None,
+        held=float(np.mean(held)) if sure.any() else None,
+    )
+
+
+def counted(answers: Answers, bounds: Bounds) -> BoolArray:
+    """(n,) which queries count: enough landmarks are visible, or nobody knows how many."""
+    return np.asarray((answers.visible < 0) | (answers.visible >= bounds.least_visible))

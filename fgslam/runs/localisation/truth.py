@@ -1,0 +1,142 @@
+"""The truth in a saved map's own world, and which landmarks are truly visible from a pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.config import ExperimentConfig
+from fgslam.config_reading import Reader
+from fgslam.datasets.rendered_lab import RenderedLabSequence
+from fgslam.errors import FgslamError
+from fgslam.evaluation.trajectory import align, associate
+from fgslam.factory import open_sequence
+from fgslam.geometry import inverse, pose, project, transform_to_camera
+from fgslam.map_file import SavedMap
+from fgslam.recordings import Sequence
+from fgslam.runs.rendered_truth import TrueDepth
+from fgslam.settings.lab import RenderedLabSettings
+from fgslam.simulation.places import PlaceChoice, plan_in_place
+from fgslam.simulation.world import make_rig
+from fgslam.types import FloatArray, LandmarkMap
+
+_SAME_TIME_S = 1e-3
+_NEAREST_M = 0.3
+_BEHIND = 1.05  # times the rendered depth, plus the next: what is farther off is hidden
+_BEHIND_M = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthInMap:
+    """True poses of a recording's frames in the map's world.
+
+    Attributes:
+        poses: (n, 4, 4) of the selected frames; NaN where unknown.
+        alignment: how the two worlds were brought together, in words.
+    """
+
+    poses: FloatArray
+    alignment: str
+
+
+def truth_in_map(saved: SavedMap, sequence: Sequence, config: ExperimentConfig) -> TruthInMap:
+    """True poses in the map's world, as far as they can be known.
+
+    Of rendered places exactly, since the map's world is where its first drive began. Of recordings
+    on disk if the map's last drive was part of the same one: by the rigid motion (SE3, least
+    squares over positions) that brings the truth of that drive to the map's own trajectory.
+
+    Args:
+        saved: the map.
+        sequence: the recording.
+        config: what it was opened with.
+    """
+    unknown = np.full((len(sequence), 4, 4), np.nan)
+    if sequence.ground_truth is None:
+        return TruthInMap(unknown, "the recording has no ground truth")
+    drives = saved.about.get("drives") or [{}]
+    if isinstance(sequence, RenderedLabSequence):
+        return _of_rendered(_drive_config(drives[0]), sequence, config) or TruthInMap(
+            unknown, "the map is of another place, so errors are not known"
+        )
+    mapped = _drive_config(drives[-1])
+    aligned = None if mapped is None else _of_recorded(saved, mapped, sequence, config)
+    if aligned is None:
+        return TruthInMap(unknown, "the map is of another recording, so errors are not known")
+    mTw, matched = aligned
+    times, true_rows = associate(
+        sequence.timestamps, sequence.ground_truth.timestamps, _SAME_TIME_S
+    )
+    unknown[times] = mTw @ sequence.ground_truth.poses[true_rows]
+    words = f"truth aligned to the map's trajectory, SE3 over {matched} poses"
+    return TruthInMap(unknown, words)
+
+
+def visible(saved_landmarks: LandmarkMap, sequence: Sequence, i: int, wTc: FloatArray) -> int:
+    """Landmarks that a rendered frame ``i`` shows from its true pose; -1 where nobody knows.
+
+    In all images, and not behind what was rendered.
+    """
+    if not isinstance(sequence, TrueDepth) or not np.isfinite(wTc).all():
+        return -1
+    rig, depth = sequence.rig, sequence.depth(i)
+    points = transform_to_camera(wTc, saved_landmarks.positions)
+    points = points[points[:, 2] > _NEAREST_M]
+    column, row, disparity = project(rig, points).T
+    rise = 0.0
+    if rig.vertical_baseline is not None:
+        rise = disparity * (rig.fy * rig.vertical_baseline) / (rig.fx * rig.baseline)
+    inside = (column >= 0.0) & (column + disparity <= rig.width - 1.0)
+    inside &= (row >= 0.0) & (row + rise <= rig.height - 1.0)
+    near = depth[
+        np.rint(row[inside]).astype(np.int64), np.rint(column[inside]).astype(np.int64)
+    ]
+    return int(np.sum(points[inside, 2] <= _BEHIND * near + _BEHIND_M))
+
+
+def _drive_config(drive: object) -> ExperimentConfig | None:
+    """What a map's drive was opened with; None where this fgslam cannot tell."""
+    if not isinstance(drive, dict) or not isinstance(drive.get("settings"), dict):
+        return None
+    try:
+        values = {"name": "map", **drive["settings"]}
+        return Reader(ExperimentConfig, ()).parse(values, "map")
+    except FgslamError:
+        return None
+
+
+def _of_rendered(
+    mapped: ExperimentConfig | None, sequence: RenderedLabSequence, config: ExperimentConfig
+) -> TruthInMap | None:
+    """Both worlds are camera poses in one room."""
+    now = config.dataset
+    if mapped is None or not isinstance(then := mapped.dataset, RenderedLabSettings):
+        return None
+    if not isinstance(now, RenderedLabSettings) or now.place != then.place:
+        return None
+    rig = make_rig(then.rig)
+    choice = PlaceChoice(then.place, then.room_seed, then.visit, then.posters == "identical")
+    drive = plan_in_place(choice, then.drive, rig)
+    start = drive.body_poses(drive.timestamps[then.start : then.start + 1])[0] @ rig.bTc
+    poses = inverse(start) @ sequence.room_from_world @ sequence.ground_truth.poses
+    return TruthInMap(poses, "truth in the world of the map's first frame, exactly")
+
+
+def _of_recorded(
+    saved: SavedMap, mapped: ExperimentConfig, sequence: Sequence, config: ExperimentConfig
+) -> tuple[FloatArray, int] | None:
+    """(4, 4) from the truth's world to the map's, and how many poses it was found from."""
+    now, then = (getattr(one.dataset, "path", None) for one in (config, mapped))
+    if now is None or then is None or Path(now).resolve() != Path(then).resolve():
+        return None
+    try:
+        truth = open_sequence(mapped).ground_truth
+    except FgslamError:
+        return None
+    if truth is None:
+        return None
+    rows, true_rows = associate(saved.trajectory.timestamps, truth.timestamps, _SAME_TIME_S)
+    found = align(truth.poses[true_rows], saved.trajectory.poses[rows])
+    return None if found is None else (pose(found.rotation, found.translation), len(rows))

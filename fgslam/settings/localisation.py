@@ -1,0 +1,68 @@
+"""Settings of the task `localisation`: which frames are sought in a saved map, and what is right."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fgslam.settings.base import STRICT
+from fgslam.settings.maps import FirstDriveSettings
+
+
+@dataclass(frozen=True, config=STRICT)
+class KnownMapSettings:
+    """The map in which frames are sought: a file, or one that is made first."""
+
+    load: Annotated[str | None, Field(description="map file")] = None
+    made_from: Annotated[
+        FirstDriveSettings | None,
+        Field(
+            description="drive this first, into RUN/first, with this experiment's front-end and "
+            "estimator, and take its map"
+        ),
+    ] = None
+
+
+@dataclass(frozen=True, config=STRICT)
+class QuerySettings:
+    """What is asked of the map, and when an answer is right."""
+
+    frames: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=100)], ...],
+        Field(
+            min_length=1,
+            description="frames of a query: 1, or a short submap of so many that ends at it; each "
+            "of these numbers is tried with the same queries",
+        ),
+    ] = (1,)
+    every: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="queries lie so many frames apart; of bursts of random poses their length",
+        ),
+    ] = 1
+    least_visible: Annotated[
+        int,
+        Field(
+            ge=0,
+            description="a pose from which fewer of the map's landmarks are visible is told apart; "
+            "where depth is not known nobody knows, and all count",
+        ),
+    ] = 20
+    within_m: Annotated[
+        float, Field(gt=0.0, description="largest error of a right position, metres")
+    ] = 0.05
+    within_deg: Annotated[
+        float, Field(gt=0.0, le=180.0, description="largest error of a right rotation, degrees")
+    ] = 1.0
+    wrong_m: Annotated[
+        float,
+        Field(gt=0.0, description="an accepted pose farther off than this is false, metres"),
+    ] = 0.30
+    wrong_deg: Annotated[
+        float,
+        Field(gt=0.0, le=180.0, description="the same of its rotation, degrees"),
+    ] = 5.0
