@@ -226,7 +226,11 @@ class LabSettings:
         int, Field(ge=0, description="seed of the room's textures and small things")
     ] = 0
     visit: Annotated[
-        Literal[1, 2], Field(description="2: some furniture has been moved since the first visit")
+        Literal[1, 2, 3],
+        Field(
+            description="2: chairs, cartons and the like have been moved since the first visit; 3: "
+            "shelves and posters of the lab have been exchanged too"
+        ),
     ] = 1
     posters: Annotated[
         Literal["different", "identical"],

@@ -6,6 +6,7 @@ The room's frame has its origin on the floor in the middle, x east, y north, z u
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -28,13 +29,17 @@ def build_lab(
 
     Args:
         rng: for the small things: which books, which posters, at what angles.
-        visit: 1 or 2. Both draw the same random numbers, so that what has not moved is the same.
+        visit: 1; 2: chairs, cartons and the plotter stand elsewhere; 3: posters and shelves have
+            been exchanged too, and the desk in the middle turned about. All draw the same random
+            numbers, so that what has not moved is the same.
         identical_posters: two posters on different walls show the same and are equally large.
     """
     things = [*_shell(), *_along_walls(rng), *_on_walls(rng), *_islands(rng)]
     if identical_posters:
         things = _with_twins(things)
-    things += _loose_things(rng, moved=visit == 2)
+    if visit == 3:
+        things = _rearranged(things)
+    things += _loose_things(rng, moved=visit > 1)
     return tuple(things)
 
 
@@ -155,9 +160,47 @@ def _with_twins(things: list[Thing]) -> list[Thing]:
     return [copy if thing.name == copy.name else thing for thing in things]
 
 
+def _rearranged(things: list[Thing]) -> list[Thing]:
+    """Things after a new start in the room: same names, and what has moved is elsewhere.
+
+    The posters of a pair show what the other one showed; of a pair of equally wide shelves each
+    stands where the other stood; the desk in the middle faces the other way.
+    """
+    by_name = {thing.name: thing.patches for thing in things}
+    for a, b in _POSTER_PAIRS:
+        first, second = by_name[f"poster_{a}"], by_name[f"poster_{b}"]
+        shown = second[0].surface, first[0].surface
+        for name, patches, surface in zip((a, b), (first, second), shown, strict=True):
+            by_name[f"poster_{name}"] = tuple(replace(p, surface=surface) for p in patches)
+    for (a, place_a), (b, place_b) in _SHELF_PAIRS:
+        first, second = by_name[a], by_name[b]
+        by_name[a] = tuple(_carried(first, place_a, place_b))
+        by_name[b] = tuple(_carried(second, place_b, place_a))
+    x, y = _ISLAND_DESK
+    by_name["island_desk"] = tuple(placed(by_name["island_desk"], 2 * x, 2 * y, 0.0, 180.0))
+    return [Thing(name, patches) for name, patches in by_name.items()]
+
+
+def _carried(
+    patches: tuple[Patch, ...], start: tuple[str, float], end: tuple[str, float]
+) -> list[Patch]:
+    """A piece carried from one (wall, along) to another."""
+    at_north = placed(patches, 0.0, 0.0, 0.0, -_WALLS[start[0]])
+    return placed(placed(at_north, end[1] - start[1], 0.0, 0.0, 0.0), 0, 0, 0, _WALLS[end[0]])
+
+
+_POSTER_PAIRS = ((1, 10), (2, 13), (3, 7), (4, 16), (6, 12), (8, 14), (9, 15))
+_SHELF_PAIRS = (
+    (("shelf_1", ("north", -3.8)), ("shelf_4", ("east", -3.6))),
+    (("shelf_2", ("north", -2.5)), ("shelf_9", ("west", 3.5))),
+    (("shelf_5", ("east", 3.3)), ("shelf_6", ("south", -2.4))),
+)
+_ISLAND_DESK = (0.2, 2.35)
+
+
 def _islands(rng: np.random.Generator) -> list[Thing]:
     """Free-standing rows north and south of the middle, low enough to see the walls over them."""
-    north = placed(furniture.desk(rng, 2.2, 2), 0.2, 2.35, 0.0, 0.0)
+    north = placed(furniture.desk(rng, 2.2, 2), *_ISLAND_DESK, 0.0, 0.0)
     south = placed(furniture.shelf(rng, 1.8, 1.1, 0.35), -0.4, -2.45, 0.0, 180.0)
     back = placed(furniture.shelf(rng, 1.8, 1.1, 0.35), -0.4, -2.45, 0.0, 0.0)
     return [Thing("island_desk", tuple(north)), Thing("island_shelf", tuple(south + back))]

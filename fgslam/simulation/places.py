@@ -49,7 +49,7 @@ class PlaceChoice:
     Attributes:
         name: which.
         seed: of textures, layout and small things.
-        visit: 1, or a later one that finds things elsewhere.
+        visit: 1, or a later one (2; in the lab 3) that finds things elsewhere.
         identical_posters: two posters of the lab are the same.
     """
 
@@ -161,4 +161,9 @@ def _require_offer(choice: PlaceChoice) -> None:
         raise ConfigError(
             f"dataset.visit {choice.visit}: nothing is ever moved in dataset.place corridors; "
             "choose the lab or rooms"
+        )
+    if choice.visit > 2 and choice.name != "lab":
+        raise ConfigError(
+            f"dataset.visit {choice.visit}: only the lab has been rearranged; dataset.place "
+            f"{choice.name} has the visits 1 and 2"
         )

@@ -13,7 +13,7 @@ from fgslam.simulation.texture_library import PHOTOGRAPHS, build_library, photog
 from fgslam.simulation.textures import book_row
 from fgslam.simulation.world import make_rig
 
-VISITS = (1, 2)
+VISITS = (1, 2, 3)
 
 
 def lab(visit: int) -> tuple[Thing, ...]:
