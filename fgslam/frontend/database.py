@@ -13,7 +13,7 @@ import numpy as np
 from fgslam.frontend.landmark_table import LandmarkTable
 from fgslam.frontend.permanence import is_blind, reliable, seen_past
 from fgslam.frontend.views import Views
-from fgslam.frontend.visibility import ExpectedLandmarks, FieldOfView, directions_to
+from fgslam.frontend.visibility import ExpectedLandmarks, FieldOfView, Wanted, directions_to
 from fgslam.settings.frontend import DatabaseSettings, PermanenceSettings
 from fgslam.types import (
     BoolArray,
@@ -53,12 +53,10 @@ class LandmarkDatabase(LandmarkTable):
 
     def expected(self, landmarks: LandmarkMap, wTc: FloatArray) -> ExpectedLandmarks:
         """Landmarks of the map that should or may be in view from ``wTc`` (4.4)."""
-        found = self._field_of_view.select(wTc, landmarks.positions)
-        rows = self.rows(landmarks.ids[found.rows])
         least = self._settings.least_scale_px
-        if least is not None:
-            large = self._largest_sizes(rows) >= least * found.points[:, 2]
-            found, rows = found.select(large), rows[large]
+        wanted = None if least is None else self._larger_than(least, landmarks.ids)
+        found = self._field_of_view.select(wTc, landmarks.positions, wanted)
+        rows = self.rows(landmarks.ids[found.rows])
         directions = directions_to(wTc, found.points) if self._pool.several else None
         views, known = self._views_from(rows, directions)
         return ExpectedLandmarks(
@@ -182,6 +180,14 @@ class LandmarkDatabase(LandmarkTable):
         return pruned
 
     # ----------------------------------------------------------------------------------------
+
+    def _larger_than(self, least: float, ids: IntArray) -> Wanted:
+        """Says which landmarks of a map, by their rows and depths, look at least that large."""
+
+        def wanted(rows: IntArray, depth: FloatArray) -> BoolArray:
+            return np.asarray(self._largest_sizes(self.rows(ids[rows])) >= least * depth)
+
+        return wanted
 
     def _reliable(self, rows: IntArray, permanence: PermanenceSettings) -> BoolArray:
         trusted = self.hits[rows] >= self._settings.valid_hits

@@ -125,7 +125,13 @@ class ViewPool:
 
     def largest_sizes(self, places: Places) -> FloatArray:
         """Largest size (v,) of the views of each landmark."""
-        return np.asarray(np.where(places >= 0, self._size[places], 0.0).max(axis=1))
+        sizes = self._size[places[:, 0]]
+        for column in range(1, self.max_views):
+            more = np.flatnonzero(places[:, column] >= 0)
+            if not len(more):
+                break
+            sizes[more] = np.maximum(sizes[more], self._size[places[more, column]])
+        return sizes
 
     def nearest(self, places: Places, directions: Directions) -> tuple[IntArray, BoolArray]:
         """The view of each landmark nearest to a direction, and whether it is near enough.

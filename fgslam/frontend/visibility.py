@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -17,6 +19,8 @@ from fgslam.geometry import (
 from fgslam.settings.frontend import DatabaseSettings
 from fgslam.types import BoolArray, ByteArray, CameraRig, FloatArray, IntArray, Prediction
 
+Wanted: TypeAlias = Callable[[IntArray, FloatArray], BoolArray]
+"""Of rows (k,) of the map and their depths: which (k,) to consider at all."""
 _NEAREST_DEPTH_M = 0.1
 _SLACK_PX = 1e-6  # of the rough test before the exact one; far above rounding
 
@@ -83,10 +87,23 @@ class FieldOfView:
         self._tangent = np.tan(np.deg2rad(settings.cone_deg))
         self._max_disparity = max_disparity_px
 
-    def select(self, wTc: FloatArray, positions: FloatArray) -> InView:
-        """The points (n, 3) of the world that may be in view from ``wTc``."""
+    def select(
+        self,
+        wTc: FloatArray,
+        positions: FloatArray,
+        wanted: Wanted | None = None,
+    ) -> InView:
+        """The points (n, 3) of the world that may be in view from ``wTc``.
+
+        Args:
+            wTc: (4, 4) pose.
+            positions: (n, 3) points.
+            wanted: asked about those roughly in view.
+        """
         points = transform_to_camera(wTc, positions)
         rows = self._roughly(points)
+        if wanted is not None:
+            rows = rows[wanted(rows, points[rows, 2])]
         points = points[rows]
         measurement = project(self._rig, points)
         if self._cone:
