@@ -167,11 +167,11 @@ def _rearranged(things: list[Thing]) -> list[Thing]:
     stands where the other stood; the desk in the middle faces the other way.
     """
     by_name = {thing.name: thing.patches for thing in things}
-    for a, b in _POSTER_PAIRS:
-        first, second = by_name[f"poster_{a}"], by_name[f"poster_{b}"]
-        shown = second[0].surface, first[0].surface
-        for name, patches, surface in zip((a, b), (first, second), shown, strict=True):
-            by_name[f"poster_{name}"] = tuple(replace(p, surface=surface) for p in patches)
+    for pair in _POSTER_PAIRS:
+        names = [f"poster_{number}" for number in pair]
+        shown = [by_name[name][0].surface for name in names]
+        for name, surface in zip(names, shown[::-1], strict=True):
+            by_name[name] = tuple(replace(p, surface=surface) for p in by_name[name])
     for (a, place_a), (b, place_b) in _SHELF_PAIRS:
         first, second = by_name[a], by_name[b]
         by_name[a] = tuple(_carried(first, place_a, place_b))
