@@ -117,6 +117,11 @@ class LandmarkKalman:
         return UpdateStats(current.wTc, current.covariance, len(self._rows), nis, dof)
 
     @property
+    def homes(self) -> IntArray:
+        """(n,) frame with which each landmark of the map moves; -1 for one that stays."""
+        return self._rows.homes
+
+    @property
     def chain(self) -> Chain:
         """The drive as tracked, with the uncertainty of its steps."""
         return self._drive.chain

@@ -257,7 +257,7 @@ class Smoother(ABC):
         """Lets the tracker go on from smoothed values.
 
         Landmarks that the graph knows nothing of stay; after a loop (``whole``) they move along
-        with the last pose, near which they are.
+        with the last pose, near which they are, unless they are a saved map's.
         """
         ids, positions = self._positions(values)
         waiting_ids, waiting_positions = self._waiting(values)
@@ -265,7 +265,7 @@ class Smoother(ABC):
         positions = np.concatenate([positions, waiting_positions])
         if whole:
             known, moved = self._tracker.landmarks(), self._tracker.predict(None).wTc
-            rest = np.flatnonzero(~np.isin(known.ids, ids))
+            rest = np.flatnonzero(~np.isin(known.ids, ids) & (self._tracker.homes >= 0))
             moved = current.wTc @ inverse(moved)
             ids = np.concatenate([ids, known.ids[rest]])
             positions = np.concatenate(

@@ -157,6 +157,7 @@ def corrected(
         step = Odometry(known.motion, known.covariance)
         graph.add(odometry_factor(pose_key(known.before), pose_key(known.after), step))
     params = solver_parameters(_ITERATIONS, _TOLERANCE)
+    params.setLinearSolverType("MULTIFRONTAL_QR")  # a tight loop on a loose chain defeats Cholesky
     found = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
     at = {frame: reorthonormalise(poses_of_frame(found, frame)) for frame in begins}
     out = poses.copy()
