@@ -162,7 +162,7 @@ def score(answers: Answers, bounds: Bounds) -> LocalisationScore:
         false=int(false.sum()),
         metres=Spread.of(errors.metres),
         degrees=Spread.of(np.rad2deg(errors.radians)),
-        nees_per_dof=float(errors.nees[sure].sum() / errors.dof[sure].sum()) if sure.any() else None,
+        nees_per_dof=errors.nees[sure].sum() / errors.dof[sure].sum() if sure.any() else None,
         held=float(np.mean(held)) if sure.any() else None,
     )
 

@@ -40,7 +40,7 @@ def inspect_recording(
     Raises:
         FgslamError: the recording cannot be opened at all, or the configuration is wrong.
     """
-    config = _configure(dataset, overrides)
+    config = configure(dataset, overrides)
     sequence = open_sequence(config, lambda done, total: progress("rendering", done, total))
     read = max(frames, _READ_AT_LEAST)
     general = inspect_sequence(sequence, read, lambda done, total: progress("reading", done, total))
@@ -64,8 +64,12 @@ def _images_read(read: int, frames: int) -> str:
     return f"{share(read, frames)} frames{all_of_them}"
 
 
-def _configure(dataset: Path, overrides: Sequence[str]) -> ExperimentConfig:
-    """The experiment's configuration, or the default one for a folder in a known layout."""
+def configure(dataset: Path, overrides: Sequence[str]) -> ExperimentConfig:
+    """The experiment's configuration, or the default one for a folder in a known layout.
+
+    Raises:
+        FgslamError: the layout is not known, or the configuration is wrong.
+    """
     if dataset.suffix.lower() in _YAML:
         return load_config(dataset, overrides)
     # The kind is named so that an override of one of its keys finds it.

@@ -29,6 +29,7 @@ from fgslam.export.point_cloud import MapPoints
 from fgslam.export.trajectories import write_tum
 from fgslam.frontend.database import LandmarkDatabase
 from fgslam.homing_config import HomingExperiment
+from fgslam.localisation_config import LocalisationConfig
 from fgslam.pipeline import SlamPipeline
 from fgslam.recordings import Sequence
 from fgslam.runs.checkpoint import save_log
@@ -148,7 +149,9 @@ class RunOutputs:
 
 
 def write_config(
-    folder: Path, config: ExperimentConfig | HomingExperiment, provenance: dict[str, Any]
+    folder: Path,
+    config: ExperimentConfig | HomingExperiment | LocalisationConfig,
+    provenance: dict[str, Any],
 ) -> None:
     """config.yaml: every default filled in, with the versions and where the data came from."""
     values = config.as_values() | {"provenance": {"versions": versions()} | provenance}

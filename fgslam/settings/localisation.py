@@ -1,4 +1,4 @@
-"""Settings of the task `localisation`: which frames are sought in a saved map, and what is right."""
+"""Settings of the task `localisation`: which frames are sought in a map, and what is right."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def draw_birds_eye(path: Path, drawing: MapDrawing) -> None:
         OutputError: the file cannot be written.
     """
     x_limits, z_limits = view_limits(drawing)
-    width, height = _figure_size(x_limits, z_limits)
+    width, height = figure_size(x_limits, z_limits)
     with picture(path, width, height) as figure:
         axes = figure.subplots()
         axes.set(xlim=x_limits, ylim=z_limits, aspect="equal")
@@ -113,9 +113,10 @@ def world_position_covariances(poses: FloatArray, covariances: FloatArray) -> Fl
     return congruence(poses[:, :3, :3], covariances[:, 3:, 3:])
 
 
-def _figure_size(
+def figure_size(
     x_limits: tuple[float, float], z_limits: tuple[float, float]
 ) -> tuple[float, float]:
+    """Inches of a picture of these limits, with room for a bar and a legend."""
     aspect = (z_limits[1] - z_limits[0]) / (x_limits[1] - x_limits[0])
     panel_height = float(np.clip(8.2 * aspect, 3.6, 9.0))
     return panel_height / aspect + 2.4, panel_height + 1.8
@@ -126,7 +127,7 @@ def _draw_landmarks(axes: Axes, drawing: MapDrawing) -> None:
         return
     ground, up = drawing.landmarks[:, _GROUND], -drawing.landmarks[:, 1]
     if drawing.landmark_covariances is not None:
-        _add_ellipses(
+        add_ellipses(
             axes,
             ground,
             drawing.landmark_covariances[:, _GROUND][:, :, _GROUND],
@@ -194,7 +195,7 @@ def _draw_pose_ellipses(axes: Axes, drawing: MapDrawing, covariances: FloatArray
     shown = known[np.unique(np.linspace(0, len(known) - 1, _POSE_ELLIPSES).astype(int))]
     factor = exaggeration(ground[shown], span=float(np.ptp(axes.get_xlim())))
     enlarged = f", drawn {factor} times larger" if factor > 1 else ""
-    _add_ellipses(
+    add_ellipses(
         axes,
         drawing.poses[shown][:, _GROUND, 3],
         factor**2 * ground[shown],
@@ -216,7 +217,7 @@ def exaggeration(covariances: FloatArray, span: float) -> int:
     return 1 if typical == 0.0 else _EXAGGERATIONS[-1]
 
 
-def _add_ellipses(
+def add_ellipses(
     axes: Axes,
     centres: FloatArray,
     covariances: FloatArray,

@@ -86,6 +86,12 @@ class Asked:
         return tuple(one for one in self.attempts if one.frames == frames)
 
 
+def nothing_asked(why: str) -> Asked:
+    """No query at all, and why."""
+    nobody = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+    return Asked((), nobody, why, whole=False)
+
+
 class Asker:
     """A map that has been learnt, and what it takes to ask it."""
 

@@ -90,9 +90,7 @@ def visible(saved_landmarks: LandmarkMap, sequence: Sequence, i: int, wTc: Float
         rise = disparity * (rig.fy * rig.vertical_baseline) / (rig.fx * rig.baseline)
     inside = (column >= 0.0) & (column + disparity <= rig.width - 1.0)
     inside &= (row >= 0.0) & (row + rise <= rig.height - 1.0)
-    near = depth[
-        np.rint(row[inside]).astype(np.int64), np.rint(column[inside]).astype(np.int64)
-    ]
+    near = depth[np.rint(row[inside]).astype(np.int64), np.rint(column[inside]).astype(np.int64)]
     return int(np.sum(points[inside, 2] <= _BEHIND * near + _BEHIND_M))
 
 
