@@ -34,6 +34,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 _KEEP_ALL = ("frontend.database.prune_after_misses=1000000",)
 _ENOUGH = 10  # times expected, before its absence says anything
 _LIMITS = (5, 10, 15, 20, 25)
+_HITS = (3, 5, 10)
 
 
 # --------------------------------------------------------------------------------------------
@@ -121,6 +122,7 @@ class Lives:
         hits, misses: (n,) by identity.
         missed: (n,) longest row of misses.
         contradicted: (n,) most contradictions without a hit between.
+        best: for each number of hits, the best n/(n+m) (n,) at a hit from that number on.
     """
 
     count: int
@@ -132,6 +134,7 @@ class Lives:
         self.hits, self.misses = zeros.copy(), zeros.copy()
         self.missed, self.contradicted = zeros.copy(), zeros.copy()
         self._missed, self._contradicted = zeros.copy(), zeros.copy()
+        self.best = {hits: np.zeros(self.count) for hits in _HITS}
 
     def follow(self, report: FrameReport, places: FloatArray) -> None:
         """One frame; ``places`` (m, 3) are where the missed ones were expected."""
@@ -147,6 +150,10 @@ class Lives:
         hits = hits[hits < self.count]
         self.hits[hits] += 1
         self._missed[hits] = self._contradicted[hits] = 0
+        share = self.hits[hits] / (self.hits[hits] + self.misses[hits])
+        for least, best in self.best.items():
+            enough = self.hits[hits] >= least
+            best[hits[enough]] = np.maximum(best[hits[enough]], share[enough])
         np.maximum(self.missed, self._missed, out=self.missed)
         np.maximum(self.contradicted, self._contradicted, out=self.contradicted)
 
@@ -211,18 +218,28 @@ def _map_of(pipeline: SlamPipeline, sequence: Sequence) -> SavedMap:
 def permanence_table(visits: Visits) -> Table:
     """How many landmarks each threshold makes permanent, and how they do in the second visit."""
     first, again = visits.first, visits.same
-    expected = again.hits + again.misses
     rows: list[tuple[Cell, ...]] = []
-    for hits in (3, 5, 10):
+    for hits in _HITS:
         for ratio in (0.2, 0.3, 0.4, 0.5, 0.6):
             settings = PermanenceSettings(ratio=ratio, hits=hits)
-            chosen = reliable(first.hits, first.misses, settings)
-            judged = chosen & (expected >= 5)
-            share = again.hits[judged] / expected[judged]
-            never = float((again.hits[judged] == 0).mean())
-            rows.append((hits, ratio, int(chosen.sum()), never, float(np.median(share))))
-    columns = ("hits", "ratio", "permanent", "never found again", "median n/(n+m) of the second")
+            at_the_end = reliable(first.hits, first.misses, settings)
+            underway = first.best[hits] > ratio
+            rows.append(
+                (hits, ratio, *_found_again(at_the_end, again), *_found_again(underway, again))
+            )
+    columns = (
+        "hits", "ratio", "permanent at the end", "never found again", "median n/(n+m)",
+        "permanent underway", "never found again ", "median n/(n+m) ",
+    )  # fmt: skip
     return Table("Permanence: thresholds, in a second visit to the same room", columns, rows)
+
+
+def _found_again(chosen: BoolArray, again: Lives) -> tuple[int, float, float]:
+    """How many were chosen; of those expected again, share never found, and median n/(n+m)."""
+    expected = again.hits + again.misses
+    judged = chosen & (expected >= 5)
+    share = again.hits[judged] / expected[judged]
+    return int(chosen.sum()), float((share == 0.0).mean()), float(np.median(share))
 
 
 def demotion_table(visits: Visits) -> Table:
