@@ -31,7 +31,7 @@ class RelocalisationSettings:
     max_distance: Annotated[
         float,
         Field(gt=0.0, description="largest distance of descriptors, whose norm is 512"),
-    ] = 330.0
+    ] = 400.0
     ratio: Annotated[
         float,
         Field(
