@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from simulated import RIG
 
 from fgslam.frontend.database import LandmarkDatabase
-from fgslam.settings.frontend import DatabaseSettings
+from fgslam.settings.frontend import DatabaseSettings, PermanenceSettings
 from fgslam.types import StereoFeatures
 
 TYPES = st.sampled_from(["I", "II", "III"])
@@ -24,6 +24,7 @@ class Entry:
     hits: int = 1
     misses: int = 0
     missed: int = 0
+    permanent: bool = False
 
 
 def some_features(count: int, seed: int) -> StereoFeatures:
@@ -46,9 +47,11 @@ def entry_bits(database: LandmarkDatabase, row: int) -> bytes:
     return b"".join(column[row].tobytes() for column in columns)
 
 
-@given(FRAMES, st.integers(1, 4))
-def test_types_I_to_IV(frames, limit) -> None:
-    database = LandmarkDatabase(RIG, DatabaseSettings(prune_after_misses=limit), 40.0)
+@given(FRAMES, st.integers(1, 4), st.booleans())
+def test_types_I_to_IV(frames, limit, lasting) -> None:
+    permanence = PermanenceSettings(ratio=0.5, hits=3) if lasting else None
+    settings = DatabaseSettings(prune_after_misses=limit, permanence=permanence)
+    database = LandmarkDatabase(RIG, settings, 40.0)
     model: dict[int, Entry] = {}
     next_id = 0
     for k, (types, new) in enumerate(frames):
@@ -63,16 +66,20 @@ def test_types_I_to_IV(frames, limit) -> None:
         fresh = database.add(found, len(hit) + np.arange(new), np.full(new, k, np.uint8))
         assert fresh.tolist() == list(range(next_id, next_id + new))
         for i in hit.tolist():
-            model[i].hits, model[i].missed = model[i].hits + 1, 0
+            entry = model[i]
+            entry.hits, entry.missed = entry.hits + 1, 0
+            share = entry.hits / (entry.hits + entry.misses)
+            entry.permanent |= lasting and entry.hits >= 3 and share > 0.5
         for i in missed.tolist():
             model[i].misses, model[i].missed = model[i].misses + 1, model[i].missed + 1
         model |= {i: Entry() for i in fresh.tolist()}
         next_id += new
-        gone = sorted(i for i, entry in model.items() if entry.missed >= limit)
+        gone = sorted(i for i, e in model.items() if e.missed >= limit and not e.permanent)
         assert database.prune().tolist() == gone
         for i in gone:
             del model[i]
         assert database.ids.tolist() == sorted(model)
+        assert database.permanent.tolist() == [model[i].permanent for i in sorted(model)]
         for row, i in enumerate(database.ids.tolist()):
             counts = (database.hits[row], database.misses[row], database.missed[row])
             assert counts == (model[i].hits, model[i].misses, model[i].missed)
