@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from simulated import (
-    RIG,
     Drive,
     noisy_odometry,
     observations,
@@ -22,11 +21,13 @@ from simulated import (
 )
 
 from fgslam import geometry as g
-from fgslam.types import BoolArray, FloatArray, Increment, IntArray, LoopClosure
+from fgslam.types import BoolArray, FloatArray, Increment, LoopClosure
 
 CIRCLE = (0.0, 0.1, 0.0, 0.0, 0.0, 0.25)
 """63 frames a round of 5 m across."""
 ROUND = 63
+CLOSED = ROUND + 6
+"""When the return is recognised."""
 LOOP_SIGMA = np.array([0.001, 0.001, 0.001, 0.005, 0.005, 0.005])
 _FORGOTTEN_AFTER = 15
 
@@ -43,10 +44,10 @@ class Rounds:
 
     drive: Drive = dataclasses.field(
         default_factory=lambda: Drive(
-            frames=84, points=110, twist=CIRCLE, sigma_px=(1.0, 1.0, 0.8), miss_rate=0.1
+            frames=75, points=80, twist=CIRCLE, sigma_px=(0.8, 0.8, 0.6), miss_rate=0.1
         )
     )
-    closes: tuple[int, ...] = (ROUND + 7,)
+    closes: tuple[int, ...] = (CLOSED,)
     lies: tuple[tuple[int, tuple[float, ...]], ...] = ()
 
 
@@ -170,12 +171,3 @@ class _Book:
         else:
             merged = merged[:0]
         return LoopClosure(frame, true @ off @ noise, np.diag(LOOP_SIGMA**2), old, merged)
-
-
-def without_loops(increments: list[Increment]) -> list[Increment]:
-    """The same measurements before any return is recognised."""
-    first = next((k for k, x in enumerate(increments) if x.loops), len(increments))
-    return [dataclasses.replace(x, loops=()) for x in increments[:first]]
-
-
-__all__ = ["RIG", "IntArray", "Returned", "Rounds", "drive_rounds", "without_loops"]

@@ -209,7 +209,8 @@ def play_directly(
         prediction = estimator.predict(increment.odometry)
         matched = increment.observations.select(~increment.observations.is_new)
         if increment.odometry is None:
-            tracking = tracked_at(prediction, len(matched))
+            first = tracked_at(prediction, len(matched))
+            tracking = dataclasses.replace(first, status=EgoMotionStatus.FIRST)
         else:
             problem = PoseProblem.of(estimator.landmarks(), matched)
             tracking = solver.solve(prediction, problem)

@@ -140,7 +140,9 @@ class FullEkf:
         # Nothing below can fail.
         self._take_over(found, wTc, front)
         used = found.matched + len(first.points)
-        self._skipped += len(increment.observations) - used
+        every = increment.observations
+        merged = every.is_new & np.isin(every.ids, increment.pruned_ids)
+        self._skipped += len(every) - used - int(merged.sum())
         for loop in increment.loops:
             self._close(increment, loop)
         self._drop(increment)
@@ -203,7 +205,10 @@ class FullEkf:
     # -- what may fail, before anything is changed ---------------------------------------------
 
     def _first_sights(self, increment: Increment) -> FirstSights:
-        new = increment.observations.is_new & ~np.isin(increment.observations.ids, self._ids)
+        seen = increment.observations
+        # What a loop merged away in its very first frame is not begun at all.
+        known = np.concatenate([self._ids, increment.pruned_ids])
+        new = seen.is_new & ~np.isin(seen.ids, known)
         return FirstSights.of(self._sensor, increment.observations.select(new))
 
     def _require_room(self, increment: Increment, new: int) -> None:

@@ -1,6 +1,7 @@
 """What an estimator was given, frame by frame: the state of those that cannot show their inside.
 
-Of the tracking only what smoothers use is kept: pose, covariance, inliers, residuals.
+Of the tracking only what smoothers use is kept: pose, covariance, inliers, residuals, and whether
+the landmarks had a say in it.
 """
 
 from __future__ import annotations
@@ -78,6 +79,7 @@ class RecordedInputs:
                 [np.empty(0, np.bool_), *(t.inliers for t in self.trackings)]
             ),
             "residuals": np.concatenate([np.empty(0), *(t.residuals for t in self.trackings)]),
+            "measured": np.array([t.status.measured for t in self.trackings], np.bool_),
             "motion_known": known,
             "motion": np.array([m.motion for m in given]).reshape(-1, 4, 4),
             "motion_covariance": np.array([m.covariance for m in given]).reshape(-1, 6, 6),
@@ -103,7 +105,7 @@ class RecordedInputs:
                 state["covariance"][k],
                 inliers[k],
                 residuals[k],
-                EgoMotionStatus.OK,
+                EgoMotionStatus.OK if state["measured"][k] else EgoMotionStatus.TOO_FEW_MATCHES,
                 0,
             )
             motion = None
