@@ -16,7 +16,13 @@ import numpy as np
 
 from fgslam.backend.segments import TrackedFrame
 from fgslam.factors.keys import landmark_key, pose_key
-from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior, weak_point_prior
+from fgslam.factors.motion import (
+    floor_factors,
+    odometry_factor,
+    point_prior,
+    pose_prior,
+    weak_point_prior,
+)
 from fgslam.factors.noise import Whitening
 from fgslam.factors.range_bearing import RangeBearingFactors
 from fgslam.factors.stereo import StereoFactors
@@ -138,6 +144,7 @@ class GraphBuilder:
         whitening = Whitening(kernel.name, kernel.width / settings.noise_factor)
         self._factors = landmark_factors(sensor, whitening)
         self._rows: dict[int, list[int]] = {}
+        self._known: dict[int, tuple[FloatArray, FloatArray]] = {}
         self._id_of: list[int] = []
         self._first_frame = 0
         self._seen_frame: list[int] = []
@@ -166,6 +173,15 @@ class GraphBuilder:
         self._add_observations(new, tracked, landmarks)
         return new
 
+    def know(self, landmarks: LandmarkMap) -> None:
+        """Landmarks of a saved map: each enters with its first sighting, on its own prior.
+
+        The priors are independent of one another. One that turns out to have moved, or to lie
+        elsewhere, becomes a landmark like any other.
+        """
+        places = zip(landmarks.positions, landmarks.covariances, strict=True)
+        self._known = dict(zip(landmarks.ids.tolist(), places, strict=True))
+
     def note(self, pruned: IntArray) -> None:
         """Books landmarks that the front-end dropped.
 
@@ -173,6 +189,7 @@ class GraphBuilder:
         """
         for identity in pruned.tolist():
             self.tracks.pop(identity, None)
+            self._known.pop(identity, None)
 
     def confirmed(self, identities: IntArray) -> None:
         """Books that landmarks were seen where they should be: nothing was said against them."""
@@ -209,6 +226,7 @@ class GraphBuilder:
     def start_anew(self, identities: Iterable[int], why: str) -> None:
         """Closes the variables of landmarks; their next sighting begins new ones."""
         for identity in identities:
+            self._known.pop(identity, None)
             track = self.tracks.pop(identity, None)
             if track is not None and why:
                 self.remarks.append(
@@ -226,6 +244,7 @@ class GraphBuilder:
         for row in self._rows.pop(variable, []):
             if self._remember:
                 self.graph.remove(row)
+        self._known.pop(identity, None)
         words = self.describe(variable)
         track = self.tracks.get(identity)
         if track is not None and track.variable == variable:
@@ -344,14 +363,18 @@ class GraphBuilder:
         """Lets a waiting landmark into the graph once it is constrained."""
         track = self.tracks[identity]
         track.waiting = [s for s in track.waiting if s.frame >= self._first_frame]
-        if len(track.waiting) < self._settings.least_sightings or parallax < track.least_parallax:
+        known = self._known.get(identity)
+        seldom = len(track.waiting) < self._settings.least_sightings
+        if known is None and (seldom or parallax < track.least_parallax):
             return
         track.variable = len(self._id_of)
         self._id_of.append(identity)
         self._rows[track.variable] = []
         key = landmark_key(track.variable)
         new.values.insert(key, position)
-        if parallax < self._settings.weak_parallax:
+        if known is not None:
+            self._rows[track.variable].append(self._push(new, point_prior(key, *known)))
+        elif parallax < self._settings.weak_parallax:
             distance = float(np.linalg.norm(position - wTc[:3, 3]))
             sigma = self._settings.weak_prior_ranges * distance
             self._rows[track.variable].append(

@@ -12,13 +12,49 @@ from fgslam.backend.graph_solution import poses_of_frame
 from fgslam.backend.loop_closing import first_guess, loop_factor, misfit, solved
 from fgslam.backend.smoother import Smoother
 from fgslam.backend.submaps import Constraint
-from fgslam.types import LoopClosure
+from fgslam.floor import Floor
+from fgslam.settings.backend import GraphSettings
+from fgslam.types import IntArray, LandmarkMap, LoopClosure, Prediction, Sensor, StateArrays
 
 _AGREES = float(chi2.ppf(0.99, 6))  # 16.8: a loop that the graph meets as it is
 
 
 class WholeGraphSmoother(Smoother):
-    """What iSAM2 and the batch share about loops."""
+    """What iSAM2 and the batch share about loops and saved maps."""
+
+    def __init__(
+        self, sensor: Sensor, settings: GraphSettings, floor: Floor, prior: Prediction
+    ) -> None:
+        """Starts at the prior pose with an empty map."""
+        super().__init__(sensor, settings, floor, prior)
+        self._begun_in: StateArrays = {}
+
+    @property
+    def keeps_maps(self) -> bool:
+        """A smoother's landmarks are what it estimates."""
+        return False
+
+    def begin_in(self, landmarks: LandmarkMap, hits: IntArray, fixed: bool) -> None:
+        """Takes a saved map over: a prior factor for each landmark that is seen again."""
+        self._tracker.begin_in(landmarks, hits, fixed=False)
+        self._builder.know(landmarks)
+        self._begun_in = {
+            "map/ids": landmarks.ids,
+            "map/positions": landmarks.positions,
+            "map/covariances": landmarks.covariances,
+            "map/hits": hits,
+        }
+
+    def state(self) -> StateArrays:
+        """The map that it began in, and everything that was put in."""
+        return super().state() | self._begun_in
+
+    def restore(self, state: StateArrays) -> None:
+        """Repeats everything since the beginning."""
+        if "map/ids" in state:
+            known = (state[f"map/{name}"] for name in ("ids", "positions", "covariances"))
+            self.begin_in(LandmarkMap(*known), state["map/hits"], fixed=False)
+        super().restore(state)
 
     def _close(self, loop: LoopClosure, where: str) -> None:
         """Closes a loop where the measurements allow it.
