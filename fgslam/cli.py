@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from fgslam.config import ExperimentConfig
     from fgslam.export.atomic import ExistingFolder
     from fgslam.homing_config import HomingExperiment
+    from fgslam.localisation_config import LocalisationConfig
     from fgslam.runs.baseline import Results
     from fgslam.runs.beginning import Progress
     from fgslam.runs.choosing import Choice
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 EXIT_USER = 2
 EXIT_FAULT = 1
 EXIT_INTERRUPTED = 130  # as a shell reports a process that Ctrl-C ended
-_SAVED_WHEN_STOPPED = ("tracking", "replaying", "trials")
+_SAVED_WHEN_STOPPED = ("tracking", "replaying", "trials", "localising")
 # Typer exports only the child; its parent's home differs from one Typer to the next.
 _UsageError: type[typer.BadParameter] = typer.BadParameter.__bases__[0]
 
@@ -67,14 +68,15 @@ def run(
         typer.Option("--map-out", metavar="MAP", help="where to save the map; sets map.save"),
     ] = None,
 ) -> None:
-    """Run an experiment: images in, run folder out; measurements without images, homing, too.
+    """Run an experiment: images in, run folder out; measurements, localisation, homing, too.
 
     With --map-in it begins in a saved map: map.start says where, map.extend whether it changes it.
 
     Ctrl-C ends it early with all files valid; --resume goes on from there.
     """
     from fgslam.errors import ConfigError
-    from fgslam.homing_config import HomingExperiment, load_experiment
+    from fgslam.homing_config import HomingExperiment
+    from fgslam.localisation_config import LocalisationConfig, load_experiment
     from fgslam.runs.measured import holds_measurements
 
     if overwrite and resume:
@@ -86,6 +88,8 @@ def run(
     existing: ExistingFolder = "resume" if resume else "overwrite" if overwrite else "refuse"
     if isinstance(settings, HomingExperiment):
         return _run_homing(settings, folder, existing)
+    if isinstance(settings, LocalisationConfig):
+        return _run_localisation(settings, folder, existing)
     run_it = _run_measurements if holds_measurements(settings) else _run_images
     return run_it(settings, folder, existing)
 
@@ -98,6 +102,19 @@ def _run_homing(settings: HomingExperiment, folder: Path, existing: ExistingFold
     with _stop_flag() as stopped, progress_bar() as progress:
         result = run_homing(settings, folder, existing, progress, stopped)
     show_homing(result)
+    if result.status == "interrupted":
+        raise typer.Exit(EXIT_INTERRUPTED)
+
+
+def _run_localisation(settings: LocalisationConfig, folder: Path, existing: ExistingFolder) -> None:
+    from fgslam.console import progress_bar
+    from fgslam.localisation_console import show_localisation
+    from fgslam.runs.localisation.experiment import run_localisation
+
+    with _stop_flag() as stopped, progress_bar() as progress:
+        tell = _stoppable(progress, stopped)
+        result = run_localisation(settings, folder, existing, tell, stopped)
+    show_localisation(result)
     if result.status == "interrupted":
         raise typer.Exit(EXIT_INTERRUPTED)
 
@@ -308,6 +325,52 @@ def _check_baseline(expected: dict[str, Any], results: Results) -> bool:
     deviations = check_baseline(expected, results)
     show_deviations(deviations)
     return any(deviation.regression for deviation in deviations)
+
+
+@app.command()
+def localize(
+    map_file: Annotated[Path, typer.Argument(metavar="MAP", help="a saved map")],
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RECORDING",
+            help="a recording's folder, or an experiment's .yaml for its data set",
+        ),
+    ],
+    frame: Annotated[
+        int | None,
+        typer.Option(min=0, help="the recording's frame to locate; default all, one by one"),
+    ] = None,
+    frames: Annotated[
+        int, typer.Option(min=1, max=100, help="locate a submap of so many frames, ending there")
+    ] = 1,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="A.B=VALUE", help="override one key of the experiment"),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="folder for table, numbers, picture and page; default none")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier one")] = False,
+) -> None:
+    """Where in a map were these frames taken? Without any prior.
+
+    A pose is told only where it is beyond doubt, with the reasons. Exits with 0 whatever the
+    answers are, with 2 where map or recording cannot be used.
+    """
+    from fgslam.console import progress_bar
+    from fgslam.localisation_console import show_localisation
+    from fgslam.runs.localisation.command import Wanted
+    from fgslam.runs.localisation.command import localize as locate
+
+    wanted = Wanted(
+        map_file, recording, tuple(overrides or ()), frame, frames, out, _existing(overwrite)
+    )
+    with _stop_flag() as stopped, progress_bar() as progress:
+        result = locate(wanted, _stoppable(progress, stopped), stopped)
+    show_localisation(result, one_by_one=True)
+    if result.status == "interrupted":
+        raise typer.Exit(EXIT_INTERRUPTED)
 
 
 @app.command()

@@ -20,7 +20,7 @@ def show_homing(result: HomingResult) -> None:
     for line in result.verdict:
         console.out(line)
     for table in result.tables:
-        console.print(_table(table))
+        console.print(text_table(table))
     for line in result.remarks[:_REMARKS_SHOWN]:
         console.out(f"note        {line}")
     if len(result.remarks) > _REMARKS_SHOWN:
@@ -35,7 +35,8 @@ def show_homing(result: HomingResult) -> None:
         console.out("interrupted: what was done is in valid files; --overwrite starts again")
 
 
-def _table(found: TextTable) -> Table:
+def text_table(found: TextTable) -> Table:
+    """A table for the terminal."""
     table = Table(title=found.heading, title_justify="left")
     table.add_column(found.first, no_wrap=True)
     for column in found.columns:

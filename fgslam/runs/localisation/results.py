@@ -269,7 +269,8 @@ def details(attempt: Attempt) -> Iterator[tuple[str, str]]:
         yield "sigma", f"{100 * metres:.1f} cm, {degrees:.2f} deg"
     yield "features", str(attempt.features)
     yield "candidates", f"{found.candidates} tentative matches by appearance"
-    yield "inliers", f"{len(found.ids)}, of {found.expected} landmarks expected in view"
+    yield "inliers", f"{len(found.ids)} matches that agree with the pose"
+    yield "expected", f"{found.expected} landmarks that should be recognised from there"
     yield "residual", f"{found.residual_px:.2f} px" if len(found.ids) else _UNKNOWN
     yield "second-best place", f"{found.second} inliers"
     yield "why", found.why
