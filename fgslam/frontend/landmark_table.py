@@ -112,9 +112,7 @@ class LandmarkTable:
     def appearances(self, ids: IntArray | None = None) -> LandmarkAppearances:
         """All views of all landmarks, or of those named (ascending); matched longest ago first."""
         rows = np.arange(len(self)) if ids is None else self.rows(ids)
-        owner, views = self._views_of(rows)
-        order = np.lexsort((views.used, owner))
-        owner, views = owner[order], views.select(order)
+        owner, views = self._views_of(rows, by_age=True)
         return LandmarkAppearances(
             ids=self.ids[rows[owner]],
             descriptors=views.descriptors,
@@ -258,11 +256,14 @@ class LandmarkTable:
     def _first_views(self) -> Views:
         return self._pool.at(self._places[:, 0])
 
-    def _views_of(self, rows: IntArray) -> tuple[IntArray, Views]:
-        """All views of the rows (k,), and to which of them each belongs."""
+    def _views_of(self, rows: IntArray, by_age: bool = False) -> tuple[IntArray, Views]:
+        """All views of the rows (k,) as kept, or by last use, and to which row each belongs."""
         places = self._places[rows]
         owner, column = np.nonzero(places >= 0)
-        return owner, self._pool.at(places[owner, column])
+        flat = places[owner, column]
+        if by_age and len(owner) > len(rows):
+            flat = flat[np.lexsort((self._pool.last_use(flat), owner))]
+        return owner, self._pool.at(flat)
 
     def _require_mergeable(self, ends: IntArray, stays: IntArray) -> None:
         unknown = np.setdiff1d(np.concatenate([ends, stays]), self.ids)

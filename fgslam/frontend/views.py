@@ -123,6 +123,10 @@ class ViewPool:
             self._used[places],
         )
 
+    def last_use(self, places: npt.NDArray[np.int32]) -> IntArray:
+        """Frame (v,) in which each of the views was last matched."""
+        return self._used[places]
+
     def largest_sizes(self, places: Places) -> FloatArray:
         """Largest size (v,) of the views of each landmark."""
         sizes = self._size[places[:, 0]]
