@@ -21,7 +21,7 @@ class LostSettings:
             description="frames in a row that the landmarks did not locate, until the whole map is "
             "searched",
         ),
-    ] = 3
+    ] = 2
     give_up_after: Annotated[
         int,
         Field(
@@ -29,7 +29,7 @@ class LostSettings:
             description="frames lost until mapping goes on from the odometry; until then nothing "
             "new enters the map, which would be misplaced if the robot was carried off",
         ),
-    ] = 60
+    ] = 10
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -78,6 +78,17 @@ class LoopSettings:
     max_drift_deg_m: Annotated[
         float, Field(ge=0.0, description="drift of heading that is believed, degrees a metre")
     ] = 0.25
+    min_matches: Annotated[
+        int, Field(ge=3, description="old landmarks that must agree on the closure in the end")
+    ] = 12
+    max_sigma_m: Annotated[
+        float,
+        Field(gt=0.0, description="largest standard deviation of a closure's position, metres"),
+    ] = 0.10
+    max_sigma_deg: Annotated[
+        float,
+        Field(gt=0.0, description="largest standard deviation of a closure's heading, degrees"),
+    ] = 1.0
     rest: Annotated[
         int, Field(ge=0, description="frames after a closure in which no other is looked for")
     ] = 15

@@ -9,6 +9,7 @@ from fgslam.frontend.loops.memory import SightingMemory
 from fgslam.frontend.resection import Resection
 from fgslam.geometry import adjoint, congruence, inverse
 from fgslam.map_types import Relocalisation
+from fgslam.settings.loops import LoopSettings
 from fgslam.types import (
     EgoMotion,
     FloatArray,
@@ -55,6 +56,16 @@ def close_loop(
         covariance=_relative_covariance(there, here),
         observations=kept,
         merged=np.column_stack([taken_for, kept.ids])[twice],
+    )
+
+
+def is_sharp(closure: LoopClosure, settings: LoopSettings) -> bool:
+    """Whether a closure rests on enough landmarks, and says where the frame is."""
+    sigma = np.sqrt(np.diagonal(closure.covariance))
+    return bool(
+        len(closure.observations) >= settings.min_matches
+        and sigma[3:].max() <= settings.max_sigma_m
+        and np.rad2deg(sigma[:3].max()) <= settings.max_sigma_deg
     )
 
 

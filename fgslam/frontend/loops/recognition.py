@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from fgslam.frontend.loops.closure import close_loop
+from fgslam.frontend.loops.closure import close_loop, is_sharp
 from fgslam.frontend.loops.confirmation import Confirmation, drift_allows
 from fgslam.frontend.loops.fusion import duplicates
 from fgslam.frontend.loops.memory import SightingMemory
@@ -74,9 +74,12 @@ class PlaceRecognition:
 
     @property
     def maps_on(self) -> bool:
-        """Whether new landmarks may enter the map: not while it is unknown where they are."""
+        """Whether new landmarks may enter the map: not while it is unknown where they are.
+
+        From the first frame on: with landmarks of its own a robot carried off would not know it.
+        """
         lost = self._parts.lost
-        return lost is None or not lost.after <= self._lost < lost.give_up_after
+        return lost is None or not 0 < self._lost < lost.give_up_after
 
     # -- lost --------------------------------------------------------------------------------
 
@@ -137,7 +140,7 @@ class PlaceRecognition:
             association.partners(len(features)),
             self._tracker.resection,
         )
-        if closure is None:
+        if closure is None or not is_sharp(closure, loops):
             return ()
         self._closed = len(self._memory)
         self._fuse_since = self._memory.last_seen(found.ids)

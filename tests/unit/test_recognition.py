@@ -1,0 +1,258 @@
+"""The whole loop on ideal features: drifting round a ring and back, carried off, in the dark."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from simulated import RIG, FeatureWorld, assert_same_bits
+
+from fgslam import geometry as g
+from fgslam.factory import make_estimator, make_places, make_tracker
+from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.frontend.loops.confirmation import difference
+from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.stream import FeatureFrame
+from fgslam.measurement_log import MeasurementLog
+from fgslam.motion import OdometryMotion
+from fgslam.pipeline import FrameReport, SlamPipeline, replay_step
+from fgslam.settings.backend import LandmarkKalmanSettings
+from fgslam.settings.frontend import EgoMotionSettings, FrontendSettings
+from fgslam.settings.loops import LoopSettings, LostSettings
+from fgslam.types import EgoMotionStatus, FloatArray, Frame, Increment, Odometry
+
+IMAGES = (np.zeros((240, 320), np.uint8),) * 3
+RADIUS = 3.0
+ROUND = 72  # frames
+NOISE = np.diag(np.concatenate([[1e-6, 0.02, 1e-6], [0.03, 1e-6, 0.03]]) ** 2)
+SETTINGS = FrontendSettings(
+    ego_motion=EgoMotionSettings(dof=3),
+    loops=LoopSettings(every=2, forgotten_after=25, confirm=2, rest=6),
+    lost=LostSettings(after=2, give_up_after=20),
+)
+
+
+def on_ring(k: float) -> FloatArray:
+    """Camera ``k`` of a drive round a circle, looking along it."""
+    a = 2.0 * np.pi * k / ROUND
+    at = np.array([RADIUS * (1.0 - np.cos(a)), 0.0, RADIUS * np.sin(a)])
+    return g.pose(g.so3_exp(np.array([0.0, a, 0.0])), at)
+
+
+def walls(rng: np.random.Generator) -> FloatArray:
+    """Points on a wall around the ring."""
+    angle = rng.uniform(0.0, 2.0 * np.pi, 1500)
+    distance = RADIUS + rng.uniform(1.0, 2.0, 1500)
+    return np.column_stack(
+        [RADIUS - distance * np.cos(angle), rng.uniform(-0.9, 0.9, 1500), distance * np.sin(angle)]
+    )
+
+
+class RingMotion(OdometryMotion):
+    """Odometry of a drive along given poses whose wheels turn too far in every frame."""
+
+    def __init__(self, poses: list[FloatArray], drift_deg: float) -> None:
+        self._poses = poses
+        self._wrong = g.so3_exp(np.array([0.0, np.deg2rad(drift_deg), 0.0]))
+
+    def between(self, i: int, timestamp: float) -> tuple[Odometry | None, bool]:
+        if i == 0:
+            return None, False
+        step = g.inverse(self._poses[i - 1]) @ self._poses[i]
+        if np.linalg.norm(step[:3, 3]) > 1.0:  # carried: the wheels know nothing of it
+            step = np.eye(4)
+        return Odometry(step @ g.pose(self._wrong, np.zeros(3)), NOISE), True
+
+    def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
+        pass
+
+
+def pipeline_of(
+    poses: list[FloatArray], drift_deg: float, settings: FrontendSettings = SETTINGS
+) -> SlamPipeline:
+    tracker = make_tracker(RIG, settings)
+    return SlamPipeline(
+        stereo=StereoMatcher(RIG, settings.stereo, settings.appearance),
+        tracker=tracker,
+        motion=RingMotion(poses, drift_deg),
+        estimator=make_estimator(RIG, LandmarkKalmanSettings(), settings.ego_motion),
+        places=make_places(RIG, settings, tracker, seed=0),
+    )
+
+
+def seen(poses: list[FloatArray], dark: range = range(0), sigma_px: float = 0.1):
+    """Frames with the features that the poses see; none in the dark."""
+    rng = np.random.default_rng(8)
+    world = FeatureWorld(walls(rng), rng)
+    for i, wTc in enumerate(poses):
+        features = world.features(wTc, sigma_px)
+        if i in dark:
+            features = tuple(_none_of(f) for f in features)
+        yield FeatureFrame(i, Frame(i, float(i), IMAGES), features, "", 0.0, 0.0)
+
+
+def _none_of(features):
+    return dataclasses.replace(
+        features,
+        xy=features.xy[:0],
+        scale=features.scale[:0],
+        orientation=features.orientation[:0],
+        descriptors=features.descriptors[:0],
+    )
+
+
+def drive(pipeline: SlamPipeline, frames) -> list[FrameReport]:
+    return [pipeline.process(found, found.i, float(found.i)) for found in frames]
+
+
+def error_m(report: FrameReport, true: FloatArray) -> float:
+    return difference(true, report.stats.wTc)[0]
+
+
+# -- the return ------------------------------------------------------------------------------
+
+RING = [on_ring(k) for k in range(ROUND + 16)]
+DARK = range(30, 42)  # in the dark the heading drifts by what no search window bridges
+
+
+@lru_cache(maxsize=1)
+def ring() -> tuple[SlamPipeline, list[FrameReport]]:
+    """Once round and past the start, a stretch of it in the dark."""
+    pipeline = pipeline_of(RING, 0.9, dataclasses.replace(SETTINGS, lost=None))
+    return pipeline, drive(pipeline, seen(RING, DARK))
+
+
+def closings(reports: list[FrameReport]) -> list[int]:
+    return [k for k, report in enumerate(reports) if report.increment.loops]
+
+
+def test_the_return_is_recognised_and_the_drift_mended() -> None:
+    _, reports = ring()
+    closed = closings(reports)
+    assert closed
+    first = closed[0]
+    assert first >= ROUND - 16
+    assert error_m(reports[first - 1], RING[first - 1]) > 0.5
+    assert error_m(reports[first], RING[first]) < 0.15
+    assert max(error_m(reports[k], RING[k]) for k in range(first, len(RING))) < 0.15
+
+
+def test_no_closure_is_false() -> None:
+    _, reports = ring()
+    for k in closings(reports):
+        for loop in reports[k].increment.loops:
+            metres, degrees = difference(g.inverse(RING[loop.frame]) @ RING[k], loop.oTc)
+            assert metres < 0.1
+            assert degrees < 1.0
+
+
+def test_landmarks_found_twice_become_one() -> None:
+    pipeline, reports = ring()
+    first = closings(reports)[0]
+    ended = np.concatenate([r.increment.pruned_ids for r in reports[first : first + 2]])
+    merged = reports[first].increment.loops[0].merged
+    assert len(merged) >= 5
+    assert np.isin(merged[:, 0], ended).all()
+    held = pipeline.estimator.landmarks().ids
+    assert not np.isin(ended, held).any()
+    assert np.isin(held, pipeline.tracker.database.ids).all()
+    later = [r.increment.observations for r in reports[first + 1 : first + 6]]
+    old = [
+        int((~o.is_new & (o.ids < reports[20].increment.observations.ids.max())).sum())
+        for o in later
+    ]
+    assert min(old) >= 5, "the old landmarks are tracked again"
+
+
+def test_a_replay_closes_the_same_loops_to_the_bit() -> None:
+    pipeline, reports = ring()
+    estimator = make_estimator(RIG, LandmarkKalmanSettings(), SETTINGS.ego_motion)
+    solver = EgoMotionSolver(RIG, SETTINGS.ego_motion)
+    motion = RingMotion(RING, 0.9)
+    for k, report in enumerate(reports):
+        replay_step(report.increment, estimator, solver, motion, k)
+    np.testing.assert_array_equal(
+        estimator.estimate().trajectory.poses, pipeline.estimator.estimate().trajectory.poses
+    )
+    np.testing.assert_array_equal(
+        estimator.landmarks().positions, pipeline.estimator.landmarks().positions
+    )
+
+
+@pytest.mark.parametrize("stop", [20, 60, ROUND + 2])
+def test_continued_from_its_state_it_goes_on_to_the_bit(stop: int) -> None:
+    _, reports = ring()
+    whole = pipeline_of(RING, 0.9, dataclasses.replace(SETTINGS, lost=None))
+    frames = list(seen(RING, DARK))
+    log = MeasurementLog(RIG, {})
+    for report in drive(whole, frames[:stop]):
+        log.append(report.increment)
+    again = pipeline_of(RING, 0.9, dataclasses.replace(SETTINGS, lost=None))
+    again.tracker.database.restore(whole.tracker.database.state())
+    again.estimator.restore(whole.estimator.state())
+    again.places.restore(whole.places.state(), log)
+    assert_same_bits(again.places.state(), whole.places.state())
+    for report, expected in zip(drive(again, frames[stop:]), reports[stop:], strict=True):
+        np.testing.assert_array_equal(report.stats.wTc, expected.stats.wTc)
+        assert_same_increments(report.increment, expected.increment)
+
+
+def assert_same_increments(a: Increment, b: Increment) -> None:
+    assert_same_bits(a.observations, b.observations)
+    np.testing.assert_array_equal(a.pruned_ids, b.pruned_ids)
+    assert len(a.loops) == len(b.loops)
+    for one, other in zip(a.loops, b.loops, strict=True):
+        assert one.frame == other.frame
+        np.testing.assert_array_equal(one.oTc, other.oTc)
+
+
+# -- lost ------------------------------------------------------------------------------------
+
+
+def carried() -> list[FloatArray]:
+    """Half round, then lifted back to where the drive was after ten frames."""
+    return [on_ring(k) for k in range(40)] + [on_ring(k) for k in range(10, 25)]
+
+
+def test_carried_off_it_finds_itself_in_its_own_map() -> None:
+    poses = carried()
+    reports = drive(pipeline_of(poses, 0.1), seen(poses))
+    found = [k for k, r in enumerate(reports) if r.increment.relocalised]
+    assert found
+    assert 40 <= found[0] <= 44
+    assert reports[found[0]].tracking.status is EgoMotionStatus.RELOCALISED
+    assert error_m(reports[-1], poses[-1]) < 0.1
+    lost = reports[41 : found[0]]
+    assert sum(int(r.increment.observations.is_new.sum()) for r in lost) == 0, "not while lost"
+
+
+def test_without_it_the_robot_stays_lost() -> None:
+    poses = carried()
+    settings = dataclasses.replace(SETTINGS, lost=None, loops=None)
+    reports = drive(pipeline_of(poses, 0.1, settings), seen(poses))
+    assert error_m(reports[-1], poses[-1]) > 1.0
+
+
+def test_a_relocalised_frame_is_replayed_to_the_bit() -> None:
+    poses = carried()
+    pipeline = pipeline_of(poses, 0.1)
+    reports = drive(pipeline, seen(poses))
+    estimator = make_estimator(RIG, LandmarkKalmanSettings(), SETTINGS.ego_motion)
+    solver, motion = EgoMotionSolver(RIG, SETTINGS.ego_motion), RingMotion(poses, 0.1)
+    for k, report in enumerate(reports):
+        stats = replay_step(report.increment, estimator, solver, motion, k)
+        np.testing.assert_array_equal(stats.wTc, report.stats.wTc)
+
+
+def test_where_nothing_is_known_it_gives_up_and_maps_on() -> None:
+    poses = [on_ring(k) for k in range(12)] + [on_ring(k) for k in range(36, 64)]
+    settings = dataclasses.replace(
+        SETTINGS, lost=LostSettings(after=2, give_up_after=6), loops=None
+    )
+    reports = drive(pipeline_of(poses, 0.1, settings), seen(poses))
+    new = [int(r.increment.observations.is_new.sum()) for r in reports]
+    assert sum(new[14:17]) == 0
+    assert sum(new[17:]) > 50
+    assert reports[-1].tracking.status is EgoMotionStatus.OK
