@@ -75,6 +75,15 @@ class RelocalisationSettings:
         float,
         Field(gt=0.0, lt=1.0, description="that one sample was clean, at which the search ends"),
     ] = 0.999
+    bin_m: Annotated[
+        float, Field(gt=0.0, description="hough: side of an accumulator's bin, metres")
+    ] = 0.3
+    bin_deg: Annotated[
+        float, Field(gt=0.0, le=90.0, description="hough: width of a bin of heading, degrees")
+    ] = 5.0
+    bins: Annotated[
+        int, Field(ge=2, description="hough: fullest bins whose matches are solved for a pose")
+    ] = 16
     refined: Annotated[
         int, Field(ge=2, description="distinct best poses that are refined and compared")
     ] = 4

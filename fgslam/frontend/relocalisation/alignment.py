@@ -63,14 +63,19 @@ def align(here: FloatArray, there: FloatArray, floor: Floor) -> FloatArray:
     return poses
 
 
+def floor_axes(floor: Floor) -> FloatArray:
+    """(3, 2) two horizontal directions; a turn about the vertical takes the first to the second."""
+    first = floor.horizontal[:, 0]
+    return np.column_stack([first, np.cross(floor.down, first)])
+
+
 def align_planar(here: FloatArray, there: FloatArray, floor: Floor) -> FloatArray:
     """The two-match alignment of design B4, for any number of points: turn, then shift.
 
     With the differences (A, B) of the camera's and (C, D) of the map's horizontal coordinates the
     turn about the vertical is ``atan2(sum A D - B C, sum A C + B D)``.
     """
-    first = floor.horizontal[:, 0]
-    axes = np.column_stack([first, np.cross(floor.down, first)])
+    axes = floor_axes(floor)
     a, b = here @ axes, there @ axes
     a_mean, b_mean = a.mean(axis=1), b.mean(axis=1)
     a, b = a - a_mean[:, None], b - b_mean[:, None]

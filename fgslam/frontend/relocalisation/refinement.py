@@ -107,6 +107,7 @@ class Refiner:
         pairs = Pairs.of(self.seen, i, self.known.landmarks, j)
         squared = squared_distances(residuals(self.rig, wTc, pairs), covariance)
         near = squared <= self.settings.gate_sigmas**2
+        cost = cost if self.settings.descriptors else squared
         return _one_to_one(i[near], j[near], cost[near])
 
     def _proposed(self) -> tuple[IntArray, IntArray, FloatArray]:
@@ -120,16 +121,21 @@ class Refiner:
         wanted = np.zeros(len(self.known.landmarks), np.bool_)
         wanted[rows] = True
         views = np.flatnonzero(wanted[self.known.owners])
-        distance = _distances(self.features.descriptors, self.known.views.descriptors[views])
+        if self.settings.descriptors:
+            distance = _distances(self.features.descriptors, self.known.views.descriptors[views])
+        else:
+            distance = np.zeros((len(self.features), len(views)))
         i, column = np.nonzero(distance <= self.settings.max_distance)
         cost, v = distance[i, column], views[column]
         looks = (self.known.views, self.known.owners)
         keep = gated(self.features, (i, v), self.known.landmarks, looks, self.floor, self.settings)
         found = i[keep], self.known.owners[v[keep]], cost[keep]
-        features, landmarks, distances = map(
-            np.concatenate, zip(found, self._proposed(), strict=True)
+        first = self._proposed()
+        return (
+            np.concatenate([found[0], first[0]]),
+            np.concatenate([found[1], first[1]]),
+            np.concatenate([found[2], first[2]]),
         )
-        return features, landmarks, distances
 
     def _solve(
         self, wTc: FloatArray, chosen: tuple[IntArray, IntArray]

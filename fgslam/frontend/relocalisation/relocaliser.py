@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.errors import ConfigError
 from fgslam.floor import Floor
-from fgslam.frontend.relocalisation import ransac
+from fgslam.frontend.relocalisation import hough, ransac
 from fgslam.frontend.relocalisation.known_map import KnownMap
 from fgslam.frontend.relocalisation.proposals import Evidence, Proposals, apart, distinct
 from fgslam.frontend.relocalisation.refinement import Refined, Refiner
 from fgslam.frontend.relocalisation.residuals import Pairs, SeenPoints, log_uniform
-from fgslam.frontend.relocalisation.tentative import Tentative, gated, specific
+from fgslam.frontend.relocalisation.tentative import Tentative, gated, specific, unspecific
 from fgslam.frontend.relocalisation.verdict import judge
 from fgslam.map_types import LandmarkAppearances, Relocalisation
 from fgslam.settings.relocalisation import RelocalisationSettings
@@ -24,6 +25,11 @@ class Relocaliser:
 
     def __init__(self, rig: CameraRig, floor: Floor, settings: RelocalisationSettings) -> None:
         """Knows no map yet; ``floor`` says which camera motions the map's robot makes."""
+        if settings.method == "hough" and floor.rigid_dof != 3:
+            raise ConfigError(
+                "frontend.relocalisation.method hough votes on a level floor alone; choose ransac, "
+                "or set frontend.ego_motion.dof to 3"
+            )
         self._rig = rig
         self._floor = floor
         self._settings = settings
@@ -54,16 +60,21 @@ class Relocaliser:
         tentative = self.tentative(features)
         seen = SeenPoints.of(features, self._rig, self._settings.view_sigma_px)
         evidence = self._evidence(seen, tentative)
-        proposals = ransac.propose(evidence, self._floor, self._settings, rng)
+        if self._settings.method == "hough":
+            proposals = hough.propose(evidence, self._floor, self._settings)
+        else:
+            proposals = ransac.propose(evidence, self._floor, self._settings, rng)
         refined = self._refine(features, seen, evidence, proposals)
         return judge(tentative, refined, self._known.landmarks, self._settings)
 
     def tentative(self, features: StereoFeatures) -> Tentative:
         """Matches of the features with landmarks anywhere in the map."""
         known, settings = self._known, self._settings
+        looks = (known.views, known.owners)
+        if not settings.descriptors:
+            return unspecific(features, known.landmarks, looks, self._floor, settings)
         found = known.index.query(features.descriptors, settings.neighbours)
         i, k = np.nonzero(found.owners >= 0)
-        looks = (known.views, known.owners)
         pairs = (i, found.owners[i, k])
         keep = np.zeros(found.owners.shape, np.bool_)
         keep[i, k] = gated(features, pairs, known.landmarks, looks, self._floor, settings)

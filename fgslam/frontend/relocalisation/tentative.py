@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.floor import Floor
+from fgslam.frontend.candidates import pairs_within
 from fgslam.frontend.relocalisation.appearance_index import Neighbours
 from fgslam.geometry import wrap_angle
 from fgslam.map_types import LandmarkAppearances
@@ -116,6 +117,29 @@ def specific(
         distances.append(far[first])
         places.append(np.full(len(first), count))
     return _joined(features, rows, distances, places)
+
+
+def unspecific(
+    features: StereoFeatures,
+    landmarks: LandmarkMap,
+    looks: tuple[LandmarkAppearances, IntArray],
+    floor: Floor,
+    settings: RelocalisationSettings,
+) -> Tentative:
+    """Every landmark that agrees in size (on a level floor in height and orientation, too).
+
+    What features without descriptors can say; each is shared by all that it may be.
+    """
+    views, owners = looks
+    depth = np.maximum(np.abs(features.position[:, 2]), 1e-6)
+    sigma = np.sqrt(features.position_covariance[:, 2, 2]) / depth
+    size = np.log(np.maximum(features.scale * depth, 1e-9))
+    reach = np.log(settings.size_ratio) + _GATE_SIGMAS * sigma
+    i, v = pairs_within(size, reach, np.log(np.maximum(views.size, 1e-9)))
+    keep = gated(features, (i, v), landmarks, looks, floor, settings)
+    pairs = np.unique(np.column_stack([i[keep], owners[v[keep]]]), axis=0)
+    counts = np.bincount(pairs[:, 0], minlength=len(features))
+    return Tentative(pairs[:, 0], pairs[:, 1], np.zeros(len(pairs)), counts[pairs[:, 0]])
 
 
 def _places(positions: FloatArray, radius: float) -> IntArray:

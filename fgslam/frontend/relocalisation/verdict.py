@@ -30,7 +30,12 @@ def judge(
             Verdict.TOO_FEW_INLIERS, len(tentative), f"{matched} features match, no two agree"
         )
     best = refined[0]
-    rivals = [(r.unshared(best, landmarks.positions, settings.piece_m), r) for r in refined[1:]]
+    # A pose that would be refused for what is not seen there is no rival.
+    rivals = [
+        (other.unshared(best, landmarks.positions, settings.piece_m), other)
+        for other in refined[1:]
+        if not _contradicted(other, settings)
+    ]
     votes, rival = max(rivals, key=lambda pair: pair[0], default=(0, None))
     second = 0 if rival is None else len(rival)
     verdict, why = _verdict(best, votes, matched, settings)
@@ -63,12 +68,17 @@ def _verdict(
         return Verdict.TOO_FEW_INLIERS, f"{said}; {settings.min_inliers} witnesses are needed"
     if rival >= settings.ambiguous_share * best.witnesses:
         return Verdict.AMBIGUOUS, f"{said}; another place explains the frame nearly as well"
-    alone = best.witnesses < settings.enough_witnesses
-    if alone and best.covered < settings.least_covered:
+    if _contradicted(best, settings):
         return Verdict.CONTRADICTED, f"{said}; what should be seen there is not"
     if sigma_m > settings.max_sigma_m or sigma_deg > settings.max_sigma_deg:
         return Verdict.INACCURATE, f"{said}; too uncertain"
     return Verdict.FOUND, said
+
+
+def _contradicted(pose: Refined, settings: RelocalisationSettings) -> bool:
+    """Whether few things agree and next to nothing else that should be seen there is."""
+    few = pose.witnesses < settings.enough_witnesses
+    return few and pose.covered < settings.least_covered
 
 
 def _nothing(verdict: Verdict, candidates: int, why: str) -> Relocalisation:
