@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fgslam import compare_options as options
 from fgslam.errors import FgslamError
+from fgslam.interruption import stop_flag, stoppable
 
 if TYPE_CHECKING:
     from fgslam.config import ExperimentConfig
@@ -21,14 +19,12 @@ if TYPE_CHECKING:
     from fgslam.homing_config import HomingExperiment
     from fgslam.localisation_config import LocalisationConfig
     from fgslam.runs.baseline import Results
-    from fgslam.runs.beginning import Progress
     from fgslam.runs.choosing import Choice
     from fgslam.runs.comparison import Compared
 
 EXIT_USER = 2
 EXIT_FAULT = 1
 EXIT_INTERRUPTED = 130  # as a shell reports a process that Ctrl-C ended
-_SAVED_WHEN_STOPPED = ("tracking", "replaying", "trials", "localising")
 # Typer exports only the child; its parent's home differs from one Typer to the next.
 _UsageError: type[typer.BadParameter] = typer.BadParameter.__bases__[0]
 
@@ -99,7 +95,7 @@ def _run_homing(settings: HomingExperiment, folder: Path, existing: ExistingFold
     from fgslam.homing_console import show_homing
     from fgslam.runs.homing.run import run_homing
 
-    with _stop_flag() as stopped, progress_bar() as progress:
+    with stop_flag() as stopped, progress_bar() as progress:
         result = run_homing(settings, folder, existing, progress, stopped)
     show_homing(result)
     if result.status == "interrupted":
@@ -111,8 +107,8 @@ def _run_localisation(settings: LocalisationConfig, folder: Path, existing: Exis
     from fgslam.localisation_console import show_localisation
     from fgslam.runs.localisation.experiment import run_localisation
 
-    with _stop_flag() as stopped, progress_bar() as progress:
-        tell = _stoppable(progress, stopped)
+    with stop_flag() as stopped, progress_bar() as progress:
+        tell = stoppable(progress, stopped)
         result = run_localisation(settings, folder, existing, tell, stopped)
     show_localisation(result)
     if result.status == "interrupted":
@@ -125,8 +121,8 @@ def _run_images(settings: ExperimentConfig, folder: Path, existing: ExistingFold
     from fgslam.runs.beginning import resume_command
     from fgslam.runs.experiment import run_experiment
 
-    with _stop_flag() as stopped, progress_bar() as progress:
-        result = run_experiment(settings, folder, existing, _stoppable(progress, stopped), stopped)
+    with stop_flag() as stopped, progress_bar() as progress:
+        result = run_experiment(settings, folder, existing, stoppable(progress, stopped), stopped)
         interrupted = stopped() and result.compared is not None
     show_result(result, resume_command(folder))
     if result.compared is not None:
@@ -140,7 +136,7 @@ def _run_measurements(settings: ExperimentConfig, folder: Path, existing: Existi
     from fgslam.console import progress_bar
     from fgslam.runs.measured import run_measured
 
-    with _stop_flag() as stopped, progress_bar() as progress:
+    with stop_flag() as stopped, progress_bar() as progress:
         compared = run_measured(settings, folder, existing, progress, stopped)
         interrupted = stopped()
     show_comparisons([compared])
@@ -155,63 +151,18 @@ def _status_of(compared: list[Compared], interrupted: bool) -> int:
     return EXIT_FAULT if any(len(c.failures) == len(c.metrics) for c in compared) else 0
 
 
-# The options of `compare`, here so that the command itself fits on a page.
-_Runs = Annotated[
-    list[Path],
-    typer.Argument(metavar="RUN...", help="run folders; with --trials one run or experiment.yaml"),
-]
-_Estimators = Annotated[
-    str | None,
-    typer.Option(
-        metavar="A,B,C",
-        help="which ones: kinds, or labels of the run's configuration; default those that it "
-        "compares, else every kind",
-    ),
-]
-_EstimatorOverrides = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="estimators.NAME.KEY=VALUE",
-        help="override one key of one estimator; may be repeated",
-    ),
-]
-_Out = Annotated[
-    Path | None, typer.Option(help="folder of the results; default RUN/compare or RUN/trials")
-]
-_OverwriteResults = Annotated[
-    bool, typer.Option("--overwrite", help="replace an earlier comparison")
-]
-_Jobs = Annotated[
-    int, typer.Option(min=1, help="processes at a time; more than 1 disturbs the times")
-]
-_TrialCount = Annotated[
-    int | None, typer.Option("--trials", min=1, help="repeat over so many worlds of noise")
-]
-_FirstSeed = Annotated[
-    int | None, typer.Option(min=0, help="of the first trial; default the configuration's")
-]
-_WriteBaseline = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="write the results as a baseline")
-]
-_CheckBaseline = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="compare with a baseline; exit with 1 where one got worse"),
-]
-
-
 @app.command()
 def compare(  # noqa: PLR0913 - each option is a parameter
-    runs: _Runs,
-    estimators: _Estimators = None,
-    overrides: _EstimatorOverrides = None,
-    out: _Out = None,
-    overwrite: _OverwriteResults = False,
-    jobs: _Jobs = 1,
-    trials: _TrialCount = None,
-    seed: _FirstSeed = None,
-    write_baseline: _WriteBaseline = None,
-    check_baseline: _CheckBaseline = None,
+    runs: options.Runs,
+    estimators: options.Estimators = None,
+    overrides: options.EstimatorOverrides = None,
+    out: options.Out = None,
+    overwrite: options.OverwriteResults = False,
+    jobs: options.Jobs = 1,
+    trials: options.TrialCount = None,
+    seed: options.FirstSeed = None,
+    write_baseline: options.WriteBaseline = None,
+    check_baseline: options.CheckBaseline = None,
 ) -> None:
     """Replay runs' measurements through estimators and set them side by side.
 
@@ -257,7 +208,7 @@ def _compare_homing(
     from fgslam.homing_console import show_homing
     from fgslam.runs.homing.compare import compare_homing_runs
 
-    with _stop_flag() as stopped, progress_bar() as progress:
+    with stop_flag() as stopped, progress_bar() as progress:
         results = compare_homing_runs(runs, choice, out, existing, jobs, progress, stopped)
     for result in results:
         show_homing(result)
@@ -277,7 +228,7 @@ def _compare_runs(
     from fgslam.console import progress_bar
     from fgslam.runs.compare import compare_runs
 
-    with _stop_flag() as stopped, progress_bar() as progress:
+    with stop_flag() as stopped, progress_bar() as progress:
         compared = compare_runs(runs, choice, out, existing, jobs, progress, stopped)
         interrupted = stopped()
     show_comparisons(compared)
@@ -298,8 +249,8 @@ def _compare_trials(
     from fgslam.runs.trial_results import together
     from fgslam.runs.trials import Seeds, run_trials
 
-    with _stop_flag() as stopped, progress_bar() as progress:
-        tell = _stoppable(progress, stopped)
+    with stop_flag() as stopped, progress_bar() as progress:
+        tell = stoppable(progress, stopped)
         trials = run_trials(source, Seeds(*seeds), choice, out, existing, jobs, tell, stopped)
         interrupted = stopped()
     show_trials(trials)
@@ -366,8 +317,8 @@ def localize(
     wanted = Wanted(
         map_file, recording, tuple(overrides or ()), frame, frames, out, _existing(overwrite)
     )
-    with _stop_flag() as stopped, progress_bar() as progress:
-        result = locate(wanted, _stoppable(progress, stopped), stopped)
+    with stop_flag() as stopped, progress_bar() as progress:
+        result = locate(wanted, stoppable(progress, stopped), stopped)
     show_localisation(result, one_by_one=True)
     if result.status == "interrupted":
         raise typer.Exit(EXIT_INTERRUPTED)
@@ -400,6 +351,20 @@ def export(
     from fgslam.runs.exporting import export_run
 
     for line in export_run(run_folder, map_file, trajectory, estimator, valid_only, graph):
+        typer.echo(line)
+
+
+@app.command()
+def merge(
+    first: Annotated[Path, typer.Argument(metavar="MAP", help="the map whose world it will be")],
+    second: Annotated[Path, typer.Argument(metavar="MAP", help="the map to lay onto it")],
+    out: Annotated[Path, typer.Option(metavar="MAP", help="where to write both as one")],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier one")] = False,
+) -> None:
+    """Make two saved maps of one place into one; refuses what does not overlap beyond doubt."""
+    from fgslam.runs.map_merging import merge_files
+
+    for line in merge_files(first, second, out, overwrite):
         typer.echo(line)
 
 
@@ -440,8 +405,8 @@ def inspect(
     from fgslam.console import progress_bar
     from fgslam.inspection.recording import inspect_recording
 
-    with _stop_flag() as stopped, progress_bar() as progress:
-        report = inspect_recording(dataset, overrides or (), frames, _stoppable(progress, stopped))
+    with stop_flag() as stopped, progress_bar() as progress:
+        report = inspect_recording(dataset, overrides or (), frames, stoppable(progress, stopped))
     typer.echo(report)
 
 
@@ -463,38 +428,3 @@ def main() -> None:
         raise SystemExit(EXIT_INTERRUPTED) from None
     except BrokenPipeError:
         raise SystemExit(EXIT_FAULT) from None
-
-
-@contextmanager
-def _stop_flag() -> Iterator[Callable[[], bool]]:
-    """Turns the first Ctrl-C or TERM into a flag; the second Ctrl-C ends at once."""
-    raised = ending = False
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        nonlocal raised, ending
-        if raised:
-            ending = True
-            # A third one would cut short the end of the threads, which aborts the process.
-            for each in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(each, signal.SIG_IGN)
-            raise KeyboardInterrupt
-        raised = True
-
-    before = {n: signal.signal(n, handle) for n in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: raised
-    finally:
-        if not ending:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-
-def _stoppable(progress: Progress, stopped: Callable[[], bool]) -> Progress:
-    """While frames are rendered there is nothing to save yet: stopping just ends it."""
-
-    def tell(what: str, done: int, total: int) -> None:
-        if what not in _SAVED_WHEN_STOPPED and stopped():
-            raise KeyboardInterrupt
-        progress(what, done, total)
-
-    return tell

@@ -1,0 +1,45 @@
+"""Merges two saved maps, as ``fgslam merge`` does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.errors import MapError
+from fgslam.frontend.map_alignment import align_maps
+from fgslam.frontend.map_fusion import merge_maps
+from fgslam.geometry import so3_log
+from fgslam.map_file import load_map, require_rig, save_map
+from fgslam.settings.maps import MergeSettings
+
+_SEED = 0  # the same maps give the same bytes
+
+
+def merge_files(first: Path, second: Path, out: Path, overwrite: bool = False) -> list[str]:
+    """Lays the second map onto the first and writes both as one; lines about what was found.
+
+    Raises:
+        MapError: one is no map, another rig made it, they do not overlap or that is ambiguous, or
+            ``out`` is there already.
+        OutputError: the map cannot be written.
+    """
+    if out.exists() and not overwrite:
+        raise MapError(f"{out}: is there already; choose another --out, or add --overwrite")
+    a, b = load_map(first), load_map(second)
+    require_rig(b, a.rig, str(second))
+    rng = np.random.default_rng(_SEED)
+    found = align_maps(a, b, MergeSettings(), rng, f"{first} and {second}")
+    merged = merge_maps(a, b, found)
+    size = save_map(merged, out)
+    x, y, z = found.aTb[:3, 3]
+    turn = np.degrees(np.linalg.norm(so3_log(found.aTb[:3, :3])))
+    return [
+        f"{second} lies at ({x:.3f}, {y:.3f}, {z:.3f}) m, turned by {turn:.2f} deg, in {first}",
+        f"{found.agreeing} of {found.candidates} landmarks that look alike agree, {found.second} "
+        "with the second-best alignment elsewhere",
+        f"{len(found.pairs)} landmarks fused, residual {100.0 * found.residual_m:.2f} cm rms "
+        f"({found.residual_sigmas:.2f} sigma); {found.found} of the {found.among} that lie among "
+        "the first map's were found there",
+        f"{out}: {len(merged)} landmarks of {len(a)} and {len(b)}, {size / 1e6:.2f} MB",
+    ]

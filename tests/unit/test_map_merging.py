@@ -1,0 +1,233 @@
+"""Two maps of one place are laid onto each other and fused; anything else is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fgslam import geometry as g
+from fgslam.errors import MapError
+from fgslam.frontend.map_alignment import Alignment, align_maps, tentative_pairs
+from fgslam.frontend.map_fusion import merge_maps
+from fgslam.map_file import SavedMap, load_map, save_map
+from fgslam.map_types import LandmarkAppearances
+from fgslam.runs.map_merging import merge_files
+from fgslam.settings.maps import MergeSettings
+from fgslam.types import ByteArray, CameraRig, FloatArray, IntArray, LandmarkMap, Trajectory
+
+RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
+BTA = g.se3_exp(np.array([0.02, 0.7, -0.01, 1.5, 0.1, -2.0]))
+SIGMA_M = 0.01
+
+
+class World:
+    """Points in a room, each with its look; two may look alike."""
+
+    def __init__(self, rng: np.random.Generator, count: int = 400) -> None:
+        self.rng = rng
+        self.points = rng.uniform([-5, -1, -5], [5, 1, 5], (count, 3))
+        looks = rng.exponential(1.0, (count, 128))
+        self.looks = 512.0 * looks / np.linalg.norm(looks, axis=1, keepdims=True)
+        self.size = rng.uniform(2.0, 8.0, count)
+
+    def seen(self, which: IntArray, wTm: FloatArray, stamp: float = 0.0) -> SavedMap:
+        """A map of these points, in a world of its own that ``wTm`` takes into this one."""
+        n, rng = len(which), self.rng
+        noise = SIGMA_M * rng.standard_normal((n, 3))
+        positions = g.transform_to_camera(wTm, self.points[which]) + noise
+        covariances = np.broadcast_to(SIGMA_M**2 * np.eye(3), (n, 3, 3)).copy()
+        ids = 3 * np.arange(n) + 1
+        looks = self.looks[which] + 8.0 * rng.standard_normal((n, 128))
+        size = self.size[which] * rng.uniform(0.9, 1.1, n)
+        return SavedMap(
+            rig=RIG,
+            landmarks=LandmarkMap(ids, positions, covariances),
+            appearances=appearances(ids, np.clip(looks, 0, 255).astype(np.uint8), size),
+            hits=rng.integers(3, 40, n),
+            misses=rng.integers(0, 10, n),
+            permanent=rng.random(n) < 0.3,
+            colour=np.full(n, 90, np.uint8),
+            trajectory=Trajectory(stamp + np.arange(5.0), np.tile(np.eye(4), (5, 1, 1))),
+            about={"drives": [{"name": "drive", "frames": 5}]},
+            session={"a": np.zeros(3)},
+        )
+
+
+def appearances(ids: IntArray, descriptors: ByteArray, size: FloatArray) -> LandmarkAppearances:
+    direction = np.tile([0.0, 0.0, 1.0], (len(ids), 1))
+    return LandmarkAppearances(ids, descriptors, size, np.zeros(len(ids)), direction)
+
+
+@pytest.fixture
+def world(rng: np.random.Generator) -> World:
+    return World(rng)
+
+
+def align(a: SavedMap, b: SavedMap, seed: int = 0) -> Alignment:
+    return align_maps(a, b, MergeSettings(), np.random.default_rng(seed), "a and b")
+
+
+def test_two_overlapping_maps_are_aligned_within_their_noise(world: World) -> None:
+    first, second = np.arange(0, 280), np.arange(180, 400)
+    a, b = world.seen(first, np.eye(4)), world.seen(second, BTA)
+    found = align(a, b)
+    error = g.se3_log(g.inverse(BTA) @ found.aTb)
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert (np.abs(error) < 4.0 * sigma).all()
+    assert np.linalg.norm(error[3:]) < 0.01
+    assert (first[found.pairs[:, 0]] == second[found.pairs[:, 1]]).all()
+    assert len(found.pairs) > 95
+    assert len(np.unique(found.pairs[:, 0])) == len(np.unique(found.pairs[:, 1]))
+    assert found.residual_m < 3.0 * SIGMA_M
+    assert found.second < 0.2 * found.agreeing
+
+
+def test_the_same_maps_give_the_same_bits(world: World) -> None:
+    a, b = world.seen(np.arange(280), np.eye(4)), world.seen(np.arange(180, 400), BTA)
+    one, other = align(a, b), align(a, b)
+    assert one.aTb.tobytes() == other.aTb.tobytes()
+    assert one.pairs.tobytes() == other.pairs.tobytes()
+
+
+@pytest.mark.parametrize("wrong", [0.3, 0.6, 0.8])
+def test_wrong_tentative_matches_do_not_mislead(wrong: float, world: World) -> None:
+    a, b = world.seen(np.arange(400), np.eye(4)), world.seen(np.arange(400), BTA)
+    mixed = np.flatnonzero(world.rng.random(400) < wrong)
+    descriptors = b.appearances.descriptors.copy()
+    descriptors[mixed] = descriptors[np.roll(mixed, 7)]
+    b = replace(b, appearances=replace(b.appearances, descriptors=descriptors))
+    found = align(a, b)
+    assert np.linalg.norm(g.se3_log(g.inverse(BTA) @ found.aTb)) < 0.02
+    true = np.setdiff1d(np.arange(400), mixed)
+    assert np.isin(found.pairs[:, 0], true).mean() > 0.95
+
+
+def test_maps_of_different_places_are_refused(world: World, rng: np.random.Generator) -> None:
+    a = world.seen(np.arange(300), np.eye(4))
+    b = World(rng, 300).seen(np.arange(300), BTA)
+    with pytest.raises(MapError, match=r"a and b: .* the maps do not overlap"):
+        align(a, b)
+
+
+def test_one_poster_in_common_is_no_overlap(world: World, rng: np.random.Generator) -> None:
+    """Forty landmarks agree to the centimetre, and all others around them do not."""
+    other = World(rng, 400)
+    poster = np.arange(40)
+    world.points[poster] = rng.uniform([-1, -1, 3.0], [1, 1, 3.02], (40, 3))
+    for name in ("points", "looks", "size"):
+        getattr(other, name)[poster] = getattr(world, name)[poster]
+    near = np.array([5.0, 1.0, 5.0]) * 0.3
+    world.points[40:] *= 0.3
+    other.points[40:] *= 0.3
+    assert (np.abs(world.points[40:]) <= near).all()
+    a = world.seen(np.arange(400), np.eye(4))
+    b = other.seen(np.arange(400), g.se3_exp(np.array([0, 0.5, 0, 0.4, 0, 0.2])))
+    with pytest.raises(MapError, match=r"only \d+ are found there; the maps do not overlap"):
+        align(a, b)
+
+
+def test_a_place_that_repeats_is_ambiguous(world: World, rng: np.random.Generator) -> None:
+    """Two identical rooms in the first map, one of them in the second."""
+    room = np.arange(100)
+    world.points[100:200] = world.points[room] + np.array([0.0, 0.0, 12.0])
+    world.looks[100:200], world.size[100:200] = world.looks[room], world.size[room]
+    a = world.seen(np.arange(400), np.eye(4))
+    b = world.seen(room, BTA)
+    with pytest.raises(MapError, match=r"ambiguous|look alike"):
+        align(a, b)
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_hardly_any_landmark(count: int, world: World) -> None:
+    a, b = world.seen(np.arange(200), np.eye(4)), world.seen(np.arange(count), BTA)
+    for pair in ((a, b), (b, a)):
+        with pytest.raises(MapError, match=r"landmarks look alike, 20 are needed"):
+            align(*pair)
+
+
+def test_all_landmarks_on_one_line_fix_no_alignment(world: World) -> None:
+    world.points[:, :2] = 0.0
+    a, b = world.seen(np.arange(300), np.eye(4)), world.seen(np.arange(300), BTA)
+    with pytest.raises(MapError, match=r"ambiguous: 300 landmarks agree with one alignment, 300"):
+        align(a, b)
+
+
+def test_unconfirmed_landmarks_propose_nothing(world: World) -> None:
+    a, b = world.seen(np.arange(200), np.eye(4)), world.seen(np.arange(200), BTA)
+    assert len(tentative_pairs(a, b, MergeSettings())) > 150
+    seldom = replace(b, hits=np.ones(200, np.int64), permanent=np.zeros(200, np.bool_))
+    assert len(tentative_pairs(a, seldom, MergeSettings())) == 0
+
+
+# --------------------------------------------------------------------------------------------
+# Fusion
+
+
+def test_what_both_hold_is_fused_by_covariance_and_the_rest_kept(world: World) -> None:
+    first, second = np.arange(0, 280), np.arange(180, 400)
+    a, b = world.seen(first, np.eye(4)), world.seen(second, BTA, stamp=100.0)
+    found = align(a, b)
+    merged = merge_maps(a, b, found)
+    both, alone = len(found.pairs), len(b) - len(found.pairs)
+    assert len(merged) == len(a) + alone
+    assert (np.diff(merged.landmarks.ids) > 0).all()
+    np.testing.assert_array_equal(merged.landmarks.ids[: len(a)], a.landmarks.ids)
+    truth = np.concatenate([first, np.delete(second, found.pairs[:, 1])])
+    error = np.linalg.norm(merged.landmarks.positions - world.points[truth], axis=1)
+    assert error.max() < 0.06
+    before = np.linalg.norm(a.landmarks.positions - world.points[first], axis=1)
+    fused = found.pairs[:, 0]
+    assert np.mean(error[fused] ** 2) < 0.75 * np.mean(before[fused] ** 2)
+    covariance = merged.landmarks.covariances[fused]
+    assert (np.linalg.eigvalsh(a.landmarks.covariances[fused] - covariance) > 0.0).all()
+    # Twice as well known, but for what the alignment itself is uncertain.
+    trace = np.trace(covariance, axis1=1, axis2=2)
+    assert (trace > 1.5 * SIGMA_M**2).all()
+    assert (trace < 1.8 * SIGMA_M**2).all()
+    assert merged.hits.sum() == a.hits.sum() + b.hits.sum()
+    assert merged.misses.sum() == a.misses.sum() + b.misses.sum()
+    assert merged.permanent.sum() >= max(a.permanent.sum(), b.permanent.sum())
+    assert len(merged.appearances) == len(a.appearances) + len(b.appearances)
+    twice = np.bincount(np.searchsorted(merged.landmarks.ids, merged.appearances.ids))
+    assert (twice[fused] == 2).all()
+    assert twice.sum() == len(merged) + both
+    assert len(merged.trajectory) == 10
+    np.testing.assert_allclose(merged.trajectory.poses[5:], np.tile(found.aTb, (5, 1, 1)))
+    assert [drive["name"] for drive in merged.about["drives"]] == ["drive", "drive"]
+    assert merged.session == {}
+
+
+def test_views_turn_with_their_map(world: World) -> None:
+    a, b = world.seen(np.arange(200), np.eye(4)), world.seen(np.arange(100, 300), BTA)
+    found = align(a, b)
+    merged = merge_maps(a, b, found)
+    added = merged.appearances.of(merged.landmarks.ids[len(a) :])
+    np.testing.assert_allclose(added.direction - found.aTb[:3, 2], 0.0, atol=1e-12)
+
+
+def test_overlapping_drives_keep_the_first_trajectory(world: World) -> None:
+    a, b = world.seen(np.arange(200), np.eye(4)), world.seen(np.arange(100, 300), BTA)
+    assert len(merge_maps(a, b, align(a, b)).trajectory) == 5
+
+
+def test_merged_files(world: World, tmp_path: Path) -> None:
+    a, b, out = tmp_path / "a", tmp_path / "b", tmp_path / "ab"
+    save_map(world.seen(np.arange(250), np.eye(4)), a)
+    save_map(world.seen(np.arange(150, 400), BTA), b)
+    lines = merge_files(a, b, out)
+    assert any("landmarks fused, residual" in line for line in lines)
+    merged = load_map(out)
+    assert 390 <= len(merged) <= 420
+    with pytest.raises(MapError, match="is there already"):
+        merge_files(a, b, out)
+    content = out.read_bytes()
+    merge_files(a, b, out, overwrite=True)
+    assert out.read_bytes() == content
+    other = replace(world.seen(np.arange(50), BTA), rig=replace(RIG, fx=300.0))
+    save_map(other, b)
+    with pytest.raises(MapError, match="made with another rig"):
+        merge_files(a, b, tmp_path / "c")
+    assert not (tmp_path / "c").exists()
