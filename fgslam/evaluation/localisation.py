@@ -42,6 +42,7 @@ class Answers:
         covariances: (n, 6, 6) in the tangent space at them.
         truth: (n, 4, 4) true poses in the map's world; NaN where unknown.
         visible: (n,) landmarks truly visible; -1 where unknown.
+        familiar: (n,) of these, those seen before from about there; -1 where unknown.
     """
 
     accepted: BoolArray
@@ -49,6 +50,7 @@ class Answers:
     covariances: FloatArray
     truth: FloatArray
     visible: IntArray
+    familiar: IntArray
 
     def __len__(self) -> int:
         return len(self.accepted)
@@ -61,6 +63,7 @@ class Answers:
             self.covariances[keep],
             self.truth[keep],
             self.visible[keep],
+            self.familiar[keep],
         )
 
 
@@ -167,6 +170,6 @@ def score(answers: Answers, bounds: Bounds) -> LocalisationScore:
     )
 
 
-def counted(answers: Answers, bounds: Bounds) -> BoolArray:
-    """(n,) which queries count: enough landmarks are visible, or nobody knows how many."""
-    return np.asarray((answers.visible < 0) | (answers.visible >= bounds.least_visible))
+def enough(in_view: IntArray, bounds: Bounds) -> BoolArray:
+    """(n,) where enough landmarks are in view (n,), or nobody knows how many."""
+    return np.asarray((in_view < 0) | (in_view >= bounds.least_visible))

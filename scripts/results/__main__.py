@@ -16,6 +16,7 @@ from scripts.results import (
     paper_views,
     person,
     real,
+    recognised,
     seeds,
     variants,
 )
@@ -32,6 +33,7 @@ WHAT: dict[str, Callable[[Path], Iterable[Table]]] = {
     "real": lambda data: [real.table(data)],
     "noise": lambda data: noise.tables(),
     "lasting": lambda data: lasting.tables(),
+    "recognised": lambda data: recognised.tables(data),
 }
 
 

@@ -20,8 +20,9 @@ from fgslam.localisation_config import LocalisationConfig
 from fgslam.map_file import require_rig
 from fgslam.map_types import Relocalisation
 from fgslam.recordings import Sequence
+from fgslam.runs.localisation.sights import Sighted, TrueSights
 from fgslam.runs.localisation.submap import Window, submap_features
-from fgslam.runs.localisation.truth import TruthInMap, truth_in_map, visible
+from fgslam.runs.localisation.truth import TruthInMap, truth_in_map
 from fgslam.runs.map_entry import GivenMap, trusted
 from fgslam.types import FloatArray, LandmarkMap
 
@@ -43,7 +44,7 @@ class Attempt:
         found: the answer; of a frame that could not be read None.
         problem: why it could not; empty where it could.
         truth: (4, 4) true pose in the map's world; NaN where unknown.
-        visible: landmarks truly visible; -1 where unknown.
+        sighted: landmarks truly in view of it.
         milliseconds: for the answer, without features.
         frontend_ms: for the frame's features in all images, and for matching them.
     """
@@ -55,7 +56,7 @@ class Attempt:
     found: Relocalisation | None
     problem: str
     truth: FloatArray
-    visible: int
+    sighted: Sighted
     milliseconds: float
     frontend_ms: float
 
@@ -112,13 +113,14 @@ class Asker:
         self._relocaliser.learn(self.landmarks, looks)
         self._floor = Floor.under(sequence.rig, frontend.ego_motion.dof)
         self.truth: TruthInMap = truth_in_map(given.saved, sequence, config.as_experiment())
+        self._sights = TrueSights(given.saved, self.landmarks, sequence, frontend)
 
-    def ask(self, found: list[FeatureFrame], seen: int) -> Attempt:
+    def ask(self, found: list[FeatureFrame], sighted: Sighted) -> Attempt:
         """One query: consecutive frames, the last of which is to be located.
 
         Args:
             found: the frames with their features.
-            seen: landmarks truly visible in the last one; -1 where unknown.
+            sighted: landmarks truly in view of the last one.
         """
         last = found[-1]
         frame = self._frame_number(last.i)
@@ -130,7 +132,7 @@ class Asker:
             found=None,
             problem=last.problem,
             truth=self.truth.poses[last.i],
-            visible=seen,
+            sighted=sighted,
             milliseconds=float("nan"),
             frontend_ms=last.sift_ms,
         )
@@ -159,9 +161,9 @@ class Asker:
             frontend_ms=last.sift_ms + 1e3 * (matched - start),
         )
 
-    def seen(self, i: int) -> int:
-        """Landmarks truly visible in the selected frame ``i``; -1 where unknown."""
-        return visible(self.landmarks, self._sequence, i, self.truth.poses[i])
+    def sighted(self, i: int) -> Sighted:
+        """Landmarks truly in view of the selected frame ``i``."""
+        return self._sights.of(i, self.truth.poses[i])
 
     def _frame_number(self, i: int) -> int:
         dataset = self._config.dataset
@@ -192,8 +194,8 @@ def ask_all(
     attempts: list[Attempt] = []
     done = 0
     for found in _queries(config, sequence):
-        seen = asker.seen(found[-1].i)
-        attempts += [asker.ask(found[len(found) - n :], seen) for n in wanted.frames]
+        sighted = asker.sighted(found[-1].i)
+        attempts += [asker.ask(found[len(found) - n :], sighted) for n in wanted.frames]
         done += 1
         progress("localising", done, queries)
         if stopped():

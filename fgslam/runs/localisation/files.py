@@ -51,6 +51,7 @@ _COLUMNS = (
     "second",
     "residual_px",
     "visible",
+    "familiar",
     "error_m",
     "error_deg",
     "nees",
@@ -94,7 +95,8 @@ def _rows(judged: Scored) -> Iterator[tuple[Cell, ...]]:
         errors = judged.errors
         judgement = errors.metres[k], np.rad2deg(errors.radians[k]), errors.nees[k], errors.dof[k]
         found = attempt.found
-        seen = None if attempt.visible < 0 else attempt.visible
+        sighted = attempt.sighted
+        in_view = [n if n >= 0 else None for n in (sighted.visible, sighted.familiar)]
         if found is None:
             nothing = [None] * (len(_COLUMNS) - 4)
             yield (attempt.frame, attempt.frames, "no_image", *nothing, attempt.problem)
@@ -112,7 +114,7 @@ def _rows(judged: Scored) -> Iterator[tuple[Cell, ...]]:
             found.expected,
             found.second,
             found.residual_px,
-            seen,
+            *in_view,
             *judgement,
             found.why,
         )
@@ -135,6 +137,7 @@ def _numbers(judged: Scored) -> dict[str, JsonValue]:
     frontend = np.array([a.frontend_ms for a in judged.attempts])
     return {
         **_score_numbers(judged.counts),
+        "familiar_view": _score_numbers(judged.familiar),
         "too_few_in_view": _score_numbers(judged.apart),
         "verdicts": dict(sorted(Counter(verdict_of(a) for a in judged.attempts).items())),
         "locate_ms": _spread_numbers(Spread.of(milliseconds)),

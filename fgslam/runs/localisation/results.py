@@ -16,7 +16,7 @@ from fgslam.evaluation.localisation import (
     LocalisationErrors,
     LocalisationScore,
     Spread,
-    counted,
+    enough,
     localisation_errors,
     score,
 )
@@ -63,7 +63,8 @@ class Scored:
         answers: the same as arrays.
         errors: of the accepted ones.
         counts: of those from which enough landmarks are visible.
-        apart: of the others.
+        familiar: of those from which enough are visible from about where they were seen before.
+        apart: of those from which too few are visible.
     """
 
     frames: int
@@ -71,6 +72,7 @@ class Scored:
     answers: Answers
     errors: LocalisationErrors
     counts: LocalisationScore
+    familiar: LocalisationScore
     apart: LocalisationScore
 
 
@@ -88,15 +90,16 @@ def scored(config: LocalisationConfig, asked: Asked) -> tuple[Scored, ...]:
     for frames in config.localisation.frames:
         attempts = asked.of(frames)
         answers = _answers(attempts)
-        counts = counted(answers, bounds)
+        visible, familiar = (enough(n, bounds) for n in (answers.visible, answers.familiar))
         out.append(
             Scored(
                 frames,
                 attempts,
                 answers,
                 localisation_errors(answers),
-                score(answers.select(counts), bounds),
-                score(answers.select(~counts), bounds),
+                score(answers.select(visible), bounds),
+                score(answers.select(familiar), bounds),
+                score(answers.select(~visible), bounds),
             )
         )
     return tuple(out)
@@ -110,7 +113,8 @@ def _answers(attempts: Sequence[Attempt]) -> Answers:
         poses=_stacked([np.eye(4) if f is None else f.wTc for f in found], (4, 4)),
         covariances=_stacked([nowhere if f is None else f.covariance for f in found], (6, 6)),
         truth=_stacked([one.truth for one in attempts], (4, 4)),
-        visible=np.array([one.visible for one in attempts], np.int64),
+        visible=np.array([one.sighted.visible for one in attempts], np.int64),
+        familiar=np.array([one.sighted.familiar for one in attempts], np.int64),
     )
 
 
@@ -185,9 +189,12 @@ def _score_table(config: LocalisationConfig, judged: Sequence[Scored]) -> TextTa
         ms = Spread.of(np.array([a.milliseconds for a in one.attempts]))
         times = f"{_number(ms.median, 0)}, {_number(ms.p95, 0)}"
         rows.append((in_frames(one.frames), (*_score_cells(one.counts), times)))
-        if one.apart.queries:
-            name = f"{in_frames(one.frames)}, too few in view"
-            rows.append((name, (*_score_cells(one.apart), _UNKNOWN)))
+        if one.apart.queries or one.familiar.queries != one.counts.queries:
+            least, name = wanted.least_visible, in_frames(one.frames)
+            familiar = f"{name}, {least} in view from familiar sides"
+            rows.append((familiar, (*_score_cells(one.familiar), _UNKNOWN)))
+            few = f"{name}, fewer than {least} in view"
+            rows.append((few, (*_score_cells(one.apart), _UNKNOWN)))
     return TextTable("score", "Localisation", "query", columns, tuple(rows))
 
 

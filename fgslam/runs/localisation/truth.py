@@ -1,4 +1,4 @@
-"""The truth in a saved map's own world, and which landmarks are truly visible from a pose."""
+"""The truth in a saved map's own world."""
 
 from __future__ import annotations
 
@@ -13,19 +13,15 @@ from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.errors import FgslamError
 from fgslam.evaluation.trajectory import align, associate
 from fgslam.factory import open_sequence
-from fgslam.geometry import inverse, pose, project, transform_to_camera
+from fgslam.geometry import inverse, pose
 from fgslam.map_file import SavedMap
 from fgslam.recordings import Sequence
-from fgslam.runs.rendered_truth import TrueDepth
 from fgslam.settings.lab import RenderedLabSettings
 from fgslam.simulation.places import PlaceChoice, plan_in_place
 from fgslam.simulation.world import make_rig
-from fgslam.types import FloatArray, LandmarkMap
+from fgslam.types import FloatArray
 
 _SAME_TIME_S = 1e-3
-_NEAREST_M = 0.3
-_BEHIND = 1.05  # times the rendered depth, plus the next: what is farther off is hidden
-_BEHIND_M = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,26 +68,6 @@ def truth_in_map(saved: SavedMap, sequence: Sequence, config: ExperimentConfig) 
     unknown[times] = mTw @ sequence.ground_truth.poses[true_rows]
     words = f"truth aligned to the map's trajectory, SE3 over {matched} poses"
     return TruthInMap(unknown, words)
-
-
-def visible(saved_landmarks: LandmarkMap, sequence: Sequence, i: int, wTc: FloatArray) -> int:
-    """Landmarks that a rendered frame ``i`` shows from its true pose; -1 where nobody knows.
-
-    In all images, and not behind what was rendered.
-    """
-    if not isinstance(sequence, TrueDepth) or not np.isfinite(wTc).all():
-        return -1
-    rig, depth = sequence.rig, sequence.depth(i)
-    points = transform_to_camera(wTc, saved_landmarks.positions)
-    points = points[points[:, 2] > _NEAREST_M]
-    column, row, disparity = project(rig, points).T
-    rise = 0.0
-    if rig.vertical_baseline is not None:
-        rise = disparity * (rig.fy * rig.vertical_baseline) / (rig.fx * rig.baseline)
-    inside = (column >= 0.0) & (column + disparity <= rig.width - 1.0)
-    inside &= (row >= 0.0) & (row + rise <= rig.height - 1.0)
-    near = depth[np.rint(row[inside]).astype(np.int64), np.rint(column[inside]).astype(np.int64)]
-    return int(np.sum(points[inside, 2] <= _BEHIND * near + _BEHIND_M))
 
 
 def _drive_config(drive: object) -> ExperimentConfig | None:
