@@ -119,8 +119,15 @@ class RelocalisationSettings:
     ] = 12
     enough_witnesses: Annotated[
         int,
-        Field(ge=3, description="with so many witnesses what is not seen no longer contradicts"),
-    ] = 20
+        Field(ge=3, description="with so many witnesses nothing but another place contradicts"),
+    ] = 24
+    max_misfit: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="with fewer, largest mean squared normalised residual (1: as modelled)",
+        ),
+    ] = 1.1
     ambiguous_share: Annotated[
         float,
         Field(
@@ -142,9 +149,9 @@ class RelocalisationSettings:
         Field(
             ge=0.0,
             le=1.0,
-            description="of this share of the pieces expected in view something must be seen",
+            description="with fewer, something must be seen of this share of the pieces in view",
         ),
-    ] = 0.15
+    ] = 0.5
     elsewhere_m: Annotated[
         float, Field(gt=0.0, description="poses farther apart than this are different places")
     ] = 0.5

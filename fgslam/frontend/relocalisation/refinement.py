@@ -37,6 +37,7 @@ class Refined:
         features: (k,) indices.
         landmarks: (k,) rows of the map, unique.
         residual_px: root mean square of the image residuals.
+        misfit: mean squared normalised residual over its three numbers; 1 where as modelled.
         proposed: how many of the frame's tentatively matched features agree.
         expected: (m,) rows of landmarks that the pose should see.
         witnesses: what the matches weigh: of one piece of the map at most four count, for a thing
@@ -49,6 +50,7 @@ class Refined:
     features: IntArray
     landmarks: IntArray
     residual_px: float
+    misfit: float
     proposed: int
     expected: IntArray
     witnesses: int
@@ -170,6 +172,7 @@ class Refiner:
             features=chosen[0],
             landmarks=chosen[1],
             residual_px=rms,
+            misfit=float(np.mean(squared_distances(found))) / 3.0,
             proposed=proposed,
             expected=expected,
             witnesses=witnesses(positions[chosen[1]], side),

@@ -62,23 +62,30 @@ def _verdict(
     said = (
         f"{n} matches agree ({best.proposed} of {matched} tentative), {best.witnesses} witnesses, "
         f"elsewhere {rival}; {len(best.expected)} landmarks expected, {best.covered:.0%} of their "
-        f"places seen; sigma {sigma_m:.3f} m {sigma_deg:.2f} deg"
+        f"places seen; misfit {best.misfit:.2f}; sigma {sigma_m:.3f} m {sigma_deg:.2f} deg"
     )
     if best.witnesses < settings.min_inliers:
         return Verdict.TOO_FEW_INLIERS, f"{said}; {settings.min_inliers} witnesses are needed"
     if rival >= settings.ambiguous_share * best.witnesses:
         return Verdict.AMBIGUOUS, f"{said}; another place explains the frame nearly as well"
     if _contradicted(best, settings):
-        return Verdict.CONTRADICTED, f"{said}; what should be seen there is not"
+        return (
+            Verdict.CONTRADICTED,
+            f"{said}; too few for how they fit, or for what should be seen and is not",
+        )
     if sigma_m > settings.max_sigma_m or sigma_deg > settings.max_sigma_deg:
         return Verdict.INACCURATE, f"{said}; too uncertain"
     return Verdict.FOUND, said
 
 
 def _contradicted(pose: Refined, settings: RelocalisationSettings) -> bool:
-    """Whether few things agree and next to nothing else that should be seen there is."""
+    """Whether few things agree, and those badly, or what should be seen beside them is not.
+
+    Matches that agree by accident fill their gates; right ones lie in the middle.
+    """
     few = pose.witnesses < settings.enough_witnesses
-    return few and pose.covered < settings.least_covered
+    unseen = pose.covered < settings.least_covered
+    return few and (unseen or pose.misfit > settings.max_misfit)
 
 
 def _nothing(verdict: Verdict, candidates: int, why: str) -> Relocalisation:
