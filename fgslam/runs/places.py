@@ -53,8 +53,9 @@ def place_numbers(recorder: RunRecorder, closures: list[JudgedClosure]) -> dict[
 
 
 def write_closures(folder: Path, recorder: RunRecorder, closures: list[JudgedClosure]) -> None:
-    """loops.csv, one line a closure; no file where none was closed."""
+    """loops.csv, one line a closure; no file where none was closed, nor an earlier run's."""
     if not closures:
+        (folder / LOOPS_FILE).unlink(missing_ok=True)
         return
     numbers = [increment.index for increment in recorder.log]
     rows: list[tuple[Cell, ...]] = [

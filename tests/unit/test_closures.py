@@ -123,6 +123,7 @@ def test_closures_of_a_run_come_back_from_their_file(tmp_path: Path) -> None:
 def test_no_closure_leaves_no_file(tmp_path: Path) -> None:
     recorder = recorded({})
     closures = closures_of(recorder, None)
+    (tmp_path / LOOPS_FILE).write_text("of an earlier run")
     write_closures(tmp_path, recorder, closures)
     assert not (tmp_path / LOOPS_FILE).exists()
     assert place_numbers(recorder, closures)["false_closures"] == 0
