@@ -1,0 +1,222 @@
+"""The kidnapped robot: found where it is, refused where it cannot be told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fgslam.errors import ConfigError
+from fgslam.frontend.relocalisation.relocaliser import Relocaliser
+from fgslam.geometry import pose, so3_exp
+from fgslam.map_types import Relocalisation, Verdict
+from fgslam.settings.relocalisation import RelocalisationSettings
+from fgslam.types import FloatArray, StereoFeatures
+from tests.known_places import RIG, Place, error, floor, planar, room, seen, things
+
+DEFAULTS = RelocalisationSettings(map_sigma_m=0.001, view_sigma_px=0.0)
+HOUGH = replace(DEFAULTS, method="hough")
+
+
+def _relocaliser(
+    place: Place, dof: int = 3, settings: RelocalisationSettings = DEFAULTS
+) -> Relocaliser:
+    made = Relocaliser(RIG, floor(dof), settings)  # type: ignore[arg-type]
+    made.learn(*place.map())
+    return made
+
+
+def _same(a: Relocalisation, b: Relocalisation) -> bool:
+    arrays = ("wTc", "covariance", "features", "ids")
+    equal = all(np.array_equal(getattr(a, n), getattr(b, n), equal_nan=True) for n in arrays)
+    return equal and a.why == b.why and a.verdict == b.verdict
+
+
+@pytest.mark.parametrize("settings", [DEFAULTS, HOUGH])
+def test_is_found_on_the_floor_without_a_prior(
+    rng: np.random.Generator, settings: RelocalisationSettings
+) -> None:
+    place, truth = room(rng), planar(1.2, -0.7, 2.1)
+    view = seen(place, truth, rng, clutter=60)
+    found = _relocaliser(place, settings=settings).locate(view, rng)
+    assert found.found, found.why
+    metres, degrees = error(found.wTc, truth)
+    assert metres < 0.05
+    assert degrees < 0.5
+    assert np.array_equal(np.unique(found.ids), np.sort(found.ids))
+    assert len(found.features) == len(found.ids) > 20
+    assert found.wTc[1, 3] == 0.0
+    assert found.covariance[4, 4] == pytest.approx(0.0, abs=1e-15)
+
+
+@pytest.mark.parametrize("dof", [5, 6])
+def test_is_found_in_space_however_it_is_held(rng: np.random.Generator, dof: int) -> None:
+    place = things(rng, np.array([-4.0, -1.5, -4.0]), np.array([4.0, 1.0, 4.0]), 2500)
+    height = 0.0 if dof == 5 else -0.4
+    truth = pose(so3_exp(np.array([0.3, 1.9, -0.5])), np.array([0.5, height, 1.0]))
+    view = seen(place, truth, rng, clutter=60, roll=0.5)
+    found = _relocaliser(place, dof).locate(view, rng)
+    assert found.found, found.why
+    metres, degrees = error(found.wTc, truth)
+    assert metres < 0.05
+    assert degrees < 0.5
+
+
+def test_matches_tell_which_feature_is_which_landmark(rng: np.random.Generator) -> None:
+    place, truth = room(rng), planar(0.0, 0.0, 0.3)
+    view = seen(place, truth, rng)
+    found = _relocaliser(place).locate(view, rng)
+    landmarks, _ = place.map()
+    there = landmarks.positions[landmarks.rows(found.ids)]
+    here = view.position[found.features] @ truth[:3, :3].T + truth[:3, 3]
+    sideways = np.linalg.norm((there - here)[:, 1])
+    assert sideways < 0.1 * len(there)
+    assert np.median(np.linalg.norm(there - here, axis=1)) < 0.3
+
+
+def test_the_same_frame_and_seed_give_the_same_bytes(rng: np.random.Generator) -> None:
+    place = room(rng)
+    view = seen(place, planar(0.4, 0.4, 1.0), rng, clutter=40)
+    both = [_relocaliser(place).locate(view, np.random.default_rng(5)) for _ in range(2)]
+    assert _same(*both)
+
+
+def test_an_unknown_place_is_refused(rng: np.random.Generator) -> None:
+    view = seen(room(rng), planar(0.0, 0.0, 0.0), rng, clutter=50)
+    assert not _relocaliser(room(rng)).locate(view, rng).found
+
+
+def _two_posters(rng: np.random.Generator) -> tuple[Place, Place]:
+    """A poster on the north wall and the same one on the same wall, six metres to the east."""
+    poster = things(rng, np.array([-3.5, -0.5, 4.99]), np.array([-2.5, 0.5, 5.0]), 60)
+    return poster, poster.moved(np.array([6.0, 0.0, 0.0]))
+
+
+def test_twins_that_fill_the_view_are_ambiguous(rng: np.random.Generator) -> None:
+    west, east = _two_posters(rng)
+    for truth in (planar(-3.0, 3.0, 0.0), planar(3.0, 3.0, 0.0)):
+        found = _relocaliser(west.join(east)).locate(seen(west.join(east), truth, rng), rng)
+        assert found.verdict is Verdict.AMBIGUOUS, found.why
+        assert found.second > 20
+
+
+def test_twins_are_told_apart_by_what_hangs_around_them(rng: np.random.Generator) -> None:
+    west, east = _two_posters(rng)
+    place = west.join(east).join(room(rng, 900))
+    made = _relocaliser(place)
+    for truth in (planar(-3.0, 1.0, 0.0), planar(3.0, 1.0, 0.0)):
+        found = made.locate(seen(place, truth, rng), rng)
+        assert found.found, found.why
+        assert error(found.wTc, truth)[0] < 0.1
+
+
+def test_a_poster_carried_elsewhere_does_not_convince(rng: np.random.Generator) -> None:
+    """The map knows the poster and its wall; the frame shows the poster on a wall unknown."""
+    poster, elsewhere = _two_posters(rng)
+    wall = things(rng, np.array([-5.0, -1.5, 4.9]), np.array([-1.0, 1.0, 5.1]), 200)
+    small = poster.select(np.arange(0, 60, 2))
+    view = seen(elsewhere.select(np.arange(0, 60, 2)), planar(3.0, 1.0, 0.0), rng, clutter=80)
+    found = _relocaliser(small.join(wall)).locate(view, rng)
+    assert not found.found, found.why
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+@pytest.mark.parametrize("dof", [3, 6])
+@pytest.mark.parametrize("descriptors", [True, False])
+def test_few_features_are_too_few(
+    rng: np.random.Generator, count: int, dof: int, descriptors: bool
+) -> None:
+    place = room(rng)
+    view = seen(place, planar(0.0, 0.0, 0.0), rng)
+    settings = replace(DEFAULTS, descriptors=descriptors)
+    found = _relocaliser(place, dof, settings).locate(_first(view, count), rng)
+    assert found.verdict in (Verdict.TOO_FEW_MATCHES, Verdict.TOO_FEW_INLIERS)
+    assert str(DEFAULTS.min_inliers) in found.why
+
+
+def test_an_empty_map_finds_nothing(rng: np.random.Generator) -> None:
+    view = seen(room(rng), planar(0.0, 0.0, 0.0), rng)
+    empty = Relocaliser(RIG, floor(3), DEFAULTS)
+    found = empty.locate(view, rng)
+    assert found.verdict is Verdict.TOO_FEW_MATCHES
+    assert np.isnan(found.covariance).all()
+    assert not len(found.ids)
+
+
+@pytest.mark.parametrize("dof", [3, 6])
+def test_landmarks_on_a_vertical_line_fix_no_pose(rng: np.random.Generator, dof: int) -> None:
+    """All turns about the line see the same."""
+    line = things(rng, np.array([0.5, -1.0, 4.0]), np.array([0.5, 1.0, 4.0]), 60)
+    found = _relocaliser(line, dof).locate(seen(line, planar(0.0, 0.0, 0.0), rng), rng)
+    assert not found.found, found.why
+
+
+def test_one_plane_is_enough(rng: np.random.Generator) -> None:
+    wall = things(rng, np.array([-4.0, -1.5, 5.0]), np.array([4.0, 1.0, 5.0]), 300)
+    truth = planar(0.3, 1.0, 0.2)
+    for dof in (3, 6):
+        found = _relocaliser(wall, dof).locate(seen(wall, truth, rng), rng)
+        assert found.found, found.why
+        assert error(found.wTc, truth)[0] < 0.05
+
+
+def test_what_looks_unlike_anything_may_still_be_found_by_shape(rng: np.random.Generator) -> None:
+    """Without descriptors, by votes over size, height and orientation alone."""
+    place, truth = room(rng, 300), planar(0.5, -1.0, 1.0)
+    settings = replace(HOUGH, descriptors=False)
+    found = _relocaliser(place, settings=settings).locate(seen(place, truth, rng), rng)
+    assert found.found, found.why
+    assert error(found.wTc, truth)[0] < 0.05
+
+
+def test_a_submap_counts_what_lies_outside_the_image(rng: np.random.Generator) -> None:
+    """Features of earlier frames, in the last camera's frame, some behind it."""
+    place, last = room(rng), planar(0.0, 0.0, 0.0)
+    views = [seen(place, turned, rng) for turned in (planar(0.0, 0.0, 2.8), planar(0.0, 0.0, 1.6))]
+    poses = [planar(0.0, 0.0, 2.8), planar(0.0, 0.0, 1.6)]
+    parts = [_carried(view, at) for view, at in zip(views, poses, strict=True)]
+    submap = _joined([*parts, seen(place, last, rng)])
+    assert (submap.position[:, 2] < 0.0).any()
+    found = _relocaliser(place).locate(submap, rng)
+    assert found.found, found.why
+    assert error(found.wTc, last)[0] < 0.05
+    assert (submap.position[found.features, 2] < 0.0).any()
+
+
+def test_hough_needs_a_level_floor() -> None:
+    with pytest.raises(ConfigError, match="choose ransac"):
+        Relocaliser(RIG, floor(6), HOUGH)
+
+
+def test_nothing_handed_in_is_changed(rng: np.random.Generator) -> None:
+    place = room(rng)
+    landmarks, views = place.map()
+    view = seen(place, planar(0.0, 0.0, 0.0), rng)
+    before = [a.copy() for a in (landmarks.positions, views.descriptors, view.measurement)]
+    made = Relocaliser(RIG, floor(3), DEFAULTS)
+    made.learn(landmarks, views)
+    made.locate(view, rng)
+    after = (landmarks.positions, views.descriptors, view.measurement)
+    assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+def _first(view: StereoFeatures, count: int) -> StereoFeatures:
+    names = StereoFeatures.__dataclass_fields__
+    return StereoFeatures(**{name: getattr(view, name)[:count] for name in names})
+
+
+def _joined(views: list[StereoFeatures]) -> StereoFeatures:
+    names = StereoFeatures.__dataclass_fields__
+    return StereoFeatures(**{n: np.concatenate([getattr(v, n) for v in views]) for n in names})
+
+
+def _carried(view: StereoFeatures, lTc: FloatArray) -> StereoFeatures:
+    """Features in the frame of another camera, where most project nowhere."""
+    rotation = lTc[:3, :3]
+    return replace(
+        view,
+        measurement=np.full_like(view.measurement, -1e4),
+        position=view.position @ rotation.T + lTc[:3, 3],
+        position_covariance=rotation @ view.position_covariance @ rotation.T,
+    )
