@@ -22,11 +22,10 @@ from fgslam.backend.graph_solution import (
     poses_of_frame,
     suspect,
 )
-from fgslam.backend.loop_closing import loop_factor
 from fgslam.backend.marginals import DenseMarginals, UndeterminedError
 from fgslam.backend.segments import TrackedFrame
 from fgslam.backend.smoother import Smoother
-from fgslam.backend.submaps import Constraint, nearest_positive
+from fgslam.backend.submaps import Constraint, constraint_factor, nearest_positive
 from fgslam.errors import EstimatorError
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 from fgslam.factors.motion import pose_prior
@@ -100,7 +99,7 @@ class FixedLagSmoother(Smoother):
         """
         known = self._between(loop)
         if known.before >= self._oldest:  # both poses are variables
-            self._recent[-1].graph.add(loop_factor(known))
+            self._recent[-1].graph.add(constraint_factor(known))
             self._rebuild(gtsam.Values(self._values))
         else:
             moved = self._drift_undone(known, f"{where}: loop closure to frame {loop.frame}")
@@ -119,8 +118,11 @@ class FixedLagSmoother(Smoother):
         carried = adjoint(inverse(known.motion))
         shared = congruence(carried, self._covariances[known.before])
         drift = nearest_positive(self._covariances[known.after] - shared)
-        off = se3_log(inverse(wTc) @ wTo @ known.motion)
-        innovation = drift + known.covariance
+        # On a hard floor nothing drifts, and nothing is measured, in the other directions.
+        basis = self._floor.basis(wTc) if self._floor.rigid_dof < 6 else np.eye(6)
+        off = basis.T @ se3_log(inverse(wTc) @ wTo @ known.motion)
+        drift = basis.T @ drift @ basis
+        innovation = drift + basis.T @ known.covariance @ basis
         gain = np.linalg.solve(innovation, drift).T
         squared, gate = float(off @ np.linalg.solve(innovation, off)), self._loop_gate
         if gate > 0.0 and not squared <= gate**2:
@@ -129,8 +131,9 @@ class FixedLagSmoother(Smoother):
                 f"{gate:g} allowed"
             )
             return None
-        target = self._floor.constrain(wTc @ se3_exp(gain @ off))
-        covariance = shared + nearest_positive(drift - gain @ drift)
+        target = wTc @ se3_exp(basis @ gain @ off)
+        target = self._floor.constrain(target) if self._floor.rigid_dof < 6 else target
+        covariance = shared + congruence(basis, nearest_positive(drift - gain @ drift))
         shift = float(np.linalg.norm(target[:3, 3] - wTc[:3, 3]))
         self._remarks.append(
             f"{what} of the log: the camera moved by {shift:.2f} m, and what lies within the lag"

@@ -15,11 +15,10 @@ from fgslam.backend.graph_solution import (
     solution,
     suspect,
 )
-from fgslam.backend.loop_closing import loop_factor
 from fgslam.backend.outliers import solver_parameters, trimmed
 from fgslam.backend.refinement import Refined, refine
 from fgslam.backend.segments import Segments, TrackedFrame
-from fgslam.backend.submaps import Constraint
+from fgslam.backend.submaps import Constraint, constraint_factor
 from fgslam.backend.whole_graph import WholeGraphSmoother
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 from fgslam.floor import Floor
@@ -84,7 +83,7 @@ class Isam2Smoother(WholeGraphSmoother):
     def _join(self, known: Constraint, found: Any | None) -> None:
         if found is None:
             graph = gtsam.NonlinearFactorGraph()
-            graph.add(loop_factor(known))
+            graph.add(constraint_factor(known))
             self._update(graph, gtsam.Values())
         else:
             try:

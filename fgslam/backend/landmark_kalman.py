@@ -200,7 +200,7 @@ class LandmarkKalman:
 
     def _close(self, increment: Increment, loop: LoopClosure) -> None:
         """Moves the drive and the map to where the loop has them; or says why not."""
-        poses = self._drive.close(loop, f"frame {increment.index}")
+        poses = self._drive.close(loop, self._current.wTc, f"frame {increment.index}")
         if poses is None:
             return
         moved_by = changes(np.array(self._past.poses), poses)

@@ -74,9 +74,11 @@ def trimmed(graph: Any, values: Any, params: Any, noise_factor: float = 1.0) -> 
     """
     rough = solver_parameters(params.getMaxIterations(), _ROUGH)
     values = gtsam.LevenbergMarquardtOptimizer(graph, values, rough).optimize()
-    # A robust factor whitens with its kernel's weight, after which everything would seem to fit.
-    factors = [_plain(graph.at(row)) for row in range(graph.size())]
+    factors = [graph.at(row) for row in range(graph.size())]
     observed = [_landmark(factor) is not None for factor in factors]
+    # A robust factor whitens with its kernel's weight, after which everything would seem to fit.
+    # Loops keep their kernels: they are too few to be told apart by a trim.
+    factors = [_plain(f) if is_one else f for f, is_one in zip(factors, observed, strict=True)]
     gate = _GATE / noise_factor**2
     fits: list[bool] = []
     for _ in range(_ROUNDS):

@@ -290,6 +290,8 @@ class Smoother(ABC):
         era, frames = self._eras[loop.frame], self._builder.frames
         fellows = [frame for frame in frames if self._eras[frame] == era] or frames
         near = min(fellows, key=lambda frame: abs(frame - loop.frame))
+        covariance = self._loop_settings.closure_factor**2 * loop.covariance
+        loop = dataclasses.replace(loop, covariance=covariance)
         return carried_to(near, loop, self._inputs.trackings, last)
 
     def _waiting(self, values: Any) -> tuple[IntArray, FloatArray]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -24,15 +25,16 @@ from fgslam.geometry import (
     congruence,
     inverse,
     reorthonormalise,
-    se3_exp,
     se3_log,
     skew,
 )
 from fgslam.types import FloatArray, IntArray, Odometry, Prediction, StateArrays
 
+_DOUBT_WIDTH = 3.0  # deviations of the whole closure; its squared residual is 6 on average
 _ITERATIONS = 100
 _TOLERANCE = 1e-12  # of the cost
 _EXACT_SIGMA = 1e-6  # radians and metres: a step's least deviation, for what a floor excludes
+_SMALL = 1e-3  # radians: below, the formula's differences lose their digits
 _STILL = 1e-12  # of a change's tangent vector: what is not to be spread
 FREE_RAD, FREE_M = 3.0, 30.0
 """Deviations of a step that nobody measured, as of a robot that was carried off: it pulls nothing
@@ -49,12 +51,14 @@ class Constraint:
         before, after: frames.
         motion: (4, 4) pose of ``after`` in ``before``.
         covariance: (6, 6) in the tangent space at it.
+        doubted: it may be wrong: the farther off, the less it pulls (Cauchy's kernel).
     """
 
     before: int
     after: int
     motion: FloatArray
     covariance: FloatArray
+    doubted: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +96,14 @@ class Chain:
         self.poses.append(self.poses[-1] @ motion if self.poses else motion)
         self.steps.append(covariance)
 
+    def cost(self, constraints: list[Constraint], every: int) -> float:
+        """What these constraints cost, without the poses."""
+        if not constraints:
+            return 0.0
+        poses = np.array(self.poses)
+        errors = _as_motions_of_the_world(poses, np.array(self.steps))
+        return _minimum(poses, errors, constraints, every)[1]
+
     def solve(self, constraints: list[Constraint], every: int) -> Corrected:
         """The chain under these constraints, with a submap every so many frames."""
         return corrected(np.array(self.poses), np.array(self.steps), constraints, every)
@@ -101,8 +113,7 @@ class Chain:
         poses = np.array(self.poses)
         errors = _as_motions_of_the_world(poses, np.array(self.steps))
         sums = [errors[a + 1 : b + 1].sum(axis=0) for a, b in itertools.pairwise([-1, *frames])]
-        here = np.array([inverse(pose) for pose in poses[frames]])
-        return congruence(_adjoints(here), np.array(sums))
+        return congruence(_adjoints(_inverses(poses[frames])), np.array(sums))
 
     def state(self) -> StateArrays:
         """All of it as plain arrays."""
@@ -114,6 +125,7 @@ class Chain:
                 -1, 2
             ),
             "chain_motions": np.array([c.motion for c in known]).reshape(-1, 4, 4),
+            "chain_doubted": np.array([c.doubted for c in known], np.bool_),
             "chain_covariances": np.array([c.covariance for c in known]).reshape(-1, 6, 6),
         }
 
@@ -124,9 +136,10 @@ class Chain:
             state["chain_between"].tolist(),
             state["chain_motions"],
             state["chain_covariances"],
+            state["chain_doubted"].tolist(),
             strict=True,
         )
-        constraints = [Constraint(a, b, motion, cov) for (a, b), motion, cov in known]
+        constraints = [Constraint(a, b, *rest) for (a, b), *rest in known]
         return Chain(list(state["chain_poses"]), list(state["chain_steps"]), constraints)
 
 
@@ -143,27 +156,23 @@ def corrected(
         every: frames to a submap; frames with a constraint begin one, too.
     """
     errors = _as_motions_of_the_world(poses, steps)
-    begins = _beginnings(len(poses), constraints, every)
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.add(pose_prior(pose_key(0), Prediction(poses[0], np.zeros((6, 6)))))
-    for frame in begins:
-        values.insert(pose_key(frame), gtsam.Pose3(poses[frame]))
-    for a, b in itertools.pairwise(begins):
-        whole = errors[a + 1 : b + 1].sum(axis=0)
-        motion = inverse(poses[a]) @ poses[b]
-        step = Odometry(motion, congruence(adjoint(inverse(poses[b])), whole))
-        graph.add(odometry_factor(pose_key(a), pose_key(b), step))
-    for known in constraints:
-        step = Odometry(known.motion, known.covariance)
-        graph.add(odometry_factor(pose_key(known.before), pose_key(known.after), step))
-    params = solver_parameters(_ITERATIONS, _TOLERANCE)
-    params.setLinearSolverType("MULTIFRONTAL_QR")  # a tight loop on a loose chain defeats Cholesky
-    found = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
-    at = {frame: reorthonormalise(poses_of_frame(found, frame)) for frame in begins}
+    at, cost = _minimum(poses, errors, constraints, every)
     out = poses.copy()
-    for a, b in itertools.pairwise(begins):
+    for a, b in itertools.pairwise(sorted(at)):
         out[a : b + 1] = _between(poses[a : b + 1], errors[a : b + 1], at[a], at[b])
-    return Corrected(out, 2.0 * float(graph.error(found)))
+    return Corrected(out, cost)
+
+
+def constraint_factor(known: Constraint) -> Any:
+    """The factor of a constraint between the poses of its frames."""
+    step = Odometry(known.motion, known.covariance)
+    factor = odometry_factor(pose_key(known.before), pose_key(known.after), step)
+    if not known.doubted:
+        return factor
+    kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(_DOUBT_WIDTH)
+    return factor.cloneWithNewNoiseModel(
+        gtsam.noiseModel.Robust.Create(kernel, factor.noiseModel())
+    )
 
 
 def rotated(transforms: FloatArray, covariances: FloatArray) -> FloatArray:
@@ -185,10 +194,58 @@ def transported(transforms: FloatArray, points: FloatArray) -> FloatArray:
 
 def changes(before: FloatArray, after: FloatArray) -> FloatArray:
     """Motions (n, 4, 4) of the world that take poses (n, 4, 4) ``before`` to those ``after``."""
-    return np.asarray(after @ np.array([inverse(pose) for pose in before]).reshape(-1, 4, 4))
+    return np.asarray(after @ _inverses(before))
 
 
 # --------------------------------------------------------------------------------------------
+
+
+def _minimum(
+    poses: FloatArray, errors: FloatArray, constraints: list[Constraint], every: int
+) -> tuple[dict[int, FloatArray], float]:
+    """Poses (4, 4) at which submaps begin, by frame, at the least cost; and that cost."""
+    begins = _beginnings(len(poses), constraints, every)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(pose_prior(pose_key(0), Prediction(poses[0], np.zeros((6, 6)))))
+    for frame in begins:
+        values.insert(pose_key(frame), gtsam.Pose3(poses[frame]))
+    for a, b in itertools.pairwise(begins):
+        whole = errors[a + 1 : b + 1].sum(axis=0)
+        motion = inverse(poses[a]) @ poses[b]
+        step = Odometry(motion, congruence(adjoint(inverse(poses[b])), whole))
+        graph.add(odometry_factor(pose_key(a), pose_key(b), step))
+    for known in constraints:
+        graph.add(constraint_factor(known))
+    params = solver_parameters(_ITERATIONS, _TOLERANCE)
+    params.setLinearSolverType("MULTIFRONTAL_QR")  # a tight loop on a loose chain defeats Cholesky
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+    at = {frame: reorthonormalise(poses_of_frame(found, frame)) for frame in begins}
+    return at, 2.0 * float(graph.error(found))
+
+
+def _inverses(poses: FloatArray) -> FloatArray:
+    """Inverses (n, 4, 4) of rigid motions."""
+    out = np.zeros_like(poses)
+    out[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
+    out[:, :3, 3] = -np.einsum("nij,nj->ni", out[:, :3, :3], poses[:, :3, 3])
+    out[:, 3, 3] = 1.0
+    return out
+
+
+def _motions(twists: FloatArray) -> FloatArray:
+    """Rigid motions (n, 4, 4) of tangent vectors (n, 6): :func:`fgslam.geometry.se3_exp` of all."""
+    angle = np.linalg.norm(twists[:, :3], axis=1)[:, None, None]
+    cross = skew(twists[:, :3])
+    square = cross @ cross
+    first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    small = angle < _SMALL
+    cubed = np.where(small, 1.0, angle) ** 3
+    third = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (angle - np.sin(angle)) / cubed)
+    out = np.tile(np.eye(4), (len(twists), 1, 1))
+    out[:, :3, :3] += first * cross + second * square
+    along = np.eye(3) + second * cross + third * square
+    out[:, :3, 3] = np.einsum("nij,nj->ni", along, twists[:, 3:])
+    return out
 
 
 def _beginnings(count: int, constraints: list[Constraint], every: int) -> list[int]:
@@ -228,7 +285,7 @@ def _between(
     else:
         spread = np.cumsum(errors[1:], axis=0)
         shares = spread @ np.linalg.solve(spread[-1], change)
-        out = begun @ np.array([np.eye(4), *(se3_exp(share) for share in shares)]) @ poses
+        out = begun @ _motions(np.concatenate([np.zeros((1, 6)), shares])) @ poses
     out[0], out[-1] = first, last
     return np.asarray(out)
 

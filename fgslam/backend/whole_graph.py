@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from abc import abstractmethod
 from typing import Any
 
@@ -9,9 +10,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from fgslam.backend.graph_solution import poses_of_frame
-from fgslam.backend.loop_closing import first_guess, loop_factor, misfit, solved
+from fgslam.backend.loop_closing import first_guess, misfit, solved
 from fgslam.backend.smoother import Smoother
-from fgslam.backend.submaps import Constraint
+from fgslam.backend.submaps import Constraint, constraint_factor
 from fgslam.floor import Floor
 from fgslam.settings.backend import GraphSettings
 from fgslam.types import IntArray, LandmarkMap, LoopClosure, Prediction, Sensor, StateArrays
@@ -65,7 +66,7 @@ class WholeGraphSmoother(Smoother):
         """
         known = self._between(loop)
         what = f"{where}: loop closure to frame {loop.frame} of the log"
-        off = misfit(loop_factor(known), self._values_now())
+        off = misfit(constraint_factor(known), self._values_now())
         if off <= _AGREES:
             self._accept(known, None)
             self._remarks.append(f"{what}: as expected, nothing moved")
@@ -90,7 +91,7 @@ class WholeGraphSmoother(Smoother):
             every = self._loop_settings.submap_frames
             chain = self._tracker.chain
             guess = first_guess(self._builder, before, chain, loops, every)
-            graph.add(loop_factor(known))
+            graph.add(constraint_factor(known))
             found = solved(graph, guess)
         except RuntimeError as error:
             raise self._failed(error) from None
@@ -99,7 +100,9 @@ class WholeGraphSmoother(Smoother):
         return 2.0 * (float(graph.error(found)) - cost), found, shift
 
     def _accept(self, known: Constraint, found: Any | None) -> None:
-        self._builder.add_factor(loop_factor(known))
+        """Believed now, it is doubted when later ones contradict it."""
+        known = dataclasses.replace(known, doubted=True)
+        self._builder.add_factor(constraint_factor(known))
         self._loops.append(known)
         self._join(known, found)
 

@@ -85,6 +85,14 @@ class LoopCorrectionSettings:
             "to it: the tracked pose's own covariance takes the landmarks as they are",
         ),
     ] = 1.0
+    closure_factor: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="deviations of a closure are multiplied by this: its own covariance takes "
+            "the map around both frames as rigid",
+        ),
+    ] = 3.0
     gate_sigmas: Annotated[
         float,
         Field(

@@ -13,6 +13,7 @@ from fgslam.backend.submaps import (
     FREE,
     Chain,
     Constraint,
+    _motions,
     changes,
     corrected,
     home_changes,
@@ -193,3 +194,20 @@ def test_the_nearest_positive_matrix() -> None:
     np.testing.assert_allclose(
         nearest_positive(mixed), turn @ np.diag([2.0, 0.0, 0.5]) @ turn.T, atol=1e-14
     )
+
+
+def test_many_motions_are_those_of_single_ones(rng: np.random.Generator) -> None:
+    sizes = np.array([0.0, 1e-9, 5e-4, 2e-3, 0.1, 1.0, 3.0])
+    twists = sizes[:, None] * rng.standard_normal((7, 6))
+    expected = np.array([g.se3_exp(twist) for twist in twists])
+    np.testing.assert_allclose(_motions(twists), expected, rtol=0, atol=1e-13)
+
+
+def test_a_doubted_loop_yields_to_those_that_agree(rng: np.random.Generator) -> None:
+    poses, steps = chained([STEP] * (COUNT - 1)), uncertain()
+    wrong = g.inverse(poses[2]) @ poses[30] @ g.se3_exp(np.array([0, 0.3, 0, 0.5, 0, 0.5]))
+    sure = 1e-6 * np.eye(6)
+    others = [Constraint(a, b, g.inverse(poses[a]) @ poses[b], sure) for a, b in ((0, 28), (3, 33))]
+    believed = corrected(poses, steps, [*others, Constraint(2, 30, wrong, sure)], 10)
+    doubted = corrected(poses, steps, [*others, Constraint(2, 30, wrong, sure, doubted=True)], 10)
+    assert apart(doubted.poses, poses) < 0.05 * apart(believed.poses, poses)
