@@ -19,6 +19,7 @@ from scripts.results import (
     recognised,
     seeds,
     variants,
+    visits,
 )
 from scripts.results.report import Table, write_json
 from scripts.results.runs import DATA, say
@@ -33,6 +34,7 @@ WHAT: dict[str, Callable[[Path], Iterable[Table]]] = {
     "real": lambda data: [real.table(data)],
     "noise": lambda data: noise.tables(),
     "lasting": lambda data: lasting.tables(),
+    "visits": lambda data: visits.tables(),
     "recognised": lambda data: recognised.tables(data),
 }
 
