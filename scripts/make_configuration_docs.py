@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 
 from fgslam.config import ExperimentConfig
 from fgslam.homing_config import TASKS
+from fgslam.localisation_config import LocalisationConfig
 
 Node: TypeAlias = dict[str, Any]
 
@@ -35,6 +36,13 @@ Keys without a default must be given. Units are metres, seconds and pixels, angl
 unless the key's name or meaning says otherwise.
 """
 
+_LOCALISATION = """## Task `localisation`
+
+{told}
+`dataset`, `odometry`, `frontend`, `estimator` and `output` have the keys that they have above;
+`estimator` is that of the drive that makes the map.
+"""
+
 _HOMING = """## Homing experiments
 
 Each task has its own keys; the groups of keys that they share are described once, below all of
@@ -49,8 +57,19 @@ def configuration_page() -> str:
     for name, node in schema["properties"].items():
         if name not in _UNWRITTEN:
             sections += _sections(schema, node, name, 2)
+    sections += _localisation()
     sections += _homing()
     return "\n".join(section.rstrip() + "\n" for section in sections)
+
+
+def _localisation() -> Iterator[str]:
+    """The keys that only this task has; the others are those of the experiments above."""
+    schema = LocalisationConfig.model_json_schema()
+    told = " ".join(schema.get("description", "").split())
+    yield _LOCALISATION.format(told=told) + "\n" + "\n".join(_table(schema, schema))
+    for name in ("map", "localisation"):
+        for section in _sections(schema, schema["properties"][name], name, 3):
+            yield section.replace("`map`", "`map` of the task `localisation`", 1)
 
 
 def _homing() -> Iterator[str]:
