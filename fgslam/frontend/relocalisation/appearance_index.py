@@ -83,7 +83,7 @@ class AppearanceIndex:
         """Brings what is held into the order of cells, then owners, then descriptors."""
         if self._sorted:
             return
-        order = np.lexsort((*self._descriptors.T[::-1], self._owners, self._words))
+        order = np.lexsort((_fingerprints(self._descriptors), self._owners, self._words))
         self._owners, self._words = self._owners[order], self._words[order]
         self._descriptors = self._descriptors[order]
         self._starts = np.searchsorted(self._words, np.arange(len(_vocabulary()) + 1))
@@ -134,13 +134,24 @@ def _vocabulary() -> ByteArray:
         return np.asarray(stored["words"], np.uint8)
 
 
+def _fingerprints(descriptors: ByteArray) -> IntArray:
+    """(m,) a number of each descriptor's bytes, by which an owner's views are put in order."""
+    weights = np.random.default_rng(0).integers(-(2**62), 2**62, (16, 2))
+    halves = np.ascontiguousarray(descriptors).view(np.int64)
+    mixed = (halves ^ (halves >> 29)) * weights[:, 0]
+    return np.asarray(np.sum((mixed ^ (mixed >> 32)) * weights[:, 1], axis=1))
+
+
 def _nearest_words(descriptors: ByteArray, count: int) -> IntArray:
     """The cells (m, count) whose centres are nearest, nearest first."""
     out = np.empty((len(descriptors), count), np.int64)
     for start in range(0, len(descriptors), _CHUNK):
         part = slice(start, start + _CHUNK)
         squared = _squared(descriptors[part].astype(np.float32), _vocabulary())
-        out[part] = np.argsort(squared, axis=1, kind="stable")[:, :count]
+        if count == 1:
+            out[part, 0] = np.argmin(squared, axis=1)
+        else:
+            out[part] = np.argsort(squared, axis=1, kind="stable")[:, :count]
     return out
 
 

@@ -23,6 +23,7 @@ from fgslam.types import BoolArray, ByteArray, CameraRig, FloatArray, IntArray, 
 _ROUNDS = 4  # of choosing matches and solving; the choice rests after two or three
 _STEPS = 6
 _KERNEL_WIDTH = 2.0  # as the tracker's
+_BEYOND = 1.5  # times the farthest feature: no landmark farther away matches one
 _VOTES = 4  # of one piece of the map
 _SEVERAL = 4  # landmarks expected in a piece, so that one should be seen
 
@@ -119,7 +120,8 @@ class Refiner:
 
     def _around(self, wTc: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
         """Pairs of features and landmarks in view that look alike, with their distances."""
-        rows, _ = self.known.in_view(self.rig, wTc)
+        rows, points = self.known.in_view(self.rig, wTc)
+        rows = rows[points[:, 2] <= _BEYOND * np.abs(self.features.position[:, 2]).max()]
         wanted = np.zeros(len(self.known.landmarks), np.bool_)
         wanted[rows] = True
         views = np.flatnonzero(wanted[self.known.owners])
