@@ -13,7 +13,9 @@ from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.backend.homing.schur_model import SchurModel, State
 from fgslam.backend.homing.schur_solver import SchurSolver
 from fgslam.backend.homing.schur_system import Factored
+from fgslam.errors import EstimatorError
 from fgslam.homing_types import HomingEstimate
+from fgslam.planar import wrap
 from fgslam.settings.backend import KernelSettings
 from fgslam.settings.homing_estimators import HomingGraphSettings
 from fgslam.settings.simulated_bearings import SimulatedBearingsSettings
@@ -123,6 +125,38 @@ def test_wrong_matches_are_found_by_what_contradicts_them() -> None:
     assert len(wrong) == 1
     assert without_target(solver_of(given, EXACT)) == []
     assert without_target(solver_of(given, HomingGraphSettings())) == wrong.tolist()
+
+
+def test_dropped_match_takes_the_elevation_from_the_target_along() -> None:
+    solver = solver_of(case(), replace(EXACT, elevations="all"))
+    model, size = solver._model, (1, len(solver._model.landmarks))
+    assert model._elevations.first(*size)[1, 0, 0] > 0.0
+    model.drop_match(0)
+    assert model._bearings.first(*size)[1, 0, 0] == 0.0
+    assert model._elevations.first(*size)[1, 0, 0] == 0.0
+
+
+@pytest.mark.parametrize("rotation", [np.pi - 1e-9, 1e-9 - np.pi])
+def test_headings_stay_within_half_a_turn(rotation: float) -> None:
+    """The solution leaves the first guess, one way or the other; its heading is an angle still."""
+    given = case()
+    vector, matches = given.start.vector, given.start.matches
+    seen = wrap(matches.bearing_b + vector.rotation - rotation)
+    start = replace(
+        given.start,
+        vector=replace(vector, rotation=rotation),
+        matches=replace(matches, bearing_b=seen),
+    )
+    heading = make_homing_estimator(start, EXACT).estimate().target[2]
+    assert -np.pi <= heading < np.pi
+    assert 1e-6 < abs(wrap(heading - rotation)) < 0.2
+
+
+def test_start_that_is_no_number_is_refused() -> None:
+    start = case().start
+    vector = replace(start.vector, covariance=np.full((2, 2), np.nan))
+    with pytest.raises(EstimatorError, match="cannot be solved"):
+        make_homing_estimator(replace(start, vector=vector), EXACT)
 
 
 def without_target(solver: SchurSolver) -> list[int]:

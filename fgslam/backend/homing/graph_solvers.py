@@ -1,4 +1,6 @@
-"""Solvers of the homing graph: incremental, over a fixed lag, and batch.
+"""Solvers of the homing graph: what all of them offer, and GTSAM's: incremental, fixed lag, batch.
+
+The own one is :mod:`fgslam.backend.homing.schur_solver`.
 
 All keep the values of every variable that they still have, and answer joint covariances.
 """

@@ -89,8 +89,10 @@ class Sights:
         self.any = True
 
     def drop(self, view: int, landmark: int) -> None:
-        """Forgets one."""
-        self._table[1, view, landmark] = 0.0
+        """Forgets one, if there is one."""
+        if self.any:
+            self._reach(view + 1, landmark + 1)
+            self._table[1, view, landmark] = 0.0
 
     def first(self, views: int, landmarks: int) -> FloatArray:
         """(2, views, landmarks) measured values and informations, of the first ones."""
@@ -396,6 +398,7 @@ class SchurModel:
     def drop_match(self, landmark: int) -> None:
         """What the target saw is not this landmark."""
         self._bearings.drop(0, landmark)
+        self._elevations.drop(0, landmark)
         self._pairs.drop(landmark)
 
 

@@ -12,6 +12,8 @@ from numpy.linalg import LinAlgError
 from fgslam.backend.homing.graph_parts import NewPart
 from fgslam.backend.homing.schur_model import Look, SchurModel, State
 from fgslam.backend.homing.schur_system import Factored
+from fgslam.errors import EstimatorError
+from fgslam.planar import wrap
 from fgslam.settings.homing_estimators import HomingGraphSettings
 from fgslam.types import FloatArray, IntArray
 
@@ -38,6 +40,10 @@ class SchurSolver:
         """See :class:`Solver`."""
         self._state = self._model.take(new, self._state)
         look = self._go_on(_FIRST_STEPS if new.image == 0 else self._steps)
+        if not np.isfinite(look.cost):
+            raise EstimatorError(
+                "the homing graph cannot be solved (its cost is no number); start the homing anew"
+            )
         if new.image % _EVERY == 0 and self._limit > 0.0:
             self._doubt(look)
 
@@ -51,7 +57,7 @@ class SchurSolver:
 
     def pose(self, image: int) -> FloatArray:
         """See :class:`Solver`."""
-        return self._state.chain[image, :3].copy()
+        return _wrapped(self._state.chain[image, :3])
 
     def velocity(self, image: int) -> FloatArray:
         """See :class:`Solver`."""
@@ -59,7 +65,7 @@ class SchurSolver:
 
     def target(self) -> FloatArray:
         """See :class:`Solver`."""
-        return self._state.target.copy()
+        return _wrapped(self._state.target)
 
     def points(self, rows: list[int]) -> FloatArray:
         """See :class:`Solver`."""
@@ -120,3 +126,8 @@ class SchurSolver:
                     return ahead, factored, damping
             damping = max(_MORE * damping, _FIRST_DAMPING)
         return None
+
+
+def _wrapped(pose: FloatArray) -> FloatArray:
+    """(3,) the same pose, its heading within half a turn: steps may lead beyond."""
+    return np.append(pose[:2], wrap(pose[2:]))
