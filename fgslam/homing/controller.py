@@ -183,6 +183,7 @@ class HomingController:
         """
         self.underway, self._pending, self._next_try = None, vector, time
         self.remaining, self._was_ahead, self._obstacle = left, False, why
+        self._recognised = self._settings.near_fraction == 0.0
         self._progress.begin_anew(time)
         if self._progress.stalls >= self._settings.max_stalls:
             return self._refuse(time, Refusal(RefusalReason.LOST, why))
@@ -262,7 +263,8 @@ class HomingController:
         self._heading = homing.start.vector.direction
         self._was_ahead = self._was_ahead or abs(self._heading) <= np.pi / 2
         self._pending = self._standing_since = None
-        self._ambiguous, self._search_until = False, -np.inf
+        self._ambiguous = False
+        self._blind_until = self._search_until = -np.inf
         self.initialisations += 1
         return self._drive(homing, time, why)
 

@@ -67,26 +67,18 @@ class ImageEyes:
 
     def begin(self, image: ByteArray, target: OmniFeatures, time: float) -> HomingStart | Refusal:
         """The initialisation step (section III); unless refused, its features are tracked now."""
-        present = self.describe(image)
-        refusal = _unusable(image, present)
-        if refusal is not None:
-            return refusal
-        matches = self._matches(present, target)
-        vector = estimate_homing_vector(matches, self._settings.homing_vector, self._rng)
-        if isinstance(vector, Refusal):
-            return vector
+        answer = self._matched(image, target)
+        if isinstance(answer, Refusal):
+            return answer
+        present, matches, vector = answer
         return self._started(image, time, vector, matches, (present, target))
 
     def look(self, image: ByteArray, target: OmniFeatures) -> Sighting | Refusal:
         """The homing vector alone, and how near the target is."""
-        present = self.describe(image)
-        refusal = _unusable(image, present)
-        if refusal is not None:
-            return refusal
-        matches = self._matches(present, target)
-        vector = estimate_homing_vector(matches, self._settings.homing_vector, self._rng)
-        if isinstance(vector, Refusal):
-            return vector
+        answer = self._matched(image, target)
+        if isinstance(answer, Refusal):
+            return answer
+        _, matches, vector = answer
         return Sighting(vector, parallax(matches.taken(vector.inliers), vector.rotation))
 
     def track(self, image: ByteArray, time: float) -> TrackedBearings:
@@ -103,11 +95,19 @@ class ImageEyes:
         rays = np.column_stack([np.cos(tracked.bearing), np.sin(tracked.bearing), rise])
         return self._tracker.view.pixels(rays)
 
-    def _matches(self, present: OmniFeatures, target: OmniFeatures) -> BearingMatches:
+    def _matched(
+        self, image: ByteArray, target: OmniFeatures
+    ) -> tuple[OmniFeatures, BearingMatches, HomingVector] | Refusal:
+        """The image's features, their matches with the target's, and what these say."""
+        present = self.describe(image)
+        refusal = _unusable(image, present)
+        if refusal is not None:
+            return refusal
         matches = match_features(present, target, self._settings.matching)
         if self._settings.wrong_matches > 0.0:
             matches = mixed_with_wrong(matches, self._settings.wrong_matches, self._rng)
-        return matches
+        vector = estimate_homing_vector(matches, self._settings.homing_vector, self._rng)
+        return vector if isinstance(vector, Refusal) else (present, matches, vector)
 
     def _started(
         self,

@@ -551,6 +551,37 @@ def test_how_near_the_target_is_seen_decides(
     assert command.remaining == pytest.approx(1.0 if vector.rotation else part)
 
 
+def test_estimate_in_doubt_is_driven_by_no_more_not_even_blind() -> None:
+    """Matched anew within the time that may be driven blind; then no look shows the target."""
+    b = bench(vector_to(0.0), FEW, vector_to(0.0), FEW, blind_s=5.0)
+    b.step()
+    b.eyes.tracks = 0
+    assert b.step().state is HomingState.BLIND
+    b.eyes.tracks, b.eyes.looks = 20, [FEW]
+    while b.controller.underway is None:
+        b.step()
+    b.at(0.99)
+    doubt = b.step()
+    assert "not seen where it is believed" in doubt.reason
+    assert doubt.stop
+
+
+def test_estimate_that_takes_another_s_place_is_looked_at_itself() -> None:
+    """One agreed with the look from near; what contradicts it later has yet to."""
+    b = bench(vector_to(0.0), vector_to(1.5))
+    b.step()
+    b.at(0.8)
+    b.step()
+    assert b.eyes.looked == 1
+    b.eyes.tracks = 9
+    assert b.step(SETTINGS.retry_s).state is HomingState.CONFIRM
+    b.eyes.robot, b.eyes.tracks = np.zeros(3), 20
+    assert b.step().state is HomingState.DRIVE
+    b.at(*(0.8 * unit(np.array(1.5))))
+    b.step()
+    assert b.eyes.looked == 2
+
+
 def test_no_arrival_where_the_target_is_not_seen() -> None:
     """The estimate is there, the look is refused: given up, then matched again or refused."""
     b = bench(vector_to(0.0), FEW)
