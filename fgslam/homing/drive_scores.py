@@ -71,11 +71,12 @@ def corners(record: DriveRecord) -> FloatArray:
     """(m,) how sharply each leg turns off the one before: the angle's sine, 1 beyond 90 degrees.
 
     The robot turns off where the switch fraction of the leg before is left, and so begins the next
-    leg that part times this beside its line. The first leg begins on its line: 0.
+    leg that part times this beside its line. The first leg begins on its line: 0. NaN for legs that
+    have no direction, two targets in one place, and for those after them.
     """
     ends = np.vstack([record.truth[0, :2], record.targets[:, :2]])
     steps = np.diff(ends, axis=0)
-    angle = np.arctan2(steps[:, 1], steps[:, 0])
+    angle = np.where(steps.any(axis=1), np.arctan2(steps[:, 1], steps[:, 0]), np.nan)
     turns = np.abs(wrap(np.diff(angle, prepend=angle[:1])))
     return np.asarray(np.sin(np.minimum(turns, 0.5 * np.pi)))
 

@@ -207,6 +207,8 @@ def test_corners_are_those_of_the_targets_lines(record: DriveRecord) -> None:
         record, truth=np.zeros((len(record), 3)), targets=np.column_stack([places, np.zeros(4)])
     )
     assert corners(drawn) == pytest.approx([0.0, 0.0, 1.0, 1.0])
+    twice = replace(drawn, targets=drawn.targets[[0, 1, 1, 2, 3]])
+    assert corners(twice) == pytest.approx([0.0, 0.0, np.nan, np.nan, 1.0], nan_ok=True)
 
 
 def test_scores_of_a_drive_that_one_can_draw(record: DriveRecord) -> None:
