@@ -133,7 +133,7 @@ class RelocalisationSettings:
         Field(
             gt=0.0,
             le=1.0,
-            description="the second-best pose elsewhere may have this share of the best's inliers",
+            description="another pose with this share of the best's witnesses makes the frame ambiguous",
         ),
     ] = 0.5
     view_deg: Annotated[

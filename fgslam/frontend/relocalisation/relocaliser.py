@@ -17,7 +17,7 @@ from fgslam.map_types import LandmarkAppearances, Relocalisation
 from fgslam.settings.relocalisation import RelocalisationSettings
 from fgslam.types import CameraRig, LandmarkMap, StereoFeatures
 
-_MAX_DISPARITY_PX = 40.0
+_MAX_DISPARITY_PX = 40.0  # of mistakes, spread evenly; the scores hardly depend on it
 
 
 class Relocaliser:
@@ -54,7 +54,8 @@ class Relocaliser:
 
         Args:
             features: of one frame, or of a short submap in its last camera's frame; positions
-                outside the image count by their own covariances.
+                outside the image count by their own covariances, and ``scale`` times the depth in
+                that frame must be the feature's physical size.
             rng: draws the samples.
         """
         tentative = self.tentative(features)

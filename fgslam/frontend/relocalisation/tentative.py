@@ -155,7 +155,7 @@ def _gap(place: IntArray, far: FloatArray, settings: RelocalisationSettings) -> 
     for k, p in enumerate(place):
         if p in seen:
             continue
-        if seen and far[k - 1] >= 0.0 and _last(far, place, seen, k) <= settings.ratio * far[k]:
+        if seen and _last(far, place, seen, k) <= settings.ratio * far[k]:
             return k, len(seen)
         if len(seen) == settings.candidates:
             return 0, 0
