@@ -133,7 +133,7 @@ class RelocalisationSettings:
         Field(
             gt=0.0,
             le=1.0,
-            description="another pose with this share of the best's witnesses makes the frame ambiguous",
+            description="with this share of the best's witnesses another pose makes it ambiguous",
         ),
     ] = 0.5
     view_deg: Annotated[
