@@ -77,13 +77,14 @@ def test_slows_down_at_the_last_target_most() -> None:
 
 
 def test_stops_when_told() -> None:
-    """And drives slowly when blind."""
+    """And drives slowly when blind or searching."""
     steering = Steering(SETTINGS)
     settled(steering, command(0.2))
     stop = command(stop=True, state=HomingState.WAIT)
     assert settled(steering, stop) == Drive(0.0, 0.0)
-    blind = settled(steering, command(state=HomingState.BLIND))
-    assert blind.speed == pytest.approx(SETTINGS.blind_share * SETTINGS.max_speed_mps)
+    for state in (HomingState.BLIND, HomingState.SEARCH):
+        slow = settled(steering, command(state=state))
+        assert slow.speed == pytest.approx(SETTINGS.blind_share * SETTINGS.max_speed_mps)
 
 
 def test_home_behind_is_turned_to_one_way_round() -> None:

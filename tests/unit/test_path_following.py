@@ -9,7 +9,8 @@ import pytest
 
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.errors import ConfigError, EstimatorError
-from fgslam.homing.command import HomingState
+from fgslam.homing.avoidance import RangeScan
+from fgslam.homing.command import Drive, HomingState
 from fgslam.homing.drive_scores import corners, cross_track, pass_distances, slope_by_leg
 from fgslam.homing.path_following import PathFollower
 from fgslam.homing.record import STAGES, DriveRecord
@@ -133,6 +134,27 @@ def test_refusal_does_not_end_a_drive() -> None:
     assert HomingState.SEARCH.value in record.state
     assert [leg.result for leg in record.legs] == ["arrived", "arrived"]
     assert pass_distances(record).max() < 0.2
+
+
+class Doorkeeper:
+    """Stops the robot for so many steps on its way."""
+
+    def __init__(self, first: int, last: int) -> None:
+        self._steps, self._closed = 0, range(first, last)
+
+    def override(self, wanted: Drive, heading: float, scan: RangeScan) -> Drive:
+        """A stand while the way is closed."""
+        self._steps += 1
+        return Drive(0.0, 0.0, overridden=True) if self._steps in self._closed else wanted
+
+
+@pytest.mark.parametrize(("wait_s", "result"), [(10.0, "arrived"), (0.0, "refused")])
+def test_way_that_is_blocked_for_a_while_is_driven_on(wait_s: float, result: str) -> None:
+    """What avoidance takes does not count as lack of progress, as long as one may wait."""
+    control = replace(HomingControlSettings(), stall_s=2.0, max_stalls=1, wait_s=wait_s)
+    behaviour = replace(HomingBehaviourSettings(), control=control)
+    record = drive_path(winding_path(7, 1, 2.0), behaviour, avoider=Doorkeeper(20, 70))
+    assert [leg.result for leg in record.legs] == [result]
 
 
 @pytest.mark.parametrize(
