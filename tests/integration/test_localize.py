@@ -1,4 +1,4 @@
-"""`fgslam localize` and the task `localisation`, on a small recording and with a user's mistakes."""
+"""`fgslam localize` and the task `localisation` on a small recording, and a user's mistakes."""
 
 from __future__ import annotations
 
@@ -163,9 +163,8 @@ def test_wrong_maps_and_recordings_are_told(
     homing.write_text(yaml.safe_dump({"task": "homing", "name": "h"}), encoding="utf-8")
     assert "is a homing experiment" in line(map_file, homing)
     measured = tmp_path / "measured.yaml"
-    measured.write_text(
-        yaml.safe_dump({"name": "m", "dataset": {"kind": "simulated_measurements"}}), encoding="utf-8"
-    )
+    values = {"name": "m", "dataset": {"kind": "simulated_measurements"}}
+    measured.write_text(yaml.safe_dump(values), encoding="utf-8")
     assert "measurements have no appearance" in line(map_file, measured)
     write_calibration(own_recording, baseline_m=0.2)
     assert "another rig (baseline 0.1" in line(map_file, own_recording)
