@@ -1,8 +1,8 @@
 """Speed as ratios within one run: `make bench` prints a table and writes bench.json.
 
 Four parts: the whole system over images, here; the estimators over simulated measurements, in
-`estimators.py` and `long_drive.py`; growth with the map, in `maps.py`; visual homing, in
-`homing.py`. `--part` runs one of them.
+`estimators.py` and `long_drive.py`; growth with the map, in `maps.py` and `relocalising.py`; visual
+homing, in `homing.py`. `--part` runs one of them.
 
 The drive goes round and round the rendered lab, so that the map saturates. It is cut into blocks.
 On each block raw SIFT is timed on the block's images in the best threading found, then the block
@@ -38,7 +38,7 @@ from fgslam.recordings import Sequence
 from fgslam.runs.recorder import RunRecorder
 from fgslam.runs.threads import one_blas_thread
 from fgslam.types import CameraRig, FloatArray, Frame, Odometry, Trajectory
-from tests.benchmark import estimators, homing, long_drive, maps
+from tests.benchmark import estimators, homing, long_drive, maps, relocalising
 from tests.benchmark.drives import open_drive
 
 BLOCK = 40
@@ -48,7 +48,14 @@ LIMITS = {
     "time_last_fifth_over_first": 1.2,
     "memory_without_log_end_over_middle": 1.1,
 }
-EVERY_LIMIT = LIMITS | estimators.LIMITS | long_drive.LIMITS | homing.LIMITS | maps.LIMITS
+EVERY_LIMIT = (
+    LIMITS
+    | estimators.LIMITS
+    | long_drive.LIMITS
+    | homing.LIMITS
+    | maps.LIMITS
+    | relocalising.LIMITS
+)
 
 
 @dataclass(frozen=True)
@@ -293,7 +300,7 @@ def main() -> None:
     if arguments.part in ("all", "estimators"):
         ratios |= over_measurements()
     if arguments.part in ("all", "maps"):
-        ratios |= maps.ratios_of_maps()
+        ratios |= maps.ratios_of_maps() | relocalising.ratios_of_relocalising()
     if arguments.part in ("all", "homing"):
         ratios |= homing.ratios_of_homing()
     arguments.out.write_text(json.dumps(ratios, indent=2) + "\n")
