@@ -22,6 +22,7 @@ from fgslam.backend.graph_solution import (
     poses_of_frame,
     suspect,
 )
+from fgslam.backend.loop_closing import misfit
 from fgslam.backend.marginals import DenseMarginals, UndeterminedError
 from fgslam.backend.segments import TrackedFrame
 from fgslam.backend.smoother import Smoother
@@ -98,11 +99,12 @@ class FixedLagSmoother(Smoother):
         after which the window is solved anew from there.
         """
         known = self._between(loop)
+        what = f"{where}: loop closure to frame {loop.frame} of the log"
         if known.before >= self._oldest:  # both poses are variables
-            self._recent[-1].graph.add(constraint_factor(known))
-            self._rebuild(gtsam.Values(self._values))
+            if not self._taken_in(known, what):
+                return
         else:
-            moved = self._drift_undone(known, f"{where}: loop closure to frame {loop.frame}")
+            moved = self._drift_undone(known, what)
             if moved is None:
                 return
             self._move_all(moved)
@@ -111,6 +113,20 @@ class FixedLagSmoother(Smoother):
             self._poses[frame] = poses_of_frame(self._values, frame)
         self._covariances[last] = self._covariance(marginals, last)
         self._take_over(self._values, Prediction(self._poses[last], self._covariances[last]))
+
+    def _taken_in(self, known: Constraint, what: str) -> bool:
+        """Adds a loop within the lag, where hardly anything drifts, as a factor; or refuses it."""
+        factor, gate = constraint_factor(known), self._loop_gate
+        off = misfit(factor, self._values)
+        if gate > 0.0 and not off <= gate**2:
+            self._remarks.append(
+                f"{what} refused: {np.sqrt(off):.1f} standard deviations off, {gate:g} allowed"
+            )
+            return False
+        self._recent[-1].graph.add(factor)
+        self._rebuild(gtsam.Values(self._values))
+        self._remarks.append(f"{what}: within the lag, a factor more")
+        return True
 
     def _drift_undone(self, known: Constraint, what: str) -> Prediction | None:
         """The last pose by the loop; None, and a remark, where the loop is refused."""
@@ -127,8 +143,7 @@ class FixedLagSmoother(Smoother):
         squared, gate = float(off @ np.linalg.solve(innovation, off)), self._loop_gate
         if gate > 0.0 and not squared <= gate**2:
             self._remarks.append(
-                f"{what} of the log refused: {np.sqrt(squared):.1f} standard deviations off, "
-                f"{gate:g} allowed"
+                f"{what} refused: {np.sqrt(squared):.1f} standard deviations off, {gate:g} allowed"
             )
             return None
         target = wTc @ se3_exp(basis @ gain @ off)
@@ -136,7 +151,7 @@ class FixedLagSmoother(Smoother):
         covariance = shared + congruence(basis, nearest_positive(drift - gain @ drift))
         shift = float(np.linalg.norm(target[:3, 3] - wTc[:3, 3]))
         self._remarks.append(
-            f"{what} of the log: the camera moved by {shift:.2f} m, and what lies within the lag"
+            f"{what}: the camera moved by {shift:.2f} m, and what lies within the lag"
         )
         return Prediction(target, self._floor.allowed_part(target, covariance))
 

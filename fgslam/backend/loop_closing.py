@@ -23,7 +23,8 @@ from fgslam.geometry import adjoint, congruence, inverse, transform_to_world
 from fgslam.types import EgoMotion, FloatArray, IntArray, LoopClosure
 
 _ITERATIONS = 20
-_TOLERANCE = 1e-4  # of the cost: a tenth of a per mille of it is far below the gate's square
+_ENOUGH = 2.0  # the last iteration's gain, half squared deviations: far below the gate's square
+_TOLERANCE = 1e-6  # of the cost, where that is small
 
 
 def misfit(factor: Any, values: Any) -> float:
@@ -74,6 +75,7 @@ def first_guess(
 def solved(graph: Any, values: Any) -> Any:
     """Values at the minimum of a graph with its kernels."""
     params = solver_parameters(_ITERATIONS, _TOLERANCE)
+    params.setAbsoluteErrorTol(_ENOUGH)
     return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
 

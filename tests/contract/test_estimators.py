@@ -41,6 +41,7 @@ from fgslam.types import (
     FloatArray,
     Increment,
     IntArray,
+    LoopClosure,
     MeasurementType,
     Observations,
     Odometry,
@@ -350,6 +351,51 @@ def test_a_restored_state_continues_to_the_same_bits(
     second.restore(state)
     play(second, world.increments[6:])
     assert_same_bits(everything(second), everything(straight))
+
+
+def looped(world: World) -> list[Increment]:
+    """The last frame but one closes a true loop, and one of its landmarks ends with it."""
+    k, old = FRAMES - 2, 3
+    last = world.increments[k]
+    kept = last.observations.ids[~last.observations.is_new]
+    seen = last.observations.select(np.isin(last.observations.ids, kept[1:]))
+    loop = LoopClosure(
+        frame=old,
+        oTc=g.inverse(world.poses[old]) @ world.poses[k],
+        covariance=np.diag([1e-3, 1e-3, 1e-3, 5e-3, 5e-3, 5e-3]) ** 2,
+        observations=seen,
+        merged=np.array([[kept[0], kept[1]]]),
+    )
+    pruned = np.union1d(last.pruned_ids, kept[:1])
+    out = list(world.increments)
+    out[k] = dataclasses.replace(last, loops=(loop,), pruned_ids=pruned)
+    # The landmark's later sightings come under the identity that stays, of which there is one.
+    after = out[k + 1]
+    gone = ~np.isin(after.observations.ids, kept[:1])
+    out[k + 1] = dataclasses.replace(
+        after,
+        observations=after.observations.select(gone),
+        rejected=after.rejected[gone],
+        missed_ids=np.setdiff1d(after.missed_ids, kept[:1]),
+    )
+    return out
+
+
+@pytest.mark.parametrize("make", CORRECTING, indirect=True)
+def test_a_true_loop_does_no_harm(make: Callable[[], Estimator], world: World) -> None:
+    estimator, increments = make(), looped(world)
+    assert MeasurementType.LOOP in estimator.supports
+    play(estimator, increments)
+    estimate = estimator.estimate()
+    truth = np.array(world.poses)
+    errors = np.linalg.norm(estimate.trajectory.poses[:, :3, 3] - truth[:, :3, 3], axis=1)
+    assert errors.max() < 0.03
+    told = [words for words in estimate.remarks if "loop closure to frame 3" in words]
+    assert len(told) == 1
+    assert "refused" not in told[0]
+    ended = increments[FRAMES - 2].loops[0].merged[0, 0]
+    assert ended not in estimate.landmarks.ids
+    assert ended not in estimator.landmarks().ids
 
 
 def test_a_frame_without_measurements_keeps_the_map(
