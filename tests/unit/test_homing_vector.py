@@ -192,6 +192,23 @@ def test_refinement_covariance_is_that_of_monte_carlo() -> None:
     )
 
 
+def test_hypotheses_refined_side_by_side_are_refined_as_if_alone() -> None:
+    """Each ends when it has converged, whatever the others do; one that is right stays."""
+    views = two_views(3, 40, HALF_DEGREE, 0.3)
+    refinement = HomingRefinement(views.matches, RefinementPrior(0.02, 0.05), 3.0, 0.0)
+    offsets = np.array([0.0, 0.02, 0.5, 2.0, -1.0])
+    directions, rotations = views.direction + offsets, views.rotation - 0.5 * offsets
+    together = refinement.refine(directions, rotations)
+    for k, one in enumerate(together):
+        (alone,) = refinement.refine(directions[k : k + 1], rotations[k : k + 1])
+        np.testing.assert_allclose(one.parameters, alone.parameters, atol=1e-9)
+        np.testing.assert_allclose(one.covariance, alone.covariance, rtol=1e-6, atol=1e-12)
+        np.testing.assert_array_equal(one.inliers, alone.inliers)
+    off = wrap(together[0].parameters[:2] - np.array([views.direction, views.rotation]))
+    assert np.abs(off).max() < 0.05
+    assert len({round(float(one.parameters[0]), 3) for one in together}) > 1
+
+
 def test_triangulation_is_exact() -> None:
     views = two_views(2, 100)
     distance = triangulate(views.matches, views.direction, views.rotation)
