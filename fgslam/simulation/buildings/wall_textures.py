@@ -15,10 +15,6 @@ from fgslam.simulation.textures import Grey
 PICTURES, CORRIDOR_PICTURES = 240, 5
 _SCUFFS = 800  # on 41 square metres
 FLOORS = ("floor", "floor_1", "floor_2", "floor_3")
-WALLS = (
-    "wall_0", "wall_1", "wall_2", "wall_3", "wall_4", "wall_5", "paper_0", "paper_1", "paper_2",
-    "bricks", "bricks_dark",
-)  # fmt: skip
 
 
 def building_library(rng: np.random.Generator) -> dict[str, Grey]:
