@@ -38,11 +38,11 @@ def export_run(
             )
         return export_map(run, map_file, trajectory_file, valid_only)
     targets = (map_file, trajectory_file, graph_file)
+    folder = run / _estimator_of(run, estimator)
     if targets == (None, None, None):
         raise ConfigError(
             "nothing to export; give --map FILE.ply, --trajectory FILE.tum or --graph FILE.g2o"
         )
-    folder = run / _estimator_of(run, estimator)
     _require_elsewhere(run, targets)
     remark = read_metrics(run / "metrics.json").get("remark") or ""
     lines = [f"note: {remark}"] if remark else []

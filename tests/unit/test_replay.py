@@ -37,9 +37,9 @@ def faulty(monkeypatch: pytest.MonkeyPatch, **methods: Any) -> None:
     """Estimators of the kind, with some of their methods replaced."""
     kind = type("Faulty", (LandmarkKalman,), methods)
 
-    def make(rig: Any, settings: Any, dof: Any) -> Any:
-        prior = factory.Prediction(np.eye(4), np.zeros((6, 6)))
-        return kind(rig, settings, prior)
+    def make(rig: Any, settings: Any, dof: Any, prior: Any) -> Any:
+        assert prior is None  # no saved map here
+        return kind(rig, settings, factory.Prediction(np.eye(4), np.zeros((6, 6))))
 
     monkeypatch.setattr(module, "make_estimator", make)
 
