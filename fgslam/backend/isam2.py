@@ -46,6 +46,7 @@ class Isam2Smoother(WholeGraphSmoother):
         """Starts at the prior pose with an empty map."""
         super().__init__(sensor, settings, floor, prior)
         self._settings = settings
+        self._careful = False
         self._isam = self._new_solver()
         self._graph = gtsam.NonlinearFactorGraph()
         self._new_values = gtsam.Values()
@@ -142,7 +143,7 @@ class Isam2Smoother(WholeGraphSmoother):
     def _new_solver(self) -> Any:
         params = gtsam.ISAM2Params()
         params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams())
-        params.setFactorization("CHOLESKY")
+        params.setFactorization("QR" if self._careful else "CHOLESKY")
         params.setRelinearizeThreshold(self._settings.relinearize_threshold)
         params.relinearizeSkip = self._settings.relinearize_skip
         return gtsam.ISAM2(params)
@@ -181,6 +182,18 @@ class Isam2Smoother(WholeGraphSmoother):
         """
         for _ in range(_REPAIRS):
             key = suspect(error)
+            if key is not None and is_pose(key) and not self._careful:
+                self._careful = True
+                self._remarks.append(
+                    f"pose of frame {number(key)} known too unevenly for Cholesky at frame "
+                    f"{self._builder.frames[-1]}: iSAM2 built anew, with QR from here on"
+                )
+                try:
+                    self._rebuild(values)
+                    return
+                except RuntimeError as another:
+                    error = another
+                    continue
             if key is None or is_pose(key) or not self._builder.in_graph(number(key)):
                 break
             self._take_out(number(key), values, "left the system indeterminate")
