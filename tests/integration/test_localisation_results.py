@@ -1,0 +1,72 @@
+"""What docs/map_results.md claims of the kidnapped robot, as regression tests with their bounds."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from fgslam.localisation_config import LocalisationConfig, load_experiment
+from fgslam.runs.localisation.experiment import run_localisation
+from fgslam.runs.localisation.results import Scored, scored
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from scripts.results import recognised
+
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+QUIET = ("output.pictures=false", "output.report=false", "output.checkpoint_seconds=3600")
+
+
+def asked(name: str, folder: Path, *overrides: str) -> tuple[Scored, ...]:
+    config = load_experiment(EXPERIMENTS / f"{name}.yaml", [*QUIET, *overrides])
+    assert isinstance(config, LocalisationConfig)
+    return scored(config, run_localisation(config, folder).asked)
+
+
+@pytest.mark.parametrize("name", ["kidnapped", "kidnapped_euroc"])
+def test_the_experiments_are_valid(name: str) -> None:
+    config = load_experiment(EXPERIMENTS / f"{name}.yaml")
+    assert isinstance(config, LocalisationConfig)
+    assert config.map.made_from is not None
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("open3d")
+def test_random_poses_are_found_in_the_lab(tmp_path: Path) -> None:
+    """Issue 5, 5.1, on its first 60 poses: never false, nearly always found."""
+    one, three = asked("kidnapped", tmp_path / "run", "dataset.drive.frames=180")
+    assert one.counts.queries >= 50
+    for judged in (one, three):
+        assert judged.counts.false == judged.apart.false == 0
+    assert one.counts.share_right is not None
+    assert three.counts.share_right is not None
+    assert one.counts.share_right > 0.85
+    assert three.counts.share_right > 0.93
+
+
+@pytest.mark.slow
+@pytest.mark.data
+def test_odd_frames_of_euroc_are_found_in_the_map_of_the_even_ones(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    """Issue 5, 5.2: 70 % found, all of them within 10 cm and 2 degrees."""
+    data = f"{shared_data / 'euroc_v101_kf100'}"
+    paths = (f"dataset.path={data}", f"map.made_from.dataset.path={data}")
+    (judged,) = asked("kidnapped_euroc", tmp_path / "run", *paths)
+    counts = judged.counts
+    assert counts.known == counts.queries == 50
+    assert counts.accepted >= 35
+    assert counts.right == counts.accepted
+    assert counts.false == counts.inexact == 0
+
+
+@pytest.mark.slow
+@pytest.mark.data
+def test_no_false_link_between_frames_of_euroc(shared_data: Path) -> None:
+    """A twelfth of all pairs: what is linked is rightly posed."""
+    links = recognised.link_frames(shared_data, every=12)
+    assert links.linked.sum() > 10
+    assert links.precision == 1.0
+    assert links.recall > 0.25
