@@ -10,6 +10,7 @@ import pytest
 
 from fgslam.config import ExperimentConfig
 from fgslam.homing_config import TASKS
+from fgslam.localisation_config import LocalisationConfig
 
 ROOT = Path(__file__).parents[2]
 
@@ -52,6 +53,15 @@ def test_every_key_of_every_homing_task_is_on_the_page(maker: ModuleType, task: 
                 assert f"kind `{node['const']}`" in page
             elif name not in ("task", "provenance"):
                 assert f"| `{name}` |" in page or f"{name}`" in page, name
+
+
+def test_every_key_of_localisation_is_on_the_page(maker: ModuleType) -> None:
+    page = maker.configuration_page()
+    assert "## Task `localisation`" in page
+    schema = LocalisationConfig.model_json_schema()
+    for group in ("KnownMapSettings", "QuerySettings"):
+        for name in schema["$defs"][group]["properties"]:
+            assert f"| `{name}` |" in page, name
 
 
 def test_a_row_holds_range_default_and_meaning(maker: ModuleType) -> None:
