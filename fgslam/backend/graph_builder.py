@@ -173,6 +173,10 @@ class GraphBuilder:
         self._add_observations(new, tracked, landmarks)
         return new
 
+    def start_at(self, prior: Prediction) -> None:
+        """Replaces the prior of the first pose, which is not there yet."""
+        self._prior = prior
+
     def know(self, landmarks: LandmarkMap) -> None:
         """Landmarks of a saved map: each enters with its first sighting, on its own prior.
 

@@ -28,6 +28,7 @@ class WholeGraphSmoother(Smoother):
     ) -> None:
         """Starts at the prior pose with an empty map."""
         super().__init__(sensor, settings, floor, prior)
+        self._prior = prior
         self._begun_in: StateArrays = {}
 
     @property
@@ -44,18 +45,27 @@ class WholeGraphSmoother(Smoother):
             "map/positions": landmarks.positions,
             "map/covariances": landmarks.covariances,
             "map/hits": hits,
+            "map/prior_pose": self._prior.wTc,
+            "map/prior_covariance": self._prior.covariance,
         }
 
     def state(self) -> StateArrays:
-        """The map that it began in, and everything that was put in."""
+        """The map that it began in, and where, and everything that was put in."""
         return super().state() | self._begun_in
 
     def restore(self, state: StateArrays) -> None:
         """Repeats everything since the beginning."""
         if "map/ids" in state:
+            self._start_at(Prediction(state["map/prior_pose"], state["map/prior_covariance"]))
             known = (state[f"map/{name}"] for name in ("ids", "positions", "covariances"))
             self.begin_in(LandmarkMap(*known), state["map/hits"], fixed=False)
         super().restore(state)
+
+    def _start_at(self, prior: Prediction) -> None:
+        """Another prior pose: who goes on with a run in a map does not know where that began."""
+        self._prior = self._smoothed = prior
+        self._builder.start_at(prior)
+        self._tracker.correct(prior, np.empty(0, np.int64), np.empty((0, 3)))
 
     def _close(self, loop: LoopClosure, where: str) -> None:
         """Closes a loop where the measurements allow it.
