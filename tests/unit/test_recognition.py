@@ -256,3 +256,13 @@ def test_where_nothing_is_known_it_gives_up_and_maps_on() -> None:
     assert sum(new[14:17]) == 0
     assert sum(new[17:]) > 50
     assert reports[-1].tracking.status is EgoMotionStatus.OK
+
+
+def test_who_begins_in_the_dark_maps_as_soon_as_there_is_light() -> None:
+    """Without a landmark there is nothing to be lost in, and nothing to wait for."""
+    poses = RING[:6]
+    reports = drive(pipeline_of(poses, 0.1), seen(poses, range(2)))
+    new = [int(r.increment.observations.is_new.sum()) for r in reports]
+    assert new[:2] == [0, 0]
+    assert new[2] > 50
+    assert all(r.tracking.status is EgoMotionStatus.OK for r in reports[3:])

@@ -92,7 +92,9 @@ class PlaceRecognition:
             The result, and whether it was found without a prior.
         """
         lost = self._parts.lost
-        self._lost = 0 if tracked.ego_motion.status.measured else self._lost + 1
+        # Without any landmark yet there is nothing to be lost in.
+        located = tracked.ego_motion.status.measured or not len(landmarks)
+        self._lost = 0 if located else self._lost + 1
         if lost is None or self._lost < lost.after or not len(features):
             return tracked, False
         found = self._locate(landmarks, self._trusted(), features)
@@ -232,5 +234,5 @@ class PlaceRecognition:
         chosen = LandmarkMap(
             landmarks.ids[rows], landmarks.positions[rows], landmarks.covariances[rows]
         )
-        self._parts.relocaliser.learn(chosen, self._tracker.database.appearances().of(chosen.ids))
+        self._parts.relocaliser.learn(chosen, self._tracker.database.appearances(chosen.ids))
         return self._parts.relocaliser.locate(features, rng)
