@@ -61,6 +61,17 @@ class LoopSettings:
     agreement_deg: Annotated[
         float, Field(gt=0.0, le=180.0, description="largest difference of those offsets, degrees")
     ] = 2.0
+    least_offset_m: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="an offset below this and below least_offset_deg is no drift worth a "
+            "closure: the tracker finds the old landmarks by itself",
+        ),
+    ] = 0.03
+    least_offset_deg: Annotated[
+        float, Field(ge=0.0, description="see least_offset_m; 0.3 degrees are 1.5 pixels")
+    ] = 0.3
     max_drift_m: Annotated[
         float, Field(gt=0.0, description="drift that needs no way to have come about, metres")
     ] = 0.5

@@ -146,6 +146,9 @@ def test_a_look_that_fails_begins_the_count_anew() -> None:
     ("recognised", "way", "allowed"),
     [
         (turned(0.0, x=0.4), 0.0, True),
+        (turned(0.2, x=0.02), 50.0, False),
+        (turned(0.2, x=0.04), 50.0, True),
+        (turned(0.4, x=0.02), 50.0, True),
         (turned(0.0, x=0.6), 0.0, False),
         (turned(0.0, x=4.0), 50.0, True),
         (turned(0.0, x=5.0), 50.0, False),
@@ -153,7 +156,9 @@ def test_a_look_that_fails_begins_the_count_anew() -> None:
         (turned(20.0), 50.0, True),
     ],
 )
-def test_drift_is_bounded_by_the_way(recognised: FloatArray, way: float, allowed: bool) -> None:
+def test_drift_is_worth_mending_and_bounded_by_the_way(
+    recognised: FloatArray, way: float, allowed: bool
+) -> None:
     assert drift_allows(recognised, np.eye(4), way, LOOPS) is allowed
 
 

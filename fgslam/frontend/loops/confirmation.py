@@ -64,9 +64,10 @@ def difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
 def drift_allows(
     recognised: FloatArray, estimated: FloatArray, way_m: float, settings: LoopSettings
 ) -> bool:
-    """Whether one can be so far off after driving ``way_m`` metres since the place was seen."""
+    """Whether the offset is that of a drift: worth mending, and possible after ``way_m`` metres."""
     metres, degrees = difference(estimated, recognised)
-    return (
+    worth = metres > settings.least_offset_m or degrees > settings.least_offset_deg
+    return worth and (
         metres <= settings.max_drift_m + settings.max_drift_share * way_m
         and degrees <= settings.max_drift_deg + settings.max_drift_deg_m * way_m
     )
