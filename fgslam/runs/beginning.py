@@ -81,7 +81,10 @@ def open_run(
     _require_odometry(config, sequence)
     if config.map.given and config.map.start != "continue":
         estimator = make_estimator(sequence.rig, config.estimator, config.frontend.ego_motion)
-        require_map_user(estimator, config.map.extend)
+        user = require_map_user(estimator, config.map.extend)
+        if given is not None:  # one that is too large is refused now, not in a folder begun
+            landmarks = given.saved.landmarks
+            user.begin_in(landmarks, given.saved.hits, fixed=not config.map.extend)
     resumed = existing == "resume" and checkpoint.exists(folder)
     run = OpenedRun(config, opened, folder, sequence, given, None, resumed)
     run = dataclasses.replace(run, entry=_entry(run, given))
@@ -150,6 +153,8 @@ def _write_config(run: OpenedRun) -> None:
     }
     if run.entry is not None:
         provenance["map"] = run.entry.as_values()
+    elif run.given is not None and (entered := mapping.entered_by(run.given)):
+        provenance["map"] = entered
     write_config(run.folder, run.config, provenance)
 
 

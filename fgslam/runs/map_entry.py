@@ -47,12 +47,14 @@ class Entry:
     """How a run entered a map: kept in its config.yaml, for those who resume or replay it.
 
     Attributes:
+        file: the map's; a run that goes on with this one knows its own map's only.
         identity: of the map's file.
         frames_before: selected frames left out because they could not be located.
         relocalised: the first pose was found without a prior.
         prior: pose expected of the first frame.
     """
 
+    file: str
     identity: str
     frames_before: int
     relocalised: bool
@@ -61,6 +63,7 @@ class Entry:
     def as_values(self) -> dict[str, Any]:
         """Plain values for YAML, exact."""
         return {
+            "file": self.file,
             "sha256": self.identity,
             "frames_before": self.frames_before,
             "relocalised": self.relocalised,
@@ -72,7 +75,9 @@ class Entry:
     def of(values: Mapping[str, Any]) -> Entry:
         """Back from :meth:`as_values`."""
         prior = Prediction(np.array(values["wTc"]), np.array(values["covariance"]))
-        return Entry(values["sha256"], values["frames_before"], values["relocalised"], prior)
+        return Entry(
+            values["file"], values["sha256"], values["frames_before"], values["relocalised"], prior
+        )
 
     def require_same(self, given: GivenMap) -> None:
         """Refuses another map than the run entered. Raises MapError."""
@@ -119,13 +124,14 @@ def enter(config: ExperimentConfig, given: GivenMap, sequence: Sequence) -> Entr
         raise MapError(f"{given.path}: holds no landmark; make the map anew")
     if settings.start == "relocalise":
         before, found = _locate(config, given, sequence)
-        return Entry(given.identity, before, True, _around(found.wTc, settings.begin))
+        prior = _around(found.wTc, settings.begin)
+        return Entry(str(given.path), given.identity, before, True, prior)
     pose = np.eye(4)
     if settings.start == "last":
         if not len(saved.trajectory):
             raise MapError(f"{given.path}: knows no last pose; use map.start relocalise")
         pose = saved.trajectory.poses[-1]
-    return Entry(given.identity, 0, False, _around(pose, settings.begin))
+    return Entry(str(given.path), given.identity, 0, False, _around(pose, settings.begin))
 
 
 def _around(wTc: FloatArray, settings: MapStartSettings) -> Prediction:
@@ -182,13 +188,13 @@ def arrival_of(run: Path) -> Arrival | None:
         return None
     settings = load_config(run / RUN_MARKER).map
     first = run / FIRST_FOLDER / MAP_FILE
-    given = open_map(first if settings.load is None else Path(settings.load))
+    given = open_map(Path(entry.file) if settings.made_from is None else first)
     entry.require_same(given)
     return entry.arrival(given, settings)
 
 
 def entry_of(run: Path) -> Entry | None:
-    """How the run in a folder entered its map; None where it had none."""
+    """How the run in a folder, or the one that it goes on with, entered its map; None without."""
     if not is_run_folder(run):
         return None
     values = (load_config(run / RUN_MARKER).provenance or {}).get("map")

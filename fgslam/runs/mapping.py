@@ -16,7 +16,7 @@ from fgslam.measurement_log import MeasurementLog
 from fgslam.pipeline import SlamPipeline
 from fgslam.recordings import Sequence
 from fgslam.runs import checkpoint
-from fgslam.runs.map_entry import FIRST_FOLDER, MAP_FILE, GivenMap
+from fgslam.runs.map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, entry_of
 from fgslam.runs.outputs import RunOutputs
 from fgslam.runs.recorder import RunRecorder
 from fgslam.settings.maps import MapSettings
@@ -132,6 +132,11 @@ def require_continuable(given: GivenMap, sequence: Sequence) -> None:
         )
 
 
+def entered_by(given: GivenMap) -> dict[str, Any] | None:
+    """How the run that is gone on with entered a map of its own; None where it had none."""
+    return _last_drive(given.saved).get("entered")
+
+
 def go_on(given: GivenMap, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
     """Takes the session up where it stopped. Raises MapError where its arrays do not fit."""
     session, where = given.saved.session, str(given.path)
@@ -208,11 +213,13 @@ def _drive(outputs: RunOutputs, estimate: Estimate) -> dict[str, Any]:
     config, values = outputs.config, outputs.config.as_values()
     settings = {name: values[name] for name in (*_SAME_SETTINGS, "dataset")}
     settings["dataset"]["start"] = outputs.first_frame
+    entry = entry_of(outputs.folder)
     return {
         "name": config.name,
         "fgslam": __version__,
         "recording": {"name": outputs.sequence.name, "identity": outputs.sequence.identity},
         "frames": len(outputs.recorder),
+        "entered": None if entry is None else entry.as_values(),
         "estimator": outputs.pipeline.estimator.kind,
         "valid_hits": config.frontend.database.valid_hits,
         "remark": outputs.remark,

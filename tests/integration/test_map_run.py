@@ -113,6 +113,26 @@ def test_going_on_may_be_interrupted_too(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("kind", [KIND, "isam2"])
+def test_going_on_with_a_run_that_began_in_a_map(
+    kind: str, recording: Path, map_file: Path, tmp_path: Path
+) -> None:
+    """Its first pose and its landmarks are that map's, also for those who replay it."""
+    maps = {name: str(tmp_path / f"{name}.fgmap") for name in ("whole", "begun", "ended")}
+    entering = {"load": str(map_file), "start": "last", "begin": {"sigma_m": 0.5}}
+    run_values(mapped(recording, kind=kind, save=maps["whole"], **entering), tmp_path / "whole")
+    part = mapped(recording, stop=CUT, kind=kind, save=maps["begun"], **entering)
+    run_values(part, tmp_path / "begun")
+    more = {"load": maps["begun"], "save": maps["ended"], "start": "continue"}
+    values = mapped(recording, kind=kind, **more)
+    values["compare"] = [{"kind": kind, "label": "again"}]
+    folder = run_values(values, tmp_path / "ended").folder
+    assert Path(maps["ended"]).read_bytes() == Path(maps["whole"]).read_bytes()
+    for name in ("final.tum", "covariance.csv"):
+        assert (folder / kind / name).read_bytes() == (folder / "again" / name).read_bytes()
+
+
+@pytest.mark.slow
 def test_without_visual_or_wheel_odometry_it_goes_on_as_exactly(
     recording: Path, tmp_path: Path
 ) -> None:
@@ -290,8 +310,7 @@ def test_maps_that_cannot_be_used(
         refused(values, run, told, ConfigError)
     small = mapped(recording, load=given)
     small["estimator"] = {"kind": "ekf", "max_landmarks": 100}
-    with pytest.raises(EstimatorError, match=r"the saved map: .* exceed max_landmarks 100"):
-        run_values(small, run)
+    refused(small, run, r"the saved map: .* exceed max_landmarks 100", EstimatorError)
     refused(mapped(recording, save=str(tmp_path / "no" / "m")), run, "does not exist", OutputError)
     refused(mapped(recording, save=str(tmp_path)), run, "is a folder", MapError)
 
