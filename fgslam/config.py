@@ -132,7 +132,9 @@ def _map_problem(config: ExperimentConfig) -> str:
             not given.extend and given.save is not None
         ),
         "map.load and map.save are one file; save to another name": (
-            given.load is not None and given.load == given.save
+            given.load is not None
+            and given.save is not None
+            and Path(given.load).resolve() == Path(given.save).resolve()
         ),
         "map.start continue goes on with the run that was saved; it takes map.load alone": (
             goes_on and (first is not None or not given.extend)

@@ -355,3 +355,31 @@ def test_wrong_types_are_told_in_plain_words(
 ) -> None:
     message = message_of(nested(MINIMAL, key, value), tmp_path)
     assert f"{key} = {value!r} is not usable: {words}" in message
+
+
+# --------------------------------------------------------------------------------------------
+# Maps
+
+
+@pytest.mark.parametrize(
+    ("maps", "expected"),
+    [
+        ({"start": "last"}, "mean nothing without a map"),
+        ({"extend": False}, "mean nothing without a map"),
+        ({"load": "a", "made_from": {"dataset": MINIMAL["dataset"]}}, "exclude each other"),
+        ({"load": "a", "save": "b", "extend": False}, "no new map to save"),
+        ({"load": "a", "save": "a"}, "are one file"),
+        ({"load": "maps/../a", "save": "./a"}, "are one file"),
+        ({"load": "a", "start": "continue", "extend": False}, "takes map.load alone"),
+    ],
+)
+def test_maps_that_contradict_themselves(maps: dict[str, Any], expected: str) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        parse_config({**MINIMAL, "map": maps}, "test")
+
+
+def test_a_map_that_stays_as_it_is_closes_no_loops() -> None:
+    values = {**MINIMAL, "map": {"load": "a", "extend": False}}
+    assert not parse_config(values, "test").map.extend
+    with pytest.raises(ConfigError, match="a map that is to stay as it is"):
+        parse_config({**values, "frontend": {"loops": {}}}, "test")
