@@ -69,8 +69,8 @@ def cloud(count: int, rng: np.random.Generator) -> FloatArray:
 # -- memory ----------------------------------------------------------------------------------
 
 
-def remembered(frames: list[list[int]]) -> SightingMemory:
-    memory, forward = SightingMemory(), turned(0.0, z=0.5)
+def remembered(frames: list[list[int]], given: int = -1) -> SightingMemory:
+    memory, forward = SightingMemory(given), turned(0.0, z=0.5)
     for k, ids in enumerate(frames):
         known = np.array(ids, np.int64)
         points = np.tile([0.0, 0.0, 3.0], (len(ids), 1))
@@ -92,9 +92,18 @@ def test_memory_tells_what_was_not_seen_for_long_and_where_it_was_seen_best() ->
         memory.best_view_of(np.array([8]))
 
 
-def test_memory_restored_from_log_goes_on_the_same() -> None:
+def test_landmarks_of_the_map_that_a_run_begins_in_are_older_than_all_it_sees() -> None:
+    """Seen or not: none of them may end as the double of another."""
+    memory = remembered([[3, 4], [4, 5], [5, 21]], given=20)
+    asked = np.array([4, 6, 20, 21, 22])
+    np.testing.assert_array_equal(memory.made_after(0, asked), asked > 20)
+    np.testing.assert_array_equal(memory.made_after(2, asked), asked > 21)
+
+
+@pytest.mark.parametrize("given", [-1, 8])
+def test_memory_restored_from_log_goes_on_the_same(given: int) -> None:
     frames = [[0, 1, 2], [1, 2, 3], [3, 4]]
-    memory = remembered(frames)
+    memory = remembered(frames, given)
     log = MeasurementLog(RIG, {})
     for k in range(3):
         log.append(frame(k, memory.view(k, _map(np.arange(9), np.zeros((9, 3))))))
@@ -107,6 +116,7 @@ def test_memory_restored_from_log_goes_on_the_same() -> None:
             again.unseen_for(frames_ago, asked), memory.unseen_for(frames_ago, asked)
         )
     assert again.way_since(0) == memory.way_since(0)
+    np.testing.assert_array_equal(again.made_after(1, asked), memory.made_after(1, asked))
 
 
 def _map(ids: IntArray, positions: FloatArray) -> LandmarkMap:

@@ -22,8 +22,9 @@ class SightingMemory:
     The observations are those of the log; nothing is copied.
     """
 
-    def __init__(self) -> None:
-        """Nothing was seen yet."""
+    def __init__(self, given: int = -1) -> None:
+        """Nothing was seen yet; ``given`` is the last identity of the map it all begins in."""
+        self._given = given
         self._seen: list[Observations] = []
         self._way: list[float] = []
         self._newest: list[int] = []
@@ -82,11 +83,12 @@ class SightingMemory:
 
     def state(self) -> StateArrays:
         """What the log does not tell."""
-        return {"way": np.array(self._way)}
+        return {"way": np.array(self._way), "given": np.array(self._given)}
 
     def restore(self, state: StateArrays, log: MeasurementLog) -> None:
         """Continues from :meth:`state` and the log of as many frames."""
         self._seen, self._newest, self._last_seen = [], [], np.empty(0, np.int64)
+        self._given = int(state["given"])
         for increment in log:
             self._book(increment)
         self._way = state["way"].tolist()
@@ -97,7 +99,7 @@ class SightingMemory:
         self._grow(int(ids.max(initial=-1)) + 1)
         self._last_seen[ids] = len(self._seen)
         self._seen.append(seen)
-        newest = self._newest[-1] if self._newest else -1
+        newest = self._newest[-1] if self._newest else self._given
         self._newest.append(int(increment.observations.ids.max(initial=newest)))
 
     def _grow(self, count: int) -> None:

@@ -62,10 +62,10 @@ class PlaceRecognition:
     """
 
     def __init__(self, parts: RecognitionParts, tracker: LandmarkTracker) -> None:
-        """Nothing is remembered yet; the tracker is the run's own."""
+        """Nothing is remembered yet; the tracker is the run's own, with the map it begins in."""
         self._parts = parts
         self._tracker = tracker
-        self._memory = SightingMemory()
+        self._memory = SightingMemory(int(tracker.database.ids.max(initial=-1)))
         self._confirmation = None if parts.loops is None else Confirmation(parts.loops)
         self._lost = 0
         self._closed = -1  # frame of the last closure
