@@ -31,6 +31,7 @@ RENDER_VERSION = 7
 """Part of the cache's key: raised whenever the same settings give other pixels."""
 
 _SHAPING_KEYS = ("rig", "drive", "room_seed", "visit", "place", "posters")
+_SELECTION = ("start", "stop", "stride")
 _THREADS = 2
 _CLEARANCE_M = 0.12
 Progress = Callable[[int, int], None]
@@ -109,8 +110,12 @@ class RenderedLabSequence:
 
     @property
     def identity(self) -> str:
-        """SHA-256 of all settings, the seed and the renderer's version."""
+        """SHA-256 of the seed, the renderer's version and all settings but which frames to use.
+
+        So it is that of the whole recording, as those on disk have it: a run may go on with it.
+        """
         settings = _without_later_keys(self._settings)
+        settings = {name: value for name, value in settings.items() if name not in _SELECTION}
         if self._settings.drive.world_from is not None:
             settings["world_from"] = self._settings.drive.world_from
         return content_hash({"settings": settings, "seed": self._seed, "render": RENDER_VERSION})

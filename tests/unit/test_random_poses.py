@@ -116,6 +116,19 @@ def test_truth_is_in_the_world_of_the_mapping_drive() -> None:
 
 
 @pytest.mark.usefixtures("_unrendered")
+def test_which_frames_are_used_is_no_part_of_a_recording_s_identity() -> None:
+    """So that a run can go on with the frames after those that its map was made of."""
+
+    def identity(**selection: int) -> str:
+        settings = RenderedLabSettings(**selection)
+        used = settings.start, settings.stop, settings.stride
+        return RenderedLabSequence(settings, 0, *used).identity
+
+    assert identity() == identity(stop=4) == identity(start=4, stop=9, stride=2)
+    assert identity() != identity(room_seed=9)
+
+
+@pytest.mark.usefixtures("_unrendered")
 def test_wheels_know_of_no_carrying() -> None:
     carried = RenderedLabSequence(LabSettings(drive=drive(9, burst=3)), 0)
     known = [carried.odometry(i) is not None for i in range(9)]
