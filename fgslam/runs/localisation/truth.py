@@ -13,7 +13,7 @@ from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.errors import FgslamError
 from fgslam.evaluation.trajectory import align, associate
 from fgslam.factory import open_sequence
-from fgslam.geometry import inverse, pose
+from fgslam.geometry import inverse, pose, transform_to_world
 from fgslam.map_file import SavedMap
 from fgslam.recordings import Sequence
 from fgslam.settings.lab import RenderedLabSettings
@@ -22,6 +22,7 @@ from fgslam.simulation.world import make_rig
 from fgslam.types import FloatArray
 
 _SAME_TIME_S = 1e-3
+_MOST_SLACK_RAD = 0.5  # of positions whose errors are all made of it: at most, not likely
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +62,10 @@ def truth_in_map(saved: SavedMap, sequence: Sequence, config: ExperimentConfig) 
     aligned = None if mapped is None else _of_recorded(saved, mapped, sequence, config)
     if aligned is None:
         return TruthInMap(unknown, "the map is of another recording, so errors are not known")
-    mTw, matched = aligned
+    mTw, matched, slack = aligned
+    if slack > _MOST_SLACK_RAD:
+        words = "the map's drive is too straight to lay the truth onto it, so errors are not known"
+        return TruthInMap(unknown, words)
     times, true_rows = associate(
         sequence.timestamps, sequence.ground_truth.timestamps, _SAME_TIME_S
     )
@@ -100,8 +104,8 @@ def _of_rendered(
 
 def _of_recorded(
     saved: SavedMap, mapped: ExperimentConfig, sequence: Sequence, config: ExperimentConfig
-) -> tuple[FloatArray, int] | None:
-    """(4, 4) from the truth's world to the map's, and how many poses it was found from."""
+) -> tuple[FloatArray, int, float] | None:
+    """(4, 4) from the truth's world to the map's, how many poses it was found from, its slack."""
     now, then = (getattr(one.dataset, "path", None) for one in (config, mapped))
     if now is None or then is None or Path(now).resolve() != Path(then).resolve():
         return None
@@ -112,5 +116,20 @@ def _of_recorded(
     if truth is None:
         return None
     rows, true_rows = associate(saved.trajectory.timestamps, truth.timestamps, _SAME_TIME_S)
-    found = align(truth.poses[true_rows], saved.trajectory.poses[rows])
-    return None if found is None else (pose(found.rotation, found.translation), len(rows))
+    true, own = truth.poses[true_rows], saved.trajectory.poses[rows]
+    found = align(true, own)
+    if found is None:
+        return None
+    mTw = pose(found.rotation, found.translation)
+    return mTw, len(rows), alignment_slack(transform_to_world(mTw, true[:, :3, 3]), own[:, :3, 3])
+
+
+def alignment_slack(aligned: FloatArray, own: FloatArray) -> float:
+    """By how much aligned positions (n, 3) may yet turn about the line that they lie along.
+
+    Radians: what is left between them and ``own`` (n, 3), over how far they stray from that line;
+    infinite where they do not. Of a straight drive's positions no alignment knows the roll.
+    """
+    spread = np.linalg.svd(own - own.mean(axis=0), compute_uv=False)[1]
+    left = np.linalg.norm(aligned - own)
+    return float(left / spread) if spread > 0.0 else np.inf
