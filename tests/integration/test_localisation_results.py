@@ -64,8 +64,9 @@ def test_odd_frames_of_euroc_are_found_in_the_map_of_the_even_ones(
 
 @pytest.mark.slow
 @pytest.mark.data
-def test_no_false_link_between_frames_of_euroc(shared_data: Path) -> None:
-    """A twelfth of all pairs: what is linked by the default limits is rightly posed."""
+def test_links_between_single_frames_of_euroc(shared_data: Path) -> None:
+    """A twelfth of all pairs. One frame is a poor map: the loop detector needs more than this."""
     links = recognised.link_frames(shared_data, every=12).surer(0.05, 1.0)
-    assert links.linked.sum() > 10
-    assert links.precision == 1.0
+    assert links.linked.sum() > 15
+    assert links.precision > 0.8
+    assert links.recall > 0.4
