@@ -16,7 +16,8 @@ from fgslam.types import BoolArray, FloatArray, Increment, IntArray, Trajectory
 _HEADER = (
     "poses wTc of the reference camera; x right, y down, z forward; metres",
     "information: g2o's error (translation, vector part of the quaternion), metres and half angles",
-    "left out: observations that the run rejected, constraints of a floor",
+    "left out: observations that the run rejected, constraints of a floor, closures of loops, "
+    "odometry to frames located anew",
     "landmarks that the map no longer holds start where they were first seen",
 )
 
@@ -80,7 +81,11 @@ def build_graph(
     moved = [
         (rows[k - 1], rows[k], increment.odometry)
         for k, increment in enumerate(log)
-        if k and increment.odometry is not None and min(rows[k - 1], rows[k]) >= 0
+        # A frame found anew after being carried off: its odometry does not know of that.
+        if k
+        and increment.odometry is not None
+        and not increment.relocalised
+        and min(rows[k - 1], rows[k]) >= 0
     ]
     return PoseLandmarkGraph(
         poses=trajectory.poses,

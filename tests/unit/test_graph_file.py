@@ -160,13 +160,14 @@ def test_rejected_and_placeless_observations_and_gaps_are_left_out(
         odometry=None,
         observations=dataclasses.replace(seen, measurement=measurement),
     )
+    increments[5] = dataclasses.replace(increments[5], relocalised=True)  # it was carried there
     spoilt = MeasurementLog(log.rig, {}, increments)
     stamps = np.array([s.timestamp for s in log])[:-1]  # the last frame has no pose
     trajectory = Trajectory(stamps, np.tile(np.eye(4), (len(stamps), 1, 1)))
     graph = build_graph(spoilt, trajectory, held, np.zeros((len(held), 3)))
     everything = sum(len(s.observations) for s in increments[:-1])
     assert len(graph.points) == everything - 3
-    assert graph.motion_to.tolist() == [1, 2, 4, 5, 6]
+    assert graph.motion_to.tolist() == [1, 2, 4, 6]
 
 
 def test_an_empty_log_has_a_graph(tmp_path: Path, rng: np.random.Generator) -> None:
