@@ -29,6 +29,13 @@ class MotionModel(Protocol):
         """Learns the last frame's pose; ``measured``: tied to odometry or the map, or its first."""
         ...
 
+    def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
+        """Learns a pose that does not go on from the one before: between them lies no motion.
+
+        A closed loop has corrected it; or the camera was ``carried`` and has been found anew.
+        """
+        ...
+
     def description(self) -> dict[str, Any]:
         """Kind and numbers, as plain JSON values, for the log."""
         ...
@@ -67,6 +74,10 @@ class OdometryMotion:
     def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
         """Keeps the stand-in's velocity fresh."""
         self._stand_in.observe(timestamp, wTc, measured)
+
+    def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
+        """The stand-in goes on from there."""
+        self._stand_in.displaced(timestamp, wTc, carried)
 
     def description(self) -> dict[str, Any]:
         """The kind of odometry and what bridges its gaps."""
@@ -130,6 +141,14 @@ class ConstantVelocityMotion:
             self._measured_at, self._pose = timestamp, wTc
         self._founded |= measured
         self._timestamp = timestamp
+
+    def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
+        """Goes on from there with the velocity so far; of one that was carried none is known."""
+        if carried:
+            self._velocity = None
+        self._founded = True
+        self._timestamp = self._measured_at = timestamp
+        self._pose = wTc
 
     def description(self) -> dict[str, Any]:
         """Kind and numbers."""

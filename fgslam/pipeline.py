@@ -101,7 +101,7 @@ class SlamPipeline:
         watch.lap("places")
         increment = _increment(index, timestamp, odometry if measured else None, seen)
         stats = self.estimator.update(increment, seen.tracking, odometry)
-        self.motion.observe(timestamp, stats.wTc, _anchored(increment, seen.tracking, stats))
+        _observe(self.motion, increment, seen.tracking, stats)
         self._remember(increment, seen, stats)
         watch.lap("update")
         return FrameReport(found, stereo, increment, seen.tracking, stats, watch.ms)
@@ -192,7 +192,7 @@ def replay_frame(
         tracking = _solve(estimator, partial(ego_motion.solve, prediction), matched)
     watch.lap("track")
     stats = estimator.update(increment, tracking, odometry)
-    motion.observe(increment.timestamp, stats.wTc, _anchored(increment, tracking, stats))
+    _observe(motion, increment, tracking, stats)
     watch.lap("update")
     return ReplayedFrame(tracking, stats, watch.ms)
 
@@ -224,6 +224,16 @@ def _relocated(
     if found.status.measured:
         return found
     return _solve(estimator, partial(ego_motion.solve, prediction), matched)
+
+
+def _observe(
+    motion: MotionModel, increment: Increment, tracking: EgoMotion, stats: UpdateStats
+) -> None:
+    """Tells the motion model the pose; what a loop or a relocalisation moved it by is no motion."""
+    if increment.loops or increment.relocalised:
+        motion.displaced(increment.timestamp, stats.wTc, increment.relocalised)
+    else:
+        motion.observe(increment.timestamp, stats.wTc, _anchored(increment, tracking, stats))
 
 
 def _anchored(increment: Increment, tracking: EgoMotion, stats: UpdateStats) -> bool:

@@ -205,6 +205,26 @@ def test_an_unmeasured_start_teaches_no_standstill() -> None:
     assert step.covariance[3, 3] == pytest.approx((0.1 * SETTINGS.start_speed_sigma_mps) ** 2)
 
 
+@pytest.mark.parametrize("carried", [False, True])
+def test_a_displacement_is_no_velocity(carried: bool) -> None:
+    """Corrected, it keeps the one that it had; carried, it begins as at first."""
+    motion, rested = (ConstantVelocityMotion(ConstantVelocitySettings()) for _ in range(2))
+    motion.observe(0.0, np.eye(4), measured=True)
+    motion.observe(0.5, g.se3_exp(0.5 * TWIST), measured=True)
+    elsewhere = g.pose(np.eye(3), np.array([7.0, 0.0, -3.0]))
+    motion.displaced(1.0, elsewhere @ g.se3_exp(TWIST), carried)
+    step, measured = motion.between(3, 1.5)
+    assert step is not None
+    assert not measured
+    expected = np.eye(4) if carried else g.se3_exp(0.5 * TWIST)
+    np.testing.assert_allclose(step.motion, expected, atol=1e-12)
+    if carried:
+        rested.observe(1.0, np.eye(4), measured=True)
+        np.testing.assert_array_equal(step.covariance, rested.between(1, 1.5)[0].covariance)
+    motion.observe(1.5, elsewhere @ g.se3_exp(1.5 * TWIST), measured=True)
+    np.testing.assert_allclose(motion.between(4, 2.0)[0].motion, g.se3_exp(0.5 * TWIST), atol=1e-12)
+
+
 def test_at_first_it_rests_and_knows_little() -> None:
     motion = ConstantVelocityMotion(SETTINGS)
     motion.observe(3.0, g.se3_exp(TWIST), measured=True)

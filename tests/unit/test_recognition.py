@@ -16,9 +16,10 @@ from fgslam.frontend.loops.confirmation import difference
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.measurement_log import MeasurementLog
-from fgslam.motion import OdometryMotion
-from fgslam.pipeline import FrameReport, SlamPipeline, replay_step
+from fgslam.motion import ConstantVelocityMotion, OdometryMotion
+from fgslam.pipeline import FrameReport, SlamPipeline, _observe, replay_step
 from fgslam.settings.backend import LandmarkKalmanSettings
+from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import EgoMotionSettings, FrontendSettings
 from fgslam.settings.loops import LoopSettings, LostSettings
 from fgslam.types import EgoMotionStatus, FloatArray, Frame, Increment, Odometry
@@ -66,6 +67,9 @@ class RingMotion(OdometryMotion):
         return Odometry(step @ g.pose(self._wrong, np.zeros(3)), NOISE), True
 
     def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
+        pass
+
+    def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
         pass
 
 
@@ -266,3 +270,25 @@ def test_who_begins_in_the_dark_maps_as_soon_as_there_is_light() -> None:
     assert new[:2] == [0, 0]
     assert new[2] > 50
     assert all(r.tracking.status is EgoMotionStatus.OK for r in reports[3:])
+
+
+def test_a_correction_is_no_motion() -> None:
+    """Nor is being found elsewhere: without wheels, the next frames are expected where they are."""
+    poses = carried()
+    for settings, path, dark in (
+        (dataclasses.replace(SETTINGS, loops=None), poses, range(0)),
+        (dataclasses.replace(SETTINGS, lost=None), RING, DARK),
+    ):
+        pipeline = pipeline_of(path, 0.9 if settings.lost is None else 0.1, settings)
+        steady = ConstantVelocityMotion(ConstantVelocitySettings())
+        jumps = []
+        for found in seen(path, dark):
+            report = pipeline.process(found, found.i, float(found.i))
+            expected, _ = steady.between(found.i, float(found.i))
+            _observe(steady, report.increment, report.tracking, report.stats)
+            after, _ = steady.between(found.i + 1, found.i + 1.0)
+            if report.increment.loops or report.increment.relocalised:
+                assert expected is not None
+                jumps.append(float(np.linalg.norm(after.motion[:3, 3])))
+        assert jumps
+        assert max(jumps) < 0.5, "a frame's step is a quarter of a metre"
