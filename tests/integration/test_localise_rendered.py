@@ -35,6 +35,7 @@ VALUES: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("open3d")
 def test_poses_between_those_of_the_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FGSLAM_CACHE", str(tmp_path / "cache"))
