@@ -12,7 +12,7 @@ import numpy as np
 
 from fgslam.arrival import Arrival
 from fgslam.config import ExperimentConfig, load_config
-from fgslam.errors import MapError
+from fgslam.errors import ConfigError, MapError
 from fgslam.export.atomic import RUN_MARKER, is_run_folder
 from fgslam.factory import make_relocaliser, make_stereo_matcher, make_stream
 from fgslam.map_file import SavedMap, load_map, require_rig
@@ -194,8 +194,18 @@ def arrival_of(run: Path) -> Arrival | None:
 
 
 def entry_of(run: Path) -> Entry | None:
-    """How the run in a folder, or the one that it goes on with, entered its map; None without."""
+    """How the run in a folder, or the one that it goes on with, entered its map; None without.
+
+    Raises:
+        ConfigError: config.yaml says it in words of another fgslam.
+    """
     if not is_run_folder(run):
         return None
     values = (load_config(run / RUN_MARKER).provenance or {}).get("map")
-    return None if values is None else Entry.of(values)
+    try:
+        return None if values is None else Entry.of(values)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ConfigError(
+            f"{run / RUN_MARKER}: provenance.map does not say how the run entered its map "
+            f"({type(error).__name__}: {error}); run again with --overwrite"
+        ) from None

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from recordings import experiment, write_recording
 from running import (
     KIND,
@@ -24,6 +25,7 @@ from fgslam.errors import ConfigError, EstimatorError, FgslamError, MapError, Ou
 from fgslam.export.point_cloud import read_ply
 from fgslam.export.trajectories import read_tum
 from fgslam.map_file import load_map, save_map
+from fgslam.runs.map_entry import arrival_of
 from fgslam.types import FloatArray
 
 CUT = 7
@@ -232,6 +234,11 @@ def test_replays_of_it_begin_in_the_map_and_give_the_same_bits(
         assert (folder / KIND / name).read_bytes() == (folder / "again" / name).read_bytes()
     failure = metrics_of(folder)["estimators"]["odometry"]["failure"]
     assert "cannot begin in a saved map" in failure
+    told = yaml.safe_load((folder / "config.yaml").read_text())
+    del told["provenance"]["map"]["file"]
+    (folder / "config.yaml").write_text(yaml.safe_dump(told))
+    with pytest.raises(ConfigError, match="does not say how the run entered its map"):
+        arrival_of(folder)
 
 
 @pytest.mark.slow
