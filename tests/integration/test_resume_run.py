@@ -35,8 +35,8 @@ from fgslam.errors import (
     OutputError,
 )
 from fgslam.measurement_log import load_arrays
-from fgslam.runs.checkpoint import write_arrays
 from fgslam.runs.beginning import resume_command
+from fgslam.runs.checkpoint import write_arrays
 from fgslam.settings.datasets import ImageFolderSettings
 from fgslam.types import Odometry
 
