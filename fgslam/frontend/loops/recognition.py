@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from fgslam.frontend.loops.closure import close_loop, is_sharp
-from fgslam.frontend.loops.confirmation import Confirmation, drift_allows
+from fgslam.frontend.loops.confirmation import Confirmation, difference, drift_allows
 from fgslam.frontend.loops.fusion import duplicates
 from fgslam.frontend.loops.memory import SightingMemory
 from fgslam.frontend.tracker import Association, LandmarkTracker, Tracked
@@ -29,6 +29,9 @@ from fgslam.types import (
 )
 
 _STREAM = 11  # of random numbers, beside those of the recording
+_ONE_PLACE_M, _ONE_PLACE_DEG = 0.3, 5.0
+"""What matching around a pose found in the whole map may change of it: several times what such a
+pose may be off (frontend.relocalisation.max_sigma_*)."""
 
 
 class Locator(Protocol):
@@ -95,6 +98,8 @@ class PlaceRecognition:
         # Without any landmark yet there is nothing to be lost in.
         located = tracked.ego_motion.status.measured or not len(landmarks)
         self._lost = 0 if located else self._lost + 1
+        if self._lost and self._confirmation is not None:
+            self._confirmation.forget()  # its frames are to be in a row
         if lost is None or self._lost < lost.after or not len(features):
             return tracked, False
         found = self._locate(landmarks, self._trusted(), features)
@@ -102,7 +107,7 @@ class PlaceRecognition:
             return tracked, False
         around = Prediction(found.wTc, found.covariance)
         anew = self._tracker.track_anew(around, landmarks, features)
-        if not anew.ego_motion.status.measured:
+        if not anew.ego_motion.status.measured or not _one_place(found.wTc, anew.ego_motion.wTc):
             return tracked, False
         self._lost = 0
         return anew, True
@@ -236,3 +241,8 @@ class PlaceRecognition:
         )
         self._parts.relocaliser.learn(chosen, self._tracker.database.appearances(chosen.ids))
         return self._parts.relocaliser.locate(features, rng)
+
+
+def _one_place(a: FloatArray, b: FloatArray) -> bool:
+    metres, degrees = difference(a, b)
+    return metres <= _ONE_PLACE_M and degrees <= _ONE_PLACE_DEG
