@@ -71,6 +71,10 @@ def assert_same(a: object, b: object) -> None:
     elif hasattr(a, "__dataclass_fields__"):
         for item in fields(a):  # type: ignore[arg-type]
             assert_same(getattr(a, item.name), getattr(b, item.name))
+    elif isinstance(a, tuple) and isinstance(b, tuple):
+        assert len(a) == len(b)
+        for one, other in zip(a, b, strict=True):
+            assert_same(one, other)
     else:
         assert a == b
 

@@ -17,7 +17,7 @@ from fgslam.datasets.opening import open_measurements
 from fgslam.errors import ConfigError
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
 from fgslam.frontend.ego_motion import EgoMotionSolver
-from fgslam.homing_config import load_experiment
+from fgslam.localisation_config import load_experiment
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
 from fgslam.recordings import MeasurementRecording
