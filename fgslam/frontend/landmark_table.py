@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.columns import GrowingColumns
 from fgslam.errors import MapError
-from fgslam.frontend.columns import GrowingColumns
 from fgslam.frontend.views import Places, ViewPool, Views
 from fgslam.map_file import SavedMap
 from fgslam.map_types import LandmarkAppearances

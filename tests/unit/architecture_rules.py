@@ -28,6 +28,7 @@ BASE = frozenset(
         "homing_types",
         "bearing_log",
         "whole_files",
+        "columns",
         "map_types",
         "map_file",
     }
@@ -49,6 +50,7 @@ FOUNDATION_ALLOWS: dict[str, frozenset[str]] = {
     "omni_cameras": frozenset({"types", "errors", "planar"}),
     "homing_types": frozenset({"types", "planar"}),
     "bearing_log": frozenset({"types", "errors", "homing_types", "measurement_log"}),
+    "columns": frozenset({"types"}),
     "map_types": frozenset({"types"}),
     "whole_files": frozenset({"errors"}),
     "map_file": frozenset(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.types import BoolArray, StateArrays
+from fgslam.types import BoolArray, IntArray, StateArrays
 
 _GROWTH = 1.5
 _LEAST = 64
@@ -48,10 +48,14 @@ class GrowingColumns:
         if not gone.any():
             return
         first = int(np.argmax(gone))
-        kept = np.flatnonzero(~gone[first:]) + first
+        self.take(first, np.flatnonzero(~gone[first:]) + first)
+
+    def take(self, start: int, rows: IntArray) -> None:
+        """Puts these rows, in this order, from row ``start`` on; they are the last ones then."""
+        stop = start + len(rows)
         for buffer in self._buffers.values():
-            buffer[first : first + len(kept)] = buffer[kept]
-        self._length = first + len(kept)
+            buffer[start:stop] = buffer[rows]
+        self._length = stop
 
     def state(self) -> StateArrays:
         """A snapshot of all columns."""
