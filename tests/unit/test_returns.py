@@ -25,12 +25,14 @@ from fgslam.types import (
     Increment,
     IntArray,
     LandmarkMap,
+    LoopClosure,
     Observations,
     StereoFeatures,
 )
 
 LOOPS = LoopSettings()
 DOWN = np.array([0.0, 1.0, 0.0])
+NOBODY = np.empty(0, np.int64)
 NOISE = 0.2**2 * np.eye(3)
 
 
@@ -98,6 +100,25 @@ def test_landmarks_of_the_map_that_a_run_begins_in_are_older_than_all_it_sees() 
     asked = np.array([4, 6, 20, 21, 22])
     np.testing.assert_array_equal(memory.made_after(0, asked), asked > 20)
     np.testing.assert_array_equal(memory.made_after(2, asked), asked > 21)
+
+
+def test_a_return_in_between_bounds_the_drift() -> None:
+    """Half a metre a frame out and back; what was seen again ties the end to the beginning."""
+    places = [list(range(20 * k, 20 * k + 20)) for k in range(41)]
+    out = remembered(places)
+    assert out.way_since(0) == pytest.approx(20.0)
+    back = remembered([*places, places[0], [900]])
+    assert back.way_since(0) == pytest.approx(0.5, abs=1e-3), (
+        "since the return, not since the start"
+    )
+    assert back.way_since(20) == pytest.approx(10.5, abs=1e-3), "the shorter way round"
+    closed = remembered(places)
+    loop = LoopClosure(
+        1, np.eye(4), np.eye(6), sight(np.eye(4), np.empty((0, 3)), NOBODY), np.empty((0, 2))
+    )
+    nothing = sight(np.eye(4), np.empty((0, 3)), NOBODY)
+    closed.add(dataclasses.replace(frame(41, nothing), loops=(loop,)), turned(0.0, z=0.5))
+    assert closed.way_since(0) == pytest.approx(0.5, abs=1e-3)
 
 
 @pytest.mark.parametrize("given", [-1, 8])

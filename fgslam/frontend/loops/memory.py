@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
+from scipy.sparse import lil_array
+from scipy.sparse.csgraph import dijkstra
 
 from fgslam.measurement_log import MeasurementLog
 from fgslam.types import (
@@ -14,6 +18,10 @@ from fgslam.types import (
     Observations,
     StateArrays,
 )
+
+_RETURN_FRAMES = 30  # unseen for so long: tracking them again ties the frame to an older one
+_RETURN_MATCHES = 10  # of them, as for the ties of the filter's backward correction
+_LEAST_M = 1e-6  # of an edge: none at all is no edge
 
 
 class SightingMemory:
@@ -28,6 +36,7 @@ class SightingMemory:
         self._seen: list[Observations] = []
         self._way: list[float] = []
         self._newest: list[int] = []
+        self._returns: list[tuple[int, int]] = []
         self._last_seen: IntArray = np.empty(0, np.int64)
 
     def __len__(self) -> int:
@@ -45,8 +54,21 @@ class SightingMemory:
         self._book(increment)
 
     def way_since(self, frame: int) -> float:
-        """Metres driven since a frame."""
-        return self._way[-1] - self._way[frame] if self._way else 0.0
+        """Metres along which the estimate can have drifted away from a frame's surroundings.
+
+        The way driven since, but cut short where a place was seen again in between: what was tied
+        there has drifted no farther apart than the rest of the way allows.
+        """
+        nodes = sorted({frame, len(self._way) - 1, *itertools.chain(*self._returns)})
+        at = {node: i for i, node in enumerate(nodes)}
+        way = np.array([self._way[node] for node in nodes])
+        lengths = lil_array((len(nodes), len(nodes)))
+        for i, step in enumerate(np.diff(way).tolist()):
+            lengths[i, i + 1] = max(step, _LEAST_M)
+        for a, b in self._returns:
+            lengths[at[b], at[a]] = _LEAST_M
+        found = dijkstra(lengths.tocsr(), directed=False, indices=at[frame])
+        return float(found[-1])
 
     def unseen_for(self, frames: int, ids: IntArray) -> IntArray:
         """Those of the landmarks that the last ``frames`` frames did not see."""
@@ -87,7 +109,8 @@ class SightingMemory:
 
     def restore(self, state: StateArrays, log: MeasurementLog) -> None:
         """Continues from :meth:`state` and the log of as many frames."""
-        self._seen, self._newest, self._last_seen = [], [], np.empty(0, np.int64)
+        self._seen, self._newest, self._returns = [], [], []
+        self._last_seen = np.empty(0, np.int64)
         self._given = int(state["given"])
         for increment in log:
             self._book(increment)
@@ -97,8 +120,14 @@ class SightingMemory:
         seen = increment.observations.select(~increment.rejected)
         ids = np.concatenate([seen.ids, *(loop.observations.ids for loop in increment.loops)])
         self._grow(int(ids.max(initial=-1)) + 1)
-        self._last_seen[ids] = len(self._seen)
+        here = len(self._seen)
+        before = np.sort(self._last_seen[seen.ids])
+        old = before[(before >= 0) & (before < here - _RETURN_FRAMES)]
+        if len(old) >= _RETURN_MATCHES:
+            self._returns.append((here, int(old[len(old) // 2])))
+        self._last_seen[ids] = here
         self._seen.append(seen)
+        self._returns += [(here, loop.frame) for loop in increment.loops]
         newest = self._newest[-1] if self._newest else self._given
         self._newest.append(int(increment.observations.ids.max(initial=newest)))
 
