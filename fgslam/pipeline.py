@@ -144,8 +144,7 @@ class SlamPipeline:
 
     def _remember(self, increment: Increment, seen: _Seen, stats: UpdateStats) -> None:
         if self.places is not None:
-            self.places.remember(increment, seen.tracking.wTc)
-            self.places.moved_to(stats.wTc)
+            self.places.remember(increment, seen.tracking.wTc, stats.wTc)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

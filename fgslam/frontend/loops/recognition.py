@@ -169,14 +169,11 @@ class PlaceRecognition:
 
     # -- upkeep ------------------------------------------------------------------------------
 
-    def remember(self, increment: Increment, wTc: FloatArray) -> None:
-        """Books a frame with its pose before any loop was closed in it."""
-        step = inverse(self._pose) @ wTc if len(self._memory) else np.eye(4)
+    def remember(self, increment: Increment, tracked: FloatArray, corrected: FloatArray) -> None:
+        """Books a frame: its pose (4, 4) before any loop was closed in it, and the estimator's."""
+        step = inverse(self._pose) @ tracked if len(self._memory) else np.eye(4)
         self._memory.add(increment, step)
-
-    def moved_to(self, wTc: FloatArray) -> None:
-        """Books where the estimator has the frame now."""
-        self._pose = wTc
+        self._pose = corrected
 
     def state(self) -> StateArrays:
         """All but what the log tells."""
