@@ -6,8 +6,13 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
+import numpy.typing as npt
 
 from fgslam.types import ByteArray, FloatArray, IntArray
+
+Words = npt.NDArray[np.int16]
+"""(v,) the cell of the vocabulary that each descriptor lies in (:mod:`fgslam.frontend.vocabulary`).
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,6 +25,8 @@ class LandmarkAppearances:
         size: (v,) physical size, scale times depth: pixels times metres.
         orientation: (v,) radians, as in the image.
         direction: (v, 3) unit vector from the camera to the landmark, world; NaN where unknown.
+        words: (v,) of the descriptors, where they are at hand; None where they must be found. No
+            part of what is known: they follow from the descriptors.
     """
 
     ids: IntArray
@@ -27,6 +34,7 @@ class LandmarkAppearances:
     size: FloatArray
     orientation: FloatArray
     direction: FloatArray
+    words: Words | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -40,6 +48,7 @@ class LandmarkAppearances:
             self.size[keep],
             self.orientation[keep],
             self.direction[keep],
+            None if self.words is None else self.words[keep],
         )
 
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from fgslam.config import load_config
 from fgslam.factory import open_sequence
-from fgslam.frontend.relocalisation.appearance_index import VOCABULARY_FILE
 from fgslam.frontend.sift import SiftExtractor
+from fgslam.frontend.vocabulary import VOCABULARY_FILE
 from fgslam.types import FloatArray
 
 _WORDS = 256

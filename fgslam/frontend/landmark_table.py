@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from fgslam.columns import GrowingColumns
 from fgslam.errors import MapError
@@ -109,16 +110,23 @@ class LandmarkTable:
         """Memory of each further view."""
         return self._pool.bytes_per_view()
 
-    def appearances(self, ids: IntArray | None = None) -> LandmarkAppearances:
-        """All views of all landmarks, or of those named (ascending); matched longest ago first."""
+    def appearances(
+        self, ids: IntArray | None = None, with_words: bool = False
+    ) -> LandmarkAppearances:
+        """All views of all landmarks, or of those named (ascending); matched longest ago first.
+
+        ``with_words`` for whoever searches among them: each word is found once in a view's life.
+        """
         rows = np.arange(len(self)) if ids is None else self.rows(ids)
-        owner, views = self._views_of(rows, by_age=True)
+        owner, places = self._places_of(rows, by_age=True)
+        views = self._pool.at(places)
         return LandmarkAppearances(
             ids=self.ids[rows[owner]],
             descriptors=views.descriptors,
             size=views.size,
             orientation=views.orientation,
             direction=views.direction.astype(np.float64),
+            words=self._pool.words(places) if with_words else None,
         )
 
     def rows(self, ids: IntArray) -> IntArray:
@@ -194,7 +202,7 @@ class LandmarkTable:
         """All entries, as arrays; a snapshot."""
         out = self._columns.state()
         del out[_PLACES]
-        _, views = self._views_of(np.arange(len(self)))
+        views = self._pool.at(self._places_of(np.arange(len(self)))[1])
         out |= {name: getattr(views, name) for name in _VIEWS}
         out["next_id"] = np.array(self._next_id)
         out["frame"] = np.array(self._frame)
@@ -256,14 +264,16 @@ class LandmarkTable:
     def _first_views(self) -> Views:
         return self._pool.at(self._places[:, 0])
 
-    def _views_of(self, rows: IntArray, by_age: bool = False) -> tuple[IntArray, Views]:
-        """All views of the rows (k,) as kept, or by last use, and to which row each belongs."""
+    def _places_of(
+        self, rows: IntArray, by_age: bool = False
+    ) -> tuple[IntArray, npt.NDArray[np.int32]]:
+        """To which of the rows (k,) each of their views belongs, as kept or by last use; places."""
         places = self._places[rows]
         owner, column = np.nonzero(places >= 0)
         flat = places[owner, column]
         if by_age and len(owner) > len(rows):
             flat = flat[np.lexsort((self._pool.last_use(flat), owner))]
-        return owner, self._pool.at(flat)
+        return owner, flat
 
     def _require_mergeable(self, ends: IntArray, stays: IntArray) -> None:
         unknown = np.setdiff1d(np.concatenate([ends, stays]), self.ids)

@@ -111,20 +111,19 @@ def align_maps(
 
 def tentative_pairs(a: SavedMap, b: SavedMap, settings: MergeSettings) -> IntArray:
     """Rows (k, 2) of confirmed landmarks that look alike and like no other place; b's ascending."""
-    index = AppearanceIndex()
     mine, yours = _trusted_views(a), _trusted_views(b)
     if not len(mine) or not len(yours):
         return np.empty((0, 2), np.int64)
-    index.add(mine, a.appearances.descriptors[mine])
+    index = AppearanceIndex(a.appearances.descriptors[mine])
     found = index.query(b.appearances.descriptors[yours], _NEIGHBOURS)
-    known = found.owners >= 0
-    owners = a.landmarks.rows(a.appearances.ids[np.where(known, found.owners, 0)].ravel())
-    owners = owners.reshape(found.owners.shape)
+    known = found.rows >= 0
+    views = mine[np.where(known, found.rows, 0)]
+    owners = a.landmarks.rows(a.appearances.ids[views].ravel()).reshape(views.shape)
     places = a.landmarks.positions[owners]
     other = known & (np.linalg.norm(places - places[:, :1], axis=2) > settings.same_place_m)
     next_place = np.where(other, found.distances, np.inf).min(axis=1)
     near = found.distances[:, 0]
-    size = np.log(a.appearances.size[found.owners[:, 0]] / b.appearances.size[yours])
+    size = np.log(a.appearances.size[views[:, 0]] / b.appearances.size[yours])
     keep = known[:, 0] & (near <= settings.max_distance) & (near <= settings.ratio * next_place)
     keep &= np.abs(size) <= np.log(settings.size_ratio)
     rows = b.landmarks.rows(b.appearances.ids[yours[keep]])

@@ -4,6 +4,7 @@ A landmark has up to ``max_views`` views: SIFT scale (kept as the physical size,
 orientation, descriptor and view vector, the unit vector from the camera to the landmark. The views
 of all landmarks lie in one pool; a landmark names its own by their places in it, the first ones
 first, and -1 for none. So it costs only the views it has, and nothing moves when one leaves.
+A view's word (:mod:`fgslam.frontend.vocabulary`) is found when it is first asked for, and kept.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.frontend.vocabulary import words_of
+from fgslam.map_types import Words
 from fgslam.types import BoolArray, ByteArray, FloatArray, IntArray, StereoFeatures
 
 Places = npt.NDArray[np.int32]
@@ -22,6 +25,7 @@ Directions = npt.NDArray[np.float32]
 """(v, 3) unit vectors, camera to landmark, world; NaN where unknown."""
 _LEAST = 64
 _GROWTH = 1.5
+_UNKNOWN = -1  # word of a view for which nobody has asked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,6 +88,7 @@ class ViewPool:
         self._descriptors: ByteArray = np.zeros((0, 128), np.uint8)
         self._direction: Directions = np.zeros((0, 3), np.float32)
         self._used: IntArray = np.zeros(0, np.int64)
+        self._words: Words = np.zeros(0, np.int16)
 
     @property
     def several(self) -> bool:
@@ -122,6 +127,12 @@ class ViewPool:
             self._direction[places],
             self._used[places],
         )
+
+    def words(self, places: npt.NDArray[np.int32]) -> Words:
+        """Words (v,) of the views at places; those that were not asked for before are found now."""
+        missing = places[self._words[places] == _UNKNOWN]
+        self._words[missing] = words_of(self._descriptors[missing])
+        return self._words[places]
 
     def last_use(self, places: npt.NDArray[np.int32]) -> IntArray:
         """Frame (v,) in which each of the views was last matched."""
@@ -198,6 +209,7 @@ class ViewPool:
             self._descriptors,
             self._direction,
             self._used,
+            self._words,
         )
         return sum(c.dtype.itemsize * int(np.prod(c.shape[1:])) for c in columns)
 
@@ -226,11 +238,12 @@ class ViewPool:
         self._descriptors[places] = views.descriptors
         self._direction[places] = views.direction
         self._used[places] = views.used
+        self._words[places] = _UNKNOWN
 
     def _grow(self, lacking: int) -> None:
         have = len(self._size)
         room = max(have + lacking, int(_GROWTH * have), _LEAST)
-        for name in ("_size", "_orientation", "_descriptors", "_direction", "_used"):
+        for name in ("_size", "_orientation", "_descriptors", "_direction", "_used", "_words"):
             old = getattr(self, name)
             larger = np.zeros((room, *old.shape[1:]), old.dtype)
             larger[:have] = old

@@ -5,16 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.frontend import vocabulary
 from fgslam.frontend.relocalisation import appearance_index
 from fgslam.frontend.relocalisation.appearance_index import AppearanceIndex
-from fgslam.types import ByteArray, IntArray
+from fgslam.types import ByteArray
 from tests.known_places import blurred, looks
-
-
-def _index(owners: IntArray, descriptors: ByteArray) -> AppearanceIndex:
-    made = AppearanceIndex()
-    made.add(owners, descriptors)
-    return made
 
 
 def _truth(asked: ByteArray, held: ByteArray) -> np.ndarray:
@@ -23,12 +18,11 @@ def _truth(asked: ByteArray, held: ByteArray) -> np.ndarray:
 
 def test_small_contents_are_answered_exactly(rng: np.random.Generator) -> None:
     held, asked = looks(rng, 300), looks(rng, 20)
-    owners = rng.permutation(300) + 1000
-    found = _index(owners, held).query(asked, 5)
+    found = AppearanceIndex(held).query(asked, 5)
     exact = _truth(asked, held)
     order = np.argsort(exact, axis=1)[:, :5]
-    assert np.allclose(found.distances, np.take_along_axis(exact, order, axis=1), atol=1e-3)
-    assert np.array_equal(found.owners, owners[order])
+    assert np.allclose(found.distances, np.take_along_axis(exact, order, axis=1), rtol=1e-12)
+    assert np.array_equal(found.rows, order)
 
 
 def test_large_contents_are_answered_nearly(
@@ -37,38 +31,51 @@ def test_large_contents_are_answered_nearly(
     monkeypatch.setattr(appearance_index, "_EXACT", 100)
     held = looks(rng, 4000)
     asked = blurred(held[:200], rng)
-    found = _index(np.arange(4000), held).query(asked, 3)
-    assert np.mean(found.owners[:, 0] == np.arange(200)) > 0.9
-    right = found.owners[:, 0] == np.arange(200)
-    exact = np.linalg.norm(asked.astype(float) - held[:200].astype(float), axis=1)
-    assert np.allclose(found.distances[right, 0], exact[right], atol=1e-3)
+    found = AppearanceIndex(held).query(asked, 3)
+    assert np.mean(found.rows[:, 0] == np.arange(200)) > 0.9
+    exact = np.linalg.norm(asked[:, None].astype(float) - held[found.rows], axis=2)
+    assert np.allclose(found.distances, exact, rtol=1e-12)
     assert (np.diff(found.distances, axis=1) >= 0.0).all()
 
 
+@pytest.mark.parametrize("chunk", [64, 4096])
+def test_every_cell_searched_finds_what_a_full_search_does(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, chunk: int
+) -> None:
+    held, asked = looks(rng, 900), looks(rng, 40)
+    held[450:600] = held[300:450]  # twins: ties, at the last of the asked neighbours as well
+    monkeypatch.setattr(appearance_index, "_CHUNK", chunk)
+    in_full = AppearanceIndex(held).query(asked, 7)
+    monkeypatch.setattr(appearance_index, "_EXACT", 0)
+    monkeypatch.setattr(appearance_index, "_PROBES", 256)
+    monkeypatch.setattr(appearance_index, "_LEADING", chunk)
+    probed = AppearanceIndex(held).query(asked, 7)
+    assert np.array_equal(in_full.rows, probed.rows)
+    assert np.array_equal(in_full.distances, probed.distances)
+
+
 @pytest.mark.parametrize("exact", [0, 10_000])
-def test_the_answer_depends_on_the_content_alone(
+def test_words_at_hand_change_nothing(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
 ) -> None:
     monkeypatch.setattr(appearance_index, "_EXACT", exact)
-    held, strangers, asked = looks(rng, 500), looks(rng, 100), looks(rng, 30)
-    held[7] = held[300]  # twins, told apart by their owners
-    at_once = _index(np.arange(500), held)
-    shuffled = rng.permutation(500)
-    underway = AppearanceIndex()
-    underway.add(shuffled[:200], held[shuffled[:200]])
-    underway.query(asked, 4)
-    underway.add(np.arange(900, 1000), strangers)
-    underway.add(shuffled[200:], held[shuffled[200:]])
-    underway.remove(np.arange(900, 1000))
-    a, b = at_once.query(asked, 8), underway.query(asked, 8)
-    assert np.array_equal(a.owners, b.owners)
-    assert np.array_equal(a.distances, b.distances)
+    held, asked = looks(rng, 500), looks(rng, 30)
+    found = AppearanceIndex(held).query(asked, 8)
+    given = AppearanceIndex(held, vocabulary.words_of(held)).query(asked, 8)
+    assert np.array_equal(found.rows, given.rows)
+    assert np.array_equal(found.distances, given.distances)
 
 
-def test_twins_come_in_the_order_of_their_owners(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("exact", [0, 10_000])
+def test_twins_come_in_the_order_of_their_rows_and_none_too_many(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
+) -> None:
+    monkeypatch.setattr(appearance_index, "_EXACT", exact)
     look = looks(rng, 1)
-    made = _index(np.array([9, 4, 6]), np.repeat(look, 3, axis=0))
-    assert made.query(look, 3).owners.tolist() == [[4, 6, 9]]
+    held = np.concatenate([looks(rng, 5), np.repeat(look, 6, axis=0)])
+    found = AppearanceIndex(held).query(look, 3)
+    assert found.rows.tolist() == [[5, 6, 7]]
+    assert found.distances.tolist() == [[0.0, 0.0, 0.0]]
 
 
 @pytest.mark.parametrize("exact", [0, 10_000])
@@ -76,12 +83,12 @@ def test_what_is_not_held_is_marked(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
 ) -> None:
     monkeypatch.setattr(appearance_index, "_EXACT", exact)
-    made = _index(np.array([3, 3]), looks(rng, 2))
+    made = AppearanceIndex(looks(rng, 2))
     found = made.query(looks(rng, 4), 6)
-    empty = found.owners == -1
-    assert (empty == np.isinf(found.distances)).all()
-    assert empty[:, 2:].all()
-    made.remove(np.array([3, 77]))
-    assert len(made) == 0
-    assert (made.query(looks(rng, 4), 2).owners == -1).all()
-    assert made.query(looks(rng, 0), 2).owners.shape == (0, 2)
+    missing = found.rows == -1
+    assert (missing == np.isinf(found.distances)).all()
+    assert missing[:, 2:].all()
+    assert made.query(looks(rng, 0), 2).rows.shape == (0, 2)
+    nothing = AppearanceIndex(looks(rng, 0))
+    assert len(nothing) == 0
+    assert (nothing.query(looks(rng, 4), 2).rows == -1).all()

@@ -12,6 +12,7 @@ from fgslam.map_types import LandmarkAppearances
 from fgslam.types import BoolArray, CameraRig, FloatArray, IntArray, LandmarkMap
 
 _NEAREST_DEPTH_M = 0.3
+_ROUNDING_M = 1e-6  # of depths computed in two ways, with thousands of kilometres to spare
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,12 +23,18 @@ class KnownMap:
         landmarks: n of them.
         views: v stored views, ascending by landmark.
         owners: (v,) row of each view's landmark.
-        index: over the views; its owners are their rows.
+        starts: (n + 1,) first view of each landmark, and the end.
+        largest: (n,) size of each landmark's largest view.
+        extent: (3,) metres along the world's axes; ones where there is no landmark.
+        index: over the views, by their rows.
     """
 
     landmarks: LandmarkMap
     views: LandmarkAppearances
     owners: IntArray
+    starts: IntArray
+    largest: FloatArray
+    extent: FloatArray
     index: AppearanceIndex
 
     @staticmethod
@@ -38,22 +45,51 @@ class KnownMap:
 
         ``map_sigma_m`` is added to the landmarks' noise.
         """
-        seen = np.isin(landmarks.ids, appearances.ids)
-        kept = LandmarkMap(
-            landmarks.ids[seen],
-            landmarks.positions[seen],
-            landmarks.covariances[seen] + map_sigma_m**2 * np.eye(3),
+        owners, counts = _owners(landmarks.ids, appearances.ids)
+        if (owners < 0).any():
+            appearances = appearances.of(landmarks.ids)
+        if (counts == 0).any():
+            landmarks = _chosen(landmarks, counts > 0)
+            owners, counts = _owners(landmarks.ids, appearances.ids)
+        owners = owners[owners >= 0]
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        return KnownMap(
+            LandmarkMap(
+                landmarks.ids,
+                landmarks.positions,
+                landmarks.covariances + map_sigma_m**2 * np.eye(3),
+            ),
+            appearances,
+            owners,
+            starts,
+            np.maximum.reduceat(appearances.size, starts[:-1]) if len(owners) else np.empty(0),
+            _extent(landmarks.positions),
+            AppearanceIndex(appearances.descriptors, appearances.words),
         )
-        views = appearances.of(kept.ids)
-        index = AppearanceIndex()
-        index.add(np.arange(len(views)), views.descriptors)
-        return KnownMap(kept, views, kept.rows(views.ids), index)
 
-    def in_view(self, rig: CameraRig, wTc: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Rows (m,) of landmarks in all images from ``wTc``, and their points in the camera."""
-        points = transform_to_camera(wTc, self.landmarks.positions)
-        rows = np.flatnonzero(points[:, 2] > _NEAREST_DEPTH_M)
-        points = points[rows]
+    def views_of(self, rows: IntArray) -> tuple[IntArray, IntArray]:
+        """Views of landmarks (m,), landmark by landmark; and to which of the m each belongs."""
+        counts = self.starts[rows + 1] - self.starts[rows]
+        at = np.repeat(np.arange(len(rows)), counts)
+        skipped = self.starts[rows] - (np.cumsum(counts) - counts)
+        return np.arange(len(at)) + skipped[at], at
+
+    def in_view(
+        self, rig: CameraRig, wTc: FloatArray, farthest: float | FloatArray = np.inf
+    ) -> tuple[IntArray, FloatArray]:
+        """Rows (m,) of landmarks in all images from ``wTc``, and their points in the camera.
+
+        Only those no deeper than ``farthest`` (metres; one for all, or one for each); depths first,
+        for most landmarks of a large map are behind the camera or too far.
+        """
+        positions, forward = self.landmarks.positions, wTc[:3, 2]
+        depth = positions @ forward - wTc[:3, 3] @ forward
+        near = (depth > _NEAREST_DEPTH_M - _ROUNDING_M) & (depth <= farthest + _ROUNDING_M)
+        rows = np.flatnonzero(near)
+        points = transform_to_camera(wTc, positions[rows])
+        limit = farthest if isinstance(farthest, float) else farthest[rows]
+        near = (points[:, 2] > _NEAREST_DEPTH_M) & (points[:, 2] <= limit)
+        rows, points = rows[near], points[near]
         column, row, disparity = project(rig, points).T
         vertical = 0.0
         if rig.vertical_baseline is not None:
@@ -63,24 +99,41 @@ class KnownMap:
         return rows[inside], points[inside]
 
     def recognisable(
-        self, wTc: FloatArray, rows: IntArray, max_angle: float, scales: tuple[float, float]
-    ) -> BoolArray:
-        """Which of the landmarks (m,) in front of ``wTc`` have a view near to that from there.
+        self, rig: CameraRig, wTc: FloatArray, max_angle: float, scales: tuple[float, float]
+    ) -> IntArray:
+        """Rows (m,) of landmarks in view from ``wTc`` that have a view near to that from there.
 
         Near is a direction within ``max_angle`` (radians) of the stored one (unknown ones are
         near), and a predicted scale within ``scales`` (pixels), which the frame's features have.
         """
+        rows, _ = self.in_view(rig, wTc, self.largest / scales[0] + _ROUNDING_M)
         sight = self.landmarks.positions[rows] - wTc[:3, 3]
         depth = np.maximum(sight @ wTc[:3, 2], _NEAREST_DEPTH_M)
         sight = sight / np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None]
-        place = np.full(len(self.landmarks), -1)
-        place[rows] = np.arange(len(rows))
-        views = np.flatnonzero(place[self.owners] >= 0)
-        at = place[self.owners[views]]
+        views, at = self.views_of(rows)
         cosine = np.einsum("vi,vi->v", self.views.direction[views], sight[at])
         near = ~(cosine < np.cos(max_angle))  # so NaN is near
         scale = self.views.size[views] / depth[at]
         near &= (scale >= scales[0]) & (scale <= scales[1])
         out = np.zeros(len(rows), np.bool_)
         out[at[near]] = True
-        return out
+        return np.asarray(rows[out])
+
+
+def _owners(ids: IntArray, viewed: IntArray) -> tuple[IntArray, IntArray]:
+    """The row (v,) of each view's landmark, -1 where there is none; views (n,) of each landmark."""
+    row = np.searchsorted(ids, viewed)
+    known = row < len(ids)
+    known[known] = ids[row[known]] == viewed[known]
+    return np.where(known, row, -1), np.bincount(row[known], minlength=len(ids))
+
+
+def _chosen(landmarks: LandmarkMap, keep: BoolArray) -> LandmarkMap:
+    return LandmarkMap(landmarks.ids[keep], landmarks.positions[keep], landmarks.covariances[keep])
+
+
+def _extent(positions: FloatArray) -> FloatArray:
+    # Axis by axis: a reduction over the rows of a narrow array takes ten times as long.
+    if not len(positions):
+        return np.ones(3)
+    return np.array([np.ptp(positions[:, axis]) for axis in range(3)])

@@ -120,11 +120,9 @@ class Refiner:
 
     def _around(self, wTc: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
         """Pairs of features and landmarks in view that look alike, with their distances."""
-        rows, points = self.known.in_view(self.rig, wTc)
-        rows = rows[points[:, 2] <= _BEYOND * np.abs(self.features.position[:, 2]).max()]
-        wanted = np.zeros(len(self.known.landmarks), np.bool_)
-        wanted[rows] = True
-        views = np.flatnonzero(wanted[self.known.owners])
+        farthest = _BEYOND * float(np.abs(self.features.position[:, 2]).max())
+        rows, _ = self.known.in_view(self.rig, wTc, farthest)
+        views, _ = self.known.views_of(rows)
         if self.settings.descriptors:
             distance = _distances(self.features.descriptors, self.known.views.descriptors[views])
         else:
@@ -162,9 +160,8 @@ class Refiner:
         found = residuals(self.rig, wTc, pairs)
         image = found.residual[pairs.seen.in_image][:, :2]
         rms = float(np.sqrt(np.mean(np.sum(image**2, axis=1)))) if len(image) else float("nan")
-        rows, _ = self.known.in_view(self.rig, wTc)
         sizes = float(self.features.scale.min()), float(self.features.scale.max())
-        expected = rows[self.known.recognisable(wTc, rows, self._view_angle, sizes)]
+        expected = self.known.recognisable(self.rig, wTc, self._view_angle, sizes)
         tentative = np.unique(self.evidence.tentative.features)
         proposed = int(np.isin(tentative, chosen[0]).sum())
         positions, side = self.known.landmarks.positions, self.settings.piece_m

@@ -75,17 +75,16 @@ class Relocaliser:
         if not settings.descriptors:
             return unspecific(features, known.landmarks, looks, self._floor, settings)
         found = known.index.query(features.descriptors, settings.neighbours)
-        i, k = np.nonzero(found.owners >= 0)
-        pairs = (i, found.owners[i, k])
-        keep = np.zeros(found.owners.shape, np.bool_)
+        i, k = np.nonzero(found.rows >= 0)
+        pairs = (i, found.rows[i, k])
+        keep = np.zeros(found.rows.shape, np.bool_)
         keep[i, k] = gated(features, pairs, known.landmarks, looks, self._floor, settings)
         return specific(found, keep, known.owners, known.landmarks, settings)
 
     def _evidence(self, seen: SeenPoints, tentative: Tentative) -> Evidence:
         landmarks = self._known.landmarks
         pairs = Pairs.of(seen, tentative.features, landmarks, tentative.landmarks)
-        extent = np.ptp(landmarks.positions, axis=0) if len(landmarks) else np.ones(3)
-        room = float(np.prod(np.maximum(extent, 1.0)))
+        room = float(np.prod(np.maximum(self._known.extent, 1.0)))
         chance = log_uniform(self._rig, pairs.seen, _MAX_DISPARITY_PX, room)
         return Evidence(self._rig, tentative, pairs, chance)
 

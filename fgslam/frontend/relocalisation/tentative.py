@@ -106,7 +106,7 @@ def specific(
     limits = np.where(keep, neighbours.distances, np.inf)
     for i in np.flatnonzero((limits <= settings.max_distance).any(axis=1)):
         order = np.flatnonzero(keep[i])
-        own, far = owners[neighbours.owners[i, order]], limits[i, order]
+        own, far = owners[neighbours.rows[i, order]], limits[i, order]
         place = _places(landmarks.positions[own], settings.same_place_m)
         end, count = _gap(place, far, settings)
         chosen = np.flatnonzero(far[:end] <= settings.max_distance)
