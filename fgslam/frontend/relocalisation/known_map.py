@@ -25,7 +25,7 @@ class KnownMap:
         owners: (v,) row of each view's landmark.
         starts: (n + 1,) first view of each landmark, and the end.
         largest: (n,) size of each landmark's largest view.
-        extent: (3,) metres along the world's axes; ones where there is no landmark.
+        axes: (3, n) the landmarks' positions, coordinate by coordinate.
         index: over the views, by their rows.
     """
 
@@ -34,7 +34,7 @@ class KnownMap:
     owners: IntArray
     starts: IntArray
     largest: FloatArray
-    extent: FloatArray
+    axes: FloatArray
     index: AppearanceIndex
 
     @staticmethod
@@ -63,9 +63,15 @@ class KnownMap:
             owners,
             starts,
             np.maximum.reduceat(appearances.size, starts[:-1]) if len(owners) else np.empty(0),
-            _extent(landmarks.positions),
+            np.ascontiguousarray(landmarks.positions.T),
             AppearanceIndex(appearances.descriptors, appearances.words),
         )
+
+    @property
+    def room(self) -> float:
+        """Volume of the box around the landmarks, no side below a metre, cubic metres."""
+        extent = np.ptp(self.axes, axis=1) if len(self.landmarks) else np.ones(3)
+        return float(np.prod(np.maximum(extent, 1.0)))
 
     def views_of(self, rows: IntArray) -> tuple[IntArray, IntArray]:
         """Views of landmarks (m,), landmark by landmark; and to which of the m each belongs."""
@@ -79,14 +85,10 @@ class KnownMap:
     ) -> tuple[IntArray, FloatArray]:
         """Rows (m,) of landmarks in all images from ``wTc``, and their points in the camera.
 
-        Only those no deeper than ``farthest`` (metres; one for all, or one for each); depths first,
-        for most landmarks of a large map are behind the camera or too far.
+        Only those no deeper than ``farthest`` (metres; one for all, or one for each).
         """
-        positions, forward = self.landmarks.positions, wTc[:3, 2]
-        depth = positions @ forward - wTc[:3, 3] @ forward
-        near = (depth > _NEAREST_DEPTH_M - _ROUNDING_M) & (depth <= farthest + _ROUNDING_M)
-        rows = np.flatnonzero(near)
-        points = transform_to_camera(wTc, positions[rows])
+        rows = self._roughly_in_view(rig, wTc, farthest)
+        points = transform_to_camera(wTc, self.landmarks.positions[rows])
         limit = farthest if isinstance(farthest, float) else farthest[rows]
         near = (points[:, 2] > _NEAREST_DEPTH_M) & (points[:, 2] <= limit)
         rows, points = rows[near], points[near]
@@ -97,6 +99,21 @@ class KnownMap:
         inside = (column >= 0.0) & (column + disparity <= rig.width - 1.0)
         inside &= (row >= 0.0) & (row + vertical <= rig.height - 1.0)
         return rows[inside], points[inside]
+
+    def _roughly_in_view(
+        self, rig: CameraRig, wTc: FloatArray, farthest: float | FloatArray
+    ) -> IntArray:
+        """Rows of those and few others: by depth and the image's left and right, a hair wider.
+
+        Most landmarks of a large map are behind the camera, beside its view, or too far.
+        """
+        right, _, forward = wTc[:3, :3].T
+        depth = forward @ self.axes - forward @ wTc[:3, 3]
+        across = right @ self.axes - right @ wTc[:3, 3]
+        near = (depth > _NEAREST_DEPTH_M - _ROUNDING_M) & (depth <= farthest + _ROUNDING_M)
+        near &= across >= -rig.cx / rig.fx * depth - _ROUNDING_M
+        near &= across <= (rig.width - 1.0 - rig.cx) / rig.fx * depth + _ROUNDING_M
+        return np.flatnonzero(near)
 
     def recognisable(
         self, rig: CameraRig, wTc: FloatArray, max_angle: float, scales: tuple[float, float]
@@ -130,10 +147,3 @@ def _owners(ids: IntArray, viewed: IntArray) -> tuple[IntArray, IntArray]:
 
 def _chosen(landmarks: LandmarkMap, keep: BoolArray) -> LandmarkMap:
     return LandmarkMap(landmarks.ids[keep], landmarks.positions[keep], landmarks.covariances[keep])
-
-
-def _extent(positions: FloatArray) -> FloatArray:
-    # Axis by axis: a reduction over the rows of a narrow array takes ten times as long.
-    if not len(positions):
-        return np.ones(3)
-    return np.array([np.ptp(positions[:, axis]) for axis in range(3)])

@@ -61,13 +61,18 @@ def _normal_equations(
         squared = np.einsum("mi,mij,mj->m", found.residual, information, found.residual)
         weight = weight / (1.0 + squared / kernel_width**2)
     weighted = np.swapaxes(found.by_pose, 1, 2) @ (weight[:, None, None] * information)
-    hessian = weighted @ found.by_pose
+    hessian = (weighted @ found.by_pose).reshape(-1, 36)
     gradient = np.einsum("mij,mj->mi", weighted, found.residual)
-    hessians = np.zeros((len(poses), 6, 6))
-    gradients = np.zeros((len(poses), 6))
-    np.add.at(hessians, pose_rows, hessian)
-    np.add.at(gradients, pose_rows, gradient)
-    return hessians, gradients
+    hessians = _summed(hessian, pose_rows, len(poses)).reshape(-1, 6, 6)
+    return hessians, _summed(gradient, pose_rows, len(poses))
+
+
+def _summed(values: FloatArray, rows: IntArray, count: int) -> FloatArray:
+    """Sums (count, d) of the values (m, d) that belong to each row, added in their order."""
+    d = values.shape[1]
+    places = rows[:, None] * d + np.arange(d)
+    sums = np.bincount(places.ravel(), values.ravel(), minlength=count * d)
+    return np.asarray(sums.reshape(count, d), np.float64)
 
 
 def _bases(floor: Floor, poses: FloatArray) -> FloatArray:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from fgslam.floor import Floor
 from fgslam.frontend.relocalisation.known_map import KnownMap
 from fgslam.frontend.relocalisation.least_squares import refine
-from fgslam.frontend.relocalisation.proposals import Evidence
+from fgslam.frontend.relocalisation.proposals import Evidence, Proposals
 from fgslam.frontend.relocalisation.residuals import (
     Pairs,
     SeenPoints,
@@ -68,6 +68,31 @@ class Refined:
         return witnesses(positions[self.landmarks[rest]], side)
 
 
+Matches = tuple[IntArray, IntArray]
+"""Features (k,) by index and landmarks (k,) by row of the map."""
+Candidates = tuple[IntArray, IntArray, FloatArray]
+"""Such pairs, and their distances (k,)."""
+
+
+def _no_matches() -> Matches:
+    return np.empty(0, np.int64), np.empty(0, np.int64)
+
+
+@dataclass(slots=True, eq=False)
+class _Search:
+    """One pose on its way: what it may match, and what it does.
+
+    ``rests`` once the choice is that of the round before, ``lost`` once it does not fix the pose.
+    """
+
+    wTc: FloatArray
+    covariance: FloatArray
+    chosen: Matches = field(default_factory=_no_matches)
+    candidates: Candidates = field(default_factory=lambda: (*_no_matches(), np.empty(0)))
+    rests: bool = False
+    lost: bool = False
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Refiner:
     """What refinement needs beside the pose."""
@@ -80,45 +105,51 @@ class Refiner:
     evidence: Evidence
     settings: RelocalisationSettings
 
-    def refine(self, wTc: FloatArray, covariance: FloatArray) -> Refined | None:
-        """The pose at rest with its matches; None where they do not fix it."""
-        tentative = self.evidence.tentative
-        least = 2 if self.floor.rigid_dof == 3 else 3
-        chosen = tentative.features[:0], tentative.landmarks[:0]
-        for guided in (False, True):
-            candidates = self._around(wTc) if guided else self._proposed()
-            for _ in range(_ROUNDS):
-                before = chosen
-                chosen = self._choose(wTc, covariance, candidates)
-                if len(chosen[0]) < least:
-                    return None
-                wTc, covariance = self._solve(wTc, chosen)
-                if not np.isfinite(covariance).all():
-                    return None
-                if np.array_equal(before[0], chosen[0]) and np.array_equal(before[1], chosen[1]):
-                    break
-        return self._finish(wTc, covariance, chosen)
+    def refine(self, proposals: Proposals) -> list[Refined]:
+        """The poses at rest with their matches, in order; without those that these do not fix.
 
-    def _choose(
-        self,
-        wTc: FloatArray,
-        covariance: FloatArray,
-        candidates: tuple[IntArray, IntArray, FloatArray],
-    ) -> tuple[IntArray, IntArray]:
+        They do not know of each other, but are solved together: many small systems cost no more
+        than one.
+        """
+        searches = [
+            _Search(wTc, covariance)
+            for wTc, covariance in zip(proposals.poses, proposals.covariances, strict=True)
+        ]
+        for guided in (False, True):
+            for one in searches:
+                one.candidates = self._around(one.wTc) if guided else self._proposed()
+            searches = self._rested(searches)
+        return [self._finish(one.wTc, one.covariance, one.chosen) for one in searches]
+
+    def _rested(self, searches: list[_Search]) -> list[_Search]:
+        """The searches whose choice of matches has come to rest, or was made often enough."""
+        least = 2 if self.floor.rigid_dof == 3 else 3
+        moving = searches
+        for _ in range(_ROUNDS):
+            for one in moving:
+                before, one.chosen = one.chosen, self._choose(one)
+                one.rests = _same(before, one.chosen)
+                one.lost = len(one.chosen[0]) < least
+            moving = [one for one in moving if not one.lost]
+            self._solve(moving)
+            moving = [one for one in moving if not one.lost and not one.rests]
+        return [one for one in searches if not one.lost]
+
+    def _choose(self, search: _Search) -> Matches:
         """One-to-one matches (features, landmarks) that agree with the pose."""
-        i, j, cost = candidates
+        i, j, cost = search.candidates
         pairs = Pairs.of(self.seen, i, self.known.landmarks, j)
-        squared = squared_distances(residuals(self.rig, wTc, pairs), covariance)
+        squared = squared_distances(residuals(self.rig, search.wTc, pairs), search.covariance)
         near = squared <= self.settings.gate_sigmas**2
         cost = cost if self.settings.descriptors else squared
         return _one_to_one(i[near], j[near], cost[near])
 
-    def _proposed(self) -> tuple[IntArray, IntArray, FloatArray]:
+    def _proposed(self) -> Candidates:
         """The tentative matches: features, landmarks, distances."""
         tentative = self.evidence.tentative
         return tentative.features, tentative.landmarks, tentative.distances
 
-    def _around(self, wTc: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+    def _around(self, wTc: FloatArray) -> Candidates:
         """Pairs of features and landmarks in view that look alike, with their distances."""
         farthest = _BEYOND * float(np.abs(self.features.position[:, 2]).max())
         rows, _ = self.known.in_view(self.rig, wTc, farthest)
@@ -139,23 +170,25 @@ class Refiner:
             np.concatenate([found[2], first[2]]),
         )
 
-    def _solve(
-        self, wTc: FloatArray, chosen: tuple[IntArray, IntArray]
-    ) -> tuple[FloatArray, FloatArray]:
+    def _solve(self, searches: list[_Search]) -> None:
         """Least squares; landmarks of one piece of the map err together and share their say."""
-        pairs = Pairs.of(self.seen, chosen[0], self.known.landmarks, chosen[1])
-        others = crowd(pairs.points, self.settings.piece_m) - 1
+        if not searches:
+            return
+        features, landmarks = (np.concatenate([one.chosen[k] for one in searches]) for k in (0, 1))
+        pairs = Pairs.of(self.seen, features, self.known.landmarks, landmarks)
+        counts = [len(one.chosen[0]) for one in searches]
+        rows = np.repeat(np.arange(len(searches)), counts)
+        sides = np.split(pairs.points, np.cumsum(counts)[:-1])
+        others = np.concatenate([crowd(points, self.settings.piece_m) for points in sides]) - 1
         drift = others[:, None, None] * self.settings.map_sigma_m**2 * np.eye(3)
         pairs = replace(pairs, point_covariances=pairs.point_covariances + drift)
-        rows = np.zeros(len(pairs), np.int64)
-        poses, covariances = refine(
-            self.rig, self.floor, wTc[None], pairs, rows, _STEPS, _KERNEL_WIDTH
-        )
-        return poses[0], covariances[0]
+        start = np.array([one.wTc for one in searches])
+        solved = refine(self.rig, self.floor, start, pairs, rows, _STEPS, _KERNEL_WIDTH)
+        for one, wTc, covariance in zip(searches, *solved, strict=True):
+            one.wTc, one.covariance = wTc, covariance
+            one.lost = not bool(np.isfinite(covariance).all())
 
-    def _finish(
-        self, wTc: FloatArray, covariance: FloatArray, chosen: tuple[IntArray, IntArray]
-    ) -> Refined:
+    def _finish(self, wTc: FloatArray, covariance: FloatArray, chosen: Matches) -> Refined:
         pairs = Pairs.of(self.seen, chosen[0], self.known.landmarks, chosen[1])
         found = residuals(self.rig, wTc, pairs)
         image = found.residual[pairs.seen.in_image][:, :2]
@@ -220,7 +253,11 @@ def _distances(a: ByteArray, b: ByteArray) -> FloatArray:
     return np.asarray(np.sqrt((squared - 2.0 * (x @ y.T)).astype(np.float64)))
 
 
-def _one_to_one(i: IntArray, j: IntArray, cost: FloatArray) -> tuple[IntArray, IntArray]:
+def _same(a: Matches, b: Matches) -> bool:
+    return np.array_equal(a[0], b[0]) and np.array_equal(a[1], b[1])
+
+
+def _one_to_one(i: IntArray, j: IntArray, cost: FloatArray) -> Matches:
     """The pairs that are each other's cheapest; ascending in the first."""
     best_i = np.zeros(len(i), np.bool_)
     best_i[np.unique(i[(order := np.lexsort((j, cost, i)))], return_index=True)[1]] = True

@@ -84,8 +84,7 @@ class Relocaliser:
     def _evidence(self, seen: SeenPoints, tentative: Tentative) -> Evidence:
         landmarks = self._known.landmarks
         pairs = Pairs.of(seen, tentative.features, landmarks, tentative.landmarks)
-        room = float(np.prod(np.maximum(self._known.extent, 1.0)))
-        chance = log_uniform(self._rig, pairs.seen, _MAX_DISPARITY_PX, room)
+        chance = log_uniform(self._rig, pairs.seen, _MAX_DISPARITY_PX, self._known.room)
         return Evidence(self._rig, tentative, pairs, chance)
 
     def _refine(
@@ -99,11 +98,7 @@ class Relocaliser:
         settings = self._settings
         limits = settings.elsewhere_m, float(np.deg2rad(settings.elsewhere_deg))
         refiner = Refiner(self._rig, self._floor, self._known, features, seen, evidence, settings)
-        out: list[Refined] = []
-        for k in range(len(best := distinct(proposals, settings.refined, *limits))):
-            found = refiner.refine(best.poses[k], best.covariances[k])
-            if found is not None:
-                out.append(found)
+        out = refiner.refine(distinct(proposals, settings.refined, *limits))
         out.sort(key=lambda found: (-found.witnesses, -len(found)))
         first: list[Refined] = []
         for candidate in out:

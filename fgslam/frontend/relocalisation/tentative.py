@@ -109,9 +109,7 @@ def specific(
         own, far = owners[neighbours.rows[i, order]], limits[i, order]
         place = _places(landmarks.positions[own], settings.same_place_m)
         end, count = _gap(place, far, settings)
-        chosen = np.flatnonzero(far[:end] <= settings.max_distance)
-        first = chosen[np.unique(own[chosen], return_index=True)[1]]
-        first = first[np.argsort(far[first], kind="stable")]
+        first = _first_views(own[:end], far[:end], settings.max_distance)
         features.append(np.full(len(first), i))
         rows.append(own[first])
         distances.append(far[first])
@@ -143,10 +141,17 @@ def unspecific(
 
 
 def _places(positions: FloatArray, radius: float) -> IntArray:
-    """Number of each position's place: the first earlier one within ``radius``."""
+    """Each position's place: the index of the first one within ``radius`` of it."""
     apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
-    leader = np.argmax(apart <= radius, axis=1)
-    return np.asarray(np.unique(leader, return_inverse=True)[1])
+    return np.asarray(np.argmax(apart <= radius, axis=1))
+
+
+def _first_views(own: IntArray, far: FloatArray, limit: float) -> IntArray:
+    """The first view of each landmark within ``limit``, the nearest ones first."""
+    first: dict[int, int] = {}
+    for k in np.flatnonzero(far <= limit).tolist():
+        first.setdefault(int(own[k]), k)
+    return np.array(sorted(first.values(), key=lambda k: (far[k], own[k])), np.int64)
 
 
 def _gap(place: IntArray, far: FloatArray, settings: RelocalisationSettings) -> tuple[int, int]:
