@@ -25,6 +25,8 @@ from fgslam.types import (
     EgoMotion,
     EgoMotionStatus,
     Increment,
+    IntArray,
+    LandmarkMap,
     LoopClosure,
     Observations,
     Odometry,
@@ -64,9 +66,9 @@ class Stopwatch:
         self._last = time.perf_counter()
 
     def lap(self, stage: str) -> None:
-        """Books the time since the last lap to ``stage``."""
+        """Books the time since the last lap to ``stage``, beside what it has."""
         now = time.perf_counter()
-        self.ms[stage] = 1e3 * (now - self._last)
+        self.ms[stage] = self.ms.get(stage, 0.0) + 1e3 * (now - self._last)
         self._last = now
 
 
@@ -95,9 +97,11 @@ class SlamPipeline:
         watch.lap("predict")
         stereo = self._match_stereo(found)
         watch.lap("stereo")
-        seen = self._track(prediction, found, stereo)
+        landmarks, ended = self._fused()
+        watch.lap("places")
+        seen = self._track(prediction, found, stereo, landmarks)
         watch.lap("track")
-        seen = self._recognise(seen, stereo)
+        seen = self._recognise(seen, stereo, landmarks, ended)
         watch.lap("places")
         increment = _increment(index, timestamp, odometry if measured else None, seen)
         stats = self.estimator.update(increment, seen.tracking, odometry)
@@ -109,10 +113,24 @@ class SlamPipeline:
     def _match_stereo(self, found: FeatureFrame) -> StereoFeatures:
         return StereoFeatures.empty() if found.frame is None else self.stereo.match(found.features)
 
-    def _track(self, prediction: Prediction, found: FeatureFrame, stereo: StereoFeatures) -> _Seen:
+    def _fused(self) -> tuple[LandmarkMap, IntArray]:
+        """The map to track on, and which landmarks a loop closed in the last frame ends.
+
+        The estimator drops these with this frame's measurements, as the log tells it.
+        """
+        landmarks = self.estimator.landmarks()
+        ended = np.empty(0, np.int64) if self.places is None else self.places.fuse(landmarks)
+        return (landmarks.without(ended) if len(ended) else landmarks), ended
+
+    def _track(
+        self,
+        prediction: Prediction,
+        found: FeatureFrame,
+        stereo: StereoFeatures,
+        landmarks: LandmarkMap,
+    ) -> _Seen:
         if found.frame is None:
             return _Seen(self.tracker.track_blind(prediction), Association.nothing())
-        landmarks = self.estimator.landmarks()
         tracked = self.tracker.track(prediction, landmarks, stereo)
         relocalised, maps_on = False, True
         if found.i == 0 and self.located is not None:
@@ -128,15 +146,13 @@ class SlamPipeline:
             return _Seen(unmeasured(prediction, EgoMotionStatus.FIRST), association)
         return _Seen(tracked.ego_motion, association, relocalised=relocalised)
 
-    def _recognise(self, seen: _Seen, stereo: StereoFeatures) -> _Seen:
-        """The frame with the loops that it closes; landmarks found to be one are made one."""
+    def _recognise(
+        self, seen: _Seen, stereo: StereoFeatures, landmarks: LandmarkMap, ended: IntArray
+    ) -> _Seen:
+        """The frame with the loops that it may close; landmarks that ended go with it."""
         if self.places is None:
             return seen
-        landmarks = self.estimator.landmarks()
-        doubles = self.places.doubles(landmarks)
         loops = self.places.look(seen.tracking.wTc, landmarks, stereo, seen.association)
-        pairs = np.concatenate([doubles, *(loop.merged for loop in loops)])
-        ended = self.tracker.merge(pairs)
         association = dataclasses.replace(
             seen.association, pruned_ids=np.union1d(seen.association.pruned_ids, ended)
         )
@@ -144,7 +160,7 @@ class SlamPipeline:
 
     def _remember(self, increment: Increment, seen: _Seen, stats: UpdateStats) -> None:
         if self.places is not None:
-            self.places.remember(increment, seen.tracking.wTc, stats.wTc)
+            self.places.remember(increment, seen.tracking.wTc, stats)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,7 +245,7 @@ def _observe(
     motion: MotionModel, increment: Increment, tracking: EgoMotion, stats: UpdateStats
 ) -> None:
     """Tells the motion model the pose; what a loop or a relocalisation moved it by is no motion."""
-    if increment.loops or increment.relocalised:
+    if any(stats.closed) or increment.relocalised:
         motion.displaced(increment.timestamp, stats.wTc, increment.relocalised)
     else:
         motion.observe(increment.timestamp, stats.wTc, _anchored(increment, tracking, stats))

@@ -312,7 +312,11 @@ class LoopClosure:
         covariance: (6, 6) of ``oTc``, [rotation, translation], in the tangent space at it.
         observations: the earlier landmarks as the present frame measures them, under their old
             identities.
-        merged: (m, 2) pairs (identity that ends, identity that stays) of landmarks found to be one.
+        merged: (m, 2) pairs (identity that ends, identity that stays) of landmarks that are one if
+            this is the same place. In the frame's own observations they go by the first. Where
+            the live run's estimator took the closure, they end with the next frame, which has
+            them among its ``pruned_ids`` and sees them as the second (logs of older runs: with
+            the closing frame itself).
     """
 
     frame: int
@@ -334,8 +338,9 @@ class Increment:
         rejected: (k,) matched observations that the live run's pose rejected as outliers.
         missed_ids: landmarks expected in view and not matched (Type II).
         pruned_ids: landmarks that the database dropped after this frame; those merged into others
-            by a loop closure among them.
-        loops: places recognised in this frame, verified; for estimators that can use them.
+            because of the last frame's loop closure among them.
+        loops: places recognised in this frame, verified; for estimators that can use them. Each
+            judges them by itself: that one is here does not say that the live run's took it.
         relocalised: the frame was placed by its landmarks alone, without a prior: its odometry,
             if any, does not tell where it is.
     """
@@ -389,6 +394,11 @@ class LandmarkMap:
     def __len__(self) -> int:
         return len(self.ids)
 
+    def without(self, ids: IntArray) -> LandmarkMap:
+        """The map but for these landmarks, as a new value."""
+        kept = ~np.isin(self.ids, ids)
+        return LandmarkMap(self.ids[kept], self.positions[kept], self.covariances[kept])
+
     def rows(self, ids: IntArray) -> IntArray:
         """Row of each id. Raises KeyError when one is absent."""
         rows = np.searchsorted(self.ids, ids)
@@ -408,6 +418,8 @@ class UpdateStats:
         landmarks: number of landmarks in the estimator.
         nis: normalised innovation squared of the matched observations, or NaN.
         nis_dof: degrees of freedom of ``nis``.
+        closed: for each of the increment's loops, in their order, whether the estimator took it;
+            one that it found met already is taken, one that it refused or cannot use is not.
     """
 
     wTc: FloatArray
@@ -415,6 +427,7 @@ class UpdateStats:
     landmarks: int
     nis: float
     nis_dof: int
+    closed: tuple[bool, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,8 +2,8 @@
 
 A point that was out of sight for long gets a new identity, as the landmark database gives one to
 what it does not find where the drifted map has it. At a recognised return the frame names the old
-landmarks that it sees, with its pose beside an earlier frame, true up to the stated noise; the new
-identities end, and from then on old landmarks are found again.
+landmarks that it sees, with its pose beside an earlier frame, true up to the stated noise; from the
+next frame on old landmarks are found again, and the new identities end with it.
 """
 
 from __future__ import annotations
@@ -87,6 +87,7 @@ class _Book:
         self._recognised = False
         self.point_of_id: list[int] = []
         self._seen: list[BoolArray] = []
+        self._ending = np.empty(0, np.int64)
 
     def increment(
         self,
@@ -115,10 +116,10 @@ class _Book:
         self._seen.append(seen)
         is_new = np.arange(len(both)) >= len(matched)
         observed = observations(self._id[both], measured[both], np.array(drive.sigma_px), is_new)
-        loops, pruned = (), np.empty(0, np.int64)
+        loops, pruned, self._ending = (), self._ending, np.empty(0, np.int64)
         if closes:
             loop = self._loop(k, measured, seen, lie, rng)
-            loops, pruned = (loop,), np.sort(loop.merged[:, 0])
+            loops, self._ending = (loop,), np.sort(loop.merged[:, 0])
         return Increment(
             index=2 * k,
             timestamp=drive.period_s * k,

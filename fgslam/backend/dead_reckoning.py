@@ -62,14 +62,15 @@ class DeadReckoning:
     def update(
         self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
     ) -> UpdateStats:
-        """Moves on by the odometry, or the stand-in; ``tracking`` and matches have no say."""
+        """Moves on by the odometry, or the stand-in; tracking, matches and loops have no say."""
         predicted = self.predict(self._past.motion_to(increment, motion))
         self._current = Prediction(reorthonormalise(predicted.wTc), predicted.covariance)
         self._add(increment.observations.select(increment.observations.is_new))
         self._remove(increment.pruned_ids)
         self._past.append(increment.timestamp, self._current)
         wTc, covariance = self._current.wTc, self._current.covariance
-        return UpdateStats(wTc, covariance, len(self._map), float("nan"), 0)
+        closed = (False,) * len(increment.loops)
+        return UpdateStats(wTc, covariance, len(self._map), float("nan"), 0, closed)
 
     def estimate(self) -> Estimate:
         """Trajectory as predicted, and the map."""

@@ -143,14 +143,13 @@ class FullEkf:
         every = increment.observations
         merged = every.is_new & np.isin(every.ids, increment.pruned_ids)
         self._skipped += len(every) - used - int(merged.sum())
-        for loop in increment.loops:
-            self._close(increment, loop)
+        closed = tuple(self._close(increment, loop) for loop in increment.loops)
         self._drop(increment)
         self._add(first)
         current = Prediction(self._wTc, self._covariance.front()[:FRONT])
         self._past.append(increment.timestamp, current)
         return UpdateStats(
-            current.wTc, current.covariance, len(self._ids), found.nis, found.nis_dof
+            current.wTc, current.covariance, len(self._ids), found.nis, found.nis_dof, closed
         )
 
     def estimate(self) -> Estimate:
@@ -206,7 +205,7 @@ class FullEkf:
 
     def _first_sights(self, increment: Increment) -> FirstSights:
         seen = increment.observations
-        # What a loop merged away in its very first frame is not begun at all.
+        # What is begun and merged away in one frame, as in older logs, is not begun at all.
         known = np.concatenate([self._ids, increment.pruned_ids])
         new = seen.is_new & ~np.isin(seen.ids, known)
         return FirstSights.of(self._sensor, increment.observations.select(new))
@@ -282,29 +281,30 @@ class FullEkf:
                 "linearises anew, or state the odometry's and the measurements' noise larger"
             ) from None
 
-    def _close(self, increment: Increment, loop: LoopClosure) -> None:
+    def _close(self, increment: Increment, loop: LoopClosure) -> bool:
         """Corrects by the old landmarks seen again; refused where the covariance rules it out."""
         what = f"frame {increment.index}: loop closure to frame {loop.frame} of the log"
         seen = loop.observations.select(np.isin(loop.observations.ids, self._ids))
         if not len(seen):
             self._remarks.append(f"{what} left out: none of its landmarks is held any more")
-            return
+            return False
         blocks, at = self._blocks(seen.ids), self._positions
         again = Sightings(self._sensor, blocks, at[blocks], seen, self._retracted, self._fixed)
         try:
             found = correct_anew(self._covariance, self._wTc, again)
         except DivergedError as cause:
             self._remarks.append(f"{what} left out: {cause}")
-            return
+            return False
         excess, gate = found.nis - found.nis_dof, self._settings.loop_gate_sigmas
         said = f"(innovation squared {found.nis:.0f}, {found.nis_dof} expected)"
         if gate > 0.0 and not excess <= gate**2:
             self._remarks.append(f"{what} refused: the covariance does not admit it {said}")
-            return
+            return False
         admitted = found.nis <= chi2.ppf(_ADMITTED, found.nis_dof)
         though = "" if admitted else ", though the covariance does not admit it"
         self._remarks.append(f"{what} taken{though} {said}")
         self._apply(found, self._wTc, self._covariance.front())
+        return True
 
     # -- the change itself ---------------------------------------------------------------------
 

@@ -91,7 +91,7 @@ class FixedLagSmoother(Smoother):
             self._covariances[frame] = self._covariance(marginals, frame)
         self._take_over(self._values, Prediction(self._poses[-1], self._covariances[-1]))
 
-    def _close(self, loop: LoopClosure, where: str) -> None:
+    def _close(self, loop: LoopClosure, where: str) -> bool:
         """Moves the window as a whole to where the loop has the last pose; the past stays.
 
         The earlier frame's pose is known as it was when it left. What the last pose is less certain
@@ -102,17 +102,18 @@ class FixedLagSmoother(Smoother):
         what = f"{where}: loop closure to frame {loop.frame} of the log"
         if known.before >= self._oldest:  # both poses are variables
             if not self._taken_in(known, what):
-                return
+                return False
         else:
             moved = self._drift_undone(known, what)
             if moved is None:
-                return
+                return False
             self._move_all(moved)
         last, marginals = known.after, self._marginals()
         for frame in range(self._oldest, last + 1):
             self._poses[frame] = poses_of_frame(self._values, frame)
         self._covariances[last] = self._covariance(marginals, last)
         self._take_over(self._values, Prediction(self._poses[last], self._covariances[last]))
+        return True
 
     def _taken_in(self, known: Constraint, what: str) -> bool:
         """Adds a loop within the lag, where hardly anything drifts, as a factor; or refuses it."""

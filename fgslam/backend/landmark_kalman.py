@@ -111,10 +111,9 @@ class LandmarkKalman:
         self._book(increment, tracking, motion, before, used.ids)
         self._rows.remove(increment.pruned_ids)
         self._past.append(increment.timestamp, self._current)
-        for loop in increment.loops:
-            self._close(increment, loop)
+        closed = tuple(self._close(increment, loop) for loop in increment.loops)
         current = self._current
-        return UpdateStats(current.wTc, current.covariance, len(self._rows), nis, dof)
+        return UpdateStats(current.wTc, current.covariance, len(self._rows), nis, dof, closed)
 
     @property
     def homes(self) -> IntArray:
@@ -198,11 +197,11 @@ class LandmarkKalman:
         homes = self._rows.homes[self._rows.rows(used)]
         self._drive.tie(homes, self._past.poses, tracking, increment.relocalised)
 
-    def _close(self, increment: Increment, loop: LoopClosure) -> None:
-        """Moves the drive and the map to where the loop has them; or says why not."""
+    def _close(self, increment: Increment, loop: LoopClosure) -> bool:
+        """Moves the drive and the map to where the loop has them; or remarks why not."""
         poses = self._drive.close(loop, self._current.wTc, f"frame {increment.index}")
         if poses is None:
-            return
+            return False
         moved_by = changes(np.array(self._past.poses), poses)
         self._past.poses[:] = list(poses)
         self._current = Prediction(poses[-1], loop.covariance)
@@ -210,6 +209,7 @@ class LandmarkKalman:
         by_landmark = home_changes(self._rows.homes, moved_by)
         self._rows.positions[:] = transported(by_landmark, self._rows.positions)
         self._rows.covariances[:] = rotated(by_landmark, self._rows.covariances)
+        return True
 
     def _update_matched(self, observed: Observations) -> tuple[float, int]:
         """Type III landmarks, all at once; returns the innovation squared and its freedom."""

@@ -60,6 +60,9 @@ class Estimator(Protocol):
                 ``inliers`` run over the increment's matched (not new) observations, in order.
             motion: what the pose was predicted with: the increment's odometry, or the motion
                 model's stand-in where none was measured; None for the first frame.
+
+        Returns:
+            What it did, with a verdict on each of ``increment.loops``.
         """
         ...
 

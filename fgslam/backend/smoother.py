@@ -118,11 +118,11 @@ class Smoother(ABC):
         self._eras.append(self._takeovers)
         self._answer = self._refined = None
         self._absorb(self._sorted_out(increment, tracking, motion))
-        for loop in increment.loops:
-            self._close(loop, f"frame {increment.index}")
+        where = f"frame {increment.index}"
+        closed = tuple(self._close(loop, where) for loop in increment.loops)
         current = self._current(tracking)
         return UpdateStats(
-            current.wTc, current.covariance, stats.landmarks, stats.nis, stats.nis_dof
+            current.wTc, current.covariance, stats.landmarks, stats.nis, stats.nis_dof, closed
         )
 
     def estimate(self) -> Estimate:
@@ -174,8 +174,8 @@ class Smoother(ABC):
         """Takes a frame in; solves when it is time to."""
 
     @abstractmethod
-    def _close(self, loop: LoopClosure, where: str) -> None:
-        """Closes a loop of the frame just taken in; ``where`` names it."""
+    def _close(self, loop: LoopClosure, where: str) -> bool:
+        """Closes a loop of the frame just taken in, which ``where`` names; or refuses it."""
 
     @abstractmethod
     def _solve(self) -> Solution:

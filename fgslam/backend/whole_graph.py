@@ -67,8 +67,8 @@ class WholeGraphSmoother(Smoother):
         self._builder.start_at(prior)
         self._tracker.correct(prior, np.empty(0, np.int64), np.empty((0, 3)))
 
-    def _close(self, loop: LoopClosure, where: str) -> None:
-        """Closes a loop where the measurements allow it.
+    def _close(self, loop: LoopClosure, where: str) -> bool:
+        """Closes a loop where the measurements allow it; whether they do.
 
         One that the graph meets anyway is a factor more. Otherwise the graph is solved with it, and
         it is refused where that raises the cost by more than measurement noise explains: a true
@@ -80,7 +80,7 @@ class WholeGraphSmoother(Smoother):
         if off <= _AGREES:
             self._accept(known, None)
             self._remarks.append(f"{what}: as expected, nothing moved")
-            return
+            return True
         rise, found, shift = self._bent(known)
         gate = self._loop_settings.gate_sigmas
         if gate > 0.0 and not rise <= gate**2:
@@ -88,9 +88,10 @@ class WholeGraphSmoother(Smoother):
                 f"{what} refused: {np.sqrt(max(rise, 0.0)):.1f} standard deviations off, "
                 f"{gate:g} allowed"
             )
-            return
+            return False
         self._accept(known, found)
         self._remarks.append(f"{what}: the camera moved by {shift:.2f} m, the graph with it")
+        return True
 
     def _bent(self, known: Constraint) -> tuple[float, Any, float]:
         """Rise of the cost with a loop closed, the values then, and how far the camera moves."""

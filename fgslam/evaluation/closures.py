@@ -1,4 +1,4 @@
-"""Judges the loops that a run closed: were they returns, and what did closing them mend?"""
+"""Judges the returns that a run recognised: were they any, and what did closing them mend?"""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ FALSE_DEG = 10.0
 
 @dataclass(frozen=True, slots=True)
 class JudgedClosure:
-    """One loop closed, beside the truth; NaN and None where nothing is known.
+    """One closure beside the truth; NaN and None where nothing is known.
 
     Attributes:
         at, to: positions in the log of the frame that closed it and the one it returned to.
         matches: old landmarks seen again.
-        merged: landmarks found to be one.
-        correction_m: how far the closure moved the pose, metres.
+        merged: landmarks found to be one; 0 for a closure that was refused.
+        correction_m: how far the closure moved the pose, metres; NaN where it was refused.
         error_m: of the relative pose that it measured, metres; error_deg: degrees.
         before_m: error of the last pose before, in the world of the first pose, metres.
-        after_m: of the pose once corrected.
+        after_m: of the pose once corrected; NaN where nothing was.
+        taken: whether the run's estimator took it, or refused it.
     """
 
     at: int
@@ -38,17 +39,18 @@ class JudgedClosure:
     error_deg: float
     before_m: float
     after_m: float
+    taken: bool
 
     @property
     def false(self) -> bool | None:
-        """Whether it closed a loop that is none; None where that is not known."""
+        """Whether the return that it claims is none; None where that is not known."""
         if not np.isfinite(self.error_m):
             return None
         return self.error_m > FALSE_M or self.error_deg > FALSE_DEG
 
 
 def judge_closures(
-    closures: list[tuple[int, LoopClosure]],
+    closures: list[tuple[int, LoopClosure, bool]],
     tracked: FloatArray,
     online: Trajectory,
     truth: Trajectory | None,
@@ -56,7 +58,8 @@ def judge_closures(
     """All closures of a run, in their order.
 
     Args:
-        closures: with the position in the log of the frame that each belongs to.
+        closures: each with the position in the log of the frame that it belongs to, and whether
+            it was taken.
         tracked: (n, 4, 4) poses ``wTc`` before their frame's closures.
         online: poses after them.
         truth: true poses, in any world.
@@ -65,7 +68,7 @@ def judge_closures(
     errors = position_errors(online.poses, true_poses)
     tracked_errors = position_errors(tracked, true_poses)
     out = []
-    for at, closure in closures:
+    for at, closure, taken in closures:
         true = inverse(true_poses[closure.frame]) @ true_poses[at]
         off = inverse(true) @ closure.oTc
         out.append(
@@ -73,15 +76,20 @@ def judge_closures(
                 at=at,
                 to=closure.frame,
                 matches=len(closure.observations),
-                merged=len(closure.merged),
-                correction_m=float(np.linalg.norm(online.poses[at, :3, 3] - tracked[at, :3, 3])),
+                merged=len(closure.merged) if taken else 0,
+                correction_m=_distance(online.poses[at], tracked[at]) if taken else np.nan,
                 error_m=float(np.linalg.norm(off[:3, 3])),
                 error_deg=_degrees(off),
                 before_m=float(tracked_errors[at]),
-                after_m=float(errors[at]),
+                after_m=float(errors[at]) if taken else np.nan,
+                taken=taken,
             )
         )
     return out
+
+
+def _distance(a: FloatArray, b: FloatArray) -> float:
+    return float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
 
 
 def _true_poses(online: Trajectory, truth: Trajectory | None) -> FloatArray:

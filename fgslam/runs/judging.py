@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
@@ -141,9 +142,18 @@ def judge_replay(replay: Replay, truth: Truth) -> Judgement:
             "solve_ms": asdict(UpdateTime.of(replay.column("solve_ms").astype(np.float64))),
             "final_ms": replay.final_ms,
             "memory_before_mb": replay.memory_before_mb,
+            **verdicts(replay.closed),
         }
     )
     return Judgement(replace(metrics, more=more), judged.nees)
+
+
+def verdicts(closed: Sequence[bool]) -> dict[str, JsonValue]:
+    """How many loops an estimator closed, and closures it refused; nothing where none came."""
+    if not closed:
+        return {}
+    taken = sum(closed)
+    return {"closures": taken, "refused_closures": len(closed) - taken}
 
 
 def seen_often(log: MeasurementLog, truth: LandmarkTruth) -> LandmarkTruth:

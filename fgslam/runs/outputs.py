@@ -35,7 +35,7 @@ from fgslam.recordings import Sequence
 from fgslam.runs.checkpoint import save_log
 from fgslam.runs.comparison import GROUND_TRUTH_FILE, load_truth, remark_of
 from fgslam.runs.estimator_files import write_estimate
-from fgslam.runs.judging import Truth
+from fgslam.runs.judging import Truth, verdicts
 from fgslam.runs.places import closures_of, place_numbers, write_closures
 from fgslam.runs.recorder import STAGES, RunRecorder
 from fgslam.runs.rendered_truth import rendered_landmark_truth
@@ -88,13 +88,15 @@ class RunOutputs:
         about = self._about(status) | run_numbers(self.recorder)
         if self.pipeline.places is not None:
             truth = load_truth(self.folder, self.recorder.log).trajectory
-            closures = closures_of(self.recorder, truth)
+            closures = closures_of(self.recorder, self.pipeline.places.taken, truth)
             write_closures(self.folder, self.recorder, closures)
             about["places"] = place_numbers(self.recorder, closures)
         write_metrics(self.folder / "metrics.json", len(self.recorder), estimators, about)
 
     def _with_kind(self, metrics: EstimatorMetrics) -> EstimatorMetrics:
-        more = {"kind": self.pipeline.estimator.kind} | dict(metrics.more)
+        places = self.pipeline.places
+        told = {} if places is None else verdicts(places.taken)
+        more = {"kind": self.pipeline.estimator.kind} | dict(metrics.more) | told
         return dataclasses.replace(metrics, more=more)
 
     def _write_truth(self, with_landmarks: bool) -> Truth:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from dataclasses import astuple, fields
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from fgslam.types import Trajectory
 LOOPS_FILE = "loops.csv"
 _NAMES = ("frame", "returned_to", *(f.name for f in fields(JudgedClosure)), "false")
 _COLUMNS = (
+    Column("taken", "whether the estimator closed the loop; one it refused changed nothing"),
     Column("returned to", "number of the frame whose place was recognised"),
     Column("matches", "landmarks of that place seen again"),
     Column("made one", "landmarks of the return found to be earlier ones"),
@@ -31,9 +33,18 @@ _COLUMNS = (
 )
 
 
-def closures_of(recorder: RunRecorder, truth: Trajectory | None) -> list[JudgedClosure]:
-    """The loops that a run closed, judged by the truth where there is one."""
-    closures = [(k, loop) for k, step in enumerate(recorder.log) for loop in step.loops]
+def closures_of(
+    recorder: RunRecorder, taken: Sequence[bool], truth: Trajectory | None
+) -> list[JudgedClosure]:
+    """The closures of a run, judged by the truth where there is one.
+
+    Args:
+        recorder: the run's.
+        taken: of each closure of the log, in its order, whether the run's estimator took it.
+        truth: true poses.
+    """
+    offered = [(k, loop) for k, step in enumerate(recorder.log) for loop in step.loops]
+    closures = [(*which, so) for which, so in zip(offered, taken, strict=True)]
     if not closures:
         return []
     stamps = np.array([increment.timestamp for increment in recorder.log], np.float64)
@@ -43,17 +54,19 @@ def closures_of(recorder: RunRecorder, truth: Trajectory | None) -> list[JudgedC
 
 
 def place_numbers(recorder: RunRecorder, closures: list[JudgedClosure]) -> dict[str, JsonValue]:
-    """For metrics.json: how many loops and relocalisations, and how many of the loops are none."""
-    known = [closure.false for closure in closures if closure.false is not None]
+    """For metrics.json: loops closed and, of these, false ones; closures refused; relocalised."""
+    closed = [closure for closure in closures if closure.taken]
+    known = [closure.false for closure in closed if closure.false is not None]
     return {
-        "closures": len(closures),
-        "false_closures": sum(known) if len(known) == len(closures) else None,
+        "closures": len(closed),
+        "false_closures": sum(known) if len(known) == len(closed) else None,
+        "refused_closures": len(closures) - len(closed),
         "relocalised": sum(increment.relocalised for increment in recorder.log),
     }
 
 
 def write_closures(folder: Path, recorder: RunRecorder, closures: list[JudgedClosure]) -> None:
-    """loops.csv, one line a closure; no file where none was closed, nor an earlier run's."""
+    """loops.csv, one line a closure; no file where there was none, nor an earlier run's."""
     if not closures:
         (folder / LOOPS_FILE).unlink(missing_ok=True)
         return
@@ -65,12 +78,16 @@ def write_closures(folder: Path, recorder: RunRecorder, closures: list[JudgedClo
 
 
 def read_closures(path: Path) -> tuple[Comparison, list[tuple[int, int]]]:
-    """The report's table of a loops.csv, and the pairs of positions (closing, returned to)."""
+    """The report's table of a loops.csv, and (closing, returned to) of the loops closed.
+
+    A file of an older run does not tell which were refused: there all count as taken.
+    """
     try:
         text = path.read_text(encoding="utf-8")
         rows = list(csv.DictReader(io.StringIO(text)))
         lines = tuple((_title(row), _values(row)) for row in rows)
-        return Comparison(_COLUMNS, lines), [(int(row["at"]), int(row["to"])) for row in rows]
+        closed = [(int(row["at"]), int(row["to"])) for row in rows if _taken(row) != "no"]
+        return Comparison(_COLUMNS, lines), closed
     except (OSError, UnicodeDecodeError, KeyError, ValueError, TypeError) as error:
         raise DatasetError(
             f"{path}: not a table of closed loops ({error}); run the experiment again"
@@ -81,9 +98,14 @@ def _title(row: dict[str, str]) -> str:
     return f"frame {row['frame']}" + (" (false)" if row["false"] == "true" else "")
 
 
+def _taken(row: dict[str, str]) -> str:
+    return {"true": "yes", "false": "no"}.get(row.get("taken", ""), "-")
+
+
 def _values(row: dict[str, str]) -> tuple[str, ...]:
     lengths = ("correction_m", "before_m", "after_m", "error_m")
     return (
+        _taken(row),
         row["returned_to"],
         row["matches"],
         row["merged"],

@@ -78,6 +78,7 @@ class Replay:
         memory_before_mb: resident memory of this process before the estimator was made.
         peak_memory_mb: its largest since the process began, the final estimate included.
         failure: empty, or at which frame and why the estimator ended early.
+        closed: of the log's loop closures so far, in their order, whether it took them.
     """
 
     title: str
@@ -90,6 +91,7 @@ class Replay:
     memory_before_mb: float | None
     peak_memory_mb: float
     failure: str = ""
+    closed: tuple[bool, ...] = ()
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -204,6 +206,7 @@ class _Replaying:
         self._poses: list[FloatArray] = []
         self._covariances: list[FloatArray] = []
         self._rows: list[ReplayRow] = []
+        self._closed: list[bool] = []
 
     def book(self, increment: Increment, frame: ReplayedFrame) -> None:
         """Keeps a frame's numbers. Raises FloatingPointError for a pose that is not finite."""
@@ -212,6 +215,7 @@ class _Replaying:
             raise FloatingPointError("the pose is not finite")
         self._poses.append(np.array(stats.wTc))
         self._covariances.append(np.array(stats.covariance))
+        self._closed += stats.closed
         self._rows.append(
             ReplayRow(
                 status=frame.tracking.status.value,
@@ -247,6 +251,7 @@ class _Replaying:
             memory_before_mb=before_mb,
             peak_memory_mb=peak_memory_mb(),
             failure=failure,
+            closed=tuple(self._closed),
         )
 
     def _online(self) -> Trajectory:

@@ -46,6 +46,7 @@ from fgslam.types import (
     Observations,
     Odometry,
     Prediction,
+    UpdateStats,
 )
 
 SETTINGS: dict[str, EstimatorSettings] = {
@@ -147,13 +148,15 @@ def observations(ids: IntArray, measured: FloatArray, is_new: bool) -> Observati
     )
 
 
-def play(estimator: Estimator, increments: list[Increment]) -> None:
+def play(estimator: Estimator, increments: list[Increment]) -> list[UpdateStats]:
     """Gives increments to an estimator as a replay does."""
+    stats = []
     solver = EgoMotionSolver(RIG, EgoMotionSettings())
     motion = ConstantVelocityMotion(ConstantVelocitySettings())
     for increment in increments:
         k = round(increment.timestamp / 0.5)
-        replay_step(increment, estimator, solver, motion, k)
+        stats.append(replay_step(increment, estimator, solver, motion, k))
+    return stats
 
 
 @pytest.fixture(params=SETTINGS)
@@ -353,8 +356,11 @@ def test_a_restored_state_continues_to_the_same_bits(
     assert_same_bits(everything(second), everything(straight))
 
 
-def looped(world: World) -> list[Increment]:
-    """The last frame but one closes a true loop, and one of its landmarks ends with it."""
+def looped(world: World, ends_at_once: bool = False) -> list[Increment]:
+    """The last frame but one closes a true loop, and one of its landmarks ends after it.
+
+    With the next frame; or, as older logs have it, with the closing frame itself.
+    """
     k, old = FRAMES - 2, 3
     last = world.increments[k]
     kept = last.observations.ids[~last.observations.is_new]
@@ -366,9 +372,8 @@ def looped(world: World) -> list[Increment]:
         observations=seen,
         merged=np.array([[kept[0], kept[1]]]),
     )
-    pruned = np.union1d(last.pruned_ids, kept[:1])
     out = list(world.increments)
-    out[k] = dataclasses.replace(last, loops=(loop,), pruned_ids=pruned)
+    out[k] = dataclasses.replace(last, loops=(loop,))
     # The landmark's later sightings come under the identity that stays, of which there is one.
     after = out[k + 1]
     gone = ~np.isin(after.observations.ids, kept[:1])
@@ -378,12 +383,41 @@ def looped(world: World) -> list[Increment]:
         rejected=after.rejected[gone],
         missed_ids=np.setdiff1d(after.missed_ids, kept[:1]),
     )
+    ends = k if ends_at_once else k + 1
+    pruned = np.union1d(out[ends].pruned_ids, kept[:1])
+    out[ends] = dataclasses.replace(out[ends], pruned_ids=pruned)
     return out
 
 
-@pytest.mark.parametrize("make", CORRECTING, indirect=True)
-def test_a_true_loop_does_no_harm(make: Callable[[], Estimator], world: World) -> None:
+def absurd(loop: LoopClosure) -> LoopClosure:
+    """Ten metres off, by the pose as by the landmarks, each of which is taken for another."""
+    seen = loop.observations
+    return dataclasses.replace(
+        loop,
+        oTc=g.pose(np.eye(3), np.array([10.0, 0.0, 0.0])) @ loop.oTc,
+        observations=dataclasses.replace(seen, ids=np.roll(seen.ids, 1)),
+    )
+
+
+def test_each_closure_gets_its_verdict(make: Callable[[], Estimator], world: World) -> None:
+    """A true one is taken, an absurd one is not; dead reckoning takes none."""
     estimator, increments = make(), looped(world)
+    true = increments[FRAMES - 2].loops
+    stats = play(estimator, increments)
+    takes = estimator.kind != "odometry"
+    assert [s.closed for s in stats[:-2]] == [()] * (FRAMES - 2)
+    assert stats[FRAMES - 2].closed == (takes,)
+    doubtful, both = make(), list(increments)
+    both[FRAMES - 2] = dataclasses.replace(both[FRAMES - 2], loops=(absurd(true[0]), *true))
+    assert play(doubtful, both)[FRAMES - 2].closed == (False, takes)
+
+
+@pytest.mark.parametrize("ends_at_once", [False, True])
+@pytest.mark.parametrize("make", CORRECTING, indirect=True)
+def test_a_true_loop_does_no_harm(
+    make: Callable[[], Estimator], world: World, ends_at_once: bool
+) -> None:
+    estimator, increments = make(), looped(world, ends_at_once)
     assert MeasurementType.LOOP in estimator.supports
     play(estimator, increments)
     estimate = estimator.estimate()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 from pathlib import Path
 
@@ -62,7 +63,7 @@ def test_a_true_closure_is_told_by_what_it_mends() -> None:
     online[-1] = true[-1]
     stamps = np.arange(COUNT, dtype=np.float64)
     found = judge_closures(
-        [(COUNT - 1, closure(0, g.inverse(true[0]) @ true[-1]))],
+        [(COUNT - 1, closure(0, g.inverse(true[0]) @ true[-1]), True)],
         before,
         Trajectory(stamps, online),
         Trajectory(stamps, g.pose(g.so3_exp(np.ones(3)), np.ones(3)) @ true),
@@ -73,6 +74,20 @@ def test_a_true_closure_is_told_by_what_it_mends() -> None:
     assert found[0].before_m == pytest.approx(0.8)
     assert found[0].after_m == pytest.approx(0.0, abs=1e-9)
     assert found[0].correction_m == pytest.approx(0.8)
+    assert found[0].merged == 1
+
+
+def test_a_refused_closure_mends_nothing() -> None:
+    true, before = circle(), drifted(circle())
+    stamps = np.arange(COUNT, dtype=np.float64)
+    offered = [(COUNT - 1, closure(0, g.inverse(true[0]) @ true[-1]), False)]
+    found = judge_closures(offered, before, Trajectory(stamps, before), Trajectory(stamps, true))
+    assert not found[0].taken
+    assert found[0].false is False, "it was a return all the same"
+    assert found[0].before_m == pytest.approx(0.8)
+    assert np.isnan(found[0].after_m)
+    assert np.isnan(found[0].correction_m)
+    assert found[0].merged == 0
 
 
 @pytest.mark.parametrize(
@@ -85,12 +100,13 @@ def test_a_closure_far_from_the_truth_is_false(
     wrong = g.pose(g.so3_exp(np.array([0.0, np.deg2rad(turned_deg), 0.0])), np.array([0, 0, moved]))
     measured = closure(2, g.inverse(true[2]) @ true[-1] @ wrong)
     trajectory = Trajectory(stamps, true)
-    assert judge_closures([(11, measured)], true, trajectory, trajectory)[0].false is false
+    assert judge_closures([(11, measured, True)], true, trajectory, trajectory)[0].false is false
 
 
 def test_without_truth_nothing_is_called_false() -> None:
     true, stamps = circle(), np.arange(COUNT, dtype=np.float64)
-    found = judge_closures([(11, closure(0, np.eye(4)))], true, Trajectory(stamps, true), None)
+    offered = [(11, closure(0, np.eye(4)), True)]
+    found = judge_closures(offered, true, Trajectory(stamps, true), None)
     assert found[0].false is None
     assert np.isnan(found[0].before_m)
 
@@ -107,22 +123,44 @@ def recorded(loops: dict[int, tuple[LoopClosure, ...]]) -> RunRecorder:
 
 
 def test_closures_of_a_run_come_back_from_their_file(tmp_path: Path) -> None:
-    recorder = recorded({11: (closure(1, np.eye(4)),)})
+    recorder = recorded({9: (closure(0, np.eye(4)),), 11: (closure(1, np.eye(4)),)})
     truth = Trajectory(np.arange(COUNT, dtype=np.float64), circle())
-    closures = closures_of(recorder, truth)
-    numbers = place_numbers(recorder, closures)
-    assert numbers == {"closures": 1, "false_closures": 1, "relocalised": 1}
+    closures = closures_of(recorder, (False, True), truth)
+    assert place_numbers(recorder, closures) == {
+        "closures": 1,
+        "false_closures": 1,
+        "refused_closures": 1,
+        "relocalised": 1,
+    }
     write_closures(tmp_path, recorder, closures)
     table, pairs = read_closures(tmp_path / LOOPS_FILE)
+    assert pairs == [(11, 1)], "the drive from above shows what was closed"
+    assert [title for title, _ in table.rows] == ["frame 19 (false)", "frame 21 (false)"]
+    assert table.rows[0][1][:5] == ("no", "10", "0", "0", "-")
+    assert table.rows[1][1][:5] == ("yes", "11", "0", "1", "0.0")
+    after = [column.name for column in table.columns].index("error after (cm)")
+    assert table.rows[0][1][after] == "-"
+    assert table.rows[1][1][after] == "0.0"
+    assert all(len(values) == len(table.columns) for _, values in table.rows)
+
+
+def test_a_file_of_an_older_run_says_nothing_of_refusals(tmp_path: Path) -> None:
+    recorder = recorded({11: (closure(1, np.eye(4)),)})
+    write_closures(tmp_path, recorder, closures_of(recorder, (True,), None))
+    with (tmp_path / LOOPS_FILE).open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    with (tmp_path / LOOPS_FILE).open("w", newline="") as file:
+        writer = csv.DictWriter(file, [n for n in rows[0] if n != "taken"], extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)
+    table, pairs = read_closures(tmp_path / LOOPS_FILE)
     assert pairs == [(11, 1)]
-    assert table.rows[0][0] == "frame 21 (false)"
-    assert table.rows[0][1][:3] == ("11", "0", "1")
-    assert len(table.rows[0][1]) == len(table.columns)
+    assert table.rows[0][1][:2] == ("-", "11")
 
 
 def test_no_closure_leaves_no_file(tmp_path: Path) -> None:
     recorder = recorded({})
-    closures = closures_of(recorder, None)
+    closures = closures_of(recorder, (), None)
     (tmp_path / LOOPS_FILE).write_text("of an earlier run")
     write_closures(tmp_path, recorder, closures)
     assert not (tmp_path / LOOPS_FILE).exists()

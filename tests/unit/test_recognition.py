@@ -18,7 +18,7 @@ from fgslam.frontend.stream import FeatureFrame
 from fgslam.measurement_log import MeasurementLog
 from fgslam.motion import ConstantVelocityMotion, OdometryMotion
 from fgslam.pipeline import FrameReport, SlamPipeline, _observe, replay_step
-from fgslam.settings.backend import LandmarkKalmanSettings
+from fgslam.settings.backend import LandmarkKalmanSettings, LoopCorrectionSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import EgoMotionSettings, FrontendSettings
 from fgslam.settings.loops import LoopSettings, LostSettings
@@ -74,14 +74,17 @@ class RingMotion(OdometryMotion):
 
 
 def pipeline_of(
-    poses: list[FloatArray], drift_deg: float, settings: FrontendSettings = SETTINGS
+    poses: list[FloatArray],
+    drift_deg: float,
+    settings: FrontendSettings = SETTINGS,
+    estimator: LandmarkKalmanSettings = LandmarkKalmanSettings(),  # noqa: B008 (frozen)
 ) -> SlamPipeline:
     tracker = make_tracker(RIG, settings)
     return SlamPipeline(
         stereo=StereoMatcher(RIG, settings.stereo, settings.appearance),
         tracker=tracker,
         motion=RingMotion(poses, drift_deg),
-        estimator=make_estimator(RIG, LandmarkKalmanSettings(), settings.ego_motion),
+        estimator=make_estimator(RIG, estimator, settings.ego_motion),
         places=make_places(RIG, settings, tracker, seed=0),
     )
 
@@ -119,12 +122,18 @@ def error_m(report: FrameReport, true: FloatArray) -> float:
 
 RING = [on_ring(k) for k in range(ROUND + 16)]
 DARK = range(30, 42)  # in the dark the heading drifts by what no search window bridges
+REFUSING = LandmarkKalmanSettings(loops=LoopCorrectionSettings(gate_sigmas=1e-6))
 
 
-@lru_cache(maxsize=1)
-def ring() -> tuple[SlamPipeline, list[FrameReport]]:
+def round_the_ring(refusing: bool = False) -> SlamPipeline:
+    settings = dataclasses.replace(SETTINGS, lost=None)
+    return pipeline_of(RING, 0.9, settings, REFUSING if refusing else LandmarkKalmanSettings())
+
+
+@lru_cache(maxsize=2)
+def ring(refusing: bool = False) -> tuple[SlamPipeline, list[FrameReport]]:
     """Once round and past the start, a stretch of it in the dark."""
-    pipeline = pipeline_of(RING, 0.9, dataclasses.replace(SETTINGS, lost=None))
+    pipeline = round_the_ring(refusing)
     return pipeline, drive(pipeline, seen(RING, DARK))
 
 
@@ -155,10 +164,16 @@ def test_no_closure_is_false() -> None:
 def test_landmarks_found_twice_become_one() -> None:
     pipeline, reports = ring()
     first = closings(reports)[0]
-    ended = np.concatenate([r.increment.pruned_ids for r in reports[first : first + 2]])
-    merged = reports[first].increment.loops[0].merged
+    closing, after = reports[first].increment, reports[first + 1].increment
+    merged, ended = closing.loops[0].merged, after.pruned_ids
+    assert reports[first].stats.closed == (True,)
     assert len(merged) >= 5
+    assert np.isin(merged[:, 0], closing.observations.ids).all()
+    assert not np.isin(merged[:, 0], closing.pruned_ids).any(), "not before it is taken"
     assert np.isin(merged[:, 0], ended).all()
+    assert len(ended) > len(merged), "and those that look alike in the corrected map"
+    assert not np.isin(after.observations.ids, ended).any(), "it is tracked on the map as fused"
+    assert reports[first + 1].tracking.status is EgoMotionStatus.OK
     held = pipeline.estimator.landmarks().ids
     assert not np.isin(ended, held).any()
     assert np.isin(held, pipeline.tracker.database.ids).all()
@@ -170,9 +185,67 @@ def test_landmarks_found_twice_become_one() -> None:
     assert min(old) >= 5, "the old landmarks are tracked again"
 
 
-def test_a_replay_closes_the_same_loops_to_the_bit() -> None:
-    pipeline, reports = ring()
+def test_a_refused_closure_changes_nothing_but_that_a_rest_follows() -> None:
+    pipeline, reports = ring(refusing=True)
+    offered = closings(reports)
+    assert offered[0] == closings(ring()[1])[0]
+    assert all(reports[k].stats.closed == (False,) for k in offered)
+    assert pipeline.places.taken == (False,) * len(offered)
+    rest = SETTINGS.loops.rest
+    assert (np.diff(offered) > rest).all()
+    without = pipeline_of(RING, 0.9, dataclasses.replace(SETTINGS, lost=None, loops=None))
+    for report, expected in zip(reports, drive(without, seen(RING, DARK)), strict=True):
+        np.testing.assert_array_equal(report.stats.wTc, expected.stats.wTc)
+        assert_same_bits(report.increment.observations, expected.increment.observations)
+        np.testing.assert_array_equal(report.increment.pruned_ids, expected.increment.pruned_ids)
+    assert_same_bits(pipeline.tracker.database.state(), without.tracker.database.state())
+
+
+def test_a_refused_closure_is_offered_again_after_the_rest() -> None:
+    """The place was not seen, as far as the map is concerned; so it can be recognised again."""
+    first = closings(ring(refusing=True)[1])[0]
+    longer = [on_ring(k) for k in range(ROUND + 16 + SETTINGS.loops.rest)]
+    again = pipeline_of(longer, 0.9, dataclasses.replace(SETTINGS, lost=None), REFUSING)
+    offered = closings(drive(again, seen(longer, DARK)))
+    assert offered[0] == first
+    assert len(offered) >= 2
+
+
+def test_only_a_closure_that_was_taken_bounds_later_drift() -> None:
+    way = {}
+    for refusing in (False, True):
+        pipeline = round_the_ring(refusing)
+        frames = list(seen(RING, DARK))[: closings(ring()[1])[0] + 1]
+        loop = drive(pipeline, frames)[-1].increment.loops[0]
+        way[refusing] = pipeline.places._memory.way_since(loop.frame)
+    assert way[False] < 0.01
+    assert way[True] > 10.0
+
+
+def test_the_estimators_of_a_comparison_judge_for_themselves() -> None:
+    """What the live one refused another one takes; its map holds both of what is one, mended."""
+    _, reports = ring(refusing=True)
     estimator = make_estimator(RIG, LandmarkKalmanSettings(), SETTINGS.ego_motion)
+    solver, motion = EgoMotionSolver(RIG, SETTINGS.ego_motion), RingMotion(RING, 0.9)
+    first = closings(reports)[0]
+    for k, report in enumerate(reports):
+        stats = replay_step(report.increment, estimator, solver, motion, k)
+        if k >= first:
+            assert difference(RING[k], stats.wTc)[0] < 0.15
+        assert stats.closed == (() if not report.increment.loops else (True,))
+    merged = reports[first].increment.loops[0].merged
+    held = estimator.landmarks()
+    both = np.isin(merged, held.ids).all(axis=1)
+    assert both.sum() >= 5
+    new, old = (held.positions[held.rows(ids)] for ids in merged[both].T)
+    assert np.median(np.linalg.norm(new - old, axis=1)) < 0.1
+
+
+@pytest.mark.parametrize("refusing", [False, True])
+def test_a_replay_closes_the_same_loops_to_the_bit(refusing: bool) -> None:
+    pipeline, reports = ring(refusing)
+    settings = REFUSING if refusing else LandmarkKalmanSettings()
+    estimator = make_estimator(RIG, settings, SETTINGS.ego_motion)
     solver = EgoMotionSolver(RIG, SETTINGS.ego_motion)
     motion = RingMotion(RING, 0.9)
     for k, report in enumerate(reports):
@@ -185,19 +258,23 @@ def test_a_replay_closes_the_same_loops_to_the_bit() -> None:
     )
 
 
-@pytest.mark.parametrize("stop", [20, 60, ROUND + 2])
-def test_continued_from_its_state_it_goes_on_to_the_bit(stop: int) -> None:
-    _, reports = ring()
-    whole = pipeline_of(RING, 0.9, dataclasses.replace(SETTINGS, lost=None))
+@pytest.mark.parametrize(
+    ("refusing", "after_closing"), [(False, -20), (False, 1), (False, 2), (True, 1), (True, 4)]
+)
+def test_continued_from_its_state_it_goes_on_to_the_bit(refusing: bool, after_closing: int) -> None:
+    _, reports = ring(refusing)
+    stop = closings(reports)[0] + after_closing
+    whole = round_the_ring(refusing)
     frames = list(seen(RING, DARK))
     log = MeasurementLog(RIG, {})
     for report in drive(whole, frames[:stop]):
         log.append(report.increment)
-    again = pipeline_of(RING, 0.9, dataclasses.replace(SETTINGS, lost=None))
+    again = round_the_ring(refusing)
     again.tracker.database.restore(whole.tracker.database.state())
     again.estimator.restore(whole.estimator.state())
     again.places.restore(whole.places.state(), log)
     assert_same_bits(again.places.state(), whole.places.state())
+    assert again.places.taken == whole.places.taken
     for report, expected in zip(drive(again, frames[stop:]), reports[stop:], strict=True):
         np.testing.assert_array_equal(report.stats.wTc, expected.stats.wTc)
         assert_same_increments(report.increment, expected.increment)

@@ -112,13 +112,34 @@ def test_a_return_in_between_bounds_the_drift() -> None:
         "since the return, not since the start"
     )
     assert back.way_since(20) == pytest.approx(10.5, abs=1e-3), "the shorter way round"
-    closed = remembered(places)
-    loop = LoopClosure(
-        1, np.eye(4), np.eye(6), sight(np.eye(4), np.empty((0, 3)), NOBODY), np.empty((0, 2))
-    )
+
+
+def closing(k: int, to: int, again: IntArray) -> Increment:
+    """A frame that sees nothing but the landmarks of an earlier one, by a closure."""
+    old = sight(np.eye(4), np.tile([0.0, 0.0, 3.0], (len(again), 1)), again)
+    loop = LoopClosure(to, np.eye(4), np.eye(6), old, np.empty((0, 2), np.int64))
     nothing = sight(np.eye(4), np.empty((0, 3)), NOBODY)
-    closed.add(dataclasses.replace(frame(41, nothing), loops=(loop,)), turned(0.0, z=0.5))
-    assert closed.way_since(0) == pytest.approx(0.5, abs=1e-3)
+    return dataclasses.replace(frame(k, nothing), loops=(loop,))
+
+
+@pytest.mark.parametrize(("taken", "way"), [(True, 0.5), (False, 20.5)])
+def test_a_closure_bounds_the_drift_only_if_the_estimator_took_it(taken: bool, way: float) -> None:
+    places = [list(range(20 * k, 20 * k + 20)) for k in range(41)]
+    memory, again = remembered(places), np.arange(20)
+    last = closing(41, to=1, again=again)
+    memory.add(last, turned(0.0, z=0.5), (taken,))
+    assert memory.way_since(0) == pytest.approx(way, abs=1e-3)
+    assert len(memory.unseen_for(30, again)) == (0 if taken else 20), "nor was the place seen"
+    assert memory.taken == [taken]
+    restored, log = SightingMemory(), MeasurementLog(RIG, {})
+    for k, ids in enumerate(places):
+        points = np.tile([0.0, 0.0, 3.0], (len(ids), 1))
+        log.append(frame(k, sight(np.eye(4), points, np.array(ids))))
+    log.append(last)
+    restored.restore(memory.state(), log)
+    assert_same_bits(restored.state(), memory.state())
+    assert restored.way_since(0) == memory.way_since(0)
+    np.testing.assert_array_equal(restored.unseen_for(30, again), memory.unseen_for(30, again))
 
 
 @pytest.mark.parametrize("given", [-1, 8])

@@ -27,7 +27,11 @@ _LEAST_M = 1e-6  # of an edge: none at all is no edge
 class SightingMemory:
     """Observations of all frames so far, and when each landmark was last seen.
 
-    The observations are those of the log; nothing is copied.
+    The observations are those of the log; nothing is copied. A closure that the estimator refused
+    is none: neither a return nor a sighting of the landmarks that it names.
+
+    Attributes:
+        taken: whether the estimator took the log's closures, in their order.
     """
 
     def __init__(self, given: int = -1) -> None:
@@ -38,20 +42,22 @@ class SightingMemory:
         self._newest: list[int] = []
         self._returns: list[tuple[int, int]] = []
         self._last_seen: IntArray = np.empty(0, np.int64)
+        self.taken: list[bool] = []
 
     def __len__(self) -> int:
         return len(self._seen)
 
-    def add(self, increment: Increment, step: FloatArray) -> None:
+    def add(self, increment: Increment, step: FloatArray, closed: tuple[bool, ...] = ()) -> None:
         """Books a frame.
 
         Args:
             increment: its measurements.
             step: (4, 4) the camera's motion since the frame before, as estimated.
+            closed: for each of its loops, whether the estimator took it.
         """
         way = self._way[-1] if self._way else 0.0
         self._way.append(way + float(np.linalg.norm(step[:3, 3])))
-        self._book(increment)
+        self._book(increment, closed)
 
     def way_since(self, frame: int) -> float:
         """Metres along which the estimate can have drifted away from a frame's surroundings.
@@ -105,20 +111,27 @@ class SightingMemory:
 
     def state(self) -> StateArrays:
         """What the log does not tell."""
-        return {"way": np.array(self._way), "given": np.array(self._given)}
+        return {
+            "way": np.array(self._way),
+            "given": np.array(self._given),
+            "taken": np.array(self.taken, np.bool_),
+        }
 
     def restore(self, state: StateArrays, log: MeasurementLog) -> None:
         """Continues from :meth:`state` and the log of as many frames."""
         self._seen, self._newest, self._returns = [], [], []
         self._last_seen = np.empty(0, np.int64)
         self._given = int(state["given"])
+        verdicts, self.taken = iter(state["taken"].tolist()), []
         for increment in log:
-            self._book(increment)
+            self._book(increment, tuple(itertools.islice(verdicts, len(increment.loops))))
         self._way = state["way"].tolist()
 
-    def _book(self, increment: Increment) -> None:
+    def _book(self, increment: Increment, closed: tuple[bool, ...]) -> None:
         seen = increment.observations.select(~increment.rejected)
-        ids = np.concatenate([seen.ids, *(loop.observations.ids for loop in increment.loops)])
+        loops = [loop for loop, taken in zip(increment.loops, closed, strict=True) if taken]
+        ids = np.concatenate([seen.ids, *(loop.observations.ids for loop in loops)])
+        self.taken += closed
         self._grow(int(ids.max(initial=-1)) + 1)
         here = len(self._seen)
         before = np.sort(self._last_seen[seen.ids])
@@ -127,7 +140,7 @@ class SightingMemory:
             self._returns.append((here, int(old[len(old) // 2])))
         self._last_seen[ids] = here
         self._seen.append(seen)
-        self._returns += [(here, loop.frame) for loop in increment.loops]
+        self._returns += [(here, loop.frame) for loop in loops]
         newest = self._newest[-1] if self._newest else self._given
         self._newest.append(int(increment.observations.ids.max(initial=newest)))
 

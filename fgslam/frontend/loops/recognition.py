@@ -26,12 +26,15 @@ from fgslam.types import (
     Prediction,
     StateArrays,
     StereoFeatures,
+    UpdateStats,
 )
 
 _STREAM = 11  # of random numbers, beside those of the recording
 _ONE_PLACE_M, _ONE_PLACE_DEG = 0.3, 5.0
 """What matching around a pose found in the whole map may change of it: several times what such a
 pose may be off (frontend.relocalisation.max_sigma_*)."""
+_NOBODY: IntArray = np.empty(0, np.int64)
+_NO_PAIRS: IntArray = np.empty((0, 2), np.int64)
 
 
 class Locator(Protocol):
@@ -71,7 +74,8 @@ class PlaceRecognition:
         self._memory = SightingMemory(int(tracker.database.ids.max(initial=-1)))
         self._confirmation = None if parts.loops is None else Confirmation(parts.loops)
         self._lost = 0
-        self._closed = -1  # frame of the last closure
+        self._offered = -1  # frame of the last closure, taken or not
+        self._merging = _NO_PAIRS  # landmarks that are one, by the closure just taken
         self._fuse_since = -1  # a frame: landmarks made after it may be older ones' doubles
         self._pose: FloatArray = np.eye(4)
 
@@ -83,6 +87,11 @@ class PlaceRecognition:
         """
         lost = self._parts.lost
         return lost is None or not 0 < self._lost < lost.give_up_after
+
+    @property
+    def taken(self) -> tuple[bool, ...]:
+        """Whether the estimator took the closures so far, in the log's order."""
+        return tuple(self._memory.taken)
 
     # -- lost --------------------------------------------------------------------------------
 
@@ -123,6 +132,9 @@ class PlaceRecognition:
     ) -> tuple[LoopClosure, ...]:
         """Looks for a return, where it is time to; the closure once it is confirmed.
 
+        Whatever the estimator makes of it, a rest follows: the same place would be offered at every
+        look. What a closure means for map and memory waits for its verdict (:meth:`remember`).
+
         Args:
             wTc: (4, 4) the frame's pose as tracked.
             landmarks: the map before this frame's update.
@@ -149,31 +161,50 @@ class PlaceRecognition:
         )
         if closure is None or not is_sharp(closure, loops):
             return ()
-        self._closed = len(self._memory)
-        self._fuse_since = self._memory.last_seen(found.ids)
+        self._offered = len(self._memory)
         return (closure,)
 
-    def doubles(self, landmarks: LandmarkMap) -> IntArray:
-        """After a closure: pairs (m, 2) of (landmark that ends, that stays), once corrected.
+    def fuse(self, landmarks: LandmarkMap) -> IntArray:
+        """After a closure that was taken: makes one what it shows to be one; identities that end.
 
-        Asked in the frame after it, when the estimator has moved the map.
+        Asked before the next frame is tracked: the estimator has moved the map, and with both of
+        two landmarks in it that look alike and lie in one place, neither would be matched.
+
+        Args:
+            landmarks: the map as corrected.
         """
-        loops = self._parts.loops
-        if loops is None or self._fuse_since < 0 or loops.fuse_m == 0.0:
-            return np.empty((0, 2), np.int64)
-        new = self._memory.made_after(self._fuse_since, landmarks.ids)
-        self._fuse_since = -1
-        sides = landmarks.ids[new], landmarks.ids[~new]
+        loops, since = self._parts.loops, self._fuse_since
+        if loops is None or since < 0:
+            return _NOBODY
+        ended = self._tracker.merge(self._merging)
+        self._merging, self._fuse_since = _NO_PAIRS, -1
+        if loops.fuse_m == 0.0:
+            return ended
+        left = landmarks.ids[~np.isin(landmarks.ids, ended)]
+        new = self._memory.made_after(since, left)
         looks = self._tracker.database.appearances()
-        return duplicates(landmarks, looks, sides, loops.fuse_m, self._parts.appearance)
+        sides = left[new], left[~new]
+        pairs = duplicates(landmarks, looks, sides, loops.fuse_m, self._parts.appearance)
+        return np.union1d(ended, self._tracker.merge(pairs))
 
     # -- upkeep ------------------------------------------------------------------------------
 
-    def remember(self, increment: Increment, tracked: FloatArray, corrected: FloatArray) -> None:
-        """Books a frame: its pose (4, 4) before any loop was closed in it, and the estimator's."""
+    def remember(self, increment: Increment, tracked: FloatArray, stats: UpdateStats) -> None:
+        """Books a frame, and prepares what the closures mean that the estimator took.
+
+        Args:
+            increment: its measurements.
+            tracked: (4, 4) its pose before any loop was closed in it.
+            stats: the estimator's pose and verdicts.
+        """
+        taken = [loop for loop, so in zip(increment.loops, stats.closed, strict=True) if so]
+        if taken:
+            self._merging = np.concatenate([loop.merged for loop in taken])
+            since = [self._memory.last_seen(loop.observations.ids) for loop in taken]
+            self._fuse_since = min(since)
         step = inverse(self._pose) @ tracked if len(self._memory) else np.eye(4)
-        self._memory.add(increment, step)
-        self._pose = corrected
+        self._memory.add(increment, step, stats.closed)
+        self._pose = stats.wTc
 
     def state(self) -> StateArrays:
         """All but what the log tells."""
@@ -182,20 +213,21 @@ class PlaceRecognition:
             "counts": np.array(
                 [
                     self._lost,
-                    self._closed,
+                    self._offered,
                     self._fuse_since,
                     0 if confirmation is None else confirmation.count,
                 ]
             ),
             "offset": np.eye(4) if confirmation is None else confirmation.offset,
+            "merging": self._merging,
             "pose": self._pose,
         }
 
     def restore(self, state: StateArrays, log: MeasurementLog) -> None:
         """Continues from :meth:`state` and the log of as many frames."""
         self._memory.restore(state, log)
-        self._lost, self._closed, self._fuse_since, count = state["counts"].tolist()
-        self._pose = state["pose"]
+        self._lost, self._offered, self._fuse_since, count = state["counts"].tolist()
+        self._merging, self._pose = state["merging"], state["pose"]
         if self._confirmation is not None:
             self._confirmation.count, self._confirmation.offset = count, state["offset"]
 
@@ -203,7 +235,7 @@ class PlaceRecognition:
 
     def _time_to_look(self, loops: LoopSettings, confirmation: Confirmation) -> bool:
         frame = len(self._memory)
-        if self._lost or (self._closed >= 0 and frame - self._closed <= loops.rest):
+        if self._lost or (self._offered >= 0 and frame - self._offered <= loops.rest):
             return False
         return confirmation.hopeful or frame % loops.every == 0
 
@@ -236,7 +268,8 @@ class PlaceRecognition:
         chosen = LandmarkMap(
             landmarks.ids[rows], landmarks.positions[rows], landmarks.covariances[rows]
         )
-        self._parts.relocaliser.learn(chosen, self._tracker.database.appearances(chosen.ids))
+        looks = self._tracker.database.appearances(chosen.ids, with_words=True)
+        self._parts.relocaliser.learn(chosen, looks)
         return self._parts.relocaliser.locate(features, rng)
 
 
