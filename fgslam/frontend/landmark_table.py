@@ -129,6 +129,10 @@ class LandmarkTable:
             words=self._pool.words(places) if with_words else None,
         )
 
+    def find_words(self) -> None:
+        """Finds the words of all views: asked for now and then, no search waits for many."""
+        self._pool.find_words()
+
     def rows(self, ids: IntArray) -> IntArray:
         """Rows of landmarks that are in the database; ids ascending in it."""
         return np.searchsorted(self.ids, ids)

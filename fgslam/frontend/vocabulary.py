@@ -50,7 +50,8 @@ def _to_centres(descriptors: ByteArray) -> npt.NDArray[np.float32]:
     Exact in float32: all sums of 128 products of bytes, and their doubles, are below 2^24.
     """
     centres, squares = _centres()
-    return np.asarray(squares - (descriptors.astype(np.float32) @ centres), np.float32)
+    products = np.asarray(descriptors.astype(np.float32) @ centres, np.float32)
+    return np.subtract(squares, products, out=products)
 
 
 @lru_cache(maxsize=1)

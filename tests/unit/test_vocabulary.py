@@ -55,4 +55,7 @@ def test_a_word_is_found_once_in_a_views_life(
     more = pool.start(_views(first))  # the pool grows; what is known stays known
     assert np.array_equal(pool.words(places[:50, 0]), vocabulary.words_of(first[:50]))
     assert asked == [40, 60, 3, 2, 0]
+    pool.find_words()
+    pool.find_words()
     assert np.array_equal(pool.words(more[:, 0]), vocabulary.words_of(first))
+    assert asked[5:] == [100, 0, 0]

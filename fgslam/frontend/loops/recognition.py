@@ -33,6 +33,9 @@ _STREAM = 11  # of random numbers, beside those of the recording
 _ONE_PLACE_M, _ONE_PLACE_DEG = 0.3, 5.0
 """What matching around a pose found in the whole map may change of it: several times what such a
 pose may be off (frontend.relocalisation.max_sigma_*)."""
+_WORDS_EVERY = 16
+"""Frames after which the words of new and renewed views are found, half a millisecond's work: the
+first look after a long time would find them all at once."""
 _NOBODY: IntArray = np.empty(0, np.int64)
 _NO_PAIRS: IntArray = np.empty((0, 2), np.int64)
 
@@ -78,6 +81,7 @@ class PlaceRecognition:
         self._merging = _NO_PAIRS  # landmarks that are one, by the closure just taken
         self._fuse_since = -1  # a frame: landmarks made after it may be older ones' doubles
         self._pose: FloatArray = np.eye(4)
+        tracker.database.find_words()
 
     @property
     def maps_on(self) -> bool:
@@ -205,6 +209,8 @@ class PlaceRecognition:
         step = inverse(self._pose) @ tracked if len(self._memory) else np.eye(4)
         self._memory.add(increment, step, stats.closed)
         self._pose = stats.wTc
+        if len(self._memory) % _WORDS_EVERY == 0:
+            self._tracker.database.find_words()
 
     def state(self) -> StateArrays:
         """All but what the log tells."""
@@ -230,6 +236,7 @@ class PlaceRecognition:
         self._merging, self._pose = state["merging"], state["pose"]
         if self._confirmation is not None:
             self._confirmation.count, self._confirmation.offset = count, state["offset"]
+        self._tracker.database.find_words()
 
     # ----------------------------------------------------------------------------------------
 
