@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from loops import CLOSED, Rounds, drive_rounds
 from simulated import RIG, Drive, assert_same_bits, play, simulate
 
 from fgslam import factory
@@ -16,7 +17,11 @@ from fgslam.measurement_log import MeasurementLog
 from fgslam.runs import replay as module
 from fgslam.runs.judging import Truth, judge_replay
 from fgslam.runs.replay import Replay, memory_mb, peak_memory_mb, replay, replay_motion
-from fgslam.settings.backend import BatchSettings, LandmarkKalmanSettings
+from fgslam.settings.backend import (
+    BatchSettings,
+    DeadReckoningSettings,
+    LandmarkKalmanSettings,
+)
 from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import EgoMotionSettings
 from fgslam.types import Estimate, Trajectory, UpdateStats
@@ -66,6 +71,19 @@ def test_a_replay_gives_what_the_loop_gives() -> None:
     assert replayed.column("solve_ms")[1:].min() > 0.0
     assert (replayed.title, replayed.kind, replayed.failure) == ("named", "landmark_kalman", "")
     assert told == [(k + 1, 8) for k in range(8)]
+    assert "closures" not in judge_replay(replayed, Truth()).metrics.more, "the log has none"
+
+
+@pytest.mark.parametrize("lies", [False, True])
+def test_each_replay_counts_the_closures_that_it_took(lies: bool) -> None:
+    rounds = Rounds(lies=((CLOSED, (0.0, 0.5, 0.0, 1.0, 0.0, 0.5)),) if lies else ())
+    drive = drive_rounds(rounds, np.random.default_rng(4))
+    log = MeasurementLog(RIG, {"kind": "recorded", "stand_in": CONSTANT_VELOCITY}, drive.increments)
+    for settings, taken in ((SETTINGS, not lies), (DeadReckoningSettings(), False)):
+        replayed = replay(log, settings, EgoMotionSettings())
+        assert replayed.closed == (taken,)
+        more = judge_replay(replayed, Truth()).metrics.more
+        assert (more["closures"], more["refused_closures"]) == (int(taken), int(not taken))
 
 
 def test_memory_is_that_of_this_process() -> None:

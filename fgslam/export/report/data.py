@@ -145,8 +145,9 @@ class ReportData:
         truth: true poses in the estimates' world; None where there are none.
         estimators: one or more, in the order of the table; their colours follow it.
         comparison: the table.
-        places: the loops that were closed, a row each; without columns where none were looked for.
-        closures: pairs of frames (closing, returned to), counted in the first estimator's poses.
+        places: closures, taken or refused, a row each; without columns where none were looked for.
+        closures: pairs of frames (closing, returned to) of the loops closed, counted in the first
+            estimator's poses.
         pictures: of the run.
         config_yaml: the resolved configuration, as text.
         versions: of the program and its libraries; None where one is not installed.

@@ -67,7 +67,7 @@ def _comparison(data: ReportData) -> Iterator[str]:
 
 
 def _places(table: Comparison) -> Iterator[str]:
-    """The loops closed, where there are any: what they mended, before and after."""
+    """Closures, where there are any: what they mended, before and after, or the refusal."""
     if not table.rows:
         return
     yield '<section aria-labelledby="places"><h2 id="places">Places recognised</h2>'
