@@ -116,18 +116,37 @@ class RelocalisationSettings:
     min_inliers: Annotated[
         int,
         Field(ge=3, description="fewer witnesses (inliers, four at most of a piece) are no pose"),
-    ] = 12
+    ] = 8
     enough_witnesses: Annotated[
         int,
         Field(ge=3, description="with so many witnesses nothing but another place contradicts"),
-    ] = 24
+    ] = 36
     max_misfit: Annotated[
         float,
         Field(
             gt=0.0,
             description="with fewer, largest mean squared normalised residual (1: as modelled)",
         ),
-    ] = 1.1
+    ] = 1.2
+    least_agreement: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            le=1.0,
+            description="with fewer, least agreement of frame and map at the pose: two parts the "
+            "share of the features that look like landmarks which it explains, one part the share "
+            "of the pieces in view of which something is seen",
+        ),
+    ] = 0.57
+    least_covered: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            le=1.0,
+            description="with fewer, of a rival: least share of its pieces in view of which "
+            "something is seen",
+        ),
+    ] = 0.5
     ambiguous_share: Annotated[
         float,
         Field(
@@ -136,6 +155,14 @@ class RelocalisationSettings:
             description="with this share of the best's witnesses another pose makes it ambiguous",
         ),
     ] = 0.5
+    ambiguous_own: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="if it explains features that the best does not, so many for each that "
+            "only the best explains; a place that explains part of the same is no rival",
+        ),
+    ] = 0.2
     view_deg: Annotated[
         float,
         Field(
@@ -144,14 +171,6 @@ class RelocalisationSettings:
             description="a landmark is expected to be seen from within this angle of a stored view",
         ),
     ] = 20.0
-    least_covered: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            le=1.0,
-            description="with fewer, something must be seen of this share of the pieces in view",
-        ),
-    ] = 0.5
     elsewhere_m: Annotated[
         float, Field(gt=0.0, description="poses farther apart than this are different places")
     ] = 0.5

@@ -67,6 +67,10 @@ class Refined:
         rest = ~np.isin(own, other.features * count + other.landmarks)
         return witnesses(positions[self.landmarks[rest]], side)
 
+    def explains_beside(self, other: Refined) -> int:
+        """Features that have a landmark at this pose, and none at the other."""
+        return int((~np.isin(self.features, other.features)).sum())
+
 
 Matches = tuple[IntArray, IntArray]
 """Features (k,) by index and landmarks (k,) by row of the map."""

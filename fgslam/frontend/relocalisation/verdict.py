@@ -30,11 +30,10 @@ def judge(
             Verdict.TOO_FEW_INLIERS, len(tentative), f"{matched} features match, no two agree"
         )
     best = refined[0]
-    # A pose that would be refused for what is not seen there is no rival.
     rivals = [
         (other.unshared(best, landmarks.positions, settings.piece_m), other)
         for other in refined[1:]
-        if not _contradicted(other, settings)
+        if _rivals(other, best, settings)
     ]
     votes, rival = max(rivals, key=lambda pair: pair[0], default=(0, None))
     second = 0 if rival is None else len(rival)
@@ -68,24 +67,44 @@ def _verdict(
         return Verdict.TOO_FEW_INLIERS, f"{said}; {settings.min_inliers} witnesses are needed"
     if rival >= settings.ambiguous_share * best.witnesses:
         return Verdict.AMBIGUOUS, f"{said}; another place explains the frame nearly as well"
-    if _contradicted(best, settings):
+    if _contradicted(best, matched, settings):
         return (
             Verdict.CONTRADICTED,
-            f"{said}; too few for how they fit, or for what should be seen and is not",
+            f"{said}; too few for how they fit, or for what does not agree beside them",
         )
     if sigma_m > settings.max_sigma_m or sigma_deg > settings.max_sigma_deg:
         return Verdict.INACCURATE, f"{said}; too uncertain"
     return Verdict.FOUND, said
 
 
-def _contradicted(pose: Refined, settings: RelocalisationSettings) -> bool:
-    """Whether few things agree, and those badly, or what should be seen beside them is not.
+def _contradicted(pose: Refined, matched: int, settings: RelocalisationSettings) -> bool:
+    """Whether few things agree, and those badly, or beside much that does not.
 
-    Matches that agree by accident fill their gates; right ones lie in the middle.
+    Matches that agree by accident fill their gates; right ones lie in the middle. And where the
+    robot is somewhere else, most of what looks like a landmark disagrees, and most of what should
+    be seen is missing.
     """
-    few = pose.witnesses < settings.enough_witnesses
-    unseen = pose.covered < settings.least_covered
-    return few and (unseen or pose.misfit > settings.max_misfit)
+    agreement = (2.0 * pose.proposed / max(matched, 1) + pose.covered) / 3.0
+    return _few_and_misfit(pose, settings) or (
+        pose.witnesses < settings.enough_witnesses and agreement < settings.least_agreement
+    )
+
+
+def _rivals(other: Refined, best: Refined, settings: RelocalisationSettings) -> bool:
+    """Whether another pose may be the right one.
+
+    Not if what should be seen there is not. Nor if it explains only what the best explains, too,
+    and less of it: were it the right one, it would explain what stands beside the things that both
+    places have.
+    """
+    unseen = other.covered < settings.least_covered
+    if _few_and_misfit(other, settings) or (unseen and other.witnesses < settings.enough_witnesses):
+        return False
+    return other.explains_beside(best) >= settings.ambiguous_own * best.explains_beside(other)
+
+
+def _few_and_misfit(pose: Refined, settings: RelocalisationSettings) -> bool:
+    return pose.witnesses < settings.enough_witnesses and pose.misfit > settings.max_misfit
 
 
 def _nothing(verdict: Verdict, candidates: int, why: str) -> Relocalisation:
