@@ -24,6 +24,9 @@ _PROBES = 12  # cells searched for each query, of 256
 _LEADING = 1024  # of a query's distances bound the rest: those of its nearest cells
 
 _Floats = npt.NDArray[np.float32]
+Candidates = tuple[IntArray, IntArray, _Floats]
+"""Queries (c,), rows (c,) that may be among their nearest, squared distances less the query's own
+square (c,)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,59 +87,71 @@ class AppearanceIndex:
         distances[query, rank] = np.sqrt((squared[first] + own[query]).astype(np.float64))
         return Neighbours(rows, distances)
 
-    def _in_full(self, asked: _Floats, neighbours: int) -> tuple[IntArray, IntArray, _Floats]:
-        """Candidates: queries, rows and squared distances less the query's own square."""
+    def _in_full(self, asked: _Floats, neighbours: int) -> Candidates:
         found = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32))]
         for start in range(0, len(self), _CHUNK):
-            squared = _squared(-2.0 * asked, self._descriptors[start : start + _CHUNK])
-            query, column = _smallest(squared, neighbours)
+            squared = _squared(asked, self._descriptors[start : start + _CHUNK])
+            bound = _bound(squared, neighbours)
+            query, column = np.nonzero(squared <= bound[:, None])
             found.append((query, start + column, squared[query, column]))
         query, row, near = (np.concatenate(part) for part in zip(*found, strict=True))
         return query, row, near
 
-    def _probed(
-        self, asked: _Floats, cells: IntArray, neighbours: int
-    ) -> tuple[IntArray, IntArray, _Floats]:
-        """As :meth:`_in_full`, of ``cells`` (q, p): cell by cell for all queries that want it."""
-        sizes = np.diff(self._starts)[cells]
-        ends = np.cumsum(sizes, axis=1)
-        squared = np.full((len(asked), max(int(ends[:, -1].max()), 1)), np.inf, np.float32)
+    def _probed(self, asked: _Floats, cells: IntArray, neighbours: int) -> Candidates:
+        """Searches ``cells`` (q, p): cell by cell, for all queries that want it.
+
+        The distances lie behind each other as they are found: of each cell, of each query that
+        wants it, to all that the cell holds. Those of a query's nearest cells bound the others.
+        """
         wanted = np.argsort(cells, axis=None, kind="stable")
-        bounds = np.searchsorted(cells.ravel()[wanted], np.arange(len(self._starts)))
-        doubled = -2.0 * asked
-        for cell in np.flatnonzero((np.diff(bounds) > 0) & (np.diff(self._starts) > 0)).tolist():
-            query, probe = np.divmod(wanted[bounds[cell] : bounds[cell + 1]], cells.shape[1])
-            held = self._descriptors[self._order[self._starts[cell] : self._starts[cell + 1]]]
-            at = ends[query, probe]
-            for i, end, values in zip(
-                query.tolist(), at.tolist(), _squared(doubled[query], held), strict=True
-            ):
-                squared[i, end - len(held) : end] = values
-        query, column = _smallest(squared, neighbours)
-        probe = (column[:, None] >= ends[query]).sum(axis=1)
-        place = self._starts[cells[query, probe] + 1] + column - ends[query, probe]
-        return query, self._order[place], squared[query, column]
+        query, cell = wanted // cells.shape[1], cells.ravel()[wanted]
+        sizes = self._starts[cell + 1] - self._starts[cell]
+        ends = np.cumsum(sizes)
+        squared = np.empty(ends[-1], np.float32)
+        first = np.searchsorted(cell, np.arange(len(self._starts))).tolist()
+        for k in np.unique(cell).tolist():
+            held = self._order[self._starts[k] : self._starts[k + 1]]
+            stop = ends[first[k + 1] - 1]
+            part = squared[stop - len(held) * (first[k + 1] - first[k]) : stop]
+            of = asked[query[first[k] : first[k + 1]]]
+            _squared(of, self._descriptors.take(held, axis=0), part.reshape(len(of), len(held)))
+        place = np.empty(cells.shape, np.int64)
+        place.flat[wanted] = ends - sizes
+        bound = _bound(self._leading(squared, place, cells), neighbours)
+        near = np.flatnonzero(squared <= np.repeat(bound[query], sizes))
+        at = np.searchsorted(ends, near, side="right")
+        row = self._order[self._starts[cell[at]] + near - (ends - sizes)[at]]
+        return query[at], row, squared[near]
+
+    def _leading(self, squared: _Floats, place: IntArray, cells: IntArray) -> _Floats:
+        """Distances (q, m) of each query to what its nearest cells hold, padded with infinity."""
+        sizes = self._starts[cells + 1] - self._starts[cells]
+        ends = np.minimum(np.cumsum(sizes, axis=1), _LEADING)
+        out = np.full((len(cells), _LEADING), np.inf, np.float32)
+        starts = ends - np.diff(ends, axis=1, prepend=0)
+        for i, probe in zip(*np.nonzero(ends > starts), strict=True):
+            start, end, here = starts[i, probe], ends[i, probe], place[i, probe]
+            out[i, start:end] = squared[here : here + end - start]
+        return out
 
 
-def _squared(doubled: _Floats, held: ByteArray) -> _Floats:
-    """Squared distances (q, m) less the queries' squares, of -2 times the queries (q, 128).
+def _squared(asked: _Floats, held: ByteArray, out: _Floats | None = None) -> _Floats:
+    """Squared distances (q, m) less the queries' own squares.
 
     Exact in float32: all sums of 128 products of bytes, and their doubles, are below 2^24.
     """
     values = held.astype(np.float32)
-    out = np.asarray(doubled @ values.T, np.float32)
-    out += np.einsum("ij,ij->i", values, values)
-    return out
+    products = (values @ (-2.0 * asked).T).T  # this way round in half the time
+    return np.add(products, np.vecdot(values, values), out=out)
 
 
-def _smallest(values: _Floats, count: int) -> tuple[IntArray, IntArray]:
-    """Rows and columns of the finite values (q, m) that may be among each row's smallest ``count``.
+def _bound(values: _Floats, count: int) -> _Floats:
+    """A finite bound (q,) of each row's smallest ``count`` of (q, m); ties are never cut.
 
-    All that are no larger than so many of the leading ones: ties are never cut.
+    No larger than that many of the leading ones, where there are so many.
     """
     bound = np.full(len(values), np.finfo(np.float32).max)
     leading = values[:, :_LEADING]
     if leading.shape[1] > count:
-        nearest = np.partition(leading, count - 1, axis=1)[:, count - 1]
-        bound = np.minimum(bound, nearest)
-    return np.divmod(np.flatnonzero(values <= bound[:, None]), values.shape[1])
+        bound = np.minimum(bound, np.partition(leading, count - 1, axis=1)[:, count - 1])
+    return bound

@@ -139,6 +139,10 @@ class KnownMap:
 
 def _owners(ids: IntArray, viewed: IntArray) -> tuple[IntArray, IntArray]:
     """The row (v,) of each view's landmark, -1 where there is none; views (n,) of each landmark."""
+    first = np.flatnonzero(np.diff(viewed, prepend=-1))
+    counts = np.diff(first, append=len(viewed))
+    if np.array_equal(viewed[first], ids):  # as nearly always, and ten times as fast
+        return np.repeat(np.arange(len(ids)), counts), counts
     row = np.searchsorted(ids, viewed)
     known = row < len(ids)
     known[known] = ids[row[known]] == viewed[known]
