@@ -32,6 +32,7 @@ _HYPOTHESES = 400  # rigid triples that are scored
 _RIVALS = 8  # of the hypotheses elsewhere that are refined: the best ones
 _LEAST_SPREAD_M = 0.3  # smaller triangles turn the map by more than least squares mends
 _ROUNDS = 8  # of least squares and choosing anew
+_AT_ONCE = 8192  # pairs of views compared together; their bytes stay in the cache
 _AMONG_M = 0.5  # a landmark this near to one of the other map's lies among them
 
 
@@ -307,13 +308,21 @@ def _same(a: SavedMap, b: SavedMap, aTb: FloatArray, settings: MergeSettings) ->
 
 def _descriptor_distances(a: SavedMap, b: SavedMap, pairs: IntArray) -> FloatArray:
     """(k,) between the nearest views of each pair; infinite where one has no view."""
-    mine, yours = _view_lists(a), _view_lists(b)
+    mine, yours = _view_lists(a)[pairs[:, 0]], _view_lists(b)[pairs[:, 1]]
+    others = np.diff(yours, axis=1)[:, 0]
+    counts = np.diff(mine, axis=1)[:, 0] * others
+    pair = np.repeat(np.arange(len(pairs)), counts)
+    own, other = np.divmod(
+        np.arange(len(pair)) - (np.cumsum(counts) - counts)[pair], np.maximum(others, 1)[pair]
+    )
+    own, other = mine[pair, 0] + own, yours[pair, 0] + other
     out = np.full(len(pairs), np.inf)
-    for k, (i, j) in enumerate(pairs.tolist()):
-        own = a.appearances.descriptors[slice(*mine[i])].astype(np.float64)
-        other = b.appearances.descriptors[slice(*yours[j])].astype(np.float64)
-        if len(own) and len(other):
-            out[k] = np.linalg.norm(own[:, None] - other[None], axis=2).min()
+    for start in range(0, len(pair), _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        difference = a.appearances.descriptors[own[part]].astype(np.int32)
+        difference -= b.appearances.descriptors[other[part]]
+        squared = np.einsum("ij,ij->i", difference, difference)
+        np.minimum.at(out, pair[part], np.sqrt(squared))
     return out
 
 

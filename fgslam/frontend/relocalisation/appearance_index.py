@@ -21,6 +21,7 @@ from fgslam.types import ByteArray, FloatArray, IntArray
 _CHUNK = 4096  # descriptors compared at a time; their distances stay in the cache
 _EXACT = 6000  # contents up to here are compared in full, which costs no more
 _PROBES = 12  # cells searched for each query, of 256
+_AT_ONCE = 1024  # queries; more than a frame has, and their distances are tens of megabytes
 _LEADING = 1024  # of a query's distances bound the rest: those of its nearest cells
 
 _Floats = npt.NDArray[np.float32]
@@ -68,6 +69,17 @@ class AppearanceIndex:
         Approximate in contents of more than a few thousand: a neighbour in a cell that the query
         does not search is not found. Distances are exact.
         """
+        found = [
+            self._some(descriptors[start : start + _AT_ONCE], neighbours)
+            for start in range(0, max(len(descriptors), 1), _AT_ONCE)
+        ]
+        return Neighbours(
+            np.concatenate([one.rows for one in found]),
+            np.concatenate([one.distances for one in found]),
+        )
+
+    def _some(self, descriptors: ByteArray, neighbours: int) -> Neighbours:
+        """The neighbours of so many descriptors that their distances fit into memory."""
         asked = descriptors.astype(np.float32)
         if self._small or not len(asked):
             query, row, squared = self._in_full(asked, neighbours)
