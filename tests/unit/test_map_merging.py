@@ -10,6 +10,7 @@ import pytest
 
 from fgslam import geometry as g
 from fgslam.errors import MapError
+from fgslam.frontend import map_alignment
 from fgslam.frontend.map_alignment import Alignment, align_maps, tentative_pairs
 from fgslam.frontend.map_fusion import merge_maps
 from fgslam.map_file import SavedMap, load_map, save_map
@@ -231,3 +232,27 @@ def test_merged_files(world: World, tmp_path: Path) -> None:
     with pytest.raises(MapError, match="made with another rig"):
         merge_files(a, b, tmp_path / "c")
     assert not (tmp_path / "c").exists()
+
+
+def test_landmarks_are_as_alike_as_the_nearest_of_their_views(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    which = np.arange(120)
+    a, b = world.seen(which, np.eye(4)), world.seen(which, BTA)
+    alone = align(a, b)
+    monkeypatch.setattr(map_alignment, "_AT_ONCE", 50)  # less than there are
+    several = align(with_strange_views(a, 2, world.rng), with_strange_views(b, 1, world.rng))
+    assert len(alone.pairs) > 100
+    assert np.array_equal(several.pairs, alone.pairs)
+
+
+def with_strange_views(saved: SavedMap, count: int, rng: np.random.Generator) -> SavedMap:
+    """Every landmark seen ``count`` more times, each time looking like nothing else."""
+    own = saved.appearances
+    looks = rng.exponential(1.0, (count * len(own), 128))
+    looks = 512.0 * looks / np.linalg.norm(looks, axis=1, keepdims=True)
+    ids = np.concatenate([own.ids, np.tile(own.ids, count)])
+    order = np.argsort(ids, kind="stable")
+    descriptors = np.concatenate([own.descriptors, np.clip(looks, 0, 255).astype(np.uint8)])
+    size = np.tile(own.size, count + 1)
+    return replace(saved, appearances=appearances(ids[order], descriptors[order], size[order]))
