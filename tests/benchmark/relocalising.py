@@ -5,7 +5,9 @@ of it around it are a building: each copy's descriptors have their 16 cells perm
 the rooms have textures of their own whose statistics are SIFT's. The drive's frames are sought in
 the building by a robot that is lost there: all that place recognition then does in a frame, which
 is to choose the landmarks, to learn them, to locate the frame among them and to track it there. A
-look for a return does the same with fewer landmarks. Both times are the processor's.
+look for a return does the same with fewer landmarks. Both times are the processor's; each look is
+made three times, the maps taking turns, and its median counts, so that a shared machine's moods do
+not make the slowest frame.
 """
 
 from __future__ import annotations
@@ -47,6 +49,7 @@ from fgslam.types import (
 
 SIZES = (1_000, 3_000, 10_000, 30_000, 100_000)
 FRAMES, EVERY = 120, 8
+ROUNDS = 3
 LIMITS = {"look_100k_over_frontend": 2.0, "look_100k_worst_over_frontend": 2.0}
 _APART_M = 12.0
 _REACH = np.arange(-4, 5)  # rooms to each side of the first one
@@ -72,8 +75,13 @@ class Lost:
     landmarks: LandmarkMap
     tracker: LandmarkTracker
     places: PlaceRecognition
-    seconds: list[float] = field(default_factory=list)
+    rounds: list[list[float]] = field(default_factory=list)
     right: int = 0
+
+    @property
+    def seconds(self) -> list[float]:
+        """Of each frame."""
+        return [statistics.median(frame) for frame in zip(*self.rounds, strict=True)]
 
     @staticmethod
     def among(known: SavedMap, settings: FrontendSettings) -> Lost:
@@ -90,7 +98,7 @@ class Lost:
         tracked = self.tracker.track(_FAR_AWAY, self.landmarks, features)
         start = time.process_time()
         tracked, found = self.places.recover(tracked, self.landmarks, features)
-        self.seconds.append(time.process_time() - start)
+        self.rounds[-1].append(time.process_time() - start)
         off = np.linalg.norm(tracked.ego_motion.wTc[:3, 3] - wTc[:3, 3])
         self.right += int(found and off < 0.2)
 
@@ -175,6 +183,15 @@ def saved(known: tuple[LandmarkMap, LandmarkAppearances], rig: CameraRig) -> Sav
     )
 
 
+def seek(robots: dict[int, Lost], driven: Driven) -> None:
+    """One round of looks: every frame in every map."""
+    for robot in robots.values():
+        robot.rounds.append([])
+    for features, wTc in zip(driven.queries, driven.poses, strict=True):
+        for robot in robots.values():
+            robot.look(features, wTc)
+
+
 @one_blas_thread()
 def ratios_of_relocalising() -> dict[str, float]:
     """Milliseconds of the processor by the size of the map, and over the front-end's median."""
@@ -187,13 +204,12 @@ def ratios_of_relocalising() -> dict[str, float]:
         robots = {
             size: Lost.among(saved(building(driven, size), rig), config.frontend) for size in SIZES
         }
-        for robot in robots.values():  # libraries and memory are fetched before the clock starts
-            robot.look(driven.queries[0], driven.poses[0])
-            robot.seconds.clear()
-            robot.right = 0
-        for features, wTc in zip(driven.queries, driven.poses, strict=True):
-            for robot in robots.values():
-                robot.look(features, wTc)
+        for k in range(1 + ROUNDS):
+            seek(robots, driven)
+            if k == 0:  # in the first one libraries and memory were fetched
+                for robot in robots.values():
+                    robot.rounds.clear()
+                    robot.right = 0
     finally:
         cv2.setNumThreads(threads)
     frontend = statistics.median(driven.frontend_s)
@@ -203,7 +219,7 @@ def ratios_of_relocalising() -> dict[str, float]:
         out[f"{name}_ms"] = 1e3 * statistics.median(robot.seconds)
         out[f"{name}_over_frontend"] = statistics.median(robot.seconds) / frontend
         out[f"{name}_worst_over_frontend"] = max(robot.seconds) / frontend
-        out[f"{name}_right"] = robot.right / len(driven.queries)
+        out[f"{name}_right"] = robot.right / (ROUNDS * len(driven.queries))
     return out
 
 
