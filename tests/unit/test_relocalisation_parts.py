@@ -8,14 +8,16 @@ import pytest
 from fgslam import geometry
 from fgslam.frontend.relocalisation.alignment import align, align_in_space, rigid
 from fgslam.frontend.relocalisation.appearance_index import Neighbours
+from fgslam.frontend.relocalisation.known_map import KnownMap
 from fgslam.frontend.relocalisation.least_squares import refine
-from fgslam.frontend.relocalisation.proposals import Proposals, distinct
-from fgslam.frontend.relocalisation.refinement import covered, crowd, witnesses
-from fgslam.frontend.relocalisation.residuals import Pairs, SeenPoints, residuals
+from fgslam.frontend.relocalisation.proposals import Evidence, Proposals, distinct
+from fgslam.frontend.relocalisation.refinement import Refiner, covered, crowd, witnesses
+from fgslam.frontend.relocalisation.relocaliser import Relocaliser
+from fgslam.frontend.relocalisation.residuals import Pairs, SeenPoints, log_uniform, residuals
 from fgslam.frontend.relocalisation.tentative import specific
 from fgslam.settings.relocalisation import RelocalisationSettings
-from fgslam.types import LandmarkMap
-from tests.known_places import RIG, floor, planar, room, seen
+from fgslam.types import LandmarkMap, StereoFeatures
+from tests.known_places import RIG, Place, error, floor, planar, room, seen
 
 
 def _seen_from(truth: np.ndarray, there: np.ndarray) -> np.ndarray:
@@ -167,3 +169,36 @@ def test_candidates_end_at_the_first_gap() -> None:
     many = [100.0, 101.0, 102.0, 103.0, 104.0]
     assert _specific(many, [0.0, 3.0, 6.0, 9.0, 12.0]) == []
     assert _specific([500.0, 900.0], [0.0, 5.0]) == []
+
+
+@pytest.mark.parametrize("dof", [3, 6])
+def test_rivals_refined_together_end_where_each_would_alone(
+    rng: np.random.Generator, dof: int
+) -> None:
+    truth = planar(0.5, -0.4, 0.3)
+    place = room(rng)
+    refiner = _refiner(seen(place, truth, rng, clutter=20), place, dof)
+    starts = [planar(0.6, -0.4, 0.3), planar(4.0, 4.0, 2.0), planar(0.5, -0.2, 0.36), truth]
+    covariance = np.diag([0.02, 0.02, 0.02, 0.05, 0.05, 0.05]) ** 2
+    proposals = Proposals(np.array(starts), np.tile(covariance, (4, 1, 1)), np.zeros(4))
+    together = refiner.refine(proposals)
+    alone = [found for k in range(4) for found in refiner.refine(proposals.select(np.array([k])))]
+    assert 3 <= len(together) == len(alone)
+    for one, other in zip(together, alone, strict=True):
+        assert np.array_equal(one.wTc, other.wTc)
+        assert np.array_equal(one.covariance, other.covariance)
+        assert np.array_equal(one.landmarks, other.landmarks)
+        assert np.array_equal(one.features, other.features)
+    assert error(together[-1].wTc, truth)[0] < 0.02
+    assert refiner.refine(Proposals.none()) == []
+
+
+def _refiner(features: StereoFeatures, place: Place, dof: int) -> Refiner:
+    settings = RelocalisationSettings()
+    relocaliser = Relocaliser(RIG, floor(dof), settings)
+    relocaliser.learn(*place.map())
+    tentative, known = relocaliser.tentative(features), KnownMap.of(*place.map())
+    points = SeenPoints.of(features, RIG)
+    pairs = Pairs.of(points, tentative.features, known.landmarks, tentative.landmarks)
+    evidence = Evidence(RIG, tentative, pairs, log_uniform(RIG, pairs.seen, 40.0, known.room))
+    return Refiner(RIG, floor(dof), known, features, points, evidence, settings)

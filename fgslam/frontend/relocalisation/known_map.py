@@ -43,7 +43,8 @@ class KnownMap:
     ) -> KnownMap:
         """Landmarks without a view, and views without a landmark, are left out.
 
-        ``map_sigma_m`` is added to the landmarks' noise.
+        ``map_sigma_m`` is added to the landmarks' noise. Positions and views are not copied where
+        all are kept, and must not change.
         """
         owners, counts = _owners(landmarks.ids, appearances.ids)
         if (owners < 0).any():

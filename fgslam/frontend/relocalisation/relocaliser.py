@@ -46,7 +46,10 @@ class Relocaliser:
         return len(self._known.landmarks)
 
     def learn(self, landmarks: LandmarkMap, appearances: LandmarkAppearances) -> None:
-        """Replaces the map; landmarks without a stored view cannot be recognised: left out."""
+        """Replaces the map; landmarks without a stored view cannot be recognised: left out.
+
+        Its arrays are not copied, and must not change until the next map is learnt.
+        """
         self._known = KnownMap.of(landmarks, appearances, self._settings.map_sigma_m)
 
     def locate(self, features: StereoFeatures, rng: np.random.Generator) -> Relocalisation:
