@@ -34,6 +34,7 @@ class DriveBook:
         self._settings = settings
         self._chain = Chain()
         self._tied = -1
+        self._sound = True
         self.remarks: list[str] = []
 
     @property
@@ -46,18 +47,24 @@ class DriveBook:
     ) -> None:
         """Books the step (4, 4) to a frame.
 
+        Two frames that were tracked well lie beside the same landmarks. Where most of what a frame
+        matched contradicts its pose, as at a return to places that the drift has displaced, old
+        landmarks and new ones pull apart: nothing measures the step to that pose, nor the one back
+        from it, but the odometry.
+
         Args:
             motion: the frame's pose as tracked, in the last one's.
             tracking: how the frame was tracked.
             known: what the frame was predicted with.
             free: nobody knows the step: the frame was found without a prior.
         """
+        before, self._sound = self._sound, _agrees_with_itself(tracking)
         if free:
             covariance = FREE
-        elif tracking.status.measured or known is None:
+        elif known is None or (before and self._sound and tracking.status.measured):
             covariance = self._settings.drift_factor**2 * tracking.covariance
         else:
-            covariance = known.covariance
+            motion, covariance = known.motion, known.covariance
         self._chain.append(motion, covariance)
 
     def tie(
@@ -76,8 +83,9 @@ class DriveBook:
         frame, every = len(self._chain) - 1, self._settings.submap_frames
         homes = np.maximum(homes, 0)  # a saved map's landmarks stay, and so does the first pose
         old = homes[homes < (frame if free else frame - _OLD * every)]
-        due = self._tied < 0 or frame - self._tied >= every
-        if len(old) < _TIED_BY or not (free or due):
+        due = self._sound and (self._tied < 0 or frame - self._tied >= every)
+        # A few old ones among many new, far ones as a rule, do not say where the frame is.
+        if len(old) < _TIED_BY or 2 * len(old) < len(homes) or not (free or due):
             return
         self._tied = frame
         home = int(np.sort(old)[len(old) // 2])
@@ -126,6 +134,7 @@ class DriveBook:
         """All of it as plain arrays."""
         return self._chain.state() | {
             "chain_tied": np.array(self._tied),
+            "chain_sound": np.array(self._sound),
             "chain_remarks": np.array(self.remarks, np.str_),
         }
 
@@ -133,4 +142,10 @@ class DriveBook:
         """Continues from :meth:`state`."""
         self._chain = Chain.restored(state)
         self._tied = int(state["chain_tied"])
+        self._sound = bool(state["chain_sound"])
         self.remarks = [str(words) for words in state["chain_remarks"]]
+
+
+def _agrees_with_itself(tracking: EgoMotion) -> bool:
+    """Whether most of a frame's matches were used; of a frame without any, yes."""
+    return 2 * int(tracking.inliers.sum()) >= len(tracking.inliers)

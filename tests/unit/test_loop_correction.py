@@ -1,0 +1,118 @@
+"""What a filter keeps of its drive: which steps were measured, and what ties a frame to a place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fgslam.backend.loop_correction import DriveBook
+from fgslam.geometry import pose
+from fgslam.settings.backend import LoopCorrectionSettings
+from fgslam.types import EgoMotion, EgoMotionStatus, FloatArray, LoopClosure, Observations, Odometry
+
+_TRACKED = np.diag([1e-6] * 6)
+_WHEELS = np.diag([1e-4] * 6)
+
+
+def _forward(metres: float) -> FloatArray:
+    return pose(np.eye(3), np.array([0.0, 0.0, metres]))
+
+
+def _tracking(wTc: FloatArray, used: int, matched: int) -> EgoMotion:
+    return EgoMotion(
+        wTc=wTc,
+        covariance=_TRACKED,
+        inliers=np.arange(matched) < used,
+        residuals=np.zeros(matched),
+        status=EgoMotionStatus.OK,
+        iterations=3,
+    )
+
+
+def _book(book: DriveBook, metres: float, used: int = 80, matched: int = 100) -> None:
+    """A frame tracked so far on from the last one, where the wheels say 0.1 m."""
+    here = _forward(metres) if not len(book.chain) else book.chain.poses[-1] @ _forward(metres)
+    odometry = Odometry(_forward(0.1), _WHEELS)
+    book.step(_forward(metres), _tracking(here, used, matched), odometry, free=False)
+
+
+def _closure(frame: int, oTc: FloatArray) -> LoopClosure:
+    nothing = Observations(
+        np.empty(0, np.int64),
+        np.empty((0, 3)),
+        np.empty((0, 3, 3)),
+        np.empty((0, 3, 2)),
+        np.empty(0, np.bool_),
+    )
+    return LoopClosure(frame, oTc, _TRACKED, nothing, np.empty((0, 2), np.int64))
+
+
+def test_a_frame_most_of_whose_matches_contradict_it_measured_no_step() -> None:
+    """Nor is the step back from it one: both are the odometry's."""
+    book = DriveBook(LoopCorrectionSettings())
+    for metres, used in ((0.0, 80), (0.1, 80), (0.9, 49), (-0.7, 80), (0.1, 50)):
+        _book(book, metres, used)
+    chain = book.chain
+    assert [p[2, 3] for p in chain.poses] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    for step, expected in zip(
+        chain.steps, (_TRACKED, _TRACKED, _WHEELS, _WHEELS, _TRACKED), strict=True
+    ):
+        np.testing.assert_array_equal(step, expected)
+
+
+def test_without_odometry_the_tracked_step_is_all_there_is() -> None:
+    """A chain needs its steps."""
+    book = DriveBook(LoopCorrectionSettings())
+    book.step(np.eye(4), _tracking(np.eye(4), 80, 100), None, free=False)
+    book.step(_forward(0.9), _tracking(_forward(0.9), 10, 100), None, free=False)
+    assert book.chain.poses[-1][2, 3] == 0.9
+
+
+def test_a_jump_of_the_tracking_does_not_make_a_true_closure_impossible() -> None:
+    """0.8 m in one frame are 800 deviations of a tracked step; the closure knows better."""
+    for used, taken in ((80, False), (30, True)):
+        book = DriveBook(LoopCorrectionSettings())
+        _book(book, 0.0)
+        for k in range(1, 40):
+            _book(book, 0.9 if k == 20 else 0.1, used if k == 20 else 80)
+        found = book.close(_closure(0, _forward(3.9)), book.chain.poses[-1], "frame 39")
+        assert (found is not None) is taken, book.remarks
+
+
+def test_a_few_old_landmarks_among_many_new_ones_tie_a_frame_to_nothing() -> None:
+    """They are far away as a rule, and do not say where the frame is."""
+    book = DriveBook(LoopCorrectionSettings())
+    poses = []
+    for k in range(120):
+        _book(book, 0.1 if k else 0.0)
+        poses.append(book.chain.poses[-1])
+    tracking = _tracking(poses[-1], 80, 100)
+    new = np.full(30, 110)
+    book.tie(np.concatenate([np.full(20, 3), new]), poses, tracking, free=False)
+    assert not book.chain.constraints
+    book.tie(np.concatenate([np.full(31, 3), new]), poses, tracking, free=False)
+    (tie,) = book.chain.constraints
+    assert (tie.before, tie.after) == (3, 119)
+
+
+def test_a_frame_at_odds_with_itself_is_tied_to_nothing() -> None:
+    """Wherever its landmarks come from."""
+    book = DriveBook(LoopCorrectionSettings())
+    poses = []
+    for k in range(120):
+        _book(book, 0.1 if k else 0.0, 80 if k < 119 else 40)
+        poses.append(book.chain.poses[-1])
+    book.tie(np.full(40, 3), poses, _tracking(poses[-1], 40, 100), free=False)
+    assert not book.chain.constraints
+
+
+def test_it_goes_on_after_a_frame_at_odds_as_if_never_interrupted() -> None:
+    """The step back is the odometry's, also after a restart."""
+    one, other = (DriveBook(LoopCorrectionSettings()) for _ in range(2))
+    for metres, used in ((0.0, 80), (0.1, 80), (0.9, 20)):
+        _book(one, metres, used)
+    other.restore(one.state())
+    for book in (one, other):
+        _book(book, -0.7)
+    np.testing.assert_array_equal(one.chain.poses, other.chain.poses)
+    np.testing.assert_array_equal(one.chain.steps, other.chain.steps)
