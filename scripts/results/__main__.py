@@ -18,6 +18,7 @@ from scripts.results import (
     real,
     recognised,
     seeds,
+    strangers,
     variants,
     visits,
 )
@@ -35,6 +36,7 @@ WHAT: dict[str, Callable[[Path], Iterable[Table]]] = {
     "noise": lambda data: noise.tables(),
     "lasting": lambda data: lasting.tables(),
     "visits": lambda data: visits.tables(),
+    "strangers": lambda data: strangers.tables(),
     "recognised": lambda data: recognised.tables(data),
 }
 
