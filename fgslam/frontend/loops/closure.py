@@ -31,7 +31,8 @@ def close_loop(
     """The closure that a frame's sighting of old landmarks means; None where it is too weak.
 
     Both frames are located by the same old landmarks, each alone, so that neither the drift between
-    them nor any estimator's past has a say in what is measured.
+    them nor any estimator's past has a say in what is measured. Of a map that the run began in, the
+    two may see different parts: it is held still, and the earlier frame is where it was entered.
 
     Args:
         memory: who saw what.
@@ -41,15 +42,18 @@ def close_loop(
         partners: (n,) the identity that each feature has got since the drift, -1 for none.
         resection: locates a frame by known landmarks.
     """
-    earlier = memory.best_view_of(found.ids)
+    earlier = memory.best_view_of(found.ids, landmarks)
+    if earlier < 0:
+        return None
     seen = features.observations(found.features, found.ids, is_new=False)
-    there = resection.solve(PoseProblem.of(landmarks, memory.view(earlier, landmarks)))
+    there = resection.solve(PoseProblem.of(landmarks, memory.view(earlier, found.ids, landmarks)))
     here = resection.solve(PoseProblem.of(landmarks, seen))
     if not (there.status.measured and here.status.measured):
         return None
     taken_for = partners[found.features[here.inliers]]
     kept = seen.select(here.inliers)
-    twice = (taken_for >= 0) & (taken_for != kept.ids)
+    # A landmark of the given map ends as no other's double: it has not been made by the drift.
+    twice = (taken_for >= 0) & (taken_for != kept.ids) & ~memory.of_given(taken_for)
     return LoopClosure(
         frame=earlier,
         oTc=inverse(there.wTc) @ here.wTc,

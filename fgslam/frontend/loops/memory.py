@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from bisect import bisect_right
 
 import numpy as np
 from scipy.sparse import lil_array
@@ -20,7 +21,8 @@ from fgslam.types import (
 )
 
 _RETURN_FRAMES = 30  # unseen for so long: tracking them again ties the frame to an older one
-_RETURN_MATCHES = 10  # of them, as for the ties of the filter's backward correction
+_RETURN_MATCHES = 10  # of them, as for the ties of the filter's backward correction; so many of a
+# given map's landmarks, whenever seen last, tie a frame to that map
 _LEAST_M = 1e-6  # of an edge: none at all is no edge
 
 
@@ -29,6 +31,9 @@ class SightingMemory:
 
     The observations are those of the log; nothing is copied. A closure that the estimator refused
     is none: neither a return nor a sighting of the landmarks that it names.
+
+    A run may begin in a map. That map is one place, whatever of it the run has seen: frames tied to
+    it do not drift apart, and what the run has yet to see of it was "seen" where the run entered.
 
     Attributes:
         taken: whether the estimator took the log's closures, in their order.
@@ -41,7 +46,8 @@ class SightingMemory:
         self._way: list[float] = []
         self._newest: list[int] = []
         self._returns: list[tuple[int, int]] = []
-        self._last_seen: IntArray = np.empty(0, np.int64)
+        self._ties: list[int] = []
+        self._last_seen: IntArray = np.full(given + 1, -1)
         self.taken: list[bool] = []
 
     def __len__(self) -> int:
@@ -56,14 +62,16 @@ class SightingMemory:
             closed: for each of its loops, whether the estimator took it.
         """
         way = self._way[-1] if self._way else 0.0
-        self._way.append(way + float(np.linalg.norm(step[:3, 3])))
         self._book(increment, closed)
+        held = self._ties[-2:] == [len(self) - 2, len(self) - 1]  # both by the map, not by the step
+        self._way.append(way if held else way + float(np.linalg.norm(step[:3, 3])))
 
     def way_since(self, frame: int) -> float:
         """Metres along which the estimate can have drifted away from a frame's surroundings.
 
         The way driven since, but cut short where a place was seen again in between: what was tied
-        there has drifted no farther apart than the rest of the way allows.
+        there has drifted no farther apart than the rest of the way allows. Nor does a way count
+        along which a given map was in view.
         """
         nodes = sorted({frame, len(self._way) - 1, *itertools.chain(*self._returns)})
         at = {node: i for i, node in enumerate(nodes)}
@@ -77,37 +85,69 @@ class SightingMemory:
         return float(found[-1])
 
     def unseen_for(self, frames: int, ids: IntArray) -> IntArray:
-        """Those of the landmarks that the last ``frames`` frames did not see."""
+        """Those of the landmarks that the last ``frames`` frames did not see.
+
+        Those that no frame saw are among them if they are of the map that the run began in, and
+        some frame tells where in that map it was.
+        """
         known = ids[ids < len(self._last_seen)]
         last = self._last_seen[known]
-        return known[(last >= 0) & (last < len(self) - frames)]
+        unseen = (last < 0) & (known <= self._given) & bool(self._ties)
+        return known[((last >= 0) & (last < len(self) - frames)) | unseen]
+
+    def of_given(self, ids: IntArray) -> BoolArray:
+        """Which of the landmarks (k,) are of the map that the run began in."""
+        return np.asarray(ids <= self._given)
 
     def made_after(self, frame: int, ids: IntArray) -> BoolArray:
         """Which of the landmarks (k,) were new only after a frame."""
         return np.asarray(ids > self._newest[frame])
 
     def last_seen(self, ids: IntArray) -> int:
-        """The last frame that saw any of the landmarks; -1 where none did."""
-        return int(self._last_seen[ids].max(initial=-1))
+        """The last frame that saw any of the landmarks; -1 where none did.
 
-    def best_view_of(self, ids: IntArray) -> int:
-        """The frame that saw most of the landmarks; the latest of several.
+        Where some are of the given map and were never seen, it is not later than the frame that
+        saw the last of this map before it was left: what was made since may be one of them.
+        """
+        last = self._last_seen[ids]
+        seen = int(last.max(initial=-1))
+        if not self._ties or not ((last < 0) & self.of_given(ids)).any():
+            return seen
+        # Frames that see the map again are those of the return; the one before them is meant.
+        before = bisect_right(self._ties, len(self) - 1 - _RETURN_FRAMES)
+        left = self._ties[max(before - 1, 0)]
+        return left if seen < 0 else min(seen, left)
 
-        Raises:
-            ValueError: none of them was ever seen.
+    def best_view_of(self, ids: IntArray, landmarks: LandmarkMap) -> int:
+        """The frame that saw most of the landmarks; the latest of several. -1 where none did.
+
+        What no frame saw of the given map counts as seen by the one that tells best where the run
+        entered it: the earliest that saw enough landmarks of it that are still in ``landmarks``.
         """
         wanted = np.zeros(len(self._last_seen), np.bool_)
         wanted[ids] = True
-        last = self.last_seen(ids)
-        counts = [int(wanted[seen.ids].sum()) for seen in self._seen[: last + 1]]
-        if max(counts, default=0) == 0:
-            raise ValueError(f"landmarks never seen: {ids[:5].tolist()}")
-        return last - int(np.argmax(counts[::-1]))
+        counts = np.array([int(wanted[seen.ids].sum()) for seen in self._seen], np.int64)
+        unseen = int((self._last_seen[ids[self.of_given(ids)]] < 0).sum())
+        if unseen and (entry := self._entry(landmarks)) >= 0:
+            counts[entry] += unseen
+        if counts.max(initial=0) == 0:
+            return -1
+        return len(counts) - 1 - int(np.argmax(counts[::-1]))
 
-    def view(self, frame: int, landmarks: LandmarkMap) -> Observations:
-        """What a frame saw of the landmarks that are still in the map."""
+    def view(self, frame: int, ids: IntArray, landmarks: LandmarkMap) -> Observations:
+        """What a frame saw of the landmarks that are still in the map, to be located beside some.
+
+        Args:
+            frame: the earlier one.
+            ids: those beside which it is located. Where some of the given map are among them that
+                no frame saw, only the given map places the frame beside them.
+            landmarks: the map.
+        """
         seen = self._seen[frame]
-        return seen.select(np.isin(seen.ids, landmarks.ids))
+        keep = np.isin(seen.ids, landmarks.ids)
+        if (self._last_seen[ids[self.of_given(ids)]] < 0).any():
+            keep &= self.of_given(seen.ids)
+        return seen.select(keep)
 
     def state(self) -> StateArrays:
         """What the log does not tell."""
@@ -119,9 +159,9 @@ class SightingMemory:
 
     def restore(self, state: StateArrays, log: MeasurementLog) -> None:
         """Continues from :meth:`state` and the log of as many frames."""
-        self._seen, self._newest, self._returns = [], [], []
-        self._last_seen = np.empty(0, np.int64)
+        self._seen, self._newest, self._returns, self._ties = [], [], [], []
         self._given = int(state["given"])
+        self._last_seen = np.full(self._given + 1, -1)
         verdicts, self.taken = iter(state["taken"].tolist()), []
         for increment in log:
             self._book(increment, tuple(itertools.islice(verdicts, len(increment.loops))))
@@ -138,11 +178,30 @@ class SightingMemory:
         old = before[(before >= 0) & (before < here - _RETURN_FRAMES)]
         if len(old) >= _RETURN_MATCHES:
             self._returns.append((here, int(old[len(old) // 2])))
+        if int(self.of_given(seen.ids).sum()) >= _RETURN_MATCHES:
+            self._tie(here)
         self._last_seen[ids] = here
         self._seen.append(seen)
         self._returns += [(here, loop.frame) for loop in loops]
         newest = self._newest[-1] if self._newest else self._given
         self._newest.append(int(increment.observations.ids.max(initial=newest)))
+
+    def _tie(self, here: int) -> None:
+        """Books that a frame saw the given map, which makes it a return to where that was entered.
+
+        One return serves a row of frames: within it no way counts.
+        """
+        if self._ties and self._ties[-1] < here - 1:
+            self._returns.append((here, self._ties[0]))
+        self._ties.append(here)
+
+    def _entry(self, landmarks: LandmarkMap) -> int:
+        """The first frame tied to the given map by what is still there of it; -1 for none."""
+        still = np.zeros(len(self._last_seen), np.bool_)
+        given = landmarks.ids[self.of_given(landmarks.ids)]
+        still[given] = True
+        counts = ((frame, int(still[self._seen[frame].ids].sum())) for frame in self._ties)
+        return next((frame for frame, count in counts if count >= _RETURN_MATCHES), -1)
 
     def _grow(self, count: int) -> None:
         lacking = count - len(self._last_seen)

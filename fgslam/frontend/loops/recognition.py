@@ -111,7 +111,7 @@ class PlaceRecognition:
         # Without any landmark yet there is nothing to be lost in.
         located = tracked.ego_motion.status.measured or not len(landmarks)
         self._lost = 0 if located else self._lost + 1
-        if self._lost and self._confirmation is not None:
+        if self._astray and self._confirmation is not None:
             self._confirmation.forget()  # its frames are to be in a row
         if lost is None or self._lost < lost.after or not len(features):
             return tracked, False
@@ -149,7 +149,7 @@ class PlaceRecognition:
         if loops is None or confirmation is None or not self._time_to_look(loops, confirmation):
             return ()
         found = self._old_place(loops, landmarks, features)
-        if found is None or not self._plausible(found, wTc, loops):
+        if found is None or not self._plausible(found, wTc, landmarks, loops):
             confirmation.forget()
             return ()
         if not confirmation.offer(found.wTc, wTc):
@@ -240,9 +240,19 @@ class PlaceRecognition:
 
     # ----------------------------------------------------------------------------------------
 
+    @property
+    def _astray(self) -> bool:
+        """Whether it is unknown where the frame is, so that no return would be believed.
+
+        Outside a map that is left as it is, nothing but the odometry ever tells; where nobody
+        searches the whole map for the lost, the return to it is a loop like any other.
+        """
+        outside = self._tracker.keeps_map and self._parts.lost is None
+        return self._lost > 0 and not outside
+
     def _time_to_look(self, loops: LoopSettings, confirmation: Confirmation) -> bool:
         frame = len(self._memory)
-        if self._lost or (self._offered >= 0 and frame - self._offered <= loops.rest):
+        if self._astray or (self._offered >= 0 and frame - self._offered <= loops.rest):
             return False
         return confirmation.hopeful or frame % loops.every == 0
 
@@ -263,9 +273,13 @@ class PlaceRecognition:
         database = self._tracker.database
         return database.ids[database.valid]
 
-    def _plausible(self, found: Relocalisation, wTc: FloatArray, loops: LoopSettings) -> bool:
-        way = self._memory.way_since(self._memory.best_view_of(found.ids))
-        return drift_allows(found.wTc, wTc, way, loops)
+    def _plausible(
+        self, found: Relocalisation, wTc: FloatArray, landmarks: LandmarkMap, loops: LoopSettings
+    ) -> bool:
+        earlier = self._memory.best_view_of(found.ids, landmarks)
+        if earlier < 0:
+            return False
+        return drift_allows(found.wTc, wTc, self._memory.way_since(earlier), loops)
 
     def _locate(
         self, landmarks: LandmarkMap, among: IntArray, features: StereoFeatures
