@@ -102,6 +102,70 @@ def test_landmarks_of_the_map_that_a_run_begins_in_are_older_than_all_it_sees() 
     np.testing.assert_array_equal(memory.made_after(2, asked), asked > 21)
 
 
+MAP = np.arange(60)
+"""Landmarks of a map in which a run begins."""
+HERE = list(range(20))
+"""Those seen where it begins."""
+
+
+def left_and_back() -> SightingMemory:
+    """In the map for 5 frames, out of it for 40, back in another part of it for 2."""
+    outside = [list(range(100 + 10 * k, 110 + 10 * k)) for k in range(40)]
+    return remembered([[0, 1]] + 4 * [HERE] + outside + 2 * [list(range(20, 32))], given=59)
+
+
+def test_what_a_run_has_not_seen_of_its_map_is_old() -> None:
+    memory = remembered([[0, 1, 60], HERE], given=59)
+    np.testing.assert_array_equal(memory.unseen_for(30, np.arange(70)), range(20, 60))
+    nowhere = remembered([[0, 1, 60], [2, 3, 60]], given=59)
+    assert not len(nowhere.unseen_for(30, np.arange(70))), "it may be anywhere in that map"
+    np.testing.assert_array_equal(memory.of_given(np.array([59, 60])), [True, False])
+
+
+def test_what_nobody_saw_of_the_map_was_seen_where_the_run_entered_it() -> None:
+    memory, unseen = left_and_back(), np.arange(40, 60)
+    held = _map(np.arange(600), np.zeros((600, 3)))
+    assert memory.best_view_of(unseen, held) == 1, "frame 0 saw too little of the map"
+    assert memory.best_view_of(np.arange(0, 22), held) == 4, (
+        "most of these were seen, the last in 4"
+    )
+    assert memory.best_view_of(np.concatenate([unseen, np.arange(20, 28)]), held) == 1
+    gone = held.without(np.arange(12))
+    assert memory.best_view_of(unseen, gone) == 45, "where so much is left of what it saw"
+    assert memory.best_view_of(unseen, held.without(np.arange(36))) == -1
+
+
+def test_a_frame_is_placed_in_the_map_by_the_map_alone() -> None:
+    memory = remembered([[*HERE, 60, 61]], given=59)
+    held = _map(np.arange(1, 70), np.zeros((69, 3)))
+    beside = memory.view(0, np.array([3, 40]), held)
+    np.testing.assert_array_equal(beside.ids, HERE[1:])
+    again = memory.view(0, np.array([3, 60]), held)
+    np.testing.assert_array_equal(again.ids, [*HERE[1:], 60, 61])
+
+
+def test_a_map_bounds_the_drift_as_long_as_it_is_seen() -> None:
+    """Half a metre a frame: five in the map, forty outside, two in it again."""
+    memory = left_and_back()
+    assert memory.way_since(1) == pytest.approx(0.0, abs=1e-3)
+    assert memory.way_since(4) == pytest.approx(0.0, abs=1e-3), "the map is one place"
+    assert memory.way_since(25) == pytest.approx(10.0, abs=1e-3), "the shorter way round"
+    out = remembered([HERE, HERE, *[[100 + k] for k in range(8)]], given=59)
+    assert out.way_since(0) == pytest.approx(4.0, abs=1e-3), "since the map was left"
+    other = remembered([HERE, HERE, *[[100 + k] for k in range(8)]])
+    assert other.way_since(0) == pytest.approx(4.5, abs=1e-3), "without a map since that frame"
+
+
+def test_doubles_of_the_map_were_made_since_it_was_left() -> None:
+    memory = left_and_back()
+    assert memory.last_seen(np.array([50])) == 4, "not in the frames of the return"
+    assert memory.last_seen(np.array([50, 300])) == 4, "nor later, whatever else is seen"
+    assert memory.last_seen(np.array([50, 0])) == 4
+    assert memory.last_seen(np.array([300])) == 25
+    brief = remembered([HERE, HERE, [100]], given=59)
+    assert brief.last_seen(np.array([50])) == 0, "just left: all that this run has made"
+
+
 def test_a_return_in_between_bounds_the_drift() -> None:
     """Half a metre a frame out and back; what was seen again ties the end to the beginning."""
     places = [list(range(20 * k, 20 * k + 20)) for k in range(41)]
@@ -140,6 +204,22 @@ def test_a_closure_bounds_the_drift_only_if_the_estimator_took_it(taken: bool, w
     assert_same_bits(restored.state(), memory.state())
     assert restored.way_since(0) == memory.way_since(0)
     np.testing.assert_array_equal(restored.unseen_for(30, again), memory.unseen_for(30, again))
+
+
+def test_memory_of_a_map_restored_from_log_goes_on_the_same() -> None:
+    memory, again, log = left_and_back(), SightingMemory(), MeasurementLog(RIG, {})
+    held = _map(np.arange(600), np.zeros((600, 3)))
+    for k in range(len(memory)):
+        log.append(frame(k, memory.view(k, NOBODY, held)))
+    again.restore(memory.state(), log)
+    assert_same_bits(again.state(), memory.state())
+    unseen = np.arange(32, 60)
+    for one in (memory, again):
+        one.add(frame(47, sight(np.eye(4), np.tile([0.0, 0.0, 3.0], (20, 1)), MAP[:20])), np.eye(4))
+        np.testing.assert_array_equal(one.unseen_for(30, MAP), unseen)
+        assert one.best_view_of(unseen, held) == 1
+        assert one.last_seen(unseen) == 4
+    assert again.way_since(30) == memory.way_since(30)
 
 
 @pytest.mark.parametrize("given", [-1, 8])

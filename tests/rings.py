@@ -1,0 +1,143 @@
+"""A drive round a ring on ideal features, with wheels that turn too far; places are recognised."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from simulated import RIG, FeatureWorld, assert_same_bits
+
+from fgslam import geometry as g
+from fgslam.arrival import Arrival, take_over
+from fgslam.factory import make_estimator, make_places, make_tracker
+from fgslam.frontend.loops.confirmation import difference
+from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.stream import FeatureFrame
+from fgslam.motion import OdometryMotion
+from fgslam.pipeline import FrameReport, SlamPipeline
+from fgslam.settings.backend import EstimatorSettings, LandmarkKalmanSettings
+from fgslam.settings.frontend import EgoMotionSettings, FrontendSettings
+from fgslam.settings.loops import LoopSettings, LostSettings
+from fgslam.types import Features, FloatArray, Frame, Increment, Odometry
+
+IMAGES = (np.zeros((240, 320), np.uint8),) * 3
+RADIUS = 3.0
+ROUND = 72  # frames
+NOISE = np.diag(np.concatenate([[1e-6, 0.02, 1e-6], [0.03, 1e-6, 0.03]]) ** 2)
+SETTINGS = FrontendSettings(
+    ego_motion=EgoMotionSettings(dof=3),
+    loops=LoopSettings(every=2, forgotten_after=25, confirm=2, rest=6),
+    lost=LostSettings(after=2, give_up_after=20),
+)
+
+
+def on_ring(k: float) -> FloatArray:
+    """Camera ``k`` of a drive round a circle, looking along it."""
+    a = 2.0 * np.pi * k / ROUND
+    at = np.array([RADIUS * (1.0 - np.cos(a)), 0.0, RADIUS * np.sin(a)])
+    return g.pose(g.so3_exp(np.array([0.0, a, 0.0])), at)
+
+
+def walls(rng: np.random.Generator) -> FloatArray:
+    """Points on a wall around the ring."""
+    angle = rng.uniform(0.0, 2.0 * np.pi, 1500)
+    distance = RADIUS + rng.uniform(1.0, 2.0, 1500)
+    return np.column_stack(
+        [RADIUS - distance * np.cos(angle), rng.uniform(-0.9, 0.9, 1500), distance * np.sin(angle)]
+    )
+
+
+class RingMotion(OdometryMotion):
+    """Odometry of a drive along given poses whose wheels turn too far in every frame."""
+
+    def __init__(self, poses: list[FloatArray], drift_deg: float) -> None:
+        self._poses = poses
+        self._wrong = g.so3_exp(np.array([0.0, np.deg2rad(drift_deg), 0.0]))
+
+    def between(self, i: int, timestamp: float) -> tuple[Odometry | None, bool]:
+        if i == 0:
+            return None, False
+        step = g.inverse(self._poses[i - 1]) @ self._poses[i]
+        if np.linalg.norm(step[:3, 3]) > 1.0:  # carried: the wheels know nothing of it
+            step = np.eye(4)
+        return Odometry(step @ g.pose(self._wrong, np.zeros(3)), NOISE), True
+
+    def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
+        pass
+
+    def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
+        pass
+
+
+def pipeline_of(
+    poses: list[FloatArray],
+    drift_deg: float,
+    settings: FrontendSettings = SETTINGS,
+    estimator: EstimatorSettings = LandmarkKalmanSettings(),  # noqa: B008 (frozen)
+    arrival: Arrival | None = None,
+) -> SlamPipeline:
+    """The loop on a ring's odometry, in an empty map or a given one."""
+    tracker = make_tracker(RIG, settings)
+    prior = None if arrival is None else arrival.prior
+    solving = make_estimator(RIG, estimator, settings.ego_motion, prior)
+    if arrival is not None:
+        take_over(solving, arrival)
+        tracker.database.load(arrival.saved)
+        tracker.keeps_map = not arrival.extends
+    return SlamPipeline(
+        stereo=StereoMatcher(RIG, settings.stereo, settings.appearance),
+        tracker=tracker,
+        motion=RingMotion(poses, drift_deg),
+        estimator=solving,
+        places=make_places(RIG, settings, tracker, seed=0),
+        located=prior if arrival is not None and arrival.relocalised else None,
+    )
+
+
+def seen(
+    poses: list[FloatArray], dark: range = range(0), sigma_px: float = 0.1
+) -> Iterator[FeatureFrame]:
+    """Frames with the features that the poses see; none in the dark."""
+    rng = np.random.default_rng(8)
+    world = FeatureWorld(walls(rng), rng)
+    for i, wTc in enumerate(poses):
+        features = world.features(wTc, sigma_px)
+        if i in dark:
+            features = tuple(_none_of(f) for f in features)
+        yield FeatureFrame(i, Frame(i, float(i), IMAGES), features, "", 0.0, 0.0)
+
+
+def _none_of(features: Features) -> Features:
+    return dataclasses.replace(
+        features,
+        xy=features.xy[:0],
+        scale=features.scale[:0],
+        orientation=features.orientation[:0],
+        descriptors=features.descriptors[:0],
+    )
+
+
+def drive(pipeline: SlamPipeline, frames: Iterable[FeatureFrame]) -> list[FrameReport]:
+    """All frames, one after the other."""
+    return [pipeline.process(found, found.i, float(found.i)) for found in frames]
+
+
+def error_m(report: FrameReport, true: FloatArray) -> float:
+    """Of the position as told with the frame."""
+    return difference(true, report.stats.wTc)[0]
+
+
+def closings(reports: list[FrameReport]) -> list[int]:
+    """Frames with a closure, taken or not."""
+    return [k for k, report in enumerate(reports) if report.increment.loops]
+
+
+def assert_same_increments(a: Increment, b: Increment) -> None:
+    """Observations, what ended, and loops."""
+    assert_same_bits(a.observations, b.observations)
+    np.testing.assert_array_equal(a.pruned_ids, b.pruned_ids)
+    assert len(a.loops) == len(b.loops)
+    for one, other in zip(a.loops, b.loops, strict=True):
+        assert one.frame == other.frame
+        np.testing.assert_array_equal(one.oTc, other.oTc)

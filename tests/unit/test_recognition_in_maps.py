@@ -1,0 +1,209 @@
+"""A run in a map of half a ring leaves it, drifts, and comes back to a part it has yet to see."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+from rings import (
+    ROUND,
+    SETTINGS,
+    RingMotion,
+    assert_same_increments,
+    closings,
+    drive,
+    error_m,
+    on_ring,
+    pipeline_of,
+    seen,
+)
+from simulated import RIG, assert_same_bits
+
+from fgslam import geometry as g
+from fgslam.arrival import Arrival, take_over
+from fgslam.backend.protocol import Estimator
+from fgslam.factory import make_estimator
+from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.frontend.loops.confirmation import difference
+from fgslam.map_file import SavedMap
+from fgslam.measurement_log import MeasurementLog
+from fgslam.pipeline import FrameReport, SlamPipeline, replay_step
+from fgslam.settings.backend import (
+    BatchSettings,
+    EstimatorSettings,
+    Isam2Settings,
+    LandmarkKalmanGraphSettings,
+    LandmarkKalmanSettings,
+)
+from fgslam.types import EgoMotionStatus, Prediction
+
+MAPPED = ROUND // 2  # frames of the drive that makes the map
+BEGIN = 22  # of it, where the second drive begins
+PATH = [on_ring(k) for k in range(BEGIN, ROUND + 14)]
+DARK = range(26, 38)  # outside the map
+WITHOUT_LOST = dataclasses.replace(SETTINGS, lost=None)
+
+
+@cache
+def half_a_ring() -> SavedMap:
+    """The map of the first half, by the paper's filter."""
+    poses = [on_ring(k) for k in range(MAPPED)]
+    pipeline = pipeline_of(poses, 0.1, WITHOUT_LOST)
+    drive(pipeline, seen(poses))
+    database, estimate = pipeline.tracker.database, pipeline.estimator.estimate()
+    rows = database.rows(estimate.landmarks.ids)
+    return SavedMap(
+        rig=RIG,
+        landmarks=estimate.landmarks,
+        appearances=database.appearances(estimate.landmarks.ids),
+        hits=database.hits[rows],
+        misses=database.misses[rows],
+        permanent=database.lasting[rows],
+        colour=database.colour[rows],
+        trajectory=estimate.trajectory,
+        about={},
+        session={},
+    )
+
+
+def arrival(extends: bool) -> Arrival:
+    prior = Prediction(PATH[0], np.diag(np.repeat([0.02, 0.05], 3) ** 2))
+    return Arrival(half_a_ring(), prior, relocalised=True, extends=extends)
+
+
+def drift_deg(extends: bool) -> float:
+    """A frame: who maps on drifts in the dark alone, the other one as long as it is outside."""
+    return 0.9 if extends else 0.5
+
+
+def in_map(extends: bool) -> SlamPipeline:
+    return pipeline_of(
+        PATH, drift_deg(extends), WITHOUT_LOST, LandmarkKalmanSettings(), arrival(extends)
+    )
+
+
+@cache
+def returned(extends: bool = True) -> tuple[SlamPipeline, list[FrameReport]]:
+    pipeline = in_map(extends)
+    return pipeline, drive(pipeline, seen(PATH, DARK))
+
+
+def landmarks_of_map(estimator: Estimator) -> np.ndarray:
+    """Positions now of the map's landmarks, NaN where one has left."""
+    given, held = half_a_ring().landmarks.ids, estimator.landmarks()
+    out = np.full((len(given), 3), np.nan)
+    kept = np.isin(given, held.ids)
+    out[kept] = held.positions[held.rows(given[kept])]
+    return out
+
+
+@pytest.mark.parametrize("extends", [True, False])
+def test_the_return_to_another_part_of_the_map_is_a_loop(extends: bool) -> None:
+    _, reports = returned(extends)
+    closed = closings(reports)
+    assert closed
+    first = closed[0]
+    assert BEGIN + first >= ROUND - 16, "the map's beginning is in view"
+    assert error_m(reports[first - 1], PATH[first - 1]) > 0.3
+    assert max(error_m(reports[k], PATH[k]) for k in range(first, len(PATH))) < 0.15
+    for k in closed:
+        assert reports[k].stats.closed == (True,)
+        for loop in reports[k].increment.loops:
+            metres, degrees = difference(g.inverse(PATH[loop.frame]) @ PATH[k], loop.oTc)
+            assert metres < 0.1
+            assert degrees < 1.0
+    loop = reports[first].increment.loops[0]
+    assert loop.frame == 0, "where the run entered the map"
+    before = np.concatenate([r.increment.observations.ids for r in reports[:first]])
+    assert not np.isin(loop.observations.ids, before).any(), "never seen in this run"
+    assert reports[first + 1].tracking.status is EgoMotionStatus.OK
+
+
+def test_where_it_is_not_lost_no_loop_is_closed() -> None:
+    """On the map, its landmarks tell; off it, nothing old is seen."""
+    path = [on_ring(k) for k in range(6, MAPPED + 8)]
+    prior = Prediction(path[0], arrival(True).prior.covariance)
+    start = dataclasses.replace(arrival(True), prior=prior)
+    pipeline = pipeline_of(path, 0.1, WITHOUT_LOST, arrival=start)
+    reports = drive(pipeline, seen(path))
+    assert not closings(reports)
+    assert error_m(reports[-1], path[-1]) < 0.1
+
+
+def test_what_was_made_since_the_map_was_left_ends_as_its_double() -> None:
+    pipeline, reports = returned()
+    first = closings(reports)[0]
+    given = int(half_a_ring().landmarks.ids.max())
+    ended = reports[first + 1].increment.pruned_ids
+    merged = reports[first].increment.loops[0].merged
+    assert len(merged) >= 5
+    assert (merged[:, 0] > given).all(), "none of the map's own"
+    assert np.isin(merged[:, 0], ended).all()
+    assert len(ended) > len(merged), "and those that look alike in the corrected map"
+    after = reports[first + 1].increment.observations
+    assert (~after.is_new & (after.ids <= given)).sum() >= 10, "the map is tracked again"
+    assert not np.isin(ended, pipeline.tracker.database.ids).any()
+
+
+def test_a_map_that_is_left_as_it_is_stays_so_to_the_bit() -> None:
+    pipeline, _ = returned(extends=False)
+    given = half_a_ring()
+    assert_same_bits(pipeline.estimator.landmarks(), given.landmarks)
+    np.testing.assert_array_equal(pipeline.tracker.database.ids, given.landmarks.ids)
+    np.testing.assert_array_equal(
+        pipeline.tracker.database.appearances().descriptors, given.appearances.descriptors
+    )
+
+
+@pytest.mark.parametrize("extends", [True, False])
+@pytest.mark.parametrize("after_closing", [-12, 1])
+def test_continued_from_its_state_it_goes_on_to_the_bit(extends: bool, after_closing: int) -> None:
+    _, reports = returned(extends)
+    stop = closings(reports)[0] + after_closing
+    whole, again = in_map(extends), in_map(extends)
+    frames = list(seen(PATH, DARK))
+    log = MeasurementLog(RIG, {})
+    for report in drive(whole, frames[:stop]):
+        log.append(report.increment)
+    again.tracker.database.restore(whole.tracker.database.state())
+    again.estimator.restore(whole.estimator.state())
+    again.places.restore(whole.places.state(), log)
+    assert_same_bits(again.places.state(), whole.places.state())
+    for report, expected in zip(drive(again, frames[stop:]), reports[stop:], strict=True):
+        np.testing.assert_array_equal(report.stats.wTc, expected.stats.wTc)
+        assert_same_increments(report.increment, expected.increment)
+
+
+ESTIMATORS: list[tuple[EstimatorSettings, bool]] = [
+    (LandmarkKalmanSettings(), True),
+    (LandmarkKalmanSettings(), False),
+    (LandmarkKalmanGraphSettings(), False),
+    (Isam2Settings(), True),
+    (BatchSettings(), True),
+]
+
+
+@pytest.mark.parametrize(
+    ("settings", "extends"), ESTIMATORS, ids=[f"{s.kind}-{e}" for s, e in ESTIMATORS]
+)
+def test_every_estimator_is_back_in_the_map(settings: EstimatorSettings, extends: bool) -> None:
+    """The closure takes it to its place in the map, whose landmarks stay where they are."""
+    _, reports = returned(extends)
+    estimator = make_estimator(RIG, settings, SETTINGS.ego_motion, arrival(extends).prior)
+    take_over(estimator, arrival(extends))
+    solver, motion = EgoMotionSolver(RIG, SETTINGS.ego_motion), RingMotion(PATH, drift_deg(extends))
+    first = closings(reports)[0]
+    for k, report in enumerate(reports[: first + 3]):
+        stats = replay_step(report.increment, estimator, solver, motion, k)
+        if report.increment.loops:
+            assert stats.closed == (True,)
+        if k >= first:
+            assert difference(PATH[k], stats.wTc)[0] < 0.15
+    moved = np.linalg.norm(landmarks_of_map(estimator) - half_a_ring().landmarks.positions, axis=1)
+    if extends:
+        assert np.nanmedian(moved) < 0.03
+        assert np.isfinite(moved).sum() > 0.5 * len(moved)
+    else:
+        np.testing.assert_array_equal(moved, 0.0)
