@@ -115,8 +115,12 @@ def left_and_back() -> SightingMemory:
 
 
 def test_what_a_run_has_not_seen_of_its_map_is_old() -> None:
-    memory = remembered([[0, 1, 60], HERE], given=59)
+    memory = remembered([[0, 1, 60], HERE, [61]], given=59)
     np.testing.assert_array_equal(memory.unseen_for(30, np.arange(70)), range(20, 60))
+    mostly = remembered([HERE, [*HERE, *range(60, 90)]], given=59)
+    assert len(mostly.unseen_for(30, np.arange(70))) == 40, "the map had the lesser say in its pose"
+    tracked = remembered([HERE, [*HERE, 60]], given=59)
+    assert not len(tracked.unseen_for(30, np.arange(70))), "it tracks the map already"
     nowhere = remembered([[0, 1, 60], [2, 3, 60]], given=59)
     assert not len(nowhere.unseen_for(30, np.arange(70))), "it may be anywhere in that map"
     np.testing.assert_array_equal(memory.of_given(np.array([59, 60])), [True, False])
@@ -138,9 +142,9 @@ def test_what_nobody_saw_of_the_map_was_seen_where_the_run_entered_it() -> None:
 def test_a_frame_is_placed_in_the_map_by_the_map_alone() -> None:
     memory = remembered([[*HERE, 60, 61]], given=59)
     held = _map(np.arange(1, 70), np.zeros((69, 3)))
-    beside = memory.view(0, np.array([3, 40]), held)
+    beside = memory.view(0, np.array([40]), held)
     np.testing.assert_array_equal(beside.ids, HERE[1:])
-    again = memory.view(0, np.array([3, 60]), held)
+    again = memory.view(0, np.array([3, 60, 40]), held)
     np.testing.assert_array_equal(again.ids, [*HERE[1:], 60, 61])
 
 
@@ -215,8 +219,9 @@ def test_memory_of_a_map_restored_from_log_goes_on_the_same() -> None:
     assert_same_bits(again.state(), memory.state())
     unseen = np.arange(32, 60)
     for one in (memory, again):
-        one.add(frame(47, sight(np.eye(4), np.tile([0.0, 0.0, 3.0], (20, 1)), MAP[:20])), np.eye(4))
-        np.testing.assert_array_equal(one.unseen_for(30, MAP), unseen)
+        new = np.arange(600, 620)
+        one.add(frame(47, sight(np.eye(4), np.tile([0.0, 0.0, 3.0], (20, 1)), new)), np.eye(4))
+        np.testing.assert_array_equal(one.unseen_for(30, MAP), [*HERE, *unseen])
         assert one.best_view_of(unseen, held) == 1
         assert one.last_seen(unseen) == 4
     assert again.way_since(30) == memory.way_since(30)

@@ -47,6 +47,7 @@ class SightingMemory:
         self._newest: list[int] = []
         self._returns: list[tuple[int, int]] = []
         self._ties: list[int] = []
+        self._on_map = False
         self._last_seen: IntArray = np.full(given + 1, -1)
         self.taken: list[bool] = []
 
@@ -87,13 +88,16 @@ class SightingMemory:
     def unseen_for(self, frames: int, ids: IntArray) -> IntArray:
         """Those of the landmarks that the last ``frames`` frames did not see.
 
-        Those that no frame saw are among them if they are of the map that the run began in, and
-        some frame tells where in that map it was.
+        Those that no frame saw are among them if they are of the map that the run began in, some
+        frame tells where in that map it was, and the last one was not placed by that map anyway:
+        what does not lie where it should then shows how the map is bent, not a drift.
         """
         known = ids[ids < len(self._last_seen)]
         last = self._last_seen[known]
-        unseen = (last < 0) & (known <= self._given) & bool(self._ties)
-        return known[((last >= 0) & (last < len(self) - frames)) | unseen]
+        wanted = (last >= 0) & (last < len(self) - frames)
+        if self._ties and not self._on_map:
+            wanted |= (last < 0) & self.of_given(known)
+        return known[wanted]
 
     def of_given(self, ids: IntArray) -> BoolArray:
         """Which of the landmarks (k,) are of the map that the run began in."""
@@ -111,7 +115,7 @@ class SightingMemory:
         """
         last = self._last_seen[ids]
         seen = int(last.max(initial=-1))
-        if not self._ties or not ((last < 0) & self.of_given(ids)).any():
+        if not self._ties or not self._never_seen(ids):
             return seen
         # Frames that see the map again are those of the return; the one before them is meant.
         before = bisect_right(self._ties, len(self) - 1 - _RETURN_FRAMES)
@@ -127,7 +131,7 @@ class SightingMemory:
         wanted = np.zeros(len(self._last_seen), np.bool_)
         wanted[ids] = True
         counts = np.array([int(wanted[seen.ids].sum()) for seen in self._seen], np.int64)
-        unseen = int((self._last_seen[ids[self.of_given(ids)]] < 0).sum())
+        unseen = self._never_seen(ids)
         if unseen and (entry := self._entry(landmarks)) >= 0:
             counts[entry] += unseen
         if counts.max(initial=0) == 0:
@@ -139,13 +143,13 @@ class SightingMemory:
 
         Args:
             frame: the earlier one.
-            ids: those beside which it is located. Where some of the given map are among them that
-                no frame saw, only the given map places the frame beside them.
+            ids: those beside which it is located. Where most of them are of the given map and no
+                frame saw them, only that map places the frame beside them.
             landmarks: the map.
         """
         seen = self._seen[frame]
         keep = np.isin(seen.ids, landmarks.ids)
-        if (self._last_seen[ids[self.of_given(ids)]] < 0).any():
+        if self._never_seen(ids) > int(np.isin(seen.ids, ids).sum()):
             keep &= self.of_given(seen.ids)
         return seen.select(keep)
 
@@ -160,7 +164,7 @@ class SightingMemory:
     def restore(self, state: StateArrays, log: MeasurementLog) -> None:
         """Continues from :meth:`state` and the log of as many frames."""
         self._seen, self._newest, self._returns, self._ties = [], [], [], []
-        self._given = int(state["given"])
+        self._given, self._on_map = int(state["given"]), False
         self._last_seen = np.full(self._given + 1, -1)
         verdicts, self.taken = iter(state["taken"].tolist()), []
         for increment in log:
@@ -178,7 +182,9 @@ class SightingMemory:
         old = before[(before >= 0) & (before < here - _RETURN_FRAMES)]
         if len(old) >= _RETURN_MATCHES:
             self._returns.append((here, int(old[len(old) // 2])))
-        if int(self.of_given(seen.ids).sum()) >= _RETURN_MATCHES:
+        by_map = int(self.of_given(seen.ids).sum())
+        self._on_map = by_map >= _RETURN_MATCHES and 2 * by_map >= int((~seen.is_new).sum())
+        if by_map >= _RETURN_MATCHES:
             self._tie(here)
         self._last_seen[ids] = here
         self._seen.append(seen)
@@ -194,6 +200,10 @@ class SightingMemory:
         if self._ties and self._ties[-1] < here - 1:
             self._returns.append((here, self._ties[0]))
         self._ties.append(here)
+
+    def _never_seen(self, ids: IntArray) -> int:
+        """How many of the landmarks are of the given map, and were never seen."""
+        return int((self._last_seen[ids[self.of_given(ids)]] < 0).sum())
 
     def _entry(self, landmarks: LandmarkMap) -> int:
         """The first frame tied to the given map by what is still there of it; -1 for none."""
