@@ -139,9 +139,6 @@ def _map_problem(config: ExperimentConfig) -> str:
         "map.start continue goes on with the run that was saved; it takes map.load alone": (
             goes_on and (first is not None or not given.extend)
         ),
-        "frontend.loops would correct a map that is to stay as it is; set it to null": (
-            not given.extend and config.frontend.loops is not None
-        ),
     }
     return next((words for words, wrong in problems.items() if wrong), "")
 

@@ -13,6 +13,7 @@ from fgslam.errors import ConfigError
 from fgslam.homing_config import is_homing
 from fgslam.settings.datasets import ConstantVelocitySettings, ImageFolderSettings
 from fgslam.settings.lab import RenderedLabSettings
+from fgslam.settings.loops import LoopSettings
 
 EXPERIMENTS = [
     path
@@ -378,8 +379,8 @@ def test_maps_that_contradict_themselves(maps: dict[str, Any], expected: str) ->
         parse_config({**MINIMAL, "map": maps}, "test")
 
 
-def test_a_map_that_stays_as_it_is_closes_no_loops() -> None:
-    values = {**MINIMAL, "map": {"load": "a", "extend": False}}
-    assert not parse_config(values, "test").map.extend
-    with pytest.raises(ConfigError, match="a map that is to stay as it is"):
-        parse_config({**values, "frontend": {"loops": {}}}, "test")
+def test_a_map_that_stays_as_it_is_may_be_returned_to() -> None:
+    values = {**MINIMAL, "map": {"load": "a", "extend": False}, "frontend": {"loops": {}}}
+    config = parse_config(values, "test")
+    assert not config.map.extend
+    assert config.frontend.loops == LoopSettings()
