@@ -307,7 +307,8 @@ class LoopClosure:
     """A place seen again: the frame sees landmarks of an earlier frame, under new identities.
 
     Attributes:
-        frame: position in the log of the earlier frame (0 is the log's first).
+        frame: position in the log of the earlier frame (0 is the log's first). Of a part of a saved
+            map that the run has yet to see: that in which it entered the map, held still between.
         oTc: (4, 4) pose of the present camera in the earlier frame's camera.
         covariance: (6, 6) of ``oTc``, [rotation, translation], in the tangent space at it.
         observations: the earlier landmarks as the present frame measures them, under their old
