@@ -259,7 +259,7 @@ class PlaceRecognition:
     def _old_place(
         self, loops: LoopSettings, landmarks: LandmarkMap, features: StereoFeatures
     ) -> Relocalisation | None:
-        """The frame located by landmarks that were not seen for long; None where it is not."""
+        """The frame located by landmarks not seen for long, or never; None where it is not."""
         trusted = self._trusted()
         known = trusted[np.isin(trusted, landmarks.ids)]
         old = self._memory.unseen_for(loops.forgotten_after, known)
