@@ -143,8 +143,9 @@ class RelocalisationSettings:
         Field(
             ge=0.0,
             le=1.0,
-            description="with fewer, of a rival: least share of its pieces in view of which "
-            "something is seen",
+            description="with fewer, something must be seen of this share of the pieces in view, "
+            "or be known in this share of the directions in which the frame sees things; a rival "
+            "of which less is seen is none",
         ),
     ] = 0.5
     ambiguous_share: Annotated[
@@ -159,8 +160,8 @@ class RelocalisationSettings:
         float,
         Field(
             ge=0.0,
-            description="if it explains features that the best does not, so many for each that "
-            "only the best explains; a place that explains part of the same is no rival",
+            description="unless it explains the lesser half of the best's features and beside "
+            "them fewer than this for each that only the best explains",
         ),
     ] = 0.2
     view_deg: Annotated[

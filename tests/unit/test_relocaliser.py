@@ -117,8 +117,20 @@ def test_a_poster_carried_elsewhere_does_not_convince(rng: np.random.Generator) 
     wall = things(rng, np.array([-5.0, -1.5, 4.9]), np.array([-1.0, 1.0, 5.1]), 200)
     small = poster.select(np.arange(0, 60, 2))
     view = seen(elsewhere.select(np.arange(0, 60, 2)), planar(3.0, 1.0, 0.0), rng, clutter=80)
-    found = _relocaliser(small.join(wall)).locate(view, rng)
-    assert not found.found, found.why
+    vague = replace(DEFAULTS, max_sigma_m=1.0, max_sigma_deg=20.0)  # its covariance shall not help
+    found = _relocaliser(small.join(wall), settings=vague).locate(view, rng)
+    assert found.verdict is Verdict.CONTRADICTED, found.why
+
+
+@pytest.mark.parametrize("kept", [0.95, 0.7])
+def test_of_twins_the_better_known_one_does_not_win(rng: np.random.Generator, kept: float) -> None:
+    """The map lost some landmarks of either."""
+    west, east = _two_posters(rng)
+    parts = (thing.select(np.flatnonzero(rng.random(60) < kept)) for thing in (west, east))
+    made = _relocaliser(next(parts).join(next(parts)))
+    for thing, x in ((west, -3.0), (east, 3.0)):
+        found = made.locate(seen(thing, planar(x, 2.5, 0.0), rng), rng)
+        assert found.verdict is Verdict.AMBIGUOUS, found.why
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3])

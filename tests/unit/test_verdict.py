@@ -41,11 +41,12 @@ def _pose(features: IntArray, place: int = 0, covered: float = 1.0, misfit: floa
         expected=np.arange(50),
         witnesses=len(features),
         covered=covered,
+        explained=1.0,
     )
 
 
-def _verdict(matched: int, *poses: Refined, settings: RelocalisationSettings = SETTINGS) -> Verdict:
-    return judge(_tentative(matched), list(poses), PLACES, settings).verdict
+def _verdict(matched: int, *poses: Refined) -> Verdict:
+    return judge(_tentative(matched), list(poses), PLACES, SETTINGS).verdict
 
 
 def test_a_few_matches_that_are_nearly_all_are_enough() -> None:
@@ -87,14 +88,29 @@ def test_a_twin_that_explains_the_frame_as_well_makes_it_ambiguous() -> None:
     assert _verdict(24, best, twin) is Verdict.AMBIGUOUS
 
 
-def test_a_place_that_explains_part_of_the_same_is_no_rival() -> None:
+@pytest.mark.parametrize("missing", [0, 1, 5, 10])
+def test_so_does_a_twin_of_which_some_landmarks_are_missing(missing: int) -> None:
+    """Which of two twins the map knows better does not say where the robot is."""
+    best, twin = _pose(np.arange(20)), _pose(np.arange(missing, 20), place=1)
+    assert _verdict(24, best, twin) is Verdict.AMBIGUOUS
+
+
+def test_a_place_that_explains_the_lesser_part_of_the_same_is_no_rival() -> None:
     """Were it the right one, what stands beside the things that both have would be explained."""
-    best = _pose(np.arange(20))
-    assert _verdict(24, best, _pose(np.arange(5, 20), place=1)) is Verdict.FOUND
-    # Two features of its own, against ten that only the best explains.
-    assert _verdict(24, best, _pose(np.arange(10, 22), place=1)) is Verdict.AMBIGUOUS
-    # An equal twin: nothing speaks for either.
-    assert _verdict(24, best, _pose(np.arange(20), place=1)) is Verdict.AMBIGUOUS
+    best = _pose(np.arange(24))
+    assert _verdict(30, best, _pose(np.arange(12, 24), place=1)) is Verdict.AMBIGUOUS
+    best = _pose(np.arange(25))
+    assert _verdict(30, best, _pose(np.arange(13, 25), place=1)) is Verdict.FOUND
+    # Three features of its own, against thirteen that only the best explains.
+    assert _verdict(30, best, _pose(np.arange(13, 28), place=1)) is Verdict.AMBIGUOUS
+
+
+def test_a_thing_carried_off_does_not_convince() -> None:
+    """All that looks like a landmark agrees; but it hung on a wall that is not there."""
+    thing = replace(_pose(np.arange(20), covered=0.3), explained=0.3)
+    assert _verdict(21, thing) is Verdict.CONTRADICTED
+    assert _verdict(21, replace(thing, explained=0.6)) is Verdict.FOUND
+    assert _verdict(21, replace(thing, covered=0.6)) is Verdict.FOUND
 
 
 def test_what_shares_the_matches_is_the_same_solution() -> None:

@@ -26,6 +26,8 @@ _KERNEL_WIDTH = 2.0  # as the tracker's
 _BEYOND = 1.5  # times the farthest feature: no landmark farther away matches one
 _VOTES = 4  # of one piece of the map
 _SEVERAL = 4  # landmarks expected in a piece, so that one should be seen
+_CELL_RAD = np.deg2rad(8.0)  # side of a direction: half a metre at 3.6 m
+_TWO = 2  # features in a direction, so that one should be known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,6 +46,7 @@ class Refined:
         witnesses: what the matches weigh: of one piece of the map at most four count, for a thing
             that stands elsewhere, too, would match as a whole.
         covered: share of the map's pieces expected in view of which something is seen.
+        explained: share of the directions in which the frame sees things in which one agrees.
     """
 
     wTc: FloatArray
@@ -56,6 +59,7 @@ class Refined:
     expected: IntArray
     witnesses: int
     covered: float
+    explained: float
 
     def __len__(self) -> int:
         return len(self.features)
@@ -213,6 +217,7 @@ class Refiner:
             expected=expected,
             witnesses=witnesses(positions[chosen[1]], side),
             covered=covered(positions[expected], np.isin(expected, chosen[1]), side),
+            explained=explained(self.features.position, chosen[0]),
         )
 
     @property
@@ -242,6 +247,22 @@ def covered(positions: FloatArray, seen: BoolArray, side: float) -> float:
     if not several.any():
         return 1.0
     return float(np.mean(np.bincount(of, weights=seen)[several] > 0.0))
+
+
+def explained(points: FloatArray, agreeing: IntArray) -> float:
+    """Share of the directions with two points (n, 3) of the frame in which one agrees; 1 of none.
+
+    Args:
+        points: all features' positions in the camera's frame.
+        agreeing: (k,) rows of those that have a landmark at the pose.
+    """
+    across = np.arctan2(points[:, 0], points[:, 2])
+    down = np.arctan2(points[:, 1], np.hypot(points[:, 0], points[:, 2]))
+    cells = np.floor(np.column_stack([across, down]) / _CELL_RAD).astype(np.int64)
+    of = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+    known = np.bincount(of[agreeing], minlength=int(of.max(initial=-1)) + 1) > 0
+    several = np.bincount(of) >= _TWO
+    return float(np.mean(known[several])) if several.any() else 1.0
 
 
 def crowd(positions: FloatArray, side: float) -> IntArray:

@@ -17,7 +17,14 @@ def judge(
     landmarks: LandmarkMap,
     settings: RelocalisationSettings,
 ) -> Relocalisation:
-    """The best of the refined poses, and whether it is to be believed."""
+    """The best of the refined poses, and whether it is to be believed.
+
+    Args:
+        tentative: the frame's matches by appearance.
+        refined: poses that lie apart, that with most witnesses first.
+        landmarks: the map.
+        settings: what it takes.
+    """
     matched = len(np.unique(tentative.features))
     if matched < settings.min_inliers:
         return _nothing(
@@ -61,7 +68,7 @@ def _verdict(
     said = (
         f"{n} matches agree ({best.proposed} of {matched} tentative), {best.witnesses} witnesses, "
         f"elsewhere {rival}; {len(best.expected)} landmarks expected, {best.covered:.0%} of their "
-        f"places seen; misfit {best.misfit:.2f}; sigma {sigma_m:.3f} m {sigma_deg:.2f} deg"
+        f"places seen; known in {best.explained:.0%} of the directions; misfit {best.misfit:.2f}; sigma {sigma_m:.3f} m {sigma_deg:.2f} deg"
     )
     if best.witnesses < settings.min_inliers:
         return Verdict.TOO_FEW_INLIERS, f"{said}; {settings.min_inliers} witnesses are needed"
@@ -82,25 +89,30 @@ def _contradicted(pose: Refined, matched: int, settings: RelocalisationSettings)
 
     Matches that agree by accident fill their gates; right ones lie in the middle. And where the
     robot is somewhere else, most of what looks like a landmark disagrees, and most of what should
-    be seen is missing.
+    be seen is missing. Of a thing that was carried off, all that looks like a landmark agrees; but
+    what surrounded it is missing, and what surrounds it is unknown.
     """
     agreement = (2.0 * pose.proposed / max(matched, 1) + pose.covered) / 3.0
+    amid_strangers = max(pose.covered, pose.explained) < settings.least_covered
     return _few_and_misfit(pose, settings) or (
-        pose.witnesses < settings.enough_witnesses and agreement < settings.least_agreement
+        pose.witnesses < settings.enough_witnesses
+        and (agreement < settings.least_agreement or amid_strangers)
     )
 
 
 def _rivals(other: Refined, best: Refined, settings: RelocalisationSettings) -> bool:
     """Whether another pose may be the right one.
 
-    Not if what should be seen there is not. Nor if it explains only what the best explains, too,
-    and less of it: were it the right one, it would explain what stands beside the things that both
-    places have.
+    Not if what should be seen there is not. Nor if it explains less than half of what the best
+    explains, and hardly anything beside it: were it the right one, it would explain what stands
+    beside the things that both places have. (A twin explains more than half, even where a third of
+    its landmarks are missing.)
     """
     unseen = other.covered < settings.least_covered
     if _few_and_misfit(other, settings) or (unseen and other.witnesses < settings.enough_witnesses):
         return False
-    return other.explains_beside(best) >= settings.ambiguous_own * best.explains_beside(other)
+    lost, own = best.explains_beside(other), other.explains_beside(best)
+    return 2 * lost <= len(best) or own >= settings.ambiguous_own * lost
 
 
 def _few_and_misfit(pose: Refined, settings: RelocalisationSettings) -> bool:
