@@ -147,5 +147,7 @@ class DriveBook:
 
 
 def _agrees_with_itself(tracking: EgoMotion) -> bool:
-    """Whether most of a frame's matches were used; of a frame without any, yes."""
-    return 2 * int(tracking.inliers.sum()) >= len(tracking.inliers)
+    """Whether most of a frame's matches were used; a frame without a pose of its own is no worse
+    for what it could not use."""
+    used, matched = int(tracking.inliers.sum()), len(tracking.inliers)
+    return not tracking.status.measured or 2 * used >= matched

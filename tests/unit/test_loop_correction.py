@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -116,3 +118,16 @@ def test_it_goes_on_after_a_frame_at_odds_as_if_never_interrupted() -> None:
         _book(book, -0.7)
     np.testing.assert_array_equal(one.chain.poses, other.chain.poses)
     np.testing.assert_array_equal(one.chain.steps, other.chain.steps)
+
+
+@pytest.mark.parametrize("matched", [0, 1, 5])
+def test_the_step_from_a_frame_without_a_pose_of_its_own_was_measured(matched: int) -> None:
+    """It began the landmarks that the next one was tracked by; stray matches change nothing."""
+    book = DriveBook(LoopCorrectionSettings())
+    _book(book, 0.0)
+    odometry, here = Odometry(_forward(0.1), _WHEELS), _forward(0.1)
+    failed = replace(_tracking(here, 0, matched), status=EgoMotionStatus.TOO_FEW_MATCHES)
+    book.step(_forward(0.1), failed, odometry, free=False)
+    _book(book, 0.13)
+    assert book.chain.poses[-1][2, 3] == pytest.approx(0.23)
+    np.testing.assert_array_equal(book.chain.steps[-1], _TRACKED)

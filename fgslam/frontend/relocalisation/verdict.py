@@ -68,7 +68,8 @@ def _verdict(
     said = (
         f"{n} matches agree ({best.proposed} of {matched} tentative), {best.witnesses} witnesses, "
         f"elsewhere {rival}; {len(best.expected)} landmarks expected, {best.covered:.0%} of their "
-        f"places seen; known in {best.explained:.0%} of the directions; misfit {best.misfit:.2f}; sigma {sigma_m:.3f} m {sigma_deg:.2f} deg"
+        f"places seen; known in {best.explained:.0%} of the directions; "
+        f"misfit {best.misfit:.2f}; sigma {sigma_m:.3f} m {sigma_deg:.2f} deg"
     )
     if best.witnesses < settings.min_inliers:
         return Verdict.TOO_FEW_INLIERS, f"{said}; {settings.min_inliers} witnesses are needed"
