@@ -98,7 +98,6 @@ class SlamPipeline:
         stereo = self._match_stereo(found)
         watch.lap("stereo")
         landmarks, ended = self._fused()
-        watch.lap("places")
         seen = self._track(prediction, found, stereo, landmarks)
         watch.lap("track")
         seen = self._recognise(seen, stereo, landmarks, ended)
@@ -138,6 +137,7 @@ class SlamPipeline:
             relocalised = anew.ego_motion.status.measured
             tracked = anew if relocalised else tracked
         elif self.places is not None and found.i > 0:
+            tracked = self.places.mended(tracked, prediction, landmarks, stereo)
             tracked, relocalised = self.places.recover(tracked, landmarks, stereo)
             maps_on = self.places.maps_on
         image = found.frame.images[0]

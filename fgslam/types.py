@@ -240,6 +240,11 @@ class EgoMotion:
     weighted_at: FloatArray | None = None
 
     @property
+    def coherent(self) -> bool:
+        """Whether most of what was matched was used; a pose that was not measured uses nothing."""
+        return not self.status.measured or 2 * int(self.inliers.sum()) >= len(self.inliers)
+
+    @property
     def correlation(self) -> FloatArray:
         """(6, 6) correlations of the pose, [rotation, translation]; 0 where motion is excluded.
 
@@ -314,10 +319,8 @@ class LoopClosure:
         observations: the earlier landmarks as the present frame measures them, under their old
             identities.
         merged: (m, 2) pairs (identity that ends, identity that stays) of landmarks that are one if
-            this is the same place. In the frame's own observations they go by the first. Where
-            the live run's estimator took the closure, they end with the next frame, which has
-            them among its ``pruned_ids`` and sees them as the second (logs of older runs: with
-            the closing frame itself).
+            this is the same place; the frame observes the first. Where the live estimator took the
+            closure, it is pruned in the next frame (older logs: in this one).
     """
 
     frame: int
@@ -419,8 +422,7 @@ class UpdateStats:
         landmarks: number of landmarks in the estimator.
         nis: normalised innovation squared of the matched observations, or NaN.
         nis_dof: degrees of freedom of ``nis``.
-        closed: for each of the increment's loops, in their order, whether the estimator took it;
-            one that it found met already is taken, one that it refused or cannot use is not.
+        closed: for each of the increment's loops whether the estimator took it (or met it already).
     """
 
     wTc: FloatArray

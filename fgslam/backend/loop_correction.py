@@ -58,7 +58,7 @@ class DriveBook:
             known: what the frame was predicted with.
             free: nobody knows the step: the frame was found without a prior.
         """
-        before, self._sound = self._sound, _agrees_with_itself(tracking)
+        before, self._sound = self._sound, tracking.coherent
         if free:
             covariance = FREE
         elif known is None or (before and self._sound and tracking.status.measured):
@@ -144,10 +144,3 @@ class DriveBook:
         self._tied = int(state["chain_tied"])
         self._sound = bool(state["chain_sound"])
         self.remarks = [str(words) for words in state["chain_remarks"]]
-
-
-def _agrees_with_itself(tracking: EgoMotion) -> bool:
-    """Whether most of a frame's matches were used; a frame without a pose of its own is no worse
-    for what it could not use."""
-    used, matched = int(tracking.inliers.sum()), len(tracking.inliers)
-    return not tracking.status.measured or 2 * used >= matched

@@ -186,7 +186,9 @@ def save(outputs: RunOutputs, given: GivenMap | None) -> str:
 def _saved_map(outputs: RunOutputs, given: GivenMap | None) -> SavedMap:
     """The estimator's geometry joined with the database's looks and counts."""
     database, estimate = outputs.pipeline.tracker.database, outputs.pipeline.estimator.estimate()
-    landmarks = estimate.landmarks
+    landmarks, places = estimate.landmarks, outputs.pipeline.places
+    if places is not None:  # no later frame of this run ends them
+        landmarks = landmarks.without(places.ending)
     rows = database.rows(landmarks.ids)
     return SavedMap(
         rig=outputs.sequence.rig,

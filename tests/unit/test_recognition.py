@@ -25,6 +25,7 @@ from fgslam import geometry as g
 from fgslam.factory import make_estimator
 from fgslam.frontend.ego_motion import EgoMotionSolver
 from fgslam.frontend.loops.confirmation import difference
+from fgslam.frontend.loops.recognition import PlaceRecognition
 from fgslam.measurement_log import MeasurementLog
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import FrameReport, SlamPipeline, _observe, replay_step
@@ -63,6 +64,27 @@ def test_the_return_is_recognised_and_the_drift_mended() -> None:
     assert max(error_m(reports[k], RING[k]) for k in range(first, len(RING))) < 0.15
 
 
+def test_no_frame_is_torn_between_a_place_and_its_drifted_self(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Back near the start, 0.24 m off: old landmarks and new ones, found in the same frames."""
+    late = dataclasses.replace(SETTINGS.loops, confirm=18)  # long after old landmarks are found
+    settings = dataclasses.replace(SETTINGS, lost=None, loops=late)
+
+    def torn() -> tuple[list[int], list[int]]:
+        reports = drive(pipeline_of(RING, 0.2, settings), seen(RING, DARK))
+        apart = [k for k, report in enumerate(reports) if not report.tracking.coherent]
+        return apart, closings(reports)
+
+    apart, closed = torn()
+    assert apart == []
+    assert closed
+    monkeypatch.setattr(PlaceRecognition, "mended", lambda self, tracked, *_: tracked)
+    apart, closed = torn()
+    assert len(apart) > 5
+    assert not closed  # nor do such frames agree on where the place lies
+
+
 def test_no_closure_is_false() -> None:
     _, reports = ring()
     for k in closings(reports):
@@ -94,6 +116,20 @@ def test_landmarks_found_twice_become_one() -> None:
         for o in later
     ]
     assert min(old) >= 5, "the old landmarks are tracked again"
+
+
+def test_a_map_saved_right_after_a_closure_has_each_landmark_once() -> None:
+    """The next frame would make them one; who saves the map now leaves out those that end."""
+    first = closings(ring()[1])[0]
+    pipeline = round_the_ring()
+    drive(pipeline, seen(RING[: first + 1], DARK))
+    assert pipeline.places is not None
+    ending, held = pipeline.places.ending, pipeline.estimator.landmarks().ids
+    assert len(ending) > 5
+    assert np.isin(ending, held).all()
+    (after,) = drive(pipeline, [frame for frame in seen(RING, DARK) if frame.i == first + 1])
+    assert np.isin(ending, after.increment.pruned_ids).all()
+    assert not len(pipeline.places.ending)
 
 
 def test_a_refused_closure_changes_nothing_but_that_a_rest_follows() -> None:

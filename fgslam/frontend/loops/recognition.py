@@ -97,6 +97,11 @@ class PlaceRecognition:
         """Whether the estimator took the closures so far, in the log's order."""
         return tuple(self._memory.taken)
 
+    @property
+    def ending(self) -> IntArray:
+        """(m,) landmarks that the last frame's closure showed to be older ones: they end next."""
+        return np.asarray(self._merging[:, 0])
+
     # -- lost --------------------------------------------------------------------------------
 
     def recover(
@@ -126,6 +131,34 @@ class PlaceRecognition:
         return anew, True
 
     # -- loops -------------------------------------------------------------------------------
+
+    def mended(
+        self,
+        tracked: Tracked,
+        prediction: Prediction,
+        landmarks: LandmarkMap,
+        features: StereoFeatures,
+    ) -> Tracked:
+        """The frame as tracked; torn between two places, as placed by recent landmarks alone.
+
+        Back at a place from which a drift has moved the estimate a little, old landmarks are found
+        among those of the way, and contradict them. Until a closure has moved the map the frame
+        belongs to the way: half way between them it would fit neither, and what it begins would
+        be misplaced.
+
+        Args:
+            tracked: the frame, placed by all landmarks.
+            prediction: where it was expected.
+            landmarks: the map.
+            features: the frame's.
+        """
+        loops = self._parts.loops
+        if loops is None or tracked.ego_motion.coherent:
+            return tracked
+        old = self._memory.unseen_for(loops.forgotten_after, landmarks.ids)
+        recent = self._tracker.track(prediction, landmarks.without(old), features)
+        found = recent.ego_motion
+        return recent if found.status.measured and found.coherent else tracked
 
     def look(
         self,
