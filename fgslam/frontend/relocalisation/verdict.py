@@ -93,12 +93,12 @@ def _contradicted(pose: Refined, matched: int, settings: RelocalisationSettings)
     be seen is missing. Of a thing that was carried off, all that looks like a landmark agrees; but
     what surrounded it is missing, and what surrounds it is unknown.
     """
+    if pose.witnesses >= settings.enough_witnesses:
+        return False
     agreement = (2.0 * pose.proposed / max(matched, 1) + pose.covered) / 3.0
     amid_strangers = max(pose.covered, pose.explained) < settings.least_covered
-    return _few_and_misfit(pose, settings) or (
-        pose.witnesses < settings.enough_witnesses
-        and (agreement < settings.least_agreement or amid_strangers)
-    )
+    misfits = pose.misfit > settings.max_misfit
+    return misfits or agreement < settings.least_agreement or amid_strangers
 
 
 def _rivals(other: Refined, best: Refined, settings: RelocalisationSettings) -> bool:
@@ -109,15 +109,11 @@ def _rivals(other: Refined, best: Refined, settings: RelocalisationSettings) -> 
     beside the things that both places have. (A twin explains more than half, even where a third of
     its landmarks are missing.)
     """
-    unseen = other.covered < settings.least_covered
-    if _few_and_misfit(other, settings) or (unseen and other.witnesses < settings.enough_witnesses):
+    refuted = other.misfit > settings.max_misfit or other.covered < settings.least_covered
+    if refuted and other.witnesses < settings.enough_witnesses:
         return False
     lost, own = best.explains_beside(other), other.explains_beside(best)
     return 2 * lost <= len(best) or own >= settings.ambiguous_own * lost
-
-
-def _few_and_misfit(pose: Refined, settings: RelocalisationSettings) -> bool:
-    return pose.witnesses < settings.enough_witnesses and pose.misfit > settings.max_misfit
 
 
 def _nothing(verdict: Verdict, candidates: int, why: str) -> Relocalisation:
