@@ -343,10 +343,8 @@ class Increment:
         missed_ids: landmarks expected in view and not matched (Type II).
         pruned_ids: landmarks that the database dropped after this frame; those merged into others
             because of the last frame's loop closure among them.
-        loops: places recognised in this frame, verified; for estimators that can use them. Each
-            judges them by itself: that one is here does not say that the live run's took it.
-        relocalised: the frame was placed by its landmarks alone, without a prior: its odometry,
-            if any, does not tell where it is.
+        loops: places recognised in this frame, verified; each estimator judges them for itself.
+        relocalised: placed by its landmarks alone, without a prior; its odometry tells nothing.
     """
 
     index: int
@@ -398,17 +396,19 @@ class LandmarkMap:
     def __len__(self) -> int:
         return len(self.ids)
 
+    def select(self, keep: BoolArray | IntArray) -> LandmarkMap:
+        """The chosen rows, ascending, as a new value."""
+        return LandmarkMap(self.ids[keep], self.positions[keep], self.covariances[keep])
+
     def without(self, ids: IntArray) -> LandmarkMap:
         """The map but for these landmarks, as a new value."""
-        kept = ~np.isin(self.ids, ids)
-        return LandmarkMap(self.ids[kept], self.positions[kept], self.covariances[kept])
+        return self.select(~np.isin(self.ids, ids))
 
     def rows(self, ids: IntArray) -> IntArray:
         """Row of each id. Raises KeyError when one is absent."""
         rows = np.searchsorted(self.ids, ids)
         if len(ids) and (rows.max() >= len(self.ids) or not np.array_equal(self.ids[rows], ids)):
-            missing = np.setdiff1d(ids, self.ids)
-            raise KeyError(f"landmarks not in the map: {missing[:5].tolist()}")
+            raise KeyError(f"landmarks not in the map: {np.setdiff1d(ids, self.ids)[:5].tolist()}")
         return rows
 
 

@@ -134,9 +134,7 @@ class DeadReckoning:
 
     def _remove(self, ids: IntArray) -> None:
         keep = ~np.isin(self._map.ids, ids)
-        self._map = LandmarkMap(
-            self._map.ids[keep], self._map.positions[keep], self._map.covariances[keep]
-        )
+        self._map = self._map.select(keep)
         self._first_frame = self._first_frame[keep]
 
     def _by_pose(self, rows: IntArray) -> list[FloatArray]:

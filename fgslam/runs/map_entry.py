@@ -172,8 +172,7 @@ def _locate(
 def trusted(saved: SavedMap, valid_hits: int) -> tuple[LandmarkMap, LandmarkAppearances]:
     """Landmarks seen often enough to be there (Se et al. 6.1), with their looks."""
     sure = saved.permanent | (saved.hits >= valid_hits)
-    every = saved.landmarks
-    landmarks = LandmarkMap(every.ids[sure], every.positions[sure], every.covariances[sure])
+    landmarks = saved.landmarks.select(sure)
     return landmarks, saved.appearances.of(landmarks.ids)
 
 

@@ -78,9 +78,10 @@ def tables(seeds: Iterable[int] = SEEDS, poses: int | None = None) -> list[Table
     for seed in seeds:
         say(f"random poses of seed {seed}")
         config = _config(f"dataset.drive.random_poses.seed={seed}")
+        known = trusted(given.saved, config.frontend.database.valid_hits)
         for query, rig in _queries(config, given, poses):
             for kept, share in KEPT.items():
-                made = _learnt(config, given, rig, query, share)
+                made = _learnt(config, known, rig, query, share)
                 for frames, features in query.features.items():
                     rng = np.random.default_rng([config.seed, _STREAM, query.number, frames])
                     answer = made.locate(features, rng)
@@ -147,13 +148,18 @@ def _submap(
 
 
 def _learnt(
-    config: LocalisationConfig, given: GivenMap, rig: CameraRig, query: Query, share: float
+    config: LocalisationConfig,
+    known: tuple[LandmarkMap, LandmarkAppearances],
+    rig: CameraRig,
+    query: Query,
+    share: float,
 ) -> Relocaliser:
-    landmarks, looks = trusted(given.saved, config.frontend.database.valid_hits)
+    landmarks, looks = known
     if share < 1.0:
         rng = np.random.default_rng([config.seed, _STREAM, query.number])
         keep = ~_before(rig, query.truth, landmarks) | (rng.random(len(landmarks)) < share)
-        landmarks, looks = _part(landmarks, looks, keep)
+        landmarks = landmarks.select(keep)
+        looks = looks.of(landmarks.ids)
     made = make_relocaliser(rig, config.frontend)
     made.learn(landmarks, looks)
     return made
@@ -167,10 +173,3 @@ def _before(rig: CameraRig, wTc: FloatArray, landmarks: LandmarkMap) -> BoolArra
     inside = (column > -_BORDER_PX) & (column < rig.width + _BORDER_PX)
     inside &= (row > -_BORDER_PX) & (row < rig.height + _BORDER_PX)
     return np.asarray(ahead & inside)
-
-
-def _part(
-    landmarks: LandmarkMap, looks: LandmarkAppearances, keep: BoolArray
-) -> tuple[LandmarkMap, LandmarkAppearances]:
-    some = LandmarkMap(landmarks.ids[keep], landmarks.positions[keep], landmarks.covariances[keep])
-    return some, looks.of(some.ids)

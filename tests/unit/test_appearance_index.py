@@ -7,13 +7,18 @@ import pytest
 
 from fgslam.frontend import vocabulary
 from fgslam.frontend.relocalisation import appearance_index
-from fgslam.frontend.relocalisation.appearance_index import AppearanceIndex
+from fgslam.frontend.relocalisation.appearance_index import AppearanceIndex, Neighbours
 from fgslam.types import ByteArray
 from tests.known_places import blurred, looks
 
 
 def _truth(asked: ByteArray, held: ByteArray) -> np.ndarray:
     return np.linalg.norm(asked[:, None].astype(float) - held[None].astype(float), axis=2)
+
+
+def _assert_equal(a: Neighbours, b: Neighbours) -> None:
+    assert np.array_equal(a.rows, b.rows)
+    assert np.array_equal(a.distances, b.distances)
 
 
 def test_small_contents_are_answered_exactly(rng: np.random.Generator) -> None:
@@ -50,8 +55,7 @@ def test_every_cell_searched_finds_what_a_full_search_does(
     monkeypatch.setattr(appearance_index, "_PROBES", 256)
     monkeypatch.setattr(appearance_index, "_LEADING", chunk)
     probed = AppearanceIndex(held).query(asked, 7)
-    assert np.array_equal(in_full.rows, probed.rows)
-    assert np.array_equal(in_full.distances, probed.distances)
+    _assert_equal(in_full, probed)
 
 
 @pytest.mark.parametrize("exact", [0, 10_000])
@@ -62,8 +66,7 @@ def test_words_at_hand_change_nothing(
     held, asked = looks(rng, 500), looks(rng, 30)
     found = AppearanceIndex(held).query(asked, 8)
     given = AppearanceIndex(held, vocabulary.words_of(held)).query(asked, 8)
-    assert np.array_equal(found.rows, given.rows)
-    assert np.array_equal(found.distances, given.distances)
+    _assert_equal(found, given)
 
 
 @pytest.mark.parametrize("exact", [0, 10_000])
@@ -75,8 +78,7 @@ def test_queries_are_answered_one_by_one(
     together = AppearanceIndex(held).query(asked, 4)
     monkeypatch.setattr(appearance_index, "_AT_ONCE", 7)
     apart = AppearanceIndex(held).query(asked, 4)
-    assert np.array_equal(together.rows, apart.rows)
-    assert np.array_equal(together.distances, apart.distances)
+    _assert_equal(together, apart)
 
 
 @pytest.mark.parametrize("exact", [0, 10_000])

@@ -318,10 +318,7 @@ class PlaceRecognition:
         self, landmarks: LandmarkMap, among: IntArray, features: StereoFeatures
     ) -> Relocalisation:
         rng = np.random.default_rng([self._parts.seed, _STREAM, len(self._memory)])
-        rows = np.flatnonzero(np.isin(landmarks.ids, among))
-        chosen = LandmarkMap(
-            landmarks.ids[rows], landmarks.positions[rows], landmarks.covariances[rows]
-        )
+        chosen = landmarks.select(np.flatnonzero(np.isin(landmarks.ids, among)))
         looks = self._tracker.database.appearances(chosen.ids, with_words=True)
         self._parts.relocaliser.learn(chosen, looks)
         return self._parts.relocaliser.locate(features, rng)

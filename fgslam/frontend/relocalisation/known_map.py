@@ -9,7 +9,7 @@ import numpy as np
 from fgslam.frontend.relocalisation.appearance_index import AppearanceIndex
 from fgslam.geometry import project, transform_to_camera
 from fgslam.map_types import LandmarkAppearances
-from fgslam.types import BoolArray, CameraRig, FloatArray, IntArray, LandmarkMap
+from fgslam.types import CameraRig, FloatArray, IntArray, LandmarkMap
 
 _NEAREST_DEPTH_M = 0.3
 _ROUNDING_M = 1e-6  # of depths computed in two ways, with thousands of kilometres to spare
@@ -50,7 +50,7 @@ class KnownMap:
         if (owners < 0).any():
             appearances = appearances.of(landmarks.ids)
         if (counts == 0).any():
-            landmarks = _chosen(landmarks, counts > 0)
+            landmarks = landmarks.select(counts > 0)
             owners, counts = _owners(landmarks.ids, appearances.ids)
         owners = owners[owners >= 0]
         starts = np.concatenate([[0], np.cumsum(counts)])
@@ -148,7 +148,3 @@ def _owners(ids: IntArray, viewed: IntArray) -> tuple[IntArray, IntArray]:
     known = row < len(ids)
     known[known] = ids[row[known]] == viewed[known]
     return np.where(known, row, -1), np.bincount(row[known], minlength=len(ids))
-
-
-def _chosen(landmarks: LandmarkMap, keep: BoolArray) -> LandmarkMap:
-    return LandmarkMap(landmarks.ids[keep], landmarks.positions[keep], landmarks.covariances[keep])
