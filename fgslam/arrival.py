@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fgslam.backend.protocol import Estimator, MapUser
-from fgslam.errors import ConfigError
-from fgslam.map_file import SavedMap
-from fgslam.types import Prediction
+from fgslam.core.errors import ConfigError
+from fgslam.core.saved_map import SavedMap
+from fgslam.core.types import Prediction
 
 
 @dataclass(frozen=True, slots=True, eq=False)

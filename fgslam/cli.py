@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fgslam import compare_options as options
-from fgslam.errors import FgslamError
+from fgslam.core.errors import FgslamError
 from fgslam.interruption import stop_flag, stoppable
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def run(
 
     Ctrl-C ends it early with all files valid; --resume goes on from there.
     """
-    from fgslam.errors import ConfigError
+    from fgslam.core.errors import ConfigError
     from fgslam.homing_config import HomingExperiment
     from fgslam.localisation_config import LocalisationConfig, load_experiment
     from fgslam.runs.measured import holds_measurements
@@ -170,7 +170,7 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     says where and why; the others go on. With --trials the experiment is repeated with new noise,
     and paired tests say whether the smoothers beat the filters.
     """
-    from fgslam.errors import ConfigError
+    from fgslam.core.errors import ConfigError
     from fgslam.runs.baseline import read_baseline
     from fgslam.runs.choosing import Choice
     from fgslam.runs.homing.compare import all_homing

@@ -17,7 +17,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
 
 Model = TypeVar("Model", bound=BaseModel)
 

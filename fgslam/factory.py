@@ -17,11 +17,13 @@ from fgslam.backend.landmark_kalman import LandmarkKalman
 from fgslam.backend.landmark_kalman_graph import LandmarkKalmanGraph
 from fgslam.backend.protocol import Estimator
 from fgslam.config import ExperimentConfig
+from fgslam.core.errors import ConfigError
+from fgslam.core.floor import DegreesOfFreedom, Floor
+from fgslam.core.recordings import Sequence
+from fgslam.core.types import CameraRig, MeasurementType, Prediction, Sensor
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.datasets.synthetic_odometry import SyntheticOdometry
-from fgslam.errors import ConfigError
-from fgslam.floor import DegreesOfFreedom, Floor
 from fgslam.frontend.database import LandmarkDatabase
 from fgslam.frontend.ego_motion import EgoMotionSolver
 from fgslam.frontend.loops.recognition import PlaceRecognition, RecognitionParts
@@ -33,7 +35,6 @@ from fgslam.frontend.stream import FeatureStream
 from fgslam.frontend.tracker import LandmarkTracker
 from fgslam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
 from fgslam.pipeline import SlamPipeline
-from fgslam.recordings import Sequence
 from fgslam.settings.backend import (
     BatchSettings,
     DeadReckoningSettings,
@@ -54,7 +55,6 @@ from fgslam.settings.datasets import (
 from fgslam.settings.frontend import EgoMotionSettings, FrontendSettings
 from fgslam.settings.lab import RenderedLabSettings
 from fgslam.settings.measurements import MeasurementDatasetSettings
-from fgslam.types import CameraRig, MeasurementType, Prediction, Sensor
 
 
 def open_sequence(

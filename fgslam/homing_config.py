@@ -20,7 +20,7 @@ from fgslam.config_reading import (
     read_mapping,
     with_default_kind,
 )
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
 from fgslam.settings.homing_behaviour import (
     HomingBehaviourSettings,
     LocalisationSettings,

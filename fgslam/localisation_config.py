@@ -13,7 +13,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from fgslam.config import ExperimentConfig
 from fgslam.config_reading import Reader, apply_overrides, read_mapping, with_default_kind
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
 from fgslam.homing_config import HomingExperiment, make_experiment
 from fgslam.settings.backend import EstimatorSettings, LandmarkKalmanSettings
 from fgslam.settings.datasets import OdometrySettings, RecordedOdometrySettings

@@ -7,15 +7,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from fgslam.geometry import (
-    inverse,
-    odometry_of_camera,
-    se3_exp,
-    se3_log,
-)
-from fgslam.recordings import Sequence
+from fgslam.core.geometry import inverse, odometry_of_camera, se3_exp, se3_log
+from fgslam.core.recordings import Sequence
+from fgslam.core.types import FloatArray, Odometry, StateArrays
 from fgslam.settings.datasets import ConstantVelocitySettings
-from fgslam.types import FloatArray, Odometry, StateArrays
 
 
 class MotionModel(Protocol):

@@ -14,14 +14,7 @@ from functools import partial
 import numpy as np
 
 from fgslam.backend.protocol import Estimator
-from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
-from fgslam.frontend.loops.recognition import PlaceRecognition
-from fgslam.frontend.resection import Resection
-from fgslam.frontend.stereo import StereoMatcher
-from fgslam.frontend.stream import FeatureFrame
-from fgslam.frontend.tracker import Association, LandmarkTracker
-from fgslam.motion import MotionModel
-from fgslam.types import (
+from fgslam.core.types import (
     EgoMotion,
     EgoMotionStatus,
     Increment,
@@ -34,6 +27,13 @@ from fgslam.types import (
     StereoFeatures,
     UpdateStats,
 )
+from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
+from fgslam.frontend.loops.recognition import PlaceRecognition
+from fgslam.frontend.resection import Resection
+from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.stream import FeatureFrame
+from fgslam.frontend.tracker import Association, LandmarkTracker
+from fgslam.motion import MotionModel
 
 
 @dataclass(frozen=True, slots=True, eq=False)

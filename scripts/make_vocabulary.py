@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.config import load_config
+from fgslam.core.types import FloatArray
 from fgslam.factory import open_sequence
 from fgslam.frontend.sift import SiftExtractor
 from fgslam.frontend.vocabulary import VOCABULARY_FILE
-from fgslam.types import FloatArray
 
 _WORDS = 256
 _ROUNDS = 25

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from fgslam.errors import MissingDependencyError
-from fgslam.runs.threads import one_blas_thread
+from fgslam.core.errors import MissingDependencyError
+from fgslam.core.threads import one_blas_thread
 from fgslam.simulation.open3d_library import load_open3d
 
 # A red test must be red again on the next run, and slow machines must not make one red.

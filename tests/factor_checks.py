@@ -8,8 +8,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam import geometry as g
-from fgslam.types import CameraRig, FloatArray
+from fgslam.core import geometry as g
+from fgslam.core.types import CameraRig, FloatArray
 
 UNEVEN_RIG = CameraRig(
     width=640,

@@ -6,10 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam import geometry
-from fgslam.floor import DegreesOfFreedom, Floor
-from fgslam.map_types import LandmarkAppearances
-from fgslam.types import ByteArray, CameraRig, FloatArray, IntArray, LandmarkMap, StereoFeatures
+from fgslam.core import geometry
+from fgslam.core.floor import DegreesOfFreedom, Floor
+from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.types import (
+    ByteArray,
+    CameraRig,
+    FloatArray,
+    IntArray,
+    LandmarkMap,
+    StereoFeatures,
+)
 
 RIG = CameraRig(
     320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, 0.1, geometry.BODY_FORWARD_LEFT_UP_FROM_CAMERA

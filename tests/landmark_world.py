@@ -13,14 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fgslam.backend.homing.factory import make_homing_estimator
-from fgslam.homing.avoidance import NoAvoidance, ObstacleAvoider
-from fgslam.homing.closed_loop import Driver, follow
-from fgslam.homing.eyes import Sighting
-from fgslam.homing.path_following import PathFollower
-from fgslam.homing.record import DriveRecord
-from fgslam.homing.soundness import parallax
-from fgslam.homing.steering import Steering
-from fgslam.homing_types import (
+from fgslam.core.homing_types import (
     BearingMatches,
     ColumnSegments,
     HomingStart,
@@ -30,12 +23,19 @@ from fgslam.homing_types import (
     TrackedBearings,
     UprightFeatures,
 )
-from fgslam.planar import bearings, compose, wrap
+from fgslam.core.planar import bearings, compose, wrap
+from fgslam.core.types import ByteArray, FloatArray, IntArray
+from fgslam.homing.avoidance import NoAvoidance, ObstacleAvoider
+from fgslam.homing.closed_loop import Driver, follow
+from fgslam.homing.eyes import Sighting
+from fgslam.homing.path_following import PathFollower
+from fgslam.homing.record import DriveRecord
+from fgslam.homing.soundness import parallax
+from fgslam.homing.steering import Steering
 from fgslam.runs.homing.starting import start_from_matches
 from fgslam.settings.homing_behaviour import HomingBehaviourSettings
 from fgslam.settings.homing_estimators import HomingEkfSettings, HomingEstimatorSettings
 from fgslam.settings.homing_vector import HomingVectorSettings
-from fgslam.types import ByteArray, FloatArray, IntArray
 
 DARK = np.zeros((1, 1, 3), dtype=np.uint8)
 

@@ -20,8 +20,8 @@ from simulated import (
     visible,
 )
 
-from fgslam import geometry as g
-from fgslam.types import BoolArray, FloatArray, Increment, LoopClosure
+from fgslam.core import geometry as g
+from fgslam.core.types import BoolArray, FloatArray, Increment, LoopClosure
 
 CIRCLE = (0.0, 0.1, 0.0, 0.0, 0.0, 0.25)
 """63 frames a round of 5 m across."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.types import FloatArray
 from fgslam.omni_cameras.panoramas import Equirectangular
 from fgslam.simulation.lighting import flat_light
 from fgslam.simulation.omni.colour_bank import ColourBank
 from fgslam.simulation.patches import Surface, Thing, rectangle, stack
 from fgslam.simulation.raycaster import RayCaster
 from fgslam.simulation.renderer import Layer
-from fgslam.types import FloatArray
 
 PANORAMA = Equirectangular(512, 256)
 

@@ -8,9 +8,9 @@ import io
 import numpy as np
 from PIL import Image
 
+from fgslam.core.geometry import pose, so3_exp
+from fgslam.core.types import FloatArray, LandmarkMap, Trajectory
 from fgslam.export.report import Column, Comparison, EstimatorReport, Picture, ReportData
-from fgslam.geometry import pose, so3_exp
-from fgslam.types import FloatArray, LandmarkMap, Trajectory
 
 HOSTILE = "<script>alert('%{x}')</script> & \"quotes\" </style>"
 

@@ -8,8 +8,9 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from simulated import RIG, FeatureWorld, assert_same_bits
 
-from fgslam import geometry as g
 from fgslam.arrival import Arrival, take_over
+from fgslam.core import geometry as g
+from fgslam.core.types import Features, FloatArray, Frame, Increment, Odometry
 from fgslam.factory import make_estimator, make_places, make_tracker
 from fgslam.frontend.loops.confirmation import difference
 from fgslam.frontend.stereo import StereoMatcher
@@ -19,7 +20,6 @@ from fgslam.pipeline import FrameReport, SlamPipeline
 from fgslam.settings.backend import EstimatorSettings, LandmarkKalmanSettings
 from fgslam.settings.frontend import EgoMotionSettings, FrontendSettings
 from fgslam.settings.loops import LoopSettings, LostSettings
-from fgslam.types import Features, FloatArray, Frame, Increment, Odometry
 
 IMAGES = (np.zeros((240, 320), np.uint8),) * 3
 RADIUS = 3.0

@@ -12,15 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam import geometry as g
 from fgslam.backend.protocol import Estimator
-from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
-from fgslam.motion import ConstantVelocityMotion
-from fgslam.pipeline import replay_step
-from fgslam.settings.datasets import ConstantVelocitySettings
-from fgslam.settings.frontend import EgoMotionSettings
-from fgslam.simulation.identities import IdentityBook
-from fgslam.types import (
+from fgslam.core import geometry as g
+from fgslam.core.types import (
     BoolArray,
     CameraRig,
     EgoMotion,
@@ -35,6 +29,12 @@ from fgslam.types import (
     Sensor,
     UpdateStats,
 )
+from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
+from fgslam.motion import ConstantVelocityMotion
+from fgslam.pipeline import replay_step
+from fgslam.settings.datasets import ConstantVelocitySettings
+from fgslam.settings.frontend import EgoMotionSettings
+from fgslam.simulation.identities import IdentityBook
 
 RIG = CameraRig(
     width=320,

@@ -8,8 +8,9 @@ from collections.abc import Callable
 import numpy as np
 from simulated import RIG, Drive, Simulation, observations, play, simulate
 
-from fgslam import geometry as g
 from fgslam.backend.protocol import Estimator
+from fgslam.core import geometry as g
+from fgslam.core.types import BoolArray, Estimate, FloatArray, Increment, Prediction, UpdateStats
 from fgslam.evaluation.consistency import Nees, landmark_nees, pose_nees
 from fgslam.factory import make_estimator
 from fgslam.settings.backend import (
@@ -19,7 +20,6 @@ from fgslam.settings.backend import (
     Isam2Settings,
 )
 from fgslam.settings.frontend import EgoMotionSettings
-from fgslam.types import BoolArray, Estimate, FloatArray, Increment, Prediction, UpdateStats
 
 FREE = EgoMotionSettings(dof=6)
 """The front-end's least squares without a floor: the simulated drives leave it."""

@@ -15,11 +15,11 @@ from fgslam.backend.refinement import Refined, refine
 from fgslam.backend.segments import TrackedFrame
 from fgslam.backend.submaps import Constraint
 from fgslam.backend.whole_graph import WholeGraphSmoother
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import reorthonormalise
+from fgslam.core.types import Prediction, Sensor
 from fgslam.factors.keys import pose_key
-from fgslam.floor import Floor
-from fgslam.geometry import reorthonormalise
 from fgslam.settings.backend import BatchSettings, KernelSettings
-from fgslam.types import Prediction, Sensor
 
 _RELATIVE_TOLERANCE = 1e-9  # of the cost; the estimate then moves by less than a micrometre
 

@@ -14,10 +14,8 @@ import numpy as np
 
 from fgslam.backend.graph_solution import Solution, allowed_parts
 from fgslam.backend.segments import TrackedFrame
-from fgslam.factors.keys import pose_key
-from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior
-from fgslam.floor import Floor
-from fgslam.geometry import (
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import (
     adjoint,
     congruence,
     in_front,
@@ -30,7 +28,9 @@ from fgslam.geometry import (
     reorthonormalise,
     se3_exp,
 )
-from fgslam.types import BoolArray, FloatArray, IntArray, Odometry, Prediction, Sensor
+from fgslam.core.types import BoolArray, FloatArray, IntArray, Odometry, Prediction, Sensor
+from fgslam.factors.keys import pose_key
+from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior
 
 _ITERATIONS = 4  # of Gauss-Newton; the tracker's pose is millimetres away
 _GATE = 16.3  # 99.9 % quantile of chi-square with three degrees of freedom

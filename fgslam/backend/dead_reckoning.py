@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 
 from fgslam.backend.filtered import FilteredTrajectory, FirstSights, moved
-from fgslam.geometry import (
+from fgslam.core.geometry import (
     adjoint,
     congruence,
     inverse,
@@ -20,7 +20,7 @@ from fgslam.geometry import (
     transform_to_camera,
     transform_to_world,
 )
-from fgslam.types import (
+from fgslam.core.types import (
     EgoMotion,
     Estimate,
     FloatArray,

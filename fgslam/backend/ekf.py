@@ -23,9 +23,9 @@ from fgslam.backend.ekf_update import (
 )
 from fgslam.backend.filtered import FilteredTrajectory, FirstSights
 from fgslam.backend.growing_covariance import BLOCK, FRONT, GrowingCovariance, rows_of
-from fgslam.errors import EstimatorError
-from fgslam.floor import Floor
-from fgslam.geometry import (
+from fgslam.core.errors import EstimatorError
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import (
     adjoint,
     congruence,
     inverse,
@@ -36,8 +36,7 @@ from fgslam.geometry import (
     so3_exp,
     transform_to_world,
 )
-from fgslam.settings.backend import EkfSettings
-from fgslam.types import (
+from fgslam.core.types import (
     EgoMotion,
     Estimate,
     FloatArray,
@@ -53,6 +52,7 @@ from fgslam.types import (
     StateArrays,
     UpdateStats,
 )
+from fgslam.settings.backend import EkfSettings
 
 _UNKNOWN = 100.0  # by which a pose found without a prior is less certain before its landmarks count
 _ADMITTED = 0.999  # quantile of an innovation squared beyond which the covariance is contradicted

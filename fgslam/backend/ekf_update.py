@@ -13,8 +13,8 @@ import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
 from fgslam.backend.growing_covariance import FRONT, GrowingCovariance, rows_of
-from fgslam.floor import Floor
-from fgslam.geometry import (
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import (
     in_front,
     measurement_difference,
     point_pose_jacobian,
@@ -24,7 +24,7 @@ from fgslam.geometry import (
     so3_log,
     transform_to_camera,
 )
-from fgslam.types import BoolArray, FloatArray, IntArray, Observations, Sensor
+from fgslam.core.types import BoolArray, FloatArray, IntArray, Observations, Sensor
 
 _ITERATIONS = 30
 _SETTLED = 1e-5  # radians and metres: far below what any measurement tells

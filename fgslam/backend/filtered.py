@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgslam.errors import EstimatorError
-from fgslam.geometry import compose_covariance, in_front, triangulate, triangulation_covariance
-from fgslam.types import (
+from fgslam.core.errors import EstimatorError
+from fgslam.core.geometry import compose_covariance, in_front, triangulate, triangulation_covariance
+from fgslam.core.types import (
     BoolArray,
     CameraRig,
     FloatArray,

@@ -27,11 +27,9 @@ from fgslam.backend.marginals import DenseMarginals, UndeterminedError
 from fgslam.backend.segments import TrackedFrame
 from fgslam.backend.smoother import Smoother
 from fgslam.backend.submaps import Constraint, constraint_factor, nearest_positive
-from fgslam.errors import EstimatorError
-from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
-from fgslam.factors.motion import pose_prior
-from fgslam.floor import Floor
-from fgslam.geometry import (
+from fgslam.core.errors import EstimatorError
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import (
     adjoint,
     congruence,
     inverse,
@@ -42,8 +40,10 @@ from fgslam.geometry import (
     transform_to_camera,
     transform_to_world,
 )
+from fgslam.core.types import FloatArray, LoopClosure, Prediction, Sensor
+from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
+from fgslam.factors.motion import pose_prior
 from fgslam.settings.backend import FixedLagSettings
-from fgslam.types import FloatArray, LoopClosure, Prediction, Sensor
 
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
 

@@ -13,10 +13,8 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.landmark_elimination import whitening
-from fgslam.factors.keys import landmark_key, pose_key
-from fgslam.factors.stereo import FROM_MEASUREMENT
-from fgslam.floor import Floor
-from fgslam.geometry import (
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import (
     congruence,
     pose,
     projection_jacobian,
@@ -24,8 +22,10 @@ from fgslam.geometry import (
     so3_exp,
     transform_to_camera,
 )
+from fgslam.core.types import CameraRig, FloatArray, LandmarkMap, Observations, Prediction
+from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.factors.stereo import FROM_MEASUREMENT
 from fgslam.settings.frontend import EgoMotionSettings
-from fgslam.types import CameraRig, FloatArray, LandmarkMap, Observations, Prediction
 
 _POSE = pose_key(0)
 _CONVERGED = 1e-9  # radians and metres; as the front-end's, which does not take that step either

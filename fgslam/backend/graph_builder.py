@@ -15,6 +15,22 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.segments import TrackedFrame
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import (
+    congruence,
+    transform_to_world,
+    triangulate,
+    triangulation_covariance,
+)
+from fgslam.core.types import (
+    CameraRig,
+    FloatArray,
+    IntArray,
+    LandmarkMap,
+    Observations,
+    Prediction,
+    Sensor,
+)
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.motion import (
     floor_factors,
@@ -26,23 +42,7 @@ from fgslam.factors.motion import (
 from fgslam.factors.noise import Whitening
 from fgslam.factors.range_bearing import RangeBearingFactors
 from fgslam.factors.stereo import StereoFactors
-from fgslam.floor import Floor
-from fgslam.geometry import (
-    congruence,
-    transform_to_world,
-    triangulate,
-    triangulation_covariance,
-)
 from fgslam.settings.backend import GraphSettings
-from fgslam.types import (
-    CameraRig,
-    FloatArray,
-    IntArray,
-    LandmarkMap,
-    Observations,
-    Prediction,
-    Sensor,
-)
 
 _SAME_PLACE = 16.3  # 99.9 % quantile of chi-square with three degrees of freedom
 

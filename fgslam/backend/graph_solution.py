@@ -8,11 +8,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from fgslam.backend.marginals import marginals_of
-from fgslam.errors import EstimatorError
+from fgslam.core.errors import EstimatorError
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import congruence
+from fgslam.core.types import FloatArray, IntArray
 from fgslam.factors.keys import landmark_key, pose_key
-from fgslam.floor import Floor
-from fgslam.geometry import congruence
-from fgslam.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgslam.errors import EstimatorError
-from fgslam.measurement_log import MeasurementLog
-from fgslam.types import (
+from fgslam.core.errors import EstimatorError
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.types import (
     EgoMotion,
     EgoMotionStatus,
     FloatArray,

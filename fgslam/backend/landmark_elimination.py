@@ -14,8 +14,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from fgslam.core.types import FloatArray
 from fgslam.factors.keys import landmark_key, pose_key
-from fgslam.types import FloatArray
 
 _POSE, _LANDMARK = pose_key(0), landmark_key(0)
 _UNIT, _ZERO = gtsam.noiseModel.Unit.Create(3), np.zeros(3)

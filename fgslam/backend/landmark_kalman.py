@@ -20,7 +20,7 @@ from fgslam.backend.filtered import FilteredTrajectory, moved
 from fgslam.backend.landmark_rows import LandmarkRows
 from fgslam.backend.loop_correction import DriveBook
 from fgslam.backend.submaps import Chain, changes, home_changes, rotated, transported
-from fgslam.geometry import (
+from fgslam.core.geometry import (
     block_diagonal,
     congruence,
     inverse,
@@ -34,8 +34,7 @@ from fgslam.geometry import (
     triangulate,
     triangulation_covariance,
 )
-from fgslam.settings.backend import LandmarkKalmanSettings
-from fgslam.types import (
+from fgslam.core.types import (
     EgoMotion,
     Estimate,
     FloatArray,
@@ -51,6 +50,7 @@ from fgslam.types import (
     StateArrays,
     UpdateStats,
 )
+from fgslam.settings.backend import LandmarkKalmanSettings
 
 
 class LandmarkKalman:

@@ -17,14 +17,9 @@ import numpy as np
 from fgslam.backend.fixed_map_pose import FixedMapPose
 from fgslam.backend.landmark_elimination import Eliminated, LandmarkElimination, fused
 from fgslam.backend.landmark_kalman import LandmarkKalman
-from fgslam.errors import EstimatorError
-from fgslam.factors.keys import landmark_key, pose_key
-from fgslam.factors.noise import Whitening
-from fgslam.factors.stereo import StereoFactors
-from fgslam.geometry import transform_to_world, triangulate
-from fgslam.settings.backend import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
-from fgslam.settings.frontend import EgoMotionSettings
-from fgslam.types import (
+from fgslam.core.errors import EstimatorError
+from fgslam.core.geometry import transform_to_world, triangulate
+from fgslam.core.types import (
     BoolArray,
     CameraRig,
     EgoMotion,
@@ -39,6 +34,11 @@ from fgslam.types import (
     Sensor,
     UpdateStats,
 )
+from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.factors.noise import Whitening
+from fgslam.factors.stereo import StereoFactors
+from fgslam.settings.backend import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
+from fgslam.settings.frontend import EgoMotionSettings
 
 _POSE, _LANDMARK = pose_key(0), landmark_key(0)
 

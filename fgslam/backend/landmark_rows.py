@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.columns import GrowingColumns
-from fgslam.types import FloatArray, IntArray, LandmarkMap
+from fgslam.core.growing_arrays import GrowingColumns
+from fgslam.core.types import FloatArray, IntArray, LandmarkMap
 
 
 class LandmarkRows:

@@ -18,9 +18,9 @@ from fgslam.backend.graph_builder import GraphBuilder
 from fgslam.backend.graph_solution import poses_of_frame
 from fgslam.backend.outliers import solver_parameters
 from fgslam.backend.submaps import Chain, Constraint, changes, corrected
+from fgslam.core.geometry import adjoint, congruence, inverse, transform_to_world
+from fgslam.core.types import EgoMotion, FloatArray, IntArray, LoopClosure
 from fgslam.factors.keys import landmark_key, pose_key
-from fgslam.geometry import adjoint, congruence, inverse, transform_to_world
-from fgslam.types import EgoMotion, FloatArray, IntArray, LoopClosure
 
 _ITERATIONS = 20
 _ENOUGH = 2.0  # the last iteration's gain, half squared deviations: far below the gate's square

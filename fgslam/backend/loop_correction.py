@@ -13,10 +13,10 @@ import dataclasses
 import numpy as np
 
 from fgslam.backend.submaps import FREE, Chain, Constraint
-from fgslam.errors import EstimatorError
-from fgslam.geometry import inverse
+from fgslam.core.errors import EstimatorError
+from fgslam.core.geometry import inverse
+from fgslam.core.types import EgoMotion, FloatArray, IntArray, LoopClosure, Odometry, StateArrays
 from fgslam.settings.backend import LoopCorrectionSettings
-from fgslam.types import EgoMotion, FloatArray, IntArray, LoopClosure, Odometry, StateArrays
 
 _TIED_BY = 10  # landmarks of an old place that hold a frame there
 _OLD = 5  # submaps

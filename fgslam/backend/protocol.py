@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import ClassVar, Protocol, runtime_checkable
 
-from fgslam.types import (
+from fgslam.core.types import (
     EgoMotion,
     Estimate,
     FloatArray,

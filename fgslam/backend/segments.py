@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.geometry import (
+from fgslam.core.geometry import (
     compose_odometry,
     in_front,
     inverse,
@@ -26,7 +26,7 @@ from fgslam.geometry import (
     transform_to_camera,
     triangulate,
 )
-from fgslam.types import (
+from fgslam.core.types import (
     CameraRig,
     FloatArray,
     IntArray,

@@ -22,10 +22,9 @@ from fgslam.backend.loop_closing import carried_to
 from fgslam.backend.refinement import Refined
 from fgslam.backend.segments import TrackedFrame
 from fgslam.backend.submaps import FREE, Constraint
-from fgslam.errors import EstimatorError
-from fgslam.factors.keys import landmark_key, pose_key
-from fgslam.floor import Floor
-from fgslam.geometry import (
+from fgslam.core.errors import EstimatorError
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import (
     adjoint,
     congruence,
     inverse,
@@ -34,8 +33,7 @@ from fgslam.geometry import (
     triangulate,
     triangulation_covariance,
 )
-from fgslam.settings.backend import GraphSettings, LandmarkKalmanSettings
-from fgslam.types import (
+from fgslam.core.types import (
     BoolArray,
     CameraRig,
     EgoMotion,
@@ -54,6 +52,8 @@ from fgslam.types import (
     Trajectory,
     UpdateStats,
 )
+from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.settings.backend import GraphSettings, LandmarkKalmanSettings
 
 _ASTRAY_PX = 12.0  # where nothing is left out: farther off, a match speaks against its landmark
 

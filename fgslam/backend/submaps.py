@@ -18,17 +18,10 @@ import numpy as np
 
 from fgslam.backend.graph_solution import poses_of_frame
 from fgslam.backend.outliers import solver_parameters
+from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise, se3_log, skew
+from fgslam.core.types import FloatArray, IntArray, Odometry, Prediction, StateArrays
 from fgslam.factors.keys import pose_key
 from fgslam.factors.motion import odometry_factor, pose_prior
-from fgslam.geometry import (
-    adjoint,
-    congruence,
-    inverse,
-    reorthonormalise,
-    se3_log,
-    skew,
-)
-from fgslam.types import FloatArray, IntArray, Odometry, Prediction, StateArrays
 
 _DOUBT_WIDTH = 3.0  # deviations of the whole closure; its squared residual is 6 on average
 _ITERATIONS = 100
@@ -233,7 +226,7 @@ def _inverses(poses: FloatArray) -> FloatArray:
 
 
 def _motions(twists: FloatArray) -> FloatArray:
-    """Rigid motions (n, 4, 4) of tangent vectors (n, 6): :func:`fgslam.geometry.se3_exp` of all."""
+    """Rigid motions (n, 4, 4) of tangent vectors (n, 6): :func:`fgslam.core.geometry.se3_exp` of all."""
     angle = np.linalg.norm(twists[:, :3], axis=1)[:, None, None]
     cross = skew(twists[:, :3])
     square = cross @ cross

@@ -13,9 +13,9 @@ from fgslam.backend.graph_solution import poses_of_frame
 from fgslam.backend.loop_closing import first_guess, misfit, solved
 from fgslam.backend.smoother import Smoother
 from fgslam.backend.submaps import Constraint, constraint_factor
-from fgslam.floor import Floor
+from fgslam.core.floor import Floor
+from fgslam.core.types import IntArray, LandmarkMap, LoopClosure, Prediction, Sensor, StateArrays
 from fgslam.settings.backend import GraphSettings
-from fgslam.types import IntArray, LandmarkMap, LoopClosure, Prediction, Sensor, StateArrays
 
 _AGREES = float(chi2.ppf(0.99, 6))  # 16.8: a loop that the graph meets as it is
 

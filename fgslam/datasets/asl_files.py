@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 import yaml
 
+from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.geometry import inverse
+from fgslam.core.types import FloatArray, IntArray, Trajectory
 from fgslam.datasets.calibration import is_rigid
 from fgslam.datasets.tables import Table, read_lines, read_table, require_increasing
 from fgslam.datasets.trajectories import (
@@ -18,9 +21,6 @@ from fgslam.datasets.trajectories import (
     poses_from_quaternions,
     require_unit_quaternions,
 )
-from fgslam.errors import CalibrationError, DatasetError
-from fgslam.geometry import inverse
-from fgslam.types import FloatArray, IntArray, Trajectory
 
 NANOSECONDS = 1e-9
 _DISTORTION_MODELS = ("radial-tangential", "radtan", "plumb_bob")

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.errors import CalibrationError
-from fgslam.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose, so3_exp
-from fgslam.types import CameraRig, FloatArray
+from fgslam.core.errors import CalibrationError
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose, so3_exp
+from fgslam.core.types import CameraRig, FloatArray
 
 _RIGID_TOLERANCE = 1e-4
 

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.recordings import Sequence
+from fgslam.core.types import CameraRig, FloatArray
 from fgslam.datasets.clock_check import check_clock
 from fgslam.datasets.findings import Finding, Level, by_severity
 from fgslam.datasets.image_checks import Told, check_images
 from fgslam.datasets.motion_checks import check_odometry, check_odometry_against_truth, check_truth
-from fgslam.recordings import Sequence
-from fgslam.types import CameraRig, FloatArray
 
 _GAP_FACTOR = 1.8
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.errors import DatasetError
+from fgslam.core.geometry import inverse, so3_log
+from fgslam.core.recordings import Sequence
+from fgslam.core.types import FloatArray
 from fgslam.datasets.findings import Finding, Level
 from fgslam.datasets.recording import OdometrySource, Recording
 from fgslam.datasets.trajectories import rows_at
-from fgslam.errors import DatasetError
-from fgslam.geometry import inverse, so3_log
-from fgslam.recordings import Sequence
-from fgslam.types import FloatArray
 
 _STAMP_TOLERANCE_S = 1e-3
 _RANGE_S, _STEP_S = 0.2, 0.02

@@ -10,6 +10,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.core.errors import CalibrationError
+from fgslam.core.geometry import inverse
+from fgslam.core.types import CameraRig, FloatArray, Image, Trajectory
 from fgslam.datasets.asl_files import (
     NANOSECONDS,
     AslCamera,
@@ -22,10 +25,7 @@ from fgslam.datasets.recording import Recording, recording_identity
 from fgslam.datasets.selection import select_frames
 from fgslam.datasets.stereo_files import StereoFiles, check_sizes, missing_notes, require_folder
 from fgslam.datasets.trajectories import trajectory_at_frames
-from fgslam.errors import CalibrationError
-from fgslam.geometry import inverse
 from fgslam.settings.datasets import EurocSettings
-from fgslam.types import CameraRig, FloatArray, Image, Trajectory
 
 MapArray: TypeAlias = npt.NDArray[np.float32]
 

@@ -8,10 +8,10 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fgslam.core.errors import FrameError
+from fgslam.core.recordings import Sequence
+from fgslam.core.types import Frame, Image, IntArray
 from fgslam.datasets.findings import Finding, Level, listed, share
-from fgslam.errors import FrameError
-from fgslam.recordings import Sequence
-from fgslam.types import Frame, Image, IntArray
 
 Told: TypeAlias = Callable[[int, int], None]
 """Called with how much is done, and of how much."""

@@ -8,6 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.errors import DatasetError, OdometryError
+from fgslam.core.geometry import right_from_left_camera
+from fgslam.core.types import CameraRig, FloatArray, IntArray, Odometry, Trajectory
 from fgslam.datasets.calibration import level_mounting, read_calibration, read_json_object
 from fgslam.datasets.images import list_numbered_images
 from fgslam.datasets.recorded_odometry import (
@@ -21,10 +24,7 @@ from fgslam.datasets.selection import select_frames
 from fgslam.datasets.stereo_files import StereoFiles, check_sizes, missing_notes, require_folder
 from fgslam.datasets.tables import Table, read_table, require_increasing
 from fgslam.datasets.trajectories import read_tum_table, trajectory_at_frames
-from fgslam.errors import DatasetError, OdometryError
-from fgslam.geometry import right_from_left_camera
 from fgslam.settings.datasets import ImageFolderSettings, RecordedOdometrySettings
-from fgslam.types import CameraRig, FloatArray, IntArray, Odometry, Trajectory
 
 TRUTH_LEFT = "gt_left_cam.txt"
 TRUTH_RIGHT = "gt_right_cam.txt"

@@ -10,6 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, right_from_left_camera
+from fgslam.core.types import CameraRig, FloatArray, Trajectory
 from fgslam.datasets.images import list_numbered_images
 from fgslam.datasets.recording import Recording, recording_identity
 from fgslam.datasets.selection import select_frames
@@ -21,10 +24,7 @@ from fgslam.datasets.stereo_files import (
     size,
 )
 from fgslam.datasets.tables import read_lines, read_table, require_increasing
-from fgslam.errors import CalibrationError, DatasetError
-from fgslam.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, right_from_left_camera
 from fgslam.settings.datasets import KittiSettings
-from fgslam.types import CameraRig, FloatArray, Trajectory
 
 _POSE_COLUMNS = tuple(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
 

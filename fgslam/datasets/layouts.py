@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fgslam.errors import DatasetError
+from fgslam.core.errors import DatasetError
 
 _KITTI_PARTS = ("image_0", "image_1", "calib.txt", "times.txt")
 

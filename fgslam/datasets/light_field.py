@@ -18,16 +18,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from fgslam.core.errors import DatasetError, FrameError
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
+from fgslam.core.types import CameraRig, FloatArray, Image, Trajectory
 from fgslam.datasets.calibration import pixels, read_json_object
 from fgslam.datasets.images import read_grey_image
 from fgslam.datasets.recording import Recording, recording_identity
 from fgslam.datasets.selection import select_frames
 from fgslam.datasets.stereo_files import require_folder
 from fgslam.datasets.tables import read_lines
-from fgslam.errors import DatasetError, FrameError
-from fgslam.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
 from fgslam.settings.datasets import LightFieldSettings
-from fgslam.types import CameraRig, FloatArray, Image, Trajectory
 
 _POSITION_COLUMNS = "file, row, column, v, u"
 

@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.errors import ConfigError
-from fgslam.measurement_log import MeasurementLog
+from fgslam.core.errors import ConfigError
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.types import FloatArray, Increment, IntArray, Observations, Odometry, Sensor
 from fgslam.settings.datasets import (
     ConstantVelocitySettings,
     OdometrySettings,
     RecordedOdometrySettings,
     SyntheticOdometrySettings,
 )
-from fgslam.types import FloatArray, Increment, IntArray, Observations, Odometry, Sensor
 
 _NONE: IntArray = np.empty(0, np.int64)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.errors import DatasetError
+from fgslam.core.geometry import inverse, se3_log
+from fgslam.core.recordings import Sequence
+from fgslam.core.types import FloatArray, Odometry, Trajectory
 from fgslam.datasets.findings import Finding, Level, listed, share
 from fgslam.datasets.trajectories import rows_at
-from fgslam.errors import DatasetError
-from fgslam.geometry import inverse, se3_log
-from fgslam.recordings import Sequence
-from fgslam.types import FloatArray, Odometry, Trajectory
 
 _STAMP_TOLERANCE_S = 1e-3
 _MAX_JUMP = 8.0

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.errors import CalibrationError
 from fgslam.datasets.tables import read_lines
-from fgslam.errors import CalibrationError
 from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
 from fgslam.omni_cameras.ocamcalib import read_ocamcalib
 from fgslam.omni_cameras.panoramas import Equirectangular

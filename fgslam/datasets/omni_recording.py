@@ -12,10 +12,10 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.types import FloatArray, Image, IntArray
 from fgslam.datasets.images import IMAGE_SUFFIXES
-from fgslam.errors import CalibrationError, DatasetError
 from fgslam.omni_cameras.protocol import OmniCamera
-from fgslam.types import FloatArray, Image, IntArray
 
 ColourLoader: TypeAlias = Callable[[int], Image]
 """Picture (height, width, 3) in R, G, B by place in the recording; raises FrameError."""

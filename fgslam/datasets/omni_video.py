@@ -7,13 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from fgslam.core.errors import DatasetError, FrameError
+from fgslam.core.types import Image
 from fgslam.datasets.omni_camera_files import make_camera
 from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.datasets.recording import recording_identity
 from fgslam.datasets.selection import select_frames
-from fgslam.errors import DatasetError, FrameError
 from fgslam.settings.omni_datasets import OmniVideoSettings
-from fgslam.types import Image
 
 
 def open_omni_video(settings: OmniVideoSettings) -> OmniRecording:

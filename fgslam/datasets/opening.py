@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
+from fgslam.core.recordings import MeasurementRecording
 from fgslam.datasets.euroc import open_euroc
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.kitti import open_kitti
@@ -13,7 +14,6 @@ from fgslam.datasets.simulated_measurements import open_simulated_measurements
 from fgslam.datasets.stereo_tracks import open_stereo_tracks
 from fgslam.datasets.utias_range_bearing import open_lost_in_the_woods
 from fgslam.datasets.utias_stereo import open_starry_night
-from fgslam.recordings import MeasurementRecording
 from fgslam.settings.datasets import (
     EurocSettings,
     ImageFolderSettings,

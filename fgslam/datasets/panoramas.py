@@ -10,6 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.errors import DatasetError, FrameError
+from fgslam.core.planar import wrap
+from fgslam.core.types import FloatArray, Image, IntArray
 from fgslam.datasets.images import IMAGE_SUFFIXES, read_colour_image
 from fgslam.datasets.omni_camera_files import make_camera
 from fgslam.datasets.omni_recording import (
@@ -23,10 +26,7 @@ from fgslam.datasets.panorama_reduction import PanoramaReduction
 from fgslam.datasets.recording import recording_identity
 from fgslam.datasets.selection import select_frames
 from fgslam.datasets.stereo_files import require_folder
-from fgslam.errors import DatasetError, FrameError
-from fgslam.planar import wrap
 from fgslam.settings.omni_datasets import PanoramasSettings
-from fgslam.types import FloatArray, Image, IntArray
 
 POSES_FILE = "poses.csv"
 _PICTURES = "panos"

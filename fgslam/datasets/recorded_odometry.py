@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fgslam.core.errors import OdometryError
+from fgslam.core.geometry import inverse, rotation_angle
+from fgslam.core.types import BoolArray, FloatArray, Odometry, Trajectory
 from fgslam.datasets.tables import Table, read_table, require_increasing
 from fgslam.datasets.trajectories import interpolate_poses, read_tum_table
-from fgslam.errors import OdometryError
-from fgslam.geometry import inverse, rotation_angle
 from fgslam.settings.datasets import RecordedOdometrySettings
-from fgslam.types import BoolArray, FloatArray, Odometry, Trajectory
 
 SPEED_COLUMNS = ("time", "forward speed", "yaw rate")
 _POSE_HOLD_S = 1e-3

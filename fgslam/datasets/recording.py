@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TypeAlias
 
-from fgslam.types import CameraRig, FloatArray, Frame, Image, IntArray, Odometry, Trajectory
+from fgslam.core.types import CameraRig, FloatArray, Frame, Image, IntArray, Odometry, Trajectory
 
 ImageLoader: TypeAlias = Callable[[int], tuple[Image, ...]]
 """Images (right, left[, top]) of one of the recording's own frames; raises FrameError."""

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from fgslam import geometry
-from fgslam.errors import ConfigError, FrameError
+from fgslam.core import geometry
+from fgslam.core.errors import ConfigError, FrameError
+from fgslam.core.types import CameraRig, FloatArray, Frame, Image, IntArray, Odometry, Trajectory
 from fgslam.settings.lab import LabSettings
 from fgslam.simulation import wheel_odometry
 from fgslam.simulation.image_effects import apply_effects, is_blocked
@@ -25,7 +26,6 @@ from fgslam.simulation.places import PlaceChoice, first_pose, plan_in_place
 from fgslam.simulation.render_cache import RenderCache, content_hash
 from fgslam.simulation.renderer import Layer
 from fgslam.simulation.world import World, camera_offsets, make_rig, open_room
-from fgslam.types import CameraRig, FloatArray, Frame, Image, IntArray, Odometry, Trajectory
 
 RENDER_VERSION = 7
 """Part of the cache's key: raised whenever the same settings give other pixels."""
@@ -38,7 +38,7 @@ Progress = Callable[[int, int], None]
 
 
 class RenderedLabSequence:
-    """A drive through a rendered place; implements :class:`fgslam.recordings.Sequence`.
+    """A drive through a rendered place; implements :class:`fgslam.core.recordings.Sequence`.
 
     The world frame of the ground truth is the reference camera's pose at the first frame of the
     drive, or of the drive that ``drive.world_from`` names: then truths of several drives agree.

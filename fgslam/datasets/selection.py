@@ -6,9 +6,9 @@ from typing import Protocol
 
 import numpy as np
 
-from fgslam.errors import DatasetError
+from fgslam.core.errors import DatasetError
+from fgslam.core.types import IntArray
 from fgslam.settings.datasets import RecordingSettings
-from fgslam.types import IntArray
 
 
 class Selection(Protocol):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict
 
+from fgslam.core.recordings import LandmarkTruth, MeasurementRecording
 from fgslam.datasets.measurement_files import make_log
-from fgslam.recordings import LandmarkTruth, MeasurementRecording
 from fgslam.settings.datasets import OdometrySettings
 from fgslam.settings.measurements import SimulatedMeasurementsSettings
 from fgslam.simulation.measurements import SimulatedMeasurements, simulate_measurements

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from fgslam.core.errors import CalibrationError, DatasetError, FrameError
+from fgslam.core.types import FloatArray, Image
 from fgslam.datasets.images import read_grey_image
-from fgslam.errors import CalibrationError, DatasetError, FrameError
-from fgslam.types import FloatArray, Image
 
 CAMERA_NAMES = ("right", "left", "top")
 _NAMED_IN_NOTES = 5

@@ -12,6 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.geometry import (
+    BODY_FORWARD_LEFT_UP_FROM_CAMERA,
+    reorthonormalise,
+    right_from_left_camera,
+)
+from fgslam.core.recordings import MeasurementRecording
+from fgslam.core.stereo_model import measurement_map
+from fgslam.core.types import CameraRig, FloatArray, IntArray, Trajectory
 from fgslam.datasets.measurement_files import (
     MeasuredFrame,
     files_identity,
@@ -20,17 +29,8 @@ from fgslam.datasets.measurement_files import (
 )
 from fgslam.datasets.selection import select_of
 from fgslam.datasets.tables import Table, read_table
-from fgslam.errors import CalibrationError, DatasetError
-from fgslam.geometry import (
-    BODY_FORWARD_LEFT_UP_FROM_CAMERA,
-    reorthonormalise,
-    right_from_left_camera,
-)
-from fgslam.recordings import MeasurementRecording
 from fgslam.settings.datasets import OdometrySettings
 from fgslam.settings.measurements import StereoTracksSettings
-from fgslam.stereo_model import measurement_map
-from fgslam.types import CameraRig, FloatArray, IntArray, Trajectory
 
 _INSIDE = {"00s": "00s", "00": "00", "large": "_large"}
 _PREFIX = "VO_stereo_factors"

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.errors import DatasetError
+from fgslam.core.geometry import inverse, se3_exp
+from fgslam.core.recordings import Sequence
+from fgslam.core.types import CameraRig, FloatArray, Frame, Odometry, Trajectory
 from fgslam.datasets.trajectories import rows_at
-from fgslam.errors import DatasetError
-from fgslam.geometry import inverse, se3_exp
-from fgslam.recordings import Sequence
 from fgslam.settings.datasets import SyntheticOdometrySettings
-from fgslam.types import CameraRig, FloatArray, Frame, Odometry, Trajectory
 
 _STAMP_TOLERANCE_S = 1e-6
 

@@ -8,9 +8,9 @@ from typing import TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from fgslam.core.errors import DatasetError
+from fgslam.core.types import BoolArray, FloatArray, IntArray, Trajectory
 from fgslam.datasets.tables import Table, read_table, require_increasing
-from fgslam.errors import DatasetError
-from fgslam.types import BoolArray, FloatArray, IntArray, Trajectory
 
 TUM_COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 _QUATERNION_TOLERANCE = 0.01

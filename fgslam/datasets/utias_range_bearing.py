@@ -17,7 +17,16 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam import geometry as g
+from fgslam.core import geometry as g
+from fgslam.core.recordings import LandmarkTruth, MeasurementRecording
+from fgslam.core.types import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Odometry,
+    RangeBearingSensor,
+    Trajectory,
+)
 from fgslam.datasets.matlab_files import MatlabFile, read_matlab
 from fgslam.datasets.measurement_files import (
     MeasuredFrame,
@@ -26,17 +35,8 @@ from fgslam.datasets.measurement_files import (
     make_log,
 )
 from fgslam.datasets.selection import select_of
-from fgslam.recordings import LandmarkTruth, MeasurementRecording
 from fgslam.settings.datasets import OdometrySettings
 from fgslam.settings.measurements import UtiasRangeBearingSettings
-from fgslam.types import (
-    BoolArray,
-    FloatArray,
-    IntArray,
-    Odometry,
-    RangeBearingSensor,
-    Trajectory,
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,7 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam import geometry as g
+from fgslam.core import geometry as g
+from fgslam.core.errors import DatasetError
+from fgslam.core.recordings import LandmarkTruth, MeasurementRecording
+from fgslam.core.types import BoolArray, CameraRig, FloatArray, IntArray, Odometry, Trajectory
 from fgslam.datasets.matlab_files import MatlabFile, read_matlab
 from fgslam.datasets.measurement_files import (
     MeasuredFrame,
@@ -23,11 +26,8 @@ from fgslam.datasets.measurement_files import (
     make_log,
 )
 from fgslam.datasets.selection import select_of
-from fgslam.errors import DatasetError
-from fgslam.recordings import LandmarkTruth, MeasurementRecording
 from fgslam.settings.datasets import OdometrySettings
 from fgslam.settings.measurements import UtiasStereoSettings
-from fgslam.types import BoolArray, CameraRig, FloatArray, IntArray, Odometry, Trajectory
 
 # (column, row, disparity) of the right camera, from left column and row, right column and row.
 _MEASURE: FloatArray = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.5, 0.0, 0.5], [1.0, 0.0, -1.0, 0.0]])

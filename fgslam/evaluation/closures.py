@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.geometry import inverse
+from fgslam.core.types import FloatArray, LoopClosure, Trajectory
 from fgslam.evaluation.trajectory import position_errors, rotation_angles, to_estimate_world
-from fgslam.geometry import inverse
-from fgslam.types import FloatArray, LoopClosure, Trajectory
 
 FALSE_M = 0.5
 """A closure that is farther from the true relative pose was none."""

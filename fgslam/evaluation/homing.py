@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.homing_types import HomingEstimate, HomingTruth, home_vector_jacobian
+from fgslam.core.planar import wrap
+from fgslam.core.types import FloatArray
 from fgslam.evaluation.consistency import Consistency, Nees, judge, nees
-from fgslam.homing_types import HomingEstimate, HomingTruth, home_vector_jacobian
-from fgslam.planar import wrap
-from fgslam.types import FloatArray
 
 DIVERGED_RAD = float(np.deg2rad(30.0))
 """A home direction further off than this leads away, not home."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.geometry import transform_to_world
+from fgslam.core.recordings import LandmarkTruth
+from fgslam.core.types import FloatArray, IntArray, LandmarkMap
 from fgslam.evaluation.consistency import Nees, landmark_nees
-from fgslam.geometry import transform_to_world
-from fgslam.recordings import LandmarkTruth
-from fgslam.types import FloatArray, IntArray, LandmarkMap
 
 
 @dataclass(frozen=True, slots=True, eq=False)

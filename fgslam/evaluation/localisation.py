@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
+from fgslam.core.geometry import inverse
+from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.evaluation.consistency import pose_nees
 from fgslam.evaluation.trajectory import rotation_angles
-from fgslam.geometry import inverse
-from fgslam.types import BoolArray, FloatArray, IntArray
 
 _HELD = 0.95
 

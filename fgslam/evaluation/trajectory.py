@@ -15,8 +15,8 @@ from enum import Enum
 
 import numpy as np
 
-from fgslam.geometry import inverse, pose, yaw_pitch_roll
-from fgslam.types import FloatArray, IntArray, Trajectory
+from fgslam.core.geometry import inverse, pose, yaw_pitch_roll
+from fgslam.core.types import FloatArray, IntArray, Trajectory
 
 # Three points are the fewest that fix a rigid motion in space.
 _MIN_POSES_TO_ALIGN = 3

@@ -1,6 +1,6 @@
 """The run folder: what it may hold, and how one is begun, resumed or replaced.
 
-Its files are written whole or not at all: :mod:`fgslam.whole_files`.
+Its files are written whole or not at all: :mod:`fgslam.core.atomic_files`.
 """
 
 from __future__ import annotations
@@ -8,14 +8,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-from fgslam.errors import OutputError
-from fgslam.whole_files import (
+from fgslam.core.atomic_files import (
     clear_output_errors,
+    make_subfolder,
     replacing,
     require_writable,
     write_bytes,
     write_text,
 )
+from fgslam.core.errors import OutputError
 
 __all__ = [
     "RUN_MARKER",
@@ -101,14 +102,6 @@ def create_run_folder(path: Path, existing: ExistingFolder = "refuse") -> Path:
         path.mkdir(parents=True, exist_ok=True)
     require_writable(path)
     return path
-
-
-def make_subfolder(run: Path, name: str) -> Path:
-    """A folder inside the run folder, created when absent. Raises OutputError."""
-    folder = run / name
-    with clear_output_errors(folder):
-        folder.mkdir(exist_ok=True)
-    return folder
 
 
 def is_run_folder(path: Path) -> bool:

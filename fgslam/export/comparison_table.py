@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fgslam.export.atomic import write_text
+from fgslam.core.atomic_files import write_text
 from fgslam.export.metrics import EstimatorMetrics
 
 RESULT_COLUMNS: tuple[tuple[str, str], ...] = (

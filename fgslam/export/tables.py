@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.export.atomic import write_text
+from fgslam.core.atomic_files import write_text
 from fgslam.export.metrics import JsonValue, plain
 
 Cell: TypeAlias = "str | bool | int | float | np.generic | None"

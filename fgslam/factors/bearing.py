@@ -14,6 +14,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from fgslam.core.planar import rotation
+from fgslam.core.types import FloatArray
 from fgslam.factors.bearing_residuals import (
     direction_and_turn,
     elevation,
@@ -21,8 +23,6 @@ from fgslam.factors.bearing_residuals import (
     elevation_pair,
 )
 from fgslam.factors.noise import KernelName, Whitening
-from fgslam.planar import rotation
-from fgslam.types import FloatArray
 
 STIFF = 1e-4
 """Deviation, legs and radians, of what defines the frame: the start's pose, and the leg's length.

@@ -13,8 +13,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from fgslam.core.types import CameraRig, FloatArray
 from fgslam.factors.noise import Whitening
-from fgslam.types import CameraRig, FloatArray
 
 
 class RawPixelFactors:

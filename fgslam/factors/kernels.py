@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.types import FloatArray
 from fgslam.factors.noise import KernelName
-from fgslam.types import FloatArray
 
 
 def kernel_weights(name: KernelName, width: float, squared: FloatArray) -> FloatArray:

@@ -7,9 +7,9 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from fgslam.core.floor import Floor
+from fgslam.core.types import FloatArray, Odometry, Prediction
 from fgslam.factors.noise import STIFF_M, STIFF_RAD, positive_definite
-from fgslam.floor import Floor
-from fgslam.types import FloatArray, Odometry, Prediction
 
 
 def pose_prior(pose: int, prior: Prediction) -> Any:

@@ -7,8 +7,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from fgslam.core.types import FloatArray
 from fgslam.factors.noise import Whitening
-from fgslam.types import FloatArray
 
 _REACH_SIGMAS = 10.0  # how far from the measured direction the predicted one is expected
 _ISOTROPIC = 1e-9  # relative difference of bearing variances that makes no difference

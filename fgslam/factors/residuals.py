@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.floor import Floor
-from fgslam.geometry import (
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import (
     inverse,
     measurement_difference,
     project,
@@ -22,9 +22,9 @@ from fgslam.geometry import (
     so3_log,
     transform_to_camera,
 )
-from fgslam.range_bearing import triangulate, triangulation_jacobian
-from fgslam.stereo_model import vertical_to_horizontal
-from fgslam.types import CameraRig, FloatArray, RangeBearingSensor
+from fgslam.core.range_bearing import triangulate, triangulation_jacobian
+from fgslam.core.stereo_model import vertical_to_horizontal
+from fgslam.core.types import CameraRig, FloatArray, RangeBearingSensor
 
 # --------------------------------------------------------------------------------------------
 # Cameras

@@ -14,8 +14,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from fgslam.core.types import CameraRig, FloatArray
 from fgslam.factors.noise import Whitening
-from fgslam.types import CameraRig, FloatArray
 
 FROM_MEASUREMENT: FloatArray = np.array([[1.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """(u_left, u_right, v) of (column, row, disparity)."""

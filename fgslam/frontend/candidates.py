@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.geometry import wrap_angle
+from fgslam.core.geometry import wrap_angle
+from fgslam.core.types import BoolArray, ByteArray, FloatArray, IntArray
 from fgslam.settings.frontend import AppearanceSettings
-from fgslam.types import BoolArray, ByteArray, FloatArray, IntArray
 
 
 def pairs_within(

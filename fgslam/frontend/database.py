@@ -10,12 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.frontend.landmark_table import LandmarkTable
-from fgslam.frontend.permanence import is_blind, reliable, seen_past
-from fgslam.frontend.views import Views
-from fgslam.frontend.visibility import ExpectedLandmarks, FieldOfView, Wanted, directions_to
-from fgslam.settings.frontend import DatabaseSettings, PermanenceSettings
-from fgslam.types import (
+from fgslam.core.types import (
     BoolArray,
     ByteArray,
     CameraRig,
@@ -24,6 +19,11 @@ from fgslam.types import (
     LandmarkMap,
     StereoFeatures,
 )
+from fgslam.frontend.landmark_table import LandmarkTable
+from fgslam.frontend.permanence import is_blind, reliable, seen_past
+from fgslam.frontend.views import Views
+from fgslam.frontend.visibility import ExpectedLandmarks, FieldOfView, Wanted, directions_to
+from fgslam.settings.frontend import DatabaseSettings, PermanenceSettings
 
 
 class LandmarkDatabase(LandmarkTable):

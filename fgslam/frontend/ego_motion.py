@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.floor import Floor
-from fgslam.geometry import (
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import (
     congruence,
     in_front,
     inverse,
@@ -31,8 +31,7 @@ from fgslam.geometry import (
     so3_exp,
     transform_to_camera,
 )
-from fgslam.settings.frontend import EgoMotionSettings
-from fgslam.types import (
+from fgslam.core.types import (
     BoolArray,
     CameraRig,
     EgoMotion,
@@ -43,6 +42,7 @@ from fgslam.types import (
     Prediction,
     Sensor,
 )
+from fgslam.settings.frontend import EgoMotionSettings
 
 _STEP_TOLERANCE = 1e-9  # radians and metres; far below anything measurable
 _ROBUST_TOLERANCE = 1e-5  # the robust minimum only chooses the inliers for the exact one

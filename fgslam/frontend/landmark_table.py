@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.columns import GrowingColumns
-from fgslam.errors import MapError
+from fgslam.core.errors import MapError
+from fgslam.core.growing_arrays import GrowingColumns
+from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.saved_map import SavedMap
+from fgslam.core.types import BoolArray, ByteArray, FloatArray, IntArray, StateArrays
 from fgslam.frontend.views import Places, ViewPool, Views
-from fgslam.map_file import SavedMap
-from fgslam.map_types import LandmarkAppearances
-from fgslam.types import BoolArray, ByteArray, FloatArray, IntArray, StateArrays
 
 _COUNTS = ("hits", "misses", "missed", "seen", "contradicted")
 _PLACES = "places"

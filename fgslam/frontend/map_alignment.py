@@ -12,10 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from fgslam.errors import MapError
-from fgslam.frontend.relocalisation.alignment import align_in_space
-from fgslam.frontend.relocalisation.appearance_index import AppearanceIndex
-from fgslam.geometry import (
+from fgslam.core.errors import MapError
+from fgslam.core.geometry import (
     congruence,
     inverse_spd3,
     point_pose_jacobian,
@@ -23,9 +21,11 @@ from fgslam.geometry import (
     so3_log,
     transform_to_world,
 )
-from fgslam.map_file import SavedMap
+from fgslam.core.saved_map import SavedMap
+from fgslam.core.types import BoolArray, FloatArray, IntArray
+from fgslam.frontend.relocalisation.alignment import align_in_space
+from fgslam.frontend.relocalisation.appearance_index import AppearanceIndex
 from fgslam.settings.maps import MergeSettings
-from fgslam.types import BoolArray, FloatArray, IntArray
 
 _NEIGHBOURS = 6  # views asked for: enough to pass over a place's own and reach the next
 _HYPOTHESES = 400  # rigid triples that are scored

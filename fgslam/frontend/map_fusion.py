@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.geometry import congruence, inverse_spd3, point_pose_jacobian, transform_to_world
+from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.saved_map import SavedMap
+from fgslam.core.types import FloatArray, IntArray, LandmarkMap, Trajectory
 from fgslam.frontend.map_alignment import Alignment
-from fgslam.geometry import congruence, inverse_spd3, point_pose_jacobian, transform_to_world
-from fgslam.map_file import SavedMap
-from fgslam.map_types import LandmarkAppearances
-from fgslam.types import FloatArray, IntArray, LandmarkMap, Trajectory
 
 
 def merge_maps(a: SavedMap, b: SavedMap, alignment: Alignment) -> SavedMap:

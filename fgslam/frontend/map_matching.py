@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.types import BoolArray, FloatArray, IntArray, StereoFeatures
 from fgslam.frontend.candidates import alike, pairs_within, pick, resembling
 from fgslam.frontend.visibility import ExpectedLandmarks
 from fgslam.settings.frontend import AppearanceSettings, MapMatchingSettings
-from fgslam.types import BoolArray, FloatArray, IntArray, StereoFeatures
 
 
 @dataclass(frozen=True, slots=True, eq=False)

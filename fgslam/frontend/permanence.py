@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.frontend.candidates import pairs_within
 from fgslam.frontend.visibility import ExpectedLandmarks
 from fgslam.settings.frontend import PermanenceSettings
-from fgslam.types import BoolArray, FloatArray, IntArray
 
 
 def reliable(hits: IntArray, misses: IntArray, settings: PermanenceSettings) -> BoolArray:

@@ -10,10 +10,10 @@ import dataclasses
 
 import numpy as np
 
+from fgslam.core.geometry import triangulate
+from fgslam.core.types import EgoMotion, EgoMotionStatus, FloatArray, Prediction
 from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
 from fgslam.frontend.relocalisation.alignment import align, sample_size
-from fgslam.geometry import triangulate
-from fgslam.types import EgoMotion, EgoMotionStatus, FloatArray, Prediction
 
 _SAMPLES = 200  # at half the matches wrong, no good triple among them once in 10^11
 _START_SIGMA_RAD = 0.5  # of the pose that starts the least squares: says nothing

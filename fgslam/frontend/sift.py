@@ -8,8 +8,8 @@ from concurrent.futures import Executor
 import cv2
 import numpy as np
 
+from fgslam.core.types import ByteArray, Features, Image, IntArray
 from fgslam.settings.frontend import Appearance, SiftSettings
-from fgslam.types import ByteArray, Features, Image, IntArray
 
 
 class SiftExtractor:

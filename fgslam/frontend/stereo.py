@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.geometry import triangulate, triangulation_covariance
+from fgslam.core.stereo_model import measurement_map, vertical_to_horizontal
+from fgslam.core.types import CameraRig, Features, FloatArray, IntArray, StereoFeatures
 from fgslam.frontend.candidates import alike, choose, pairs_within
-from fgslam.geometry import triangulate, triangulation_covariance
 from fgslam.settings.frontend import AppearanceSettings, StereoSettings
-from fgslam.stereo_model import measurement_map, vertical_to_horizontal
-from fgslam.types import CameraRig, Features, FloatArray, IntArray, StereoFeatures
 
 
 class StereoMatcher:

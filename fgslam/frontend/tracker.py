@@ -6,12 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgslam.frontend.database import LandmarkDatabase
-from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
-from fgslam.frontend.map_matching import MapMatcher, MapMatches
-from fgslam.frontend.resection import Resection
-from fgslam.frontend.visibility import ExpectedLandmarks, directions_to, predicted_covariance
-from fgslam.types import (
+from fgslam.core.types import (
     BoolArray,
     ByteArray,
     CameraRig,
@@ -25,6 +20,11 @@ from fgslam.types import (
     Prediction,
     StereoFeatures,
 )
+from fgslam.frontend.database import LandmarkDatabase
+from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
+from fgslam.frontend.map_matching import MapMatcher, MapMatches
+from fgslam.frontend.resection import Resection
+from fgslam.frontend.visibility import ExpectedLandmarks, directions_to, predicted_covariance
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.core.map_types import Words
+from fgslam.core.types import BoolArray, ByteArray, FloatArray, IntArray, StereoFeatures
 from fgslam.frontend.vocabulary import words_of
-from fgslam.map_types import Words
-from fgslam.types import BoolArray, ByteArray, FloatArray, IntArray, StereoFeatures
 
 Places = npt.NDArray[np.int32]
 """(n, max_views) places in the pool; -1 where there is no view."""

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.geometry import (
+from fgslam.core.geometry import (
     congruence,
     point_pose_jacobian,
     project,
@@ -16,8 +16,8 @@ from fgslam.geometry import (
     rotate_covariances,
     transform_to_camera,
 )
+from fgslam.core.types import BoolArray, ByteArray, CameraRig, FloatArray, IntArray, Prediction
 from fgslam.settings.frontend import DatabaseSettings
-from fgslam.types import BoolArray, ByteArray, CameraRig, FloatArray, IntArray, Prediction
 
 Wanted: TypeAlias = Callable[[IntArray, FloatArray], BoolArray]
 """Of rows (k,) of the map and their depths: which (k,) to consider at all."""

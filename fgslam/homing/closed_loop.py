@@ -9,15 +9,15 @@ from typing import Protocol
 
 import numpy as np
 
+from fgslam.core.homing_types import HomingEstimate
+from fgslam.core.types import ByteArray, FloatArray
 from fgslam.homing.avoidance import ObstacleAvoider, RangeScan
 from fgslam.homing.command import Command, Drive
 from fgslam.homing.path_following import PathFollower
 from fgslam.homing.record import STAGES, DriveRecord, HomingLog
 from fgslam.homing.steering import Steering
 from fgslam.homing.underway import HomingUnderWay
-from fgslam.homing_types import HomingEstimate
 from fgslam.settings.homing_behaviour import ClosedLoopSettings
-from fgslam.types import ByteArray, FloatArray
 
 
 class World(Protocol):

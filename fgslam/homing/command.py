@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from fgslam.homing_types import Refusal
-from fgslam.types import FloatArray
+from fgslam.core.homing_types import Refusal
+from fgslam.core.types import FloatArray
 
 
 class HomingState(str, Enum):

@@ -12,14 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from fgslam.errors import EstimatorError
+from fgslam.core.errors import EstimatorError
+from fgslam.core.homing_types import HomingVector, OmniFeatures, Refusal, RefusalReason
+from fgslam.core.planar import wrap
+from fgslam.core.types import ByteArray
 from fgslam.homing.command import Command, HomingState
 from fgslam.homing.eyes import HomingEyes, Sighting
 from fgslam.homing.underway import EstimatorMaker, Fault, HomingUnderWay
-from fgslam.homing_types import HomingVector, OmniFeatures, Refusal, RefusalReason
-from fgslam.planar import wrap
 from fgslam.settings.homing_behaviour import HomingControlSettings
-from fgslam.types import ByteArray
 
 _PROGRESS = 0.02  # parts of a leg; less is noise of the distance
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student_t
 
+from fgslam.core.planar import wrap
+from fgslam.core.types import FloatArray, IntArray
 from fgslam.homing.record import DriveRecord
-from fgslam.planar import wrap
-from fgslam.types import FloatArray, IntArray
 
 ARRIVED_M = 0.5
 """Metres: a robot that claims an arrival and stands farther from the last target has not arrived.

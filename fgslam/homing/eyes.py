@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from fgslam.homing_types import (
+from fgslam.core.homing_types import (
     HomingStart,
     HomingVector,
     OmniFeatures,
     Refusal,
     TrackedBearings,
 )
-from fgslam.types import ByteArray
+from fgslam.core.types import ByteArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

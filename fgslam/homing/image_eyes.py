@@ -6,15 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgslam.frontend.omni.features import OmniFeatureExtractor
-from fgslam.frontend.omni.homing_ransac import estimate_homing_vector, paired_anew
-from fgslam.frontend.omni.local_map import make_local_map, triangulable
-from fgslam.frontend.omni.matching import joined, match_features
-from fgslam.frontend.omni.trackable import move_to_trackable
-from fgslam.frontend.omni.tracking import BearingTracker
-from fgslam.homing.eyes import Sighting
-from fgslam.homing.soundness import parallax
-from fgslam.homing_types import (
+from fgslam.core.homing_types import (
     BearingMatches,
     HomingStart,
     HomingVector,
@@ -23,11 +15,19 @@ from fgslam.homing_types import (
     RefusalReason,
     TrackedBearings,
 )
+from fgslam.core.types import ByteArray, FloatArray, IntArray
+from fgslam.frontend.omni.features import OmniFeatureExtractor
+from fgslam.frontend.omni.homing_ransac import estimate_homing_vector, paired_anew
+from fgslam.frontend.omni.local_map import make_local_map, triangulable
+from fgslam.frontend.omni.matching import joined, match_features
+from fgslam.frontend.omni.trackable import move_to_trackable
+from fgslam.frontend.omni.tracking import BearingTracker
+from fgslam.homing.eyes import Sighting
+from fgslam.homing.soundness import parallax
 from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.settings.homing_vector import HomingVectorSettings
 from fgslam.settings.omni_features import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.settings.omni_tracking import OmniTrackingSettings
-from fgslam.types import ByteArray, FloatArray, IntArray
 
 _SECTORS = 8  # of 45 degrees
 _DARK = 8.0  # mean grey value of what the camera sees

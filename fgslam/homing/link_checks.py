@@ -13,10 +13,10 @@ from collections.abc import Collection, Iterable
 
 import numpy as np
 
+from fgslam.core.planar import wrap
+from fgslam.core.types import FloatArray
 from fgslam.homing.linking import Link, Pair
-from fgslam.planar import wrap
 from fgslam.settings.homing_behaviour import TopologicalMapSettings
-from fgslam.types import FloatArray
 
 _SIGMAS = 3.0
 _ROUNDS = 10  # of the rotation averaging's reweighting

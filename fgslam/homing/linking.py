@@ -8,10 +8,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.homing_types import HomingVector, OmniFeatures, Refusal, RefusalReason
-from fgslam.planar import wrap
+from fgslam.core.homing_types import HomingVector, OmniFeatures, Refusal, RefusalReason
+from fgslam.core.planar import wrap
+from fgslam.core.types import FloatArray
 from fgslam.settings.homing_behaviour import TopologicalMapSettings
-from fgslam.types import FloatArray
 
 Answer: TypeAlias = HomingVector | Refusal
 Linker: TypeAlias = Callable[[OmniFeatures, OmniFeatures], Answer]

@@ -10,12 +10,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import diags
 
+from fgslam.core.homing_types import OmniFeatures, Refusal, RefusalReason
+from fgslam.core.types import FloatArray, IntArray
 from fgslam.homing.linking import Linker
 from fgslam.homing.retrieval import VisualWords
 from fgslam.homing.topological_map import TopologicalMap
-from fgslam.homing_types import OmniFeatures, Refusal, RefusalReason
 from fgslam.settings.homing_behaviour import LocalisationSettings
-from fgslam.types import FloatArray, IntArray
 
 
 class Localiser:

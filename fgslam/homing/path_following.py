@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
+from fgslam.core.homing_types import OmniFeatures
+from fgslam.core.types import ByteArray
 from fgslam.homing.command import Command, HomingState
 from fgslam.homing.controller import HomingController
 from fgslam.homing.eyes import HomingEyes
 from fgslam.homing.underway import EstimatorMaker
-from fgslam.homing_types import OmniFeatures
 from fgslam.settings.homing_behaviour import HomingControlSettings, PathFollowingSettings
-from fgslam.types import ByteArray
 
 LegResult: TypeAlias = Literal["arrived", "skipped", "refused", "unfinished"]
 

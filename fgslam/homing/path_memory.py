@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fgslam.errors import StoredMapError
+from fgslam.core.errors import StoredMapError
+from fgslam.core.homing_types import OmniFeatures
 from fgslam.homing.feature_file import load_archive, pack_features, save_archive, unpack_features
-from fgslam.homing_types import OmniFeatures
 
 FORMAT = "fgslam path memory"
 VERSION = 1

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from fgslam.core.homing_types import HomingEstimate, HomingStart, TrackedBearings
+from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.homing.path_following import LegOutcome
-from fgslam.homing_types import HomingEstimate, HomingStart, TrackedBearings
-from fgslam.types import BoolArray, FloatArray, IntArray
 
 STAGES = ("image", "homing", "steering", "drive")
 """What a step's seconds are split into: camera; eyes, estimator and command; steering and

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
-from fgslam.homing_types import OmniFeatures
+from fgslam.core.homing_types import OmniFeatures
+from fgslam.core.types import FloatArray, IntArray
 from fgslam.settings.homing_behaviour import RetrievalSettings
-from fgslam.types import FloatArray, IntArray
 
 
 class VisualWords:

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.homing_types import (
+from fgslam.core.homing_types import (
     BearingMatches,
     HomingEstimate,
     HomingStart,
     TrackedBearings,
     among,
 )
-from fgslam.planar import bearings, wrap
-from fgslam.types import FloatArray
+from fgslam.core.planar import bearings, wrap
+from fgslam.core.types import FloatArray
 
 _FEWEST = 3  # fewer bearings say nothing about a pose with three unknowns
 

@@ -15,11 +15,11 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fgslam.core.homing_types import OmniFeatures
+from fgslam.core.planar import wrap
+from fgslam.core.types import IntArray
 from fgslam.homing.linking import Link, Pair
-from fgslam.homing_types import OmniFeatures
-from fgslam.planar import wrap
 from fgslam.settings.homing_behaviour import TopologicalMapSettings
-from fgslam.types import IntArray
 
 InlierRows: TypeAlias = Mapping[Pair, IntArray]
 """Of pairs (from, to): (k, 2) rows of the SIFT features of both images that are inliers."""

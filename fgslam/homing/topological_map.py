@@ -11,7 +11,9 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from fgslam.errors import StoredMapError
+from fgslam.core.errors import StoredMapError
+from fgslam.core.homing_types import OmniFeatures
+from fgslam.core.types import FloatArray, IntArray, StateArrays
 from fgslam.homing.feature_file import (
     load_archive,
     pack_features,
@@ -24,9 +26,7 @@ from fgslam.homing.linking import Answer, Link, Linker, Pair, link_pairs
 from fgslam.homing.path_memory import PathMemory, read_names
 from fgslam.homing.retrieval import VisualWords, candidate_pairs
 from fgslam.homing.third_views import InlierRows, ThirdViews
-from fgslam.homing_types import OmniFeatures
 from fgslam.settings.homing_behaviour import TopologicalMapSettings
-from fgslam.types import FloatArray, IntArray, StateArrays
 
 FORMAT = "fgslam topological map"
 VERSION = 1

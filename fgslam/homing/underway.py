@@ -9,17 +9,12 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.backend.homing.protocol import HomingEstimator
-from fgslam.errors import EstimatorError
+from fgslam.core.errors import EstimatorError
+from fgslam.core.homing_types import HomeVector, HomingStart, HomingVector, TrackedBearings
+from fgslam.core.planar import wrap
+from fgslam.core.types import BoolArray
 from fgslam.homing.soundness import common_turn, parallax, target_misfit, tracked_misfit
-from fgslam.homing_types import (
-    HomeVector,
-    HomingStart,
-    HomingVector,
-    TrackedBearings,
-)
-from fgslam.planar import wrap
 from fgslam.settings.homing_behaviour import HomingControlSettings
-from fgslam.types import BoolArray
 
 EstimatorMaker: TypeAlias = Callable[[HomingStart], HomingEstimator]
 

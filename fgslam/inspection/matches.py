@@ -10,6 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.errors import FrameError
+from fgslam.core.recordings import Sequence
+from fgslam.core.types import CameraRig, Features, FloatArray, IntArray, StereoFeatures
 from fgslam.datasets.findings import Finding, Level
 from fgslam.datasets.image_checks import spread_over
 from fgslam.datasets.match_checks import (
@@ -25,13 +28,10 @@ from fgslam.datasets.match_checks import (
     check_stereo_counts,
     fit_turn,
 )
-from fgslam.errors import FrameError
 from fgslam.frontend.descriptor_matching import mutual_nearest
 from fgslam.frontend.sift import SiftExtractor
 from fgslam.frontend.stereo import StereoMatcher
-from fgslam.recordings import Sequence
 from fgslam.settings.frontend import FrontendSettings, StereoSettings
-from fgslam.types import CameraRig, Features, FloatArray, IntArray, StereoFeatures
 
 _FEWEST_FOR_MEDIAN = 10
 _NEAR_LINE_PX = 2.0

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.errors import CalibrationError
+from fgslam.core.errors import CalibrationError
+from fgslam.core.types import FloatArray
 from fgslam.omni_cameras.radial import AHEAD_IS_UP, MirrorFrame, RadialCamera
-from fgslam.types import FloatArray
 
 
 @dataclass(frozen=True)

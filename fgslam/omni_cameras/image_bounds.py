@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.errors import CalibrationError
-from fgslam.types import FloatArray
+from fgslam.core.errors import CalibrationError
+from fgslam.core.types import FloatArray
 
 
 def require_size(what: str, width: int, height: int) -> None:

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.errors import CalibrationError
+from fgslam.core.errors import CalibrationError
+from fgslam.core.types import FloatArray
 from fgslam.omni_cameras.bearing_measurement import unit_rays
 from fgslam.omni_cameras.image_bounds import inside, require_size
-from fgslam.types import FloatArray
 
 _HALF_TURN = np.pi
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from fgslam.types import FloatArray
+from fgslam.core.types import FloatArray
 
 
 class OmniCamera(Protocol):

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from fgslam.errors import ConfigError
-from fgslam.export.atomic import write_text
+from fgslam.core.atomic_files import write_text
+from fgslam.core.errors import ConfigError
 from fgslam.export.comparison_table import RESULT_COLUMNS, value_at
 from fgslam.export.metrics import EstimatorMetrics
 

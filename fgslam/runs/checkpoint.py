@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.errors import OutputError
-from fgslam.export.atomic import write_bytes
-from fgslam.measurement_log import MeasurementLog, load_arrays
+from fgslam.core.atomic_files import write_bytes
+from fgslam.core.errors import OutputError
+from fgslam.core.measurement_log import MeasurementLog, load_arrays
+from fgslam.core.types import StateArrays
 from fgslam.pipeline import SlamPipeline
 from fgslam.runs.recorder import RunRecorder
-from fgslam.types import StateArrays
 
 STATE_FILE = "checkpoint.npz"
 LOG_FILE = "measurements.npz"

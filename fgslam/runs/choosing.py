@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fgslam.config import ExperimentConfig, make_config
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
 from fgslam.settings.backend import EstimatorSettings
 
 _PREFIX = "estimators."

@@ -6,12 +6,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from fgslam.config import ExperimentConfig
-from fgslam.errors import ConfigError, OutputError
-from fgslam.export.atomic import (
-    ExistingFolder,
-    create_run_folder,
-    is_run_folder,
-)
+from fgslam.core.errors import ConfigError, OutputError
+from fgslam.export.atomic import ExistingFolder, create_run_folder, is_run_folder
 from fgslam.export.comparison_table import write_comparison_csv
 from fgslam.export.metrics import EstimatorMetrics, JsonValue, read_metrics, write_metrics
 from fgslam.runs.choosing import EVERY, Choice, choose

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.errors import DatasetError
-from fgslam.export.atomic import make_subfolder, write_text
+from fgslam.core.atomic_files import make_subfolder, write_text
+from fgslam.core.errors import DatasetError
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.types import Estimate, IntArray, LandmarkMap, Trajectory
 from fgslam.export.point_cloud import MapPoints, write_ply
 from fgslam.export.trajectories import write_covariances, write_tum
-from fgslam.measurement_log import MeasurementLog
 from fgslam.runs.replay import Replay, ReplayRow
-from fgslam.types import Estimate, IntArray, LandmarkMap, Trajectory
 
 FRAMES_FILE = "frames.csv"
 _VALUE: dict[str, Callable[[str], Any]] = typing.get_type_hints(ReplayRow)

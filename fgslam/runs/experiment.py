@@ -12,14 +12,16 @@ from typing import Literal
 import numpy as np
 
 from fgslam.config import ExperimentConfig
-from fgslam.errors import DatasetError
+from fgslam.core.errors import DatasetError
+from fgslam.core.recordings import Sequence
+from fgslam.core.threads import one_blas_thread
+from fgslam.core.types import StereoFeatures
 from fgslam.export.atomic import ExistingFolder
 from fgslam.export.comparison_table import write_comparison_csv
 from fgslam.export.metrics import EstimatorMetrics
 from fgslam.factory import make_stream
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.pipeline import FrameReport
-from fgslam.recordings import Sequence
 from fgslam.runs import checkpoint, map_entry, mapping
 from fgslam.runs.beginning import BegunRun, OpenedRun, Progress, begin, open_run
 from fgslam.runs.choosing import compared_with
@@ -28,8 +30,6 @@ from fgslam.runs.outputs import RunOutputs
 from fgslam.runs.pictures import draw_frame, draw_run, figures_of, frames_to_show
 from fgslam.runs.rendered_truth import TrueDepth
 from fgslam.runs.report import report_from_folder
-from fgslam.runs.threads import one_blas_thread
-from fgslam.types import StereoFeatures
 
 _SAVING_SHARE = 10.0  # the loop runs at least this many times as long as it saves
 _PRECISION_EVERY = 10  # frames between checks of stereo matches against rendered depth

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fgslam.errors import ConfigError, DatasetError
+from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.export.atomic import RUN_MARKER, is_run_folder
 from fgslam.export.metrics import read_metrics
 from fgslam.export.point_cloud import read_ply, write_map

@@ -7,6 +7,9 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.recordings import LandmarkTruth
+from fgslam.core.types import Estimate, FloatArray, IntArray, Trajectory
 from fgslam.evaluation.consistency import Consistency, Nees, judge, pose_nees
 from fgslam.evaluation.landmarks import LandmarkErrors, landmark_errors
 from fgslam.evaluation.timing import time_growth
@@ -19,10 +22,7 @@ from fgslam.evaluation.trajectory import (
     to_estimate_world,
 )
 from fgslam.export.metrics import EstimatorMetrics, JsonValue, UpdateTime
-from fgslam.measurement_log import MeasurementLog
-from fgslam.recordings import LandmarkTruth
 from fgslam.runs.replay import Replay
-from fgslam.types import Estimate, FloatArray, IntArray, Trajectory
 
 LEAST_SIGHTINGS = 3
 """Landmarks are judged that were seen so often: `valid` of Se et al. (6.1), for all estimators."""

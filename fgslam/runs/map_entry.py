@@ -12,14 +12,14 @@ import numpy as np
 
 from fgslam.arrival import Arrival
 from fgslam.config import ExperimentConfig, load_config
-from fgslam.errors import ConfigError, MapError
+from fgslam.core.errors import ConfigError, MapError
+from fgslam.core.map_types import LandmarkAppearances, Relocalisation
+from fgslam.core.recordings import Sequence
+from fgslam.core.saved_map import SavedMap, load_map, require_rig
+from fgslam.core.types import FloatArray, LandmarkMap, Prediction
 from fgslam.export.atomic import RUN_MARKER, is_run_folder
 from fgslam.factory import make_relocaliser, make_stereo_matcher, make_stream
-from fgslam.map_file import SavedMap, load_map, require_rig
-from fgslam.map_types import LandmarkAppearances, Relocalisation
-from fgslam.recordings import Sequence
 from fgslam.settings.maps import MapSettings, MapStartSettings
-from fgslam.types import FloatArray, LandmarkMap, Prediction
 
 FIRST_FOLDER = "first"
 MAP_FILE = "map.fgmap"

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
+from fgslam.core.saved_map import SavedMap, load_map
+from fgslam.core.types import BoolArray
 from fgslam.export.point_cloud import MapPoints, write_map
 from fgslam.export.trajectories import write_trajectory
-from fgslam.map_file import SavedMap, load_map
-from fgslam.types import BoolArray
 
 _VALID_HITS = 3  # where the map does not say how many its run asked for (Se et al. 6.1)
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.errors import MapError
+from fgslam.core.errors import MapError
+from fgslam.core.geometry import so3_log
+from fgslam.core.saved_map import load_map, require_rig, save_map
 from fgslam.frontend.map_alignment import align_maps
 from fgslam.frontend.map_fusion import merge_maps
-from fgslam.geometry import so3_log
-from fgslam.map_file import load_map, require_rig, save_map
 from fgslam.settings.maps import MergeSettings
 
 _SEED = 0  # the same maps give the same bytes

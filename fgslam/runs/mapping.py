@@ -10,18 +10,18 @@ import numpy as np
 
 from fgslam import __version__
 from fgslam.config import ExperimentConfig, parse_config
-from fgslam.errors import ConfigError, MapError, MeasurementLogError
-from fgslam.map_file import SavedMap, require_rig, save_map
-from fgslam.measurement_log import MeasurementLog
+from fgslam.core.atomic_files import require_writable
+from fgslam.core.errors import ConfigError, MapError, MeasurementLogError
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.recordings import Sequence
+from fgslam.core.saved_map import SavedMap, require_rig, save_map
+from fgslam.core.types import Estimate, StateArrays
 from fgslam.pipeline import SlamPipeline
-from fgslam.recordings import Sequence
 from fgslam.runs import checkpoint
 from fgslam.runs.map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, entry_of
 from fgslam.runs.outputs import RunOutputs
 from fgslam.runs.recorder import RunRecorder
 from fgslam.settings.maps import MapSettings
-from fgslam.types import Estimate, StateArrays
-from fgslam.whole_files import require_writable
 
 _LOG = "log/"
 _TIMES = "recorder/stage_ms"

@@ -9,14 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.config import ExperimentConfig
+from fgslam.core.errors import ConfigError
+from fgslam.core.recordings import MeasurementRecording
+from fgslam.core.types import Estimate, LandmarkMap
 from fgslam.datasets.opening import open_measurements
-from fgslam.errors import ConfigError
 from fgslam.export.atomic import ExistingFolder, create_run_folder
 from fgslam.export.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
 from fgslam.export.metrics import JsonValue, StageTime, write_timing
 from fgslam.export.point_cloud import read_ply
 from fgslam.export.trajectories import read_covariances, read_tum, write_tum
-from fgslam.recordings import MeasurementRecording
 from fgslam.runs.checkpoint import save_log
 from fgslam.runs.choosing import estimators_of
 from fgslam.runs.compare import write_comparison
@@ -34,7 +35,6 @@ from fgslam.runs.pictures import RunFigures, draw_run
 from fgslam.runs.replay import ReplayRow
 from fgslam.runs.summary import spread
 from fgslam.settings.measurements import MeasurementDatasetSettings
-from fgslam.types import Estimate, LandmarkMap
 
 
 def holds_measurements(config: ExperimentConfig) -> bool:

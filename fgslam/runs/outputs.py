@@ -16,7 +16,10 @@ import yaml
 
 from fgslam import __version__
 from fgslam.config import ExperimentConfig
-from fgslam.export.atomic import RUN_MARKER, make_subfolder, write_text
+from fgslam.core.atomic_files import make_subfolder, write_text
+from fgslam.core.recordings import Sequence
+from fgslam.core.types import Estimate, LandmarkMap, Trajectory
+from fgslam.export.atomic import RUN_MARKER
 from fgslam.export.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
 from fgslam.export.metrics import (
     EstimatorMetrics,
@@ -31,7 +34,6 @@ from fgslam.frontend.database import LandmarkDatabase
 from fgslam.homing_config import HomingExperiment
 from fgslam.localisation_config import LocalisationConfig
 from fgslam.pipeline import SlamPipeline
-from fgslam.recordings import Sequence
 from fgslam.runs.checkpoint import save_log
 from fgslam.runs.comparison import GROUND_TRUTH_FILE, load_truth, remark_of
 from fgslam.runs.estimator_files import write_estimate
@@ -40,7 +42,6 @@ from fgslam.runs.places import closures_of, place_numbers, write_closures
 from fgslam.runs.recorder import STAGES, RunRecorder
 from fgslam.runs.rendered_truth import rendered_landmark_truth
 from fgslam.runs.summary import estimator_metrics, run_numbers
-from fgslam.types import Estimate, LandmarkMap, Trajectory
 
 _VERSIONS_OF = ("numpy", "scipy", "opencv-python-headless", "gtsam", "open3d")
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.atomic_files import make_subfolder
+from fgslam.core.types import BoolArray, Estimate, FloatArray, Increment, IntArray, Trajectory
 from fgslam.evaluation.trajectory import to_estimate_world
-from fgslam.export.atomic import make_subfolder
 from fgslam.export.pictures import (
     MapDrawing,
     draw_birds_eye,
@@ -22,7 +23,6 @@ from fgslam.export.pictures import (
 from fgslam.export.pictures.birds_eye import world_position_covariances
 from fgslam.pipeline import FrameReport
 from fgslam.runs.outputs import RunOutputs
-from fgslam.types import BoolArray, Estimate, FloatArray, Increment, IntArray, Trajectory
 
 FOLDER = "pictures"
 _SYNTHETIC = ", synthetic odometry"

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.errors import DatasetError
+from fgslam.core.errors import DatasetError
+from fgslam.core.types import Trajectory
 from fgslam.evaluation.closures import JudgedClosure, judge_closures
 from fgslam.export.metrics import JsonValue
 from fgslam.export.report import Column, Comparison
 from fgslam.export.tables import Cell, write_csv
 from fgslam.runs.recorder import RunRecorder
-from fgslam.types import Trajectory
 
 LOOPS_FILE = "loops.csv"
 _NAMES = ("frame", "returned_to", *(f.name for f in fields(JudgedClosure)), "false")

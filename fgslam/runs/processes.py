@@ -13,7 +13,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Generic, TypeVar
 
-from fgslam.errors import FgslamError
+from fgslam.core.errors import FgslamError
 
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")

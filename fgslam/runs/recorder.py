@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.measurement_log import MeasurementLog
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.types import FloatArray, StateArrays
 from fgslam.pipeline import FrameReport
-from fgslam.types import FloatArray, StateArrays
 
 STAGES = ("load", "sift", "wait", "predict", "stereo", "track", "places", "update")
 """Per frame: `load` and `sift` run in threads beside the loop, `wait` is what they held it up."""

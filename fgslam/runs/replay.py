@@ -16,17 +16,10 @@ import numpy.typing as npt
 
 from fgslam.arrival import Arrival, take_over
 from fgslam.backend.protocol import Estimator
-from fgslam.errors import ConfigError, FgslamError, MeasurementLogError
-from fgslam.factory import make_estimator
-from fgslam.frontend.ego_motion import EgoMotionSolver
-from fgslam.measurement_log import MeasurementLog
-from fgslam.motion import ConstantVelocityMotion
-from fgslam.pipeline import ReplayedFrame, replay_frame
-from fgslam.runs.threads import one_blas_thread
-from fgslam.settings.backend import EstimatorSettings
-from fgslam.settings.datasets import ConstantVelocitySettings
-from fgslam.settings.frontend import EgoMotionSettings
-from fgslam.types import (
+from fgslam.core.errors import ConfigError, FgslamError, MeasurementLogError
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.threads import one_blas_thread
+from fgslam.core.types import (
     CameraRig,
     Estimate,
     FloatArray,
@@ -35,6 +28,13 @@ from fgslam.types import (
     MeasurementType,
     Trajectory,
 )
+from fgslam.factory import make_estimator
+from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.motion import ConstantVelocityMotion
+from fgslam.pipeline import ReplayedFrame, replay_frame
+from fgslam.settings.backend import EstimatorSettings
+from fgslam.settings.datasets import ConstantVelocitySettings
+from fgslam.settings.frontend import EgoMotionSettings
 
 ESTIMATOR_FAULTS = (
     FgslamError,

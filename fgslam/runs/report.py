@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from fgslam.errors import DatasetError, FgslamError
+from fgslam.core.errors import DatasetError, FgslamError
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.types import FloatArray, IntArray, LandmarkMap, Trajectory
 from fgslam.evaluation.consistency import chi_square_band, judge, pose_nees
 from fgslam.evaluation.trajectory import (
     Alignment,
@@ -23,11 +25,9 @@ from fgslam.export.metrics import read_metrics
 from fgslam.export.point_cloud import MapPoints, read_ply
 from fgslam.export.report import Comparison, EstimatorReport, ReportData, write_report
 from fgslam.export.trajectories import read_covariances, read_tum
-from fgslam.measurement_log import MeasurementLog
 from fgslam.runs.checkpoint import LOG_FILE
 from fgslam.runs.places import LOOPS_FILE, read_closures
 from fgslam.runs.report_parts import comparison_table, sample_pictures
-from fgslam.types import FloatArray, IntArray, LandmarkMap, Trajectory
 
 REPORT = "report.html"
 _UP = np.array([0.0, -1.0, 0.0])

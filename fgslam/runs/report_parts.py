@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fgslam.errors import DatasetError
+from fgslam.core.errors import DatasetError
 from fgslam.export.report import Column, Comparison, Picture
 
 UNKNOWN = "-"

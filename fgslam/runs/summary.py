@@ -7,11 +7,18 @@ from dataclasses import asdict
 
 import numpy as np
 
+from fgslam.core.types import (
+    EgoMotionStatus,
+    Estimate,
+    FloatArray,
+    IntArray,
+    Trajectory,
+    correlation,
+)
 from fgslam.export.metrics import EstimatorMetrics, JsonValue, UpdateTime
 from fgslam.runs.judging import Answer, Truth, judge_answer
 from fgslam.runs.recorder import STAGES, RunRecorder
 from fgslam.runs.replay import peak_memory_mb
-from fgslam.types import EgoMotionStatus, Estimate, FloatArray, IntArray, Trajectory, correlation
 
 _ESTIMATOR_STAGES = ("predict", "update")
 _LOOP_STAGES = ("predict", "stereo", "track", "places", "update")

@@ -10,6 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fgslam.core.types import FloatArray
 from fgslam.evaluation.consistency import Consistency, Nees, judge
 from fgslam.evaluation.paired import MeanInterval, PairedTest, mean_interval, paired_test
 from fgslam.export.comparison_table import (
@@ -19,7 +20,6 @@ from fgslam.export.comparison_table import (
     write_comparison_csv,
 )
 from fgslam.export.metrics import EstimatorMetrics, JsonValue, write_metrics
-from fgslam.types import FloatArray
 
 FILTERS = frozenset({"landmark_kalman", "landmark_kalman_graph", "ekf"})
 SMOOTHERS = frozenset({"fixed_lag", "isam2", "batch"})

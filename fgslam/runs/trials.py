@@ -9,17 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fgslam.config import ExperimentConfig, load_config
-from fgslam.errors import ConfigError, OutputError
+from fgslam.core.errors import ConfigError, OutputError
+from fgslam.core.measurement_log import MeasurementLog
 from fgslam.evaluation.consistency import Nees
-from fgslam.export.atomic import (
-    RUN_MARKER,
-    ExistingFolder,
-    create_run_folder,
-    is_run_folder,
-)
+from fgslam.export.atomic import RUN_MARKER, ExistingFolder, create_run_folder, is_run_folder
 from fgslam.export.metrics import EstimatorMetrics
 from fgslam.factory import open_sequence
-from fgslam.measurement_log import MeasurementLog
 from fgslam.runs.checkpoint import LOG_FILE
 from fgslam.runs.choosing import EVERY, Choice, choose
 from fgslam.runs.comparison import Progress, load_truth

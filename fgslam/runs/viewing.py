@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.errors import MissingDependencyError, OutputError
-from fgslam.export.atomic import replacing
+from fgslam.core.atomic_files import replacing
+from fgslam.core.errors import MissingDependencyError, OutputError
+from fgslam.core.geometry import quaternion_from_rotation
+from fgslam.core.types import FloatArray
 from fgslam.export.pictures.birds_eye import world_position_covariances
 from fgslam.export.report import EstimatorReport, ReportData
 from fgslam.export.report.palette import COUNT, ON_DARK
 from fgslam.export.report.paths import level_axes
 from fgslam.export.report.traces import thinned
-from fgslam.geometry import quaternion_from_rotation
 from fgslam.runs.report import load_report
-from fgslam.types import FloatArray
 
 SUFFIX = ".rrd"
 _TIMELINE = "time"

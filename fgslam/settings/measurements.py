@@ -7,22 +7,11 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.settings.base import STRICT
+from fgslam.core.settings import STRICT, MeasurementSelection
 from fgslam.settings.datasets import RecordingSettings
 from fgslam.settings.lab import LabRigSettings, WheelOdometrySettings
 
 Correlation: TypeAlias = Annotated[float, Field(gt=-1.0, lt=1.0)]
-
-
-@dataclass(frozen=True, config=STRICT)
-class MeasurementSelection:
-    """What every recording of measurements has: which of its frames are used."""
-
-    start: Annotated[int, Field(ge=0, description="first frame used, counted from 0")] = 0
-    stop: Annotated[
-        int | None, Field(ge=1, description="frame before which to stop; null: to the end")
-    ] = None
-    stride: Annotated[int, Field(ge=1, description="use every n-th frame")] = 1
 
 
 # --------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.settings.base import STRICT
+from fgslam.core.settings import STRICT
 
 Pair: TypeAlias = tuple[float, float]
 Size: TypeAlias = tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]]

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.settings.base import STRICT
+from fgslam.core.settings import STRICT
 from fgslam.settings.datasets import RecordingSettings
 from fgslam.settings.omni_cameras import (
     BloggieSettings,

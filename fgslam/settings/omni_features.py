@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.settings.base import STRICT
+from fgslam.core.settings import STRICT
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.settings.base import STRICT
+from fgslam.core.settings import STRICT
 
 
 @dataclass(frozen=True, config=STRICT)

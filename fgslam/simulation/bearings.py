@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.errors import ConfigError
-from fgslam.homing_types import BearingMatches, FeatureKind, HomingTruth, TrackedBearings
-from fgslam.planar import bearings, rotation, wrap
+from fgslam.core.errors import ConfigError
+from fgslam.core.homing_types import BearingMatches, FeatureKind, HomingTruth, TrackedBearings
+from fgslam.core.planar import bearings, rotation, wrap
+from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.settings.simulated_bearings import SimulatedBearingsSettings
-from fgslam.types import BoolArray, FloatArray, IntArray
 
 _CORRELATION_S = 0.5  # of the disturbances of the drive
 _STEERING = 2.0  # 1/s: turning rate over the bearing of the target

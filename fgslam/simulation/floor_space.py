@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from fgslam.core.types import BoolArray, FloatArray
 from fgslam.simulation.patches import PatchArrays
-from fgslam.types import BoolArray, FloatArray
 
 # What is lower is driven over (rugs), what is higher driven under (lintels, lamps); metres.
 BAND = (0.03, 1.35)

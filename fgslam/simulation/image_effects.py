@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.core.types import Image
 from fgslam.settings.lab import LabEffectsSettings, LabExposureSettings
-from fgslam.types import Image
 
 _COVER_SEED = 7
 

@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from fgslam.core.types import FloatArray
 from fgslam.simulation import furniture
 from fgslam.simulation.patches import Patch, Surface, Thing, placed, rectangle
 from fgslam.simulation.texture_library import PHOTOGRAPHS, POSTERS
-from fgslam.types import FloatArray
 
 HALF_SIDE = 5.0
 HEIGHT = 3.0

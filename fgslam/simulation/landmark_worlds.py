@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.settings.measurements import MeasurementWorldSettings
 from fgslam.simulation.lab import build_lab
 from fgslam.simulation.measurement_drives import CORRIDOR_WIDTH_M
 from fgslam.simulation.patches import stack
-from fgslam.types import BoolArray, FloatArray, IntArray
 
 _BARE = frozenset({"floor", "ceiling"})
 """Things of the lab with few features; they get this share of what their area would earn."""

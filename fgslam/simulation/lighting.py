@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.core.types import FloatArray, IntArray
 from fgslam.simulation.patches import PatchArrays
 from fgslam.simulation.raycaster import RayCaster
-from fgslam.types import FloatArray, IntArray
 
 Float32 = npt.NDArray[np.float32]
 

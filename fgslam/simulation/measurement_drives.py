@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
+from fgslam.core.types import FloatArray
 from fgslam.settings.lab import LabDriveSettings
 from fgslam.settings.measurements import MeasurementDriveSettings
 from fgslam.simulation.paths import (
@@ -19,7 +20,6 @@ from fgslam.simulation.paths import (
     planar_poses,
     straights_and_turns,
 )
-from fgslam.types import FloatArray
 
 CORRIDOR_WIDTH_M = 2.4
 

@@ -12,16 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam import geometry as g
-from fgslam.errors import ConfigError
-from fgslam.settings.measurements import SimulatedMeasurementsSettings
-from fgslam.simulation.identities import IdentityBook, Sightings
-from fgslam.simulation.landmark_worlds import LandmarkWorld, build_world
-from fgslam.simulation.measurement_drives import plan_measured_drive
-from fgslam.simulation.simulated_odometry import simulate_odometry
-from fgslam.simulation.world import make_rig
-from fgslam.stereo_model import measurement_map, pixel_model, vertical_to_horizontal
-from fgslam.types import (
+from fgslam.core import geometry as g
+from fgslam.core.errors import ConfigError
+from fgslam.core.stereo_model import measurement_map, pixel_model, vertical_to_horizontal
+from fgslam.core.types import (
     BoolArray,
     CameraRig,
     FloatArray,
@@ -31,6 +25,12 @@ from fgslam.types import (
     Odometry,
     Trajectory,
 )
+from fgslam.settings.measurements import SimulatedMeasurementsSettings
+from fgslam.simulation.identities import IdentityBook, Sightings
+from fgslam.simulation.landmark_worlds import LandmarkWorld, build_world
+from fgslam.simulation.measurement_drives import plan_measured_drive
+from fgslam.simulation.simulated_odometry import simulate_odometry
+from fgslam.simulation.world import make_rig
 
 # Streams of random numbers, apart so that one imperfection does not redraw another's.
 _DETECTION, _PIXELS, _ODOMETRY, _WRONG = 1, 2, 3, 4

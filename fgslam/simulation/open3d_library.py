@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
-from fgslam.errors import MissingDependencyError
+from fgslam.core.errors import MissingDependencyError
 from fgslam.system_check import DEBIAN_PACKAGES
 
 _LIBUSB = "libusb-1.0.so.0"

@@ -13,9 +13,9 @@ from typing import Protocol
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
+from fgslam.core.types import BoolArray, FloatArray
 from fgslam.settings.lab import LabDriveSettings
-from fgslam.types import BoolArray, FloatArray
 
 _STEP_M = 0.004
 # Waypoints must not ask for tighter turns: the curve's heading would jump between its samples.

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
+from fgslam.core.types import CameraRig, FloatArray
 from fgslam.settings.lab import LabPersonSettings, LabSettings
 from fgslam.simulation.patches import Patch, Surface, Thing, box, placed, prism
 from fgslam.simulation.paths import PosesInTime
-from fgslam.types import CameraRig, FloatArray
 
 _STRIDE_M = 1.3
 _THIGH, _SHIN, _UPPER_ARM, _FOREARM = 0.43, 0.42, 0.29, 0.27

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
+from fgslam.core.types import CameraRig, FloatArray
 from fgslam.settings.lab import LabDriveSettings, PathName, PlaceName
 from fgslam.simulation import lab
 from fgslam.simulation.buildings import alike, office
@@ -29,7 +30,6 @@ from fgslam.simulation.paths import (
 from fgslam.simulation.random_poses import draw_poses
 from fgslam.simulation.texture_library import build_library
 from fgslam.simulation.textures import Grey
-from fgslam.types import CameraRig, FloatArray
 
 _BEND_M = 2.3
 """Way of a quarter turn between two rooms: fits into a corridor, and into a lane of 3.3 m twice."""

@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
+from fgslam.core.types import BoolArray, FloatArray
 from fgslam.settings.lab import LabDriveSettings
 from fgslam.simulation.floor_space import FloorSpace
 from fgslam.simulation.paths import planar_poses
-from fgslam.types import BoolArray, FloatArray
 
 _STREAM = 31  # of random numbers, apart from the world's
 _BLOCK, _BLOCKS = 64, 200

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.core.types import BoolArray, FloatArray
 from fgslam.simulation.open3d_library import load_open3d
 from fgslam.simulation.patches import PatchArrays
-from fgslam.types import BoolArray, FloatArray
 
 Float32 = npt.NDArray[np.float32]
 Int32 = npt.NDArray[np.int32]

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.core.types import FloatArray, IntArray
 from fgslam.simulation.lighting import LightMaps
 from fgslam.simulation.mipmap import TextureBank, TextureSizes, texture_indices
 from fgslam.simulation.patches import PatchArrays
 from fgslam.simulation.raycaster import RayCaster
-from fgslam.types import FloatArray, IntArray
 
 Float32 = npt.NDArray[np.float32]
 Int32 = npt.NDArray[np.int32]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam import geometry as g
+from fgslam.core import geometry as g
+from fgslam.core.types import FloatArray, Odometry
 from fgslam.settings.measurements import SimulatedMeasurementsSettings
 from fgslam.simulation import wheel_odometry
-from fgslam.types import FloatArray, Odometry
 
 
 def simulate_odometry(

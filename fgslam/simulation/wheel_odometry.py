@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam import geometry
+from fgslam.core import geometry
+from fgslam.core.types import FloatArray, Odometry
 from fgslam.settings.lab import WheelOdometrySettings
-from fgslam.types import FloatArray, Odometry
 
 _YAW, _ALONG = 2, 3
 

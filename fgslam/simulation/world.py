@@ -6,7 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from fgslam import geometry
+from fgslam.core import geometry
+from fgslam.core.types import CameraRig, FloatArray
 from fgslam.settings.lab import LabRigSettings
 from fgslam.simulation.lighting import bake, flat_light
 from fgslam.simulation.mipmap import TextureBank
@@ -15,7 +16,6 @@ from fgslam.simulation.person import Stance, person
 from fgslam.simulation.places import PlaceChoice, build_place, build_textures
 from fgslam.simulation.raycaster import RayCaster
 from fgslam.simulation.renderer import Layer, Pinhole, Renderer
-from fgslam.types import CameraRig, FloatArray
 
 
 def make_rig(settings: LabRigSettings) -> CameraRig:

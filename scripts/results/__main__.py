@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from fgslam.errors import FgslamError
+from fgslam.core.errors import FgslamError
 from scripts.results import (
     chess,
     lasting,

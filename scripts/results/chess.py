@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.config import ExperimentConfig
+from fgslam.core.recordings import Sequence
+from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.stream import FeatureFrame
-from fgslam.recordings import Sequence
 from fgslam.settings.datasets import LightFieldSettings
 from fgslam.settings.frontend import Appearance
-from fgslam.types import BoolArray, FloatArray, IntArray
 from scripts.results import epi
 from scripts.results.report import Cell, Table
 from scripts.results.runs import DATA, experiment, find_features, say

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.datasets.opening import open_recording
 from fgslam.settings.datasets import LightFieldSettings
-from fgslam.types import BoolArray, FloatArray, IntArray
 
 HALF_PATCH = 3
 _KEEP = 0.6  # share of the views that must see the point: the best ones count

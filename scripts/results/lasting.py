@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fgslam.core.recordings import Sequence
+from fgslam.core.saved_map import SavedMap
+from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.frontend.permanence import reliable, seen_past
-from fgslam.map_file import SavedMap
 from fgslam.pipeline import FrameReport, SlamPipeline
-from fgslam.recordings import Sequence
 from fgslam.settings.frontend import PermanenceSettings
-from fgslam.types import BoolArray, FloatArray, IntArray
 from scripts.results.person import position_errors
 from scripts.results.report import Cell, Table
 from scripts.results.runs import (

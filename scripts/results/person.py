@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.recordings import Sequence
+from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.evaluation.trajectory import to_estimate_world
 from fgslam.pipeline import FrameReport, SlamPipeline
-from fgslam.recordings import Sequence
 from fgslam.settings.lab import RenderedLabSettings
-from fgslam.types import BoolArray, FloatArray, IntArray
 from scripts.results.report import Cell, Table
 from scripts.results.runs import (
     experiment,

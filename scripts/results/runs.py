@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from fgslam.config import ExperimentConfig, load_config
+from fgslam.core.recordings import Sequence
 from fgslam.evaluation.trajectory import Alignment, TrajectoryError, evaluate_trajectory
 from fgslam.factory import make_pipeline, make_stream, open_sequence
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.pipeline import FrameReport, SlamPipeline
-from fgslam.recordings import Sequence
 from fgslam.runs.experiment import RunResult, run_experiment
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"

@@ -9,19 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.geometry import inverse, project, transform_to_camera
+from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.recordings import Sequence
+from fgslam.core.types import BoolArray, CameraRig, FloatArray, LandmarkMap, StereoFeatures
 from fgslam.evaluation.trajectory import rotation_angles
 from fgslam.factory import make_relocaliser, make_stereo_matcher, make_stream, open_sequence
 from fgslam.frontend.relocalisation.relocaliser import Relocaliser
 from fgslam.frontend.stream import FeatureFrame
-from fgslam.geometry import inverse, project, transform_to_camera
 from fgslam.localisation_config import LocalisationConfig, load_experiment
-from fgslam.map_types import LandmarkAppearances
-from fgslam.recordings import Sequence
 from fgslam.runs.localisation.experiment import run_localisation
 from fgslam.runs.localisation.submap import Window, submap_features
 from fgslam.runs.localisation.truth import truth_in_map
 from fgslam.runs.map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map, trusted
-from fgslam.types import BoolArray, CameraRig, FloatArray, LandmarkMap, StereoFeatures
 from scripts.results.report import Cell, Table
 from scripts.results.runs import EXPERIMENTS, say
 

@@ -7,18 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.config import ExperimentConfig
+from fgslam.core.geometry import inverse, pose, so3_exp
+from fgslam.core.types import CameraRig, Features, FloatArray, Frame, Odometry, Trajectory
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.sift import SiftExtractor
-from fgslam.geometry import (
-    inverse,
-    pose,
-    so3_exp,
-)
 from fgslam.settings.lab import RenderedLabSettings
 from fgslam.simulation import wheel_odometry
 from fgslam.simulation.image_effects import apply_effects
 from fgslam.simulation.world import World, camera_offsets, open_room
-from fgslam.types import CameraRig, Features, FloatArray, Frame, Odometry, Trajectory
 
 FORWARD_M = 0.10
 CLOCKWISE_DEG = 5.0
@@ -80,7 +76,7 @@ class LabViews:
 
 @dataclass(frozen=True, eq=False)
 class ViewPair:
-    """Two views as a recording of two frames; implements :class:`fgslam.recordings.Sequence`."""
+    """Two views as a recording of two frames; implements :class:`fgslam.core.recordings.Sequence`."""
 
     rig: CameraRig
     views: tuple[View, View]

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.core.saved_map import SavedMap, load_map
+from fgslam.core.types import BoolArray
 from fgslam.datasets.rendered_lab import RenderedLabSequence
-from fgslam.map_file import SavedMap, load_map
 from fgslam.runs.experiment import RunResult, run_experiment
 from fgslam.runs.map_entry import MAP_FILE
 from fgslam.runs.mapping import first_config
 from fgslam.simulation.lab import build_lab
 from fgslam.simulation.patches import Thing
-from fgslam.types import BoolArray
 from scripts.results.report import Table
 from scripts.results.runs import experiment, say
 

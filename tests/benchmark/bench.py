@@ -30,14 +30,14 @@ from rich.table import Table
 
 from fgslam.config import ExperimentConfig, load_config
 from fgslam.console import progress_bar
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.recordings import Sequence
+from fgslam.core.threads import one_blas_thread
+from fgslam.core.types import CameraRig, FloatArray, Frame, Odometry, Trajectory
 from fgslam.factory import make_pipeline, make_stream, open_sequence
 from fgslam.frontend.stream import FeatureFrame
-from fgslam.measurement_log import MeasurementLog
 from fgslam.pipeline import SlamPipeline
-from fgslam.recordings import Sequence
 from fgslam.runs.recorder import RunRecorder
-from fgslam.runs.threads import one_blas_thread
-from fgslam.types import CameraRig, FloatArray, Frame, Odometry, Trajectory
 from tests.benchmark import estimators, homing, long_drive, maps, relocalising
 from tests.benchmark.drives import open_drive
 

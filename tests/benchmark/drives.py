@@ -12,16 +12,8 @@ import numpy as np
 
 from fgslam.backend.protocol import Estimator
 from fgslam.config import load_config
-from fgslam.datasets.opening import open_measurements
-from fgslam.factory import make_estimator
-from fgslam.frontend.ego_motion import EgoMotionSolver
-from fgslam.measurement_log import MeasurementLog
-from fgslam.pipeline import replay_frame
-from fgslam.runs.replay import replay_motion
-from fgslam.settings.backend import EstimatorSettings
-from fgslam.settings.frontend import EgoMotionSettings
-from fgslam.settings.measurements import MeasurementDatasetSettings
-from fgslam.types import (
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.types import (
     EgoMotion,
     FloatArray,
     Increment,
@@ -31,6 +23,14 @@ from fgslam.types import (
     Trajectory,
     UpdateStats,
 )
+from fgslam.datasets.opening import open_measurements
+from fgslam.factory import make_estimator
+from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.pipeline import replay_frame
+from fgslam.runs.replay import replay_motion
+from fgslam.settings.backend import EstimatorSettings
+from fgslam.settings.frontend import EgoMotionSettings
+from fgslam.settings.measurements import MeasurementDatasetSettings
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,10 @@ from fgslam.backend.landmark_kalman import LandmarkKalman
 from fgslam.backend.landmark_kalman_graph import LandmarkKalmanGraph
 from fgslam.backend.marginals import marginals_of
 from fgslam.backend.outliers import solver_parameters
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.types import FloatArray, LandmarkMap
 from fgslam.factory import make_estimator
 from fgslam.frontend.ego_motion import EgoMotionSolver
-from fgslam.measurement_log import MeasurementLog
 from fgslam.pipeline import replay_frame
 from fgslam.runs.replay import replay_motion
 from fgslam.settings.backend import (
@@ -29,7 +30,6 @@ from fgslam.settings.backend import (
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
 )
-from fgslam.types import FloatArray, LandmarkMap
 from tests.benchmark.drives import (
     MeasuredDrive,
     Played,

@@ -15,12 +15,13 @@ import cv2
 import numpy as np
 
 from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.core.homing_types import OmniFeatures, TrackedBearings
+from fgslam.core.threads import one_blas_thread
+from fgslam.core.types import FloatArray, Image
 from fgslam.frontend.omni.features import OmniFeatureExtractor
 from fgslam.homing.controller import HomingController
 from fgslam.homing.eyes import HomingEyes
 from fgslam.homing.image_eyes import EyesSettings, ImageEyes
-from fgslam.homing_types import OmniFeatures, TrackedBearings
-from fgslam.runs.threads import one_blas_thread
 from fgslam.settings.homing_behaviour import HomingControlSettings
 from fgslam.settings.homing_estimators import (
     HomingEkfSettings,
@@ -32,7 +33,6 @@ from fgslam.settings.omni_features import OmniFeatureSettings, OmniMatchingSetti
 from fgslam.settings.omni_tracking import OmniTrackingSettings
 from fgslam.settings.omni_worlds import HousePathSettings, OmniHouseSettings
 from fgslam.simulation.omni.omni_world import OmniWorld
-from fgslam.types import FloatArray, Image
 from tests.benchmark.drives import cpu_seconds, interleaved
 
 LIMITS = {

@@ -12,8 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.threads import one_blas_thread
+from fgslam.core.types import Estimate
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
-from fgslam.runs.threads import one_blas_thread
 from fgslam.settings.backend import (
     BatchSettings,
     EstimatorSettings,
@@ -22,7 +23,6 @@ from fgslam.settings.backend import (
     KernelSettings,
     LandmarkKalmanSettings,
 )
-from fgslam.types import Estimate
 from tests.benchmark.drives import MeasuredDrive, Player, cpu_seconds, open_drive, play
 
 KEYFRAMES = Isam2Settings(keyframe_every=4, update_every=40, ordering_window=10)

@@ -13,20 +13,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgslam import geometry as g
-from fgslam.factory import make_tracker
-from fgslam.frontend.database import LandmarkDatabase
-from fgslam.frontend.tracker import LandmarkTracker
-from fgslam.map_file import SavedMap
-from fgslam.map_types import LandmarkAppearances
-from fgslam.runs.threads import one_blas_thread
-from fgslam.settings.frontend import (
-    DatabaseSettings,
-    FrontendSettings,
-    PermanenceSettings,
-    ViewpointSettings,
-)
-from fgslam.types import (
+from fgslam.core import geometry as g
+from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.saved_map import SavedMap
+from fgslam.core.threads import one_blas_thread
+from fgslam.core.types import (
     CameraRig,
     FloatArray,
     LandmarkMap,
@@ -34,6 +25,15 @@ from fgslam.types import (
     Prediction,
     StereoFeatures,
     Trajectory,
+)
+from fgslam.factory import make_tracker
+from fgslam.frontend.database import LandmarkDatabase
+from fgslam.frontend.tracker import LandmarkTracker
+from fgslam.settings.frontend import (
+    DatabaseSettings,
+    FrontendSettings,
+    PermanenceSettings,
+    ViewpointSettings,
 )
 
 SIZES = (1_000, 10_000, 100_000)

@@ -21,6 +21,18 @@ import cv2
 import numpy as np
 
 from fgslam.config import load_config
+from fgslam.core.geometry import pose
+from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.saved_map import SavedMap
+from fgslam.core.threads import one_blas_thread
+from fgslam.core.types import (
+    CameraRig,
+    FloatArray,
+    LandmarkMap,
+    Prediction,
+    StereoFeatures,
+    Trajectory,
+)
 from fgslam.factory import (
     make_pipeline,
     make_places,
@@ -32,20 +44,8 @@ from fgslam.frontend.loops.recognition import PlaceRecognition
 from fgslam.frontend.sift import SiftExtractor
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.frontend.tracker import LandmarkTracker
-from fgslam.geometry import pose
-from fgslam.map_file import SavedMap
-from fgslam.map_types import LandmarkAppearances
-from fgslam.runs.threads import one_blas_thread
 from fgslam.settings.frontend import FrontendSettings
 from fgslam.settings.loops import LostSettings
-from fgslam.types import (
-    CameraRig,
-    FloatArray,
-    LandmarkMap,
-    Prediction,
-    StereoFeatures,
-    Trajectory,
-)
 
 SIZES = (1_000, 3_000, 10_000, 30_000, 100_000)
 FRAMES, EVERY = 120, 8

@@ -14,10 +14,24 @@ import numpy as np
 import pytest
 from simulated import RIG
 
-from fgslam import geometry as g
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.smoother import Smoother
-from fgslam.errors import EstimatorError
+from fgslam.core import geometry as g
+from fgslam.core.errors import EstimatorError
+from fgslam.core.types import (
+    BoolArray,
+    EgoMotion,
+    EgoMotionStatus,
+    FloatArray,
+    Increment,
+    IntArray,
+    LoopClosure,
+    MeasurementType,
+    Observations,
+    Odometry,
+    Prediction,
+    UpdateStats,
+)
 from fgslam.factory import make_estimator
 from fgslam.frontend.ego_motion import EgoMotionSolver
 from fgslam.motion import ConstantVelocityMotion
@@ -34,20 +48,6 @@ from fgslam.settings.backend import (
 )
 from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import EgoMotionSettings
-from fgslam.types import (
-    BoolArray,
-    EgoMotion,
-    EgoMotionStatus,
-    FloatArray,
-    Increment,
-    IntArray,
-    LoopClosure,
-    MeasurementType,
-    Observations,
-    Odometry,
-    Prediction,
-    UpdateStats,
-)
 
 SETTINGS: dict[str, EstimatorSettings] = {
     "odometry": DeadReckoningSettings(),

@@ -14,8 +14,9 @@ import pytest
 from simulated import RIG, play, tracked_at
 from smoothing import FREE, SMOOTHERS, answer, ate, blackout, build, drawn, run
 
-from fgslam import geometry as g
 from fgslam.backend.protocol import Estimator
+from fgslam.core import geometry as g
+from fgslam.core.types import Estimate, FloatArray, Increment, Odometry, Prediction
 from fgslam.settings.backend import (
     BatchSettings,
     DeadReckoningSettings,
@@ -27,7 +28,6 @@ from fgslam.settings.backend import (
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
 )
-from fgslam.types import Estimate, FloatArray, Increment, Odometry, Prediction
 
 PRIOR = Prediction(np.eye(4), np.diag([1e-3, 2e-3, 1e-3, 3e-3, 2e-3, 4e-3]) ** 2)
 LEAST_SQUARES = {

@@ -22,8 +22,9 @@ from simulated import (
 )
 from test_estimators import CORRECTING, SETTINGS
 
-from fgslam import geometry as g
 from fgslam.backend.protocol import Estimator
+from fgslam.core import geometry as g
+from fgslam.core.types import FloatArray, Frame, Odometry, Prediction
 from fgslam.factory import make_estimator, make_tracker
 from fgslam.frontend.ego_motion import EgoMotionSolver
 from fgslam.frontend.stereo import StereoMatcher
@@ -33,7 +34,6 @@ from fgslam.pipeline import FrameReport, SlamPipeline, replay_step
 from fgslam.settings.backend import EstimatorSettings, FixedLagSettings, Isam2Settings
 from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import EgoMotionSettings, FrontendSettings
-from fgslam.types import FloatArray, Frame, Odometry, Prediction
 
 DRIVE = Drive(frames=10)
 SIXDOF = EgoMotionSettings(dof=6)

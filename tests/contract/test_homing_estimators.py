@@ -12,8 +12,8 @@ from homings import Trial, trial
 
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.backend.homing.protocol import HomingEstimator
-from fgslam.errors import EstimatorError
-from fgslam.homing_types import HomingEstimate, TrackedBearings
+from fgslam.core.errors import EstimatorError
+from fgslam.core.homing_types import HomingEstimate, TrackedBearings
 from fgslam.settings.homing_estimators import (
     PAPER,
     AverageLandmarkVectorSettings,

@@ -17,10 +17,10 @@ import yaml
 
 from fgslam import cli
 from fgslam.config import parse_config
+from fgslam.core.measurement_log import MeasurementLog
 from fgslam.export.atomic import ExistingFolder
 from fgslam.export.point_cloud import read_ply
 from fgslam.export.trajectories import read_covariances, read_tum
-from fgslam.measurement_log import MeasurementLog
 from fgslam.runs.experiment import RunResult, run_experiment
 from fgslam.runs.recorder import STAGES
 

@@ -23,7 +23,7 @@ from running import (
     write_config,
 )
 
-from fgslam.errors import OutputError
+from fgslam.core.errors import OutputError
 from fgslam.export.trajectories import read_tum
 
 Refusal = Callable[..., str]

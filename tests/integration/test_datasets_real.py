@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
+from fgslam.core.types import FloatArray
 from fgslam.datasets.checks import inspect_sequence
 from fgslam.datasets.findings import Level
 from fgslam.datasets.image_folder import open_image_folder
@@ -16,7 +18,6 @@ from fgslam.datasets.light_field import open_light_field
 from fgslam.datasets.match_checks import check_epipolar
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.synthetic_odometry import SyntheticOdometry
-from fgslam.geometry import body_to_camera_motion, inverse, se3_log
 from fgslam.settings.datasets import (
     ImageFolderSettings,
     KittiSettings,
@@ -24,7 +25,6 @@ from fgslam.settings.datasets import (
     RecordedOdometrySettings,
     SyntheticOdometrySettings,
 )
-from fgslam.types import FloatArray
 
 pytestmark = pytest.mark.data
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fgslam.core.geometry import se3_exp
+from fgslam.core.types import Trajectory
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory, path_length
 from fgslam.export.trajectories import read_tum, write_tum
-from fgslam.geometry import se3_exp
-from fgslam.types import Trajectory
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 pytestmark = pytest.mark.data

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.core.planar import compose
 from fgslam.homing.drive_scores import cross_track, pass_distances, slope_by_leg, truly_arrived
 from fgslam.homing.record import DriveRecord
-from fgslam.planar import compose
 from tests.landmark_world import drive_path, winding_path
 
 LEGS = 10

@@ -12,8 +12,8 @@ import pytest
 from PIL import Image as PictureFile
 from running import main, write_config
 
-from fgslam.bearing_log import BearingLog
-from fgslam.errors import DatasetError
+from fgslam.core.bearing_log import BearingLog
+from fgslam.core.errors import DatasetError
 from fgslam.export.atomic import RUN_MARKER
 from fgslam.homing_config import load_homing, parse_homing
 from fgslam.runs.homing.run import run_homing

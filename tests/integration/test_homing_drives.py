@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from landmark_world import drive_path, make_follower, winding_path
 
+from fgslam.core.homing_types import TrackedBearings
 from fgslam.evaluation.homing import homing_errors
 from fgslam.homing.avoidance import NoAvoidance
 from fgslam.homing.closed_loop import Driver, follow
@@ -20,7 +21,6 @@ from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.record import DriveRecord
 from fgslam.homing.steering import Steering
 from fgslam.homing_config import PathFollowingConfig, parse_homing
-from fgslam.homing_types import TrackedBearings
 from fgslam.runs.homing.drive_files import bearing_log, drive_of
 from fgslam.runs.homing.drive_pictures import DriveWatcher, Unwrapping, draw_leg_views
 from fgslam.runs.homing.drive_results import drive_numbers, finish_drives

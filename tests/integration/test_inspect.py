@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from fgslam import cli
-from fgslam.errors import CalibrationError, ConfigError, DatasetError
+from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
+from fgslam.core.types import Image
 from fgslam.inspection.recording import inspect_recording
-from fgslam.types import Image
 
 WIDTH, HEIGHT, FRAMES = 240, 180, 6
 FAR, NEAR = 6, 15  # disparities of the back wall and of the board before it, pixels

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from fgslam.errors import DatasetError
+from fgslam.core.errors import DatasetError
 from fgslam.inspection.recording import inspect_recording
 
 pytestmark = pytest.mark.data

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from fgslam import geometry
+from fgslam.core import geometry
+from fgslam.core.errors import ConfigError, FrameError, MissingDependencyError
+from fgslam.core.recordings import Sequence
 from fgslam.datasets import rendered_lab
 from fgslam.datasets.rendered_lab import RenderedLabSequence
-from fgslam.errors import ConfigError, FrameError, MissingDependencyError
-from fgslam.recordings import Sequence
 from fgslam.settings.lab import (
     LabBlurSettings,
     LabDriveSettings,

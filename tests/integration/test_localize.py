@@ -14,7 +14,7 @@ import yaml
 from recordings import experiment, write_calibration
 from running import main, run_values
 
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
 from fgslam.localisation_config import LocalisationConfig, load_experiment, parse_localisation
 from fgslam.runs.localisation.experiment import run_localisation
 

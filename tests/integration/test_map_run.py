@@ -21,12 +21,12 @@ from running import (
     write_config,
 )
 
-from fgslam.errors import ConfigError, EstimatorError, FgslamError, MapError, OutputError
+from fgslam.core.errors import ConfigError, EstimatorError, FgslamError, MapError, OutputError
+from fgslam.core.saved_map import load_map, save_map
+from fgslam.core.types import FloatArray
 from fgslam.export.point_cloud import read_ply
 from fgslam.export.trajectories import read_tum
-from fgslam.map_file import load_map, save_map
 from fgslam.runs.map_entry import arrival_of
-from fgslam.types import FloatArray
 
 CUT = 7
 EVERY = (

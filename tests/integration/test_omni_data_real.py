@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from fgslam.core.types import FloatArray, Image
 from fgslam.datasets.images import read_colour_image
 from fgslam.datasets.omni_opening import open_omni
 from fgslam.datasets.omni_recording import OmniRecording
@@ -19,7 +20,6 @@ from fgslam.omni_cameras.radial import RadialCamera
 from fgslam.omni_cameras.unwrapping import unwrap_maps
 from fgslam.settings.omni_cameras import OCamCalibSettings
 from fgslam.settings.omni_datasets import OmniPathSettings, OmniVideoSettings, PanoramasSettings
-from fgslam.types import FloatArray, Image
 
 pytestmark = pytest.mark.data
 

@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
+from fgslam.core.homing_types import BearingMatches
+from fgslam.core.planar import between
+from fgslam.core.types import BoolArray, FloatArray
 from fgslam.frontend.omni.epipolar import EpipolarTest
 from fgslam.frontend.omni.features import OmniFeatureExtractor
 from fgslam.frontend.omni.matching import match_features
 from fgslam.frontend.omni.plain_sift import match_plain, plain_sift
-from fgslam.homing_types import BearingMatches
 from fgslam.omni_cameras.panoramas import Equirectangular
-from fgslam.planar import between
 from fgslam.settings.omni_features import OmniFeatureSettings
-from fgslam.types import BoolArray, FloatArray
 
 pytestmark = pytest.mark.data
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.core.homing_types import BearingMatches
+from fgslam.core.planar import wrap
+from fgslam.core.types import FloatArray, Image
 from fgslam.frontend.omni.features import OmniFeatureExtractor
 from fgslam.frontend.omni.matching import match_features
 from fgslam.frontend.omni.trackable import move_to_trackable
 from fgslam.frontend.omni.tracking import BearingTracker
-from fgslam.homing_types import BearingMatches
-from fgslam.planar import wrap
 from fgslam.settings.omni_features import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.settings.omni_tracking import OmniTrackingSettings
 from fgslam.settings.omni_worlds import HousePathSettings, OmniHouseSettings
 from fgslam.simulation.omni.omni_world import OmniWorld
-from fgslam.types import FloatArray, Image
 
 SETTINGS = OmniTrackingSettings()
 STEPS = 20

@@ -12,11 +12,11 @@ from running import KIND, run_values
 
 from fgslam import factory
 from fgslam.config import ExperimentConfig, parse_config
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.types import Estimate
 from fgslam.export.trajectories import write_tum
 from fgslam.frontend.ego_motion import EgoMotionSolver
-from fgslam.measurement_log import MeasurementLog
 from fgslam.pipeline import replay_step
-from fgslam.types import Estimate
 
 
 def replay(config: ExperimentConfig, log: MeasurementLog) -> Estimate:

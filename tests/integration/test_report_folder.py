@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from running import KIND, Finished, main
 
-from fgslam.errors import DatasetError, FgslamError, MissingDependencyError, OutputError
+from fgslam.core.errors import DatasetError, FgslamError, MissingDependencyError, OutputError
+from fgslam.core.geometry import rotation_from_quaternion
+from fgslam.core.types import Trajectory
 from fgslam.evaluation.trajectory import to_estimate_world
 from fgslam.export.report import EstimatorReport
 from fgslam.export.trajectories import read_covariances, read_tum, write_tum
-from fgslam.geometry import rotation_from_quaternion
 from fgslam.runs.report import load_report, report_from_folder
 from fgslam.runs.viewing import ellipsoids, view_run
-from fgslam.types import Trajectory
 
 Capture = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch

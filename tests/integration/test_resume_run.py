@@ -25,20 +25,20 @@ from running import (
     write_config,
 )
 
-from fgslam.datasets.image_folder import open_image_folder
-from fgslam.datasets.recording import Recording
-from fgslam.errors import (
+from fgslam.core.errors import (
     ConfigError,
     DatasetError,
     MeasurementLogError,
     OdometryError,
     OutputError,
 )
-from fgslam.measurement_log import load_arrays
+from fgslam.core.measurement_log import load_arrays
+from fgslam.core.types import Odometry
+from fgslam.datasets.image_folder import open_image_folder
+from fgslam.datasets.recording import Recording
 from fgslam.runs.beginning import resume_command
 from fgslam.runs.checkpoint import write_arrays
 from fgslam.settings.datasets import ImageFolderSettings
-from fgslam.types import Odometry
 
 
 @pytest.mark.parametrize("frames", [1, 2, 7, 11])

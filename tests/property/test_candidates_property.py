@@ -8,13 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from fgslam.frontend.candidates import (
-    alike,
-    choose,
-    descriptor_distance,
-    pairs_within,
-    unambiguous,
-)
+from fgslam.frontend.candidates import alike, choose, descriptor_distance, pairs_within, unambiguous
 from fgslam.settings.frontend import AppearanceSettings
 
 # Halves and quarters: sums and differences are exact, so borders are met exactly.

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulated import RIG
 
+from fgslam.core.types import StereoFeatures
 from fgslam.frontend.database import LandmarkDatabase
 from fgslam.settings.frontend import DatabaseSettings, PermanenceSettings
-from fgslam.types import StereoFeatures
 
 TYPES = st.sampled_from(["I", "II", "III"])
 FRAMES = st.lists(

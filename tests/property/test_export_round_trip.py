@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as nps
 
+from fgslam.core.geometry import pose, so3_exp
+from fgslam.core.types import FloatArray, Trajectory
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory, umeyama
 from fgslam.export.trajectories import read_tum, write_tum
-from fgslam.geometry import pose, so3_exp
-from fgslam.types import FloatArray, Trajectory
 
 UNIT = st.floats(-1.0, 1.0, allow_subnormal=False)
 ANGLES = st.one_of(

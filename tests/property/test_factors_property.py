@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from simulated import RIG
 
-from fgslam import geometry as g
+from fgslam.core import geometry as g
+from fgslam.core.floor import Floor
+from fgslam.core.types import FloatArray, Odometry, RangeBearingSensor
 from fgslam.factors import residuals
 from fgslam.factors.motion import floor_factors, odometry_factor
 from fgslam.factors.noise import Whitening, positive_definite
 from fgslam.factors.range_bearing import RangeBearingFactors
 from fgslam.factors.stereo import StereoFactors
-from fgslam.floor import Floor
-from fgslam.types import FloatArray, Odometry, RangeBearingSensor
 
 SENSOR = RangeBearingSensor(20.0, g.BODY_FORWARD_LEFT_UP_FROM_CAMERA)
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import assume, given, reject
 from hypothesis import strategies as st
 
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
 from fgslam.settings.lab import LabDriveSettings
 from fgslam.simulation.paths import plan_drive
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.core.types import ByteArray
 from fgslam.frontend import vocabulary
 from fgslam.frontend.relocalisation import appearance_index
 from fgslam.frontend.relocalisation.appearance_index import AppearanceIndex, Neighbours
-from fgslam.types import ByteArray
 from tests.known_places import blurred, looks
 
 

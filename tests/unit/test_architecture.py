@@ -37,15 +37,20 @@ def test_fgslam_keeps_the_house_rules() -> None:
 
 def test_the_checker_sees_the_whole_package() -> None:
     names = {module.name for module in load_package(PACKAGE)}
-    assert {"fgslam", "fgslam.types", "fgslam.geometry", "fgslam.backend.protocol"} <= names
+    assert {
+        "fgslam",
+        "fgslam.core.types",
+        "fgslam.core.geometry",
+        "fgslam.backend.protocol",
+    } <= names
     assert len(names) == len(list(PACKAGE.rglob("*.py")))
 
 
 def test_a_lawful_package_passes(tmp_path: Path) -> None:
     files = {
         "types.py": "import numpy as np\n",
-        "geometry.py": "from fgslam.types import x\n",
-        "settings/lab.py": "from fgslam.settings.base import STRICT\n",
+        "geometry.py": "from fgslam.core.types import x\n",
+        "settings/lab.py": "from fgslam.core.settings import STRICT\n",
         "settings/base.py": "STRICT = 1\n",
         "simulation/open3d_library.py": "def load():\n    import open3d\n    return open3d\n",
         "datasets/lab.py": "import cv2\nfrom fgslam.simulation import open3d_library\n",
@@ -61,7 +66,7 @@ def test_a_lawful_package_passes(tmp_path: Path) -> None:
 
 LAYER_CASES = {
     "geometry imports a stage": ("geometry.py", "from fgslam.frontend import sift\n", 1),
-    "types imports geometry": ("types.py", "\nimport fgslam.geometry\n", 2),
+    "types imports geometry": ("types.py", "\nimport fgslam.core.geometry\n", 2),
     "settings import config": ("settings/a.py", "from fgslam.config import load\n", 1),
     "stage imports a stage": ("frontend/sift.py", "x = 1\nimport fgslam.export.ply\n", 2),
     "stage imports a stage from the root": ("frontend/b.py", "from fgslam import factors\n", 1),
@@ -84,7 +89,7 @@ LAYER_CASES = {
     "only datasets may open a simulation": ("export/a.py", "import fgslam.simulation.lab\n", 1),
     "simulation must not import datasets": ("simulation/a.py", "import fgslam.datasets.lab\n", 1),
     "backend imports factors only": ("backend/a.py", "from fgslam.frontend import sift\n", 1),
-    "the root imports nothing": ("__init__.py", "from fgslam.types import Frame\n", 1),
+    "the root imports nothing": ("__init__.py", "from fgslam.core.types import Frame\n", 1),
     "nothing imports cli": ("pipeline.py", "from fgslam.cli import main\n", 1),
     "stages do not import the pipeline": ("backend/b.py", "import fgslam.pipeline\n", 1),
 }

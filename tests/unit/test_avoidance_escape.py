@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.planar import to_robot, wrap
+from fgslam.core.types import FloatArray
 from fgslam.homing.avoidance import CorridorAvoidance, RangeScan
 from fgslam.homing.command import Drive
-from fgslam.planar import to_robot, wrap
 from fgslam.settings.homing_behaviour import AvoidanceSettings
-from fgslam.types import FloatArray
 
 BEAMS = np.linspace(-np.pi, np.pi, 72, endpoint=False)
 

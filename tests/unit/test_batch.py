@@ -23,7 +23,7 @@ from smoothing import (
 
 from fgslam.backend import refinement
 from fgslam.backend.batch import BatchSmoother
-from fgslam.errors import EstimatorError
+from fgslam.core.errors import EstimatorError
 from fgslam.evaluation.consistency import judge
 from fgslam.settings.backend import BatchSettings
 

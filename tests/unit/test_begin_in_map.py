@@ -5,26 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam import geometry as g
 from fgslam.arrival import Arrival, require_map_user, take_over
 from fgslam.backend.ekf_update import FRONT, FloorMeasurement, Matches, correct
 from fgslam.backend.growing_covariance import GrowingCovariance, rows_of
 from fgslam.backend.protocol import Estimator, MapUser
-from fgslam.errors import ConfigError
-from fgslam.factory import make_estimator
-from fgslam.map_file import SavedMap
-from fgslam.map_types import LandmarkAppearances
-from fgslam.settings.backend import (
-    BatchSettings,
-    DeadReckoningSettings,
-    EkfSettings,
-    EstimatorSettings,
-    FixedLagSettings,
-    Isam2Settings,
-    LandmarkKalmanGraphSettings,
-    LandmarkKalmanSettings,
-)
-from fgslam.types import (
+from fgslam.core import geometry as g
+from fgslam.core.errors import ConfigError
+from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.saved_map import SavedMap
+from fgslam.core.types import (
     CameraRig,
     EgoMotion,
     EgoMotionStatus,
@@ -34,6 +23,17 @@ from fgslam.types import (
     Observations,
     Prediction,
     Trajectory,
+)
+from fgslam.factory import make_estimator
+from fgslam.settings.backend import (
+    BatchSettings,
+    DeadReckoningSettings,
+    EkfSettings,
+    EstimatorSettings,
+    FixedLagSettings,
+    Isam2Settings,
+    LandmarkKalmanGraphSettings,
+    LandmarkKalmanSettings,
 )
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))

@@ -9,12 +9,12 @@ import pytest
 from simulated import RIG, Simulation
 from smoothing import drawn
 
-from fgslam import geometry as g
 from fgslam.backend.between import fill_between
 from fgslam.backend.graph_solution import Solution
 from fgslam.backend.segments import TrackedFrame
-from fgslam.floor import Floor
-from fgslam.types import FloatArray, Odometry
+from fgslam.core import geometry as g
+from fgslam.core.floor import Floor
+from fgslam.core.types import FloatArray, Odometry
 
 FREE = Floor.under(RIG, 6)
 KNOWN = [0, 4, 8]

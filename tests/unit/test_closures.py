@@ -10,19 +10,13 @@ import numpy as np
 import pytest
 from simulated import RIG
 
-from fgslam import geometry as g
-from fgslam.errors import DatasetError
+from fgslam.core import geometry as g
+from fgslam.core.errors import DatasetError
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.types import FloatArray, Increment, LoopClosure, Observations, Trajectory
 from fgslam.evaluation.closures import judge_closures
-from fgslam.measurement_log import MeasurementLog
-from fgslam.runs.places import (
-    LOOPS_FILE,
-    closures_of,
-    place_numbers,
-    read_closures,
-    write_closures,
-)
+from fgslam.runs.places import LOOPS_FILE, closures_of, place_numbers, read_closures, write_closures
 from fgslam.runs.recorder import RunRecorder
-from fgslam.types import FloatArray, Increment, LoopClosure, Observations, Trajectory
 
 COUNT = 12
 

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fgslam.columns import GrowingColumns
+from fgslam.core.growing_arrays import GrowingColumns
 
 STEPS = st.lists(st.tuples(st.integers(0, 90), st.floats(0.0, 1.0)), max_size=12)
 

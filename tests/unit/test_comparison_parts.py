@@ -13,7 +13,10 @@ import pytest
 from simulated import RIG, Drive, simulate
 
 from fgslam.config import ExperimentConfig, parse_config
-from fgslam.errors import ConfigError, DatasetError
+from fgslam.core.errors import ConfigError, DatasetError
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.recordings import LandmarkTruth
+from fgslam.core.types import LandmarkMap
 from fgslam.evaluation.consistency import Nees
 from fgslam.export.comparison_table import (
     RESULT_COLUMNS,
@@ -24,8 +27,6 @@ from fgslam.export.comparison_table import (
 from fgslam.export.landmark_truth import read_landmark_truth, write_landmark_truth
 from fgslam.export.metrics import EstimatorMetrics, UpdateTime
 from fgslam.export.point_cloud import MapPoints
-from fgslam.measurement_log import MeasurementLog
-from fgslam.recordings import LandmarkTruth
 from fgslam.runs.baseline import check_baseline, read_baseline, write_baseline
 from fgslam.runs.choosing import Choice, all_kinds, choose, estimators_of
 from fgslam.runs.estimator_files import points_from_log
@@ -33,7 +34,6 @@ from fgslam.runs.judging import seen_often
 from fgslam.runs.rendered_truth import points_under
 from fgslam.runs.trial_results import summarise, together
 from fgslam.settings.backend import Isam2Settings, LandmarkKalmanSettings
-from fgslam.types import LandmarkMap
 
 LAB: dict[str, Any] = {"name": "x", "dataset": {"kind": "rendered_lab"}}
 

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from fgslam.config import ExperimentConfig, load_config, parse_config
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
 from fgslam.homing_config import is_homing
 from fgslam.settings.datasets import ConstantVelocitySettings, ImageFolderSettings
 from fgslam.settings.lab import RenderedLabSettings

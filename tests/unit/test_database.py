@@ -9,11 +9,18 @@ import numpy as np
 import pytest
 from simulated import RIG, assert_same_bits
 
-from fgslam import geometry as g
+from fgslam.core import geometry as g
+from fgslam.core.types import (
+    CameraRig,
+    FloatArray,
+    IntArray,
+    LandmarkMap,
+    Prediction,
+    StereoFeatures,
+)
 from fgslam.frontend.database import LandmarkDatabase
 from fgslam.frontend.visibility import predicted_covariance
 from fgslam.settings.frontend import DatabaseSettings
-from fgslam.types import CameraRig, FloatArray, IntArray, LandmarkMap, Prediction, StereoFeatures
 
 NO_BORDER = DatabaseSettings(border_px=0.0)
 BORDER = DatabaseSettings(border_px=8.0)

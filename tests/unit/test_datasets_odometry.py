@@ -9,6 +9,9 @@ from dataset_builders import curve, image_folder, write_tum
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fgslam.core.errors import DatasetError, OdometryError
+from fgslam.core.geometry import inverse
+from fgslam.core.types import FloatArray, Odometry
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.recorded_odometry import (
     SpeedLog,
@@ -18,10 +21,7 @@ from fgslam.datasets.recorded_odometry import (
     steps_covered,
 )
 from fgslam.datasets.recording import Recording
-from fgslam.errors import DatasetError, OdometryError
-from fgslam.geometry import inverse
 from fgslam.settings.datasets import ImageFolderSettings, RecordedOdometrySettings
-from fgslam.types import FloatArray, Odometry
 
 DEFAULT = RecordedOdometrySettings()
 

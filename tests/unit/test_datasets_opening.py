@@ -7,8 +7,8 @@ import pytest
 from dataset_builders import euroc, image_folder, kitti
 from pydantic import TypeAdapter, ValidationError
 
+from fgslam.core.geometry import pose
 from fgslam.datasets.opening import open_recording
-from fgslam.geometry import pose
 from fgslam.settings.datasets import (
     ConstantVelocitySettings,
     EurocSettings,

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from simulated import RIG, Drive, Simulation, play, play_directly, simulate, tracked_at
 
-from fgslam import geometry as g
 from fgslam.backend.dead_reckoning import DeadReckoning
-from fgslam.errors import EstimatorError
+from fgslam.core import geometry as g
+from fgslam.core.errors import EstimatorError
+from fgslam.core.types import FloatArray, Prediction, RangeBearingSensor
 from fgslam.evaluation.consistency import judge, nees, pose_nees
-from fgslam.types import FloatArray, Prediction, RangeBearingSensor
 
 DRIVE = Drive(frames=10, points=60, odometry_sigma=(1e-3,) * 3 + (2e-3,) * 3)
 PRIOR = np.diag([1e-3, 2e-3, 1e-3, 3e-3, 2e-3, 4e-3]) ** 2

@@ -11,10 +11,8 @@ import pytest
 from scipy import optimize, stats
 from simulated import RIG, assert_same_bits, points_in_view
 
-from fgslam import geometry as g
-from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
-from fgslam.settings.frontend import EgoMotionSettings
-from fgslam.types import (
+from fgslam.core import geometry as g
+from fgslam.core.types import (
     CameraRig,
     EgoMotion,
     EgoMotionStatus,
@@ -23,6 +21,8 @@ from fgslam.types import (
     Observations,
     Prediction,
 )
+from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
+from fgslam.settings.frontend import EgoMotionSettings
 
 SIGMA = np.array([0.3, 0.3, 0.2])
 PRIOR_SIGMA = np.array([0.01, 0.01, 0.01, 0.03, 0.03, 0.03])

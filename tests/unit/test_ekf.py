@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 from simulated import RIG, Drive, Simulation, assert_same_bits, play, simulate, tracked_at
 
-from fgslam import geometry as g
 from fgslam.backend.ekf import FullEkf
 from fgslam.backend.ekf_update import DivergedError, FloorMeasurement, Matches, correct
 from fgslam.backend.growing_covariance import GrowingCovariance
-from fgslam.errors import EstimatorError
+from fgslam.core import geometry as g
+from fgslam.core.errors import EstimatorError
+from fgslam.core.floor import Floor
+from fgslam.core.types import FloatArray, Increment, Odometry, Prediction, UpdateStats
 from fgslam.evaluation.consistency import judge, landmark_nees, pose_nees
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior
 from fgslam.factors.noise import Whitening
 from fgslam.factors.stereo import StereoFactors
-from fgslam.floor import Floor
 from fgslam.settings.backend import EkfSettings
 from fgslam.settings.frontend import EgoMotionSettings
-from fgslam.types import FloatArray, Increment, Odometry, Prediction, UpdateStats
 
 FREE = Floor.under(RIG, 6)
 PRIOR = np.diag([1e-3, 2e-3, 1e-3, 3e-3, 2e-3, 4e-3]) ** 2

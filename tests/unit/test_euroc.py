@@ -18,14 +18,14 @@ from dataset_builders import (
     write_euroc_truth,
 )
 
+from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
+from fgslam.core.geometry import inverse, pose, project, se3_exp, so3_exp, transform_to_camera
+from fgslam.core.recordings import Sequence
+from fgslam.core.types import FloatArray
 from fgslam.datasets.asl_files import AslCamera, read_camera
 from fgslam.datasets.euroc import open_euroc, rectifier
 from fgslam.datasets.recording import Recording
-from fgslam.errors import CalibrationError, DatasetError, FgslamError, FrameError
-from fgslam.geometry import inverse, pose, project, se3_exp, so3_exp, transform_to_camera
-from fgslam.recordings import Sequence
 from fgslam.settings.datasets import EurocSettings
-from fgslam.types import FloatArray
 
 # Two cameras that look along the body's x axis, slightly turned against each other, 11 cm apart.
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

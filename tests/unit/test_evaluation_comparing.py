@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from fgslam.core.geometry import inverse, se3_exp, transform_to_world
+from fgslam.core.recordings import LandmarkTruth
+from fgslam.core.types import LandmarkMap, Trajectory
 from fgslam.evaluation.landmarks import landmark_errors
 from fgslam.evaluation.paired import mean_interval, paired_test
 from fgslam.evaluation.timing import time_growth
 from fgslam.evaluation.trajectory import estimate_from_truth
-from fgslam.geometry import inverse, se3_exp, transform_to_world
-from fgslam.recordings import LandmarkTruth
-from fgslam.types import LandmarkMap, Trajectory
 
 ALIGNED = se3_exp(np.array([0.1, -0.2, 0.3, 1.0, 2.0, -3.0]))
 

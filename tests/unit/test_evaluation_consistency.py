@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from fgslam.core.geometry import se3_exp
 from fgslam.evaluation.consistency import (
     Nees,
     chi_square_band,
@@ -15,7 +16,6 @@ from fgslam.evaluation.consistency import (
     pose_errors,
     pose_nees,
 )
-from fgslam.geometry import se3_exp
 
 
 def random_covariances(rng: np.random.Generator, n: int, d: int) -> np.ndarray:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.core.homing_types import HomingEstimate, HomingTruth
+from fgslam.core.planar import between
+from fgslam.core.types import FloatArray
 from fgslam.evaluation.homing import homing_errors, summarise_homings
-from fgslam.homing_types import HomingEstimate, HomingTruth
-from fgslam.planar import between
-from fgslam.types import FloatArray
 
 TRUTH = HomingTruth(
     np.array([1.8, 0.6, 0.4]), np.array([[0.4, 0.1, 0.2], [1.2, 0.5, 0.3]]), np.zeros((0, 2))

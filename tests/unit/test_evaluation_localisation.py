@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.core.geometry import pose, so3_exp
 from fgslam.evaluation.localisation import (
     Answers,
     Bounds,
@@ -13,7 +14,6 @@ from fgslam.evaluation.localisation import (
     localisation_errors,
     score,
 )
-from fgslam.geometry import pose, so3_exp
 
 BOUNDS = Bounds(0.05, np.deg2rad(1.0), 0.3, np.deg2rad(5.0), 20)
 

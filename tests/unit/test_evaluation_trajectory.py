@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.core.geometry import pose, quaternion_from_rotation, se3_exp, so3_exp
+from fgslam.core.types import FloatArray, Trajectory
 from fgslam.evaluation.trajectory import (
     Alignment,
     align,
@@ -17,8 +19,6 @@ from fgslam.evaluation.trajectory import (
     to_estimate_world,
     umeyama,
 )
-from fgslam.geometry import pose, quaternion_from_rotation, se3_exp, so3_exp
-from fgslam.types import FloatArray, Trajectory
 
 
 def wandering(seed: int, n: int = 60) -> Trajectory:

@@ -10,16 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam import whole_files
-from fgslam.errors import OutputError
-from fgslam.export.atomic import (
-    create_run_folder,
-    is_run_folder,
-    make_subfolder,
-    replacing,
-    write_bytes,
-    write_text,
-)
+from fgslam.core import atomic_files as whole_files
+from fgslam.core.atomic_files import make_subfolder, replacing, write_bytes, write_text
+from fgslam.core.errors import OutputError
+from fgslam.export.atomic import create_run_folder, is_run_folder
 
 
 def leftovers(folder: Path) -> list[Path]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.errors import DatasetError
+from fgslam.core.errors import DatasetError
 from fgslam.export.metrics import (
     EstimatorMetrics,
     StageTime,

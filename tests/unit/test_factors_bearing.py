@@ -8,11 +8,11 @@ import gtsam
 import numpy as np
 import pytest
 
+from fgslam.core.planar import bearings
+from fgslam.core.types import FloatArray
 from fgslam.factors import bearing as f
 from fgslam.factors import bearing_residuals as r
 from fgslam.factors.keys import height_key, landmark_key, pose_key, target_key, velocity_key
-from fgslam.planar import bearings
-from fgslam.types import FloatArray
 
 POSE = np.array([1.2, -0.5, 0.7])
 POINTS = np.array([[3.0, 2.0], [-1.0, 0.4], [1.5, -3.0], [1.1, 2.0]])

@@ -22,13 +22,13 @@ from factor_checks import (
 )
 from simulated import RIG
 
-from fgslam import geometry as g
+from fgslam.core import geometry as g
+from fgslam.core.stereo_model import measurement_map, pixel_model, vertical_to_horizontal
+from fgslam.core.types import CameraRig, FloatArray
 from fgslam.factors import residuals
 from fgslam.factors.cameras import RawPixelFactors
 from fgslam.factors.noise import Whitening
 from fgslam.factors.stereo import FROM_MEASUREMENT, StereoFactors
-from fgslam.stereo_model import measurement_map, pixel_model, vertical_to_horizontal
-from fgslam.types import CameraRig, FloatArray
 
 RIGS = [RIG, UNEVEN_RIG]
 MEASURED = np.array([170.0, 131.0, 9.0])

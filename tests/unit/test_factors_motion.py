@@ -17,12 +17,12 @@ from factor_checks import (
     values_of,
 )
 
-from fgslam import geometry as g
+from fgslam.core import geometry as g
+from fgslam.core.floor import DegreesOfFreedom, Floor
+from fgslam.core.types import FloatArray, Odometry, Prediction
 from fgslam.factors import residuals
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior, weak_point_prior
 from fgslam.factors.noise import STIFF_M, STIFF_RAD, positive_definite
-from fgslam.floor import DegreesOfFreedom, Floor
-from fgslam.types import FloatArray, Odometry, Prediction
 
 TILTED = g.so3_exp(np.array([0.31, 0.1, -0.24])) @ np.array([0.0, 1.0, 0.0])
 """The vertical of a camera that is pitched and rolled on the robot: no axis of anything."""

@@ -10,11 +10,11 @@ import pytest
 from factor_checks import assert_near, random_covariance, root_information, values_of
 from simulated import RIG
 
-from fgslam import geometry as g
+from fgslam.core import geometry as g
+from fgslam.core.types import FloatArray
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 from fgslam.factors.noise import KernelName, Whitening
 from fgslam.factors.stereo import FROM_MEASUREMENT, StereoFactors
-from fgslam.types import FloatArray
 
 WIDTH = 1.7
 WEIGHTS: dict[KernelName, Callable[[float], float]] = {

@@ -22,11 +22,11 @@ from factor_checks import (
     values_of,
 )
 
-from fgslam import geometry as g
+from fgslam.core import geometry as g
+from fgslam.core.types import FloatArray, RangeBearingSensor
 from fgslam.factors import residuals
 from fgslam.factors.noise import Whitening
 from fgslam.factors.range_bearing import RangeBearingFactors, bearing_axes
-from fgslam.types import FloatArray, RangeBearingSensor
 
 SENSOR = RangeBearingSensor(20.0, g.BODY_FORWARD_LEFT_UP_FROM_CAMERA)
 UNEVEN = np.diag([0.03, 0.005, 0.04]) ** 2

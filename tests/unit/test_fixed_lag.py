@@ -24,11 +24,11 @@ from smoothing import (
 )
 
 from fgslam.backend.fixed_lag import FixedLagSmoother
-from fgslam.errors import EstimatorError
+from fgslam.core.errors import EstimatorError
+from fgslam.core.types import Prediction
 from fgslam.evaluation.consistency import judge
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 from fgslam.settings.backend import FixedLagSettings
-from fgslam.types import Prediction
 
 LAG = FixedLagSettings(lag_frames=5)
 

@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from fgslam import geometry as g
-from fgslam.types import CameraRig, FloatArray
+from fgslam.core import geometry as g
+from fgslam.core.types import CameraRig, FloatArray
 
 RIG = CameraRig(
     width=320,

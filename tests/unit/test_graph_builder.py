@@ -22,15 +22,15 @@ from smoothing import (
     unseen,
 )
 
-from fgslam import geometry as g
 from fgslam.backend.graph_builder import GraphBuilder
 from fgslam.backend.segments import TrackedFrame
-from fgslam.errors import EstimatorError
+from fgslam.core import geometry as g
+from fgslam.core.errors import EstimatorError
+from fgslam.core.floor import Floor
+from fgslam.core.types import Increment, LandmarkMap, Odometry, Prediction
 from fgslam.evaluation.consistency import judge, landmark_nees
 from fgslam.factors.keys import is_pose, landmark_key, pose_key
-from fgslam.floor import Floor
 from fgslam.settings.backend import BatchSettings, EstimatorSettings, GraphSettings
-from fgslam.types import Increment, LandmarkMap, Odometry, Prediction
 
 ORIGIN = Prediction(np.eye(4), np.zeros((6, 6)))
 STEP = g.se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.1]))

@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 from simulated import Drive, simulate
 
-from fgslam.errors import OutputError
+from fgslam.core.errors import OutputError
+from fgslam.core.geometry import inverse, pose, rotation_from_quaternion, se3_exp
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.types import FloatArray, IntArray, Trajectory
 from fgslam.export.graph_file import (
     EXACT_SIGMA,
     PoseLandmarkGraph,
@@ -18,10 +21,7 @@ from fgslam.export.graph_file import (
     information_of,
     write_g2o,
 )
-from fgslam.geometry import inverse, pose, rotation_from_quaternion, se3_exp
-from fgslam.measurement_log import MeasurementLog
 from fgslam.runs.graph_export import build_graph
-from fgslam.types import FloatArray, IntArray, Trajectory
 
 Lines = dict[str, list[list[float]]]
 

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from fgslam.config import ExperimentConfig, load_config
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
 from fgslam.homing_config import (
     TASKS,
     HomingExperiment,

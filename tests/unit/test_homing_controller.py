@@ -9,13 +9,8 @@ import numpy as np
 import pytest
 
 from fgslam.backend.homing.factory import make_homing_estimator
-from fgslam.errors import EstimatorError
-from fgslam.homing.command import Command, HomingState
-from fgslam.homing.controller import HomingController
-from fgslam.homing.eyes import Sighting
-from fgslam.homing.soundness import parallax
-from fgslam.homing.underway import HomingUnderWay
-from fgslam.homing_types import (
+from fgslam.core.errors import EstimatorError
+from fgslam.core.homing_types import (
     HomingEstimate,
     HomingStart,
     HomingVector,
@@ -25,7 +20,13 @@ from fgslam.homing_types import (
     RefusalReason,
     TrackedBearings,
 )
-from fgslam.planar import bearings, between, unit, wrap
+from fgslam.core.planar import bearings, between, unit, wrap
+from fgslam.core.types import ByteArray, FloatArray
+from fgslam.homing.command import Command, HomingState
+from fgslam.homing.controller import HomingController
+from fgslam.homing.eyes import Sighting
+from fgslam.homing.soundness import parallax
+from fgslam.homing.underway import HomingUnderWay
 from fgslam.settings.homing_behaviour import HomingControlSettings
 from fgslam.settings.homing_estimators import (
     AverageLandmarkVectorSettings,
@@ -34,7 +35,6 @@ from fgslam.settings.homing_estimators import (
     HomingGraphSettings,
     SnapshotSettings,
 )
-from fgslam.types import ByteArray, FloatArray
 from tests.homing import make_matches
 from tests.landmark_world import DARK, Setting, winding_path
 

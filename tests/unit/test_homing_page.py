@@ -12,6 +12,7 @@ import pytest
 from homing_pages import FEATURES, drive, estimates, page, truth
 from reports import HOSTILE
 
+from fgslam.core.types import FloatArray
 from fgslam.export.homing_report import Column, TextTable, write_homing_report
 from fgslam.export.homing_report.curves import claimed_against_true, sorted_errors
 from fgslam.export.homing_report.local_map import (
@@ -25,7 +26,6 @@ from fgslam.export.homing_report.network import Links, network_figure, unfolded
 from fgslam.export.homing_report.page import render
 from fgslam.export.homing_report.plan import catchment_figure, drive_figure
 from fgslam.export.report.traces import Figure, Trace
-from fgslam.types import FloatArray
 
 
 def numbers(packed: dict[str, str]) -> FloatArray:

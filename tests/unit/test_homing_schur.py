@@ -13,13 +13,13 @@ from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.backend.homing.schur_model import SchurModel, State
 from fgslam.backend.homing.schur_solver import SchurSolver
 from fgslam.backend.homing.schur_system import Factored
-from fgslam.errors import EstimatorError
-from fgslam.homing_types import HomingEstimate
-from fgslam.planar import wrap
+from fgslam.core.errors import EstimatorError
+from fgslam.core.homing_types import HomingEstimate
+from fgslam.core.planar import wrap
+from fgslam.core.types import FloatArray
 from fgslam.settings.backend import KernelSettings
 from fgslam.settings.homing_estimators import HomingGraphSettings
 from fgslam.settings.simulated_bearings import SimulatedBearingsSettings
-from fgslam.types import FloatArray
 
 NONE, CAUCHY, HUBER = (
     KernelSettings("none"),

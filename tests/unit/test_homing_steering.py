@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fgslam.core.planar import wrap
+from fgslam.core.types import FloatArray
 from fgslam.homing.avoidance import (
     CorridorAvoidance,
     NoAvoidance,
@@ -16,13 +18,11 @@ from fgslam.homing.avoidance import (
 )
 from fgslam.homing.command import Command, Drive, HomingState
 from fgslam.homing.steering import Steering
-from fgslam.planar import wrap
 from fgslam.settings.homing_behaviour import (
     AvoidanceSettings,
     HomingBehaviourSettings,
     SteeringSettings,
 )
-from fgslam.types import FloatArray
 from tests.landmark_world import drive_path, ray_ranges, winding_path
 
 SETTINGS = SteeringSettings()

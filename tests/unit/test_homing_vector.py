@@ -8,20 +8,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from fgslam.core.homing_types import BearingMatches, HomingVector, LocalMap, Refusal, RefusalReason
+from fgslam.core.planar import wrap
+from fgslam.core.types import FloatArray
 from fgslam.frontend.omni.epipolar import EpipolarTest
 from fgslam.frontend.omni.homing_ransac import _cells, estimate_homing_vector
 from fgslam.frontend.omni.homing_refinement import HomingRefinement, RefinementPrior
 from fgslam.frontend.omni.local_map import make_local_map, triangulable, triangulate
-from fgslam.homing_types import (
-    BearingMatches,
-    HomingVector,
-    LocalMap,
-    Refusal,
-    RefusalReason,
-)
-from fgslam.planar import wrap
 from fgslam.settings.homing_vector import HomingVectorSettings
-from fgslam.types import FloatArray
 from tests.homing import TwoViews, make_matches, two_views
 
 HALF_DEGREE = np.deg2rad(0.5)

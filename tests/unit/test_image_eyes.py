@@ -7,13 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from fgslam.homing.image_eyes import (
-    EyesSettings,
-    ImageEyes,
-    mixed_with_wrong,
-    surest_all_around,
-)
-from fgslam.homing_types import FeatureKind, Refusal, RefusalReason
+from fgslam.core.homing_types import FeatureKind, Refusal, RefusalReason
+from fgslam.homing.image_eyes import EyesSettings, ImageEyes, mixed_with_wrong, surest_all_around
 from fgslam.omni_cameras.panoramas import Equirectangular
 from fgslam.settings.homing_vector import HomingVectorSettings
 from fgslam.settings.omni_features import OmniFeatureSettings

@@ -14,12 +14,12 @@ from dataset_builders import (
     write_tum,
 )
 
+from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, right_from_left_camera
+from fgslam.core.recordings import Sequence
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.images import read_grey_image
 from fgslam.datasets.recording import Recording
-from fgslam.errors import CalibrationError, DatasetError, FgslamError, FrameError
-from fgslam.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, right_from_left_camera
-from fgslam.recordings import Sequence
 from fgslam.settings.datasets import ImageFolderSettings
 
 

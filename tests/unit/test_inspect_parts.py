@@ -9,6 +9,8 @@ import pytest
 from dataset_builders import euroc, image_folder, kitti, picture, save, write_tum
 from scipy.spatial.transform import Rotation
 
+from fgslam.core.errors import DatasetError
+from fgslam.core.geometry import pose
 from fgslam.datasets.clock_check import check_clock
 from fgslam.datasets.findings import Finding, Level
 from fgslam.datasets.image_folder import open_image_folder
@@ -25,9 +27,7 @@ from fgslam.datasets.match_checks import (
     check_stereo_counts,
     fit_turn,
 )
-from fgslam.errors import DatasetError
 from fgslam.frontend.descriptor_matching import mutual_nearest
-from fgslam.geometry import pose
 from fgslam.inspection.recording import inspect_recording
 from fgslam.inspection.report import render_report
 from fgslam.settings.datasets import ImageFolderSettings, RecordedOdometrySettings

@@ -23,7 +23,7 @@ from smoothing import (
 )
 
 from fgslam.backend.isam2 import Isam2Smoother
-from fgslam.errors import EstimatorError
+from fgslam.core.errors import EstimatorError
 from fgslam.evaluation.consistency import judge
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.settings.backend import Isam2Settings

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from dataset_builders import kitti, picture, save
 
+from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
+from fgslam.core.recordings import Sequence
 from fgslam.datasets.kitti import open_kitti
 from fgslam.datasets.recording import Recording
-from fgslam.errors import CalibrationError, DatasetError, FgslamError, FrameError
-from fgslam.recordings import Sequence
 from fgslam.settings.datasets import KittiSettings
 
 

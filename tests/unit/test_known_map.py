@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.core.geometry import project, transform_to_camera
+from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.types import FloatArray, IntArray, LandmarkMap
 from fgslam.frontend.relocalisation.known_map import KnownMap
-from fgslam.geometry import project, transform_to_camera
-from fgslam.map_types import LandmarkAppearances
-from fgslam.types import FloatArray, IntArray, LandmarkMap
 from tests.known_places import RIG, looks, planar
 
 SIGMA_M = 0.02

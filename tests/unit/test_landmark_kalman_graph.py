@@ -20,18 +20,11 @@ from simulated import (
     tracked_at,
 )
 
-from fgslam import geometry as g
 from fgslam.backend.landmark_kalman import LandmarkKalman
 from fgslam.backend.landmark_kalman_graph import LandmarkKalmanGraph
-from fgslam.errors import EstimatorError
-from fgslam.factors.keys import landmark_key, pose_key
-from fgslam.factors.motion import pose_prior
-from fgslam.factors.noise import Whitening
-from fgslam.factors.stereo import StereoFactors
-from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
-from fgslam.settings.backend import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
-from fgslam.settings.frontend import EgoMotionSettings
-from fgslam.types import (
+from fgslam.core import geometry as g
+from fgslam.core.errors import EstimatorError
+from fgslam.core.types import (
     EgoMotionStatus,
     FloatArray,
     Increment,
@@ -40,6 +33,13 @@ from fgslam.types import (
     RangeBearingSensor,
     UpdateStats,
 )
+from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.factors.motion import pose_prior
+from fgslam.factors.noise import Whitening
+from fgslam.factors.stereo import StereoFactors
+from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
+from fgslam.settings.backend import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
+from fgslam.settings.frontend import EgoMotionSettings
 
 SIGMA = np.array([0.3, 0.4, 0.2])
 NO_IDS = np.empty(0, np.int64)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fgslam.backend.landmark_rows import LandmarkRows
-from fgslam.types import IntArray, LandmarkMap
+from fgslam.core.types import IntArray, LandmarkMap
 
 
 def fill(rows: LandmarkRows, ids: IntArray, rng: np.random.Generator, home: int) -> None:

@@ -9,12 +9,12 @@ import pytest
 from simulated import RIG, assert_same_bits
 from test_database import at_pixels, database_of, landmark_map, stereo_features
 
-from fgslam.errors import MapError
+from fgslam.core.errors import MapError
+from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.saved_map import SavedMap
+from fgslam.core.types import FloatArray, IntArray, Trajectory
 from fgslam.frontend.database import LandmarkDatabase
-from fgslam.map_file import SavedMap
-from fgslam.map_types import LandmarkAppearances
 from fgslam.settings.frontend import DatabaseSettings, PermanenceSettings, ViewpointSettings
-from fgslam.types import FloatArray, IntArray, Trajectory
 
 PLACES = at_pixels([(80, 60, 8), (100, 110, 12), (120, 90, 10), (150, 100, 9)])
 LASTING = DatabaseSettings(

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from dataset_builders import save
 
+from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
+from fgslam.core.geometry import project, transform_to_camera
+from fgslam.core.recordings import Sequence
+from fgslam.core.types import FloatArray, Image
 from fgslam.datasets.light_field import open_light_field, shift_image
 from fgslam.datasets.recording import Recording
-from fgslam.errors import CalibrationError, DatasetError, FgslamError, FrameError
-from fgslam.geometry import project, transform_to_camera
-from fgslam.recordings import Sequence
 from fgslam.settings.datasets import LightFieldSettings
-from fgslam.types import FloatArray, Image
 
 WIDTH, HEIGHT, COLUMNS, ROWS = 120, 90, 9, 3
 FOCAL, PITCH, FOCAL_DEPTH = 100.0, 0.005, 0.6

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam import geometry as g
+from fgslam.core import geometry as g
 from fgslam.runs.localisation.truth import alignment_slack
 
 

@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 
 from fgslam.backend.loop_correction import DriveBook
-from fgslam.geometry import pose
+from fgslam.core.geometry import pose
+from fgslam.core.types import (
+    EgoMotion,
+    EgoMotionStatus,
+    FloatArray,
+    LoopClosure,
+    Observations,
+    Odometry,
+)
 from fgslam.settings.backend import LoopCorrectionSettings
-from fgslam.types import EgoMotion, EgoMotionStatus, FloatArray, LoopClosure, Observations, Odometry
 
 _TRACKED = np.diag([1e-6] * 6)
 _WHEELS = np.diag([1e-4] * 6)

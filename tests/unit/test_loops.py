@@ -11,9 +11,10 @@ from loops import CLOSED, ROUND, Returned, Rounds, drive_rounds
 from simulated import Drive, assert_same_bits, play, play_directly, simulate
 from smoothing import FREE, PIXELS, build
 
-from fgslam import geometry as g
 from fgslam.backend.protocol import Estimator
-from fgslam.errors import EstimatorError
+from fgslam.core import geometry as g
+from fgslam.core.errors import EstimatorError
+from fgslam.core.types import Estimate, FloatArray, Increment, Odometry
 from fgslam.evaluation.consistency import pose_nees
 from fgslam.settings.backend import (
     BatchSettings,
@@ -26,7 +27,6 @@ from fgslam.settings.backend import (
     LandmarkKalmanSettings,
     LoopCorrectionSettings,
 )
-from fgslam.types import Estimate, FloatArray, Increment, Odometry
 
 CLOSING: dict[str, EstimatorSettings] = {
     "landmark_kalman": LandmarkKalmanSettings(),

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from fgslam.core.types import FloatArray, StereoFeatures
 from fgslam.frontend.map_matching import MapMatcher, MapMatches
 from fgslam.frontend.visibility import ExpectedLandmarks
 from fgslam.settings.frontend import AppearanceSettings, MapMatchingSettings
-from fgslam.types import FloatArray, StereoFeatures
 
 PAPER = AppearanceSettings(mode="paper")
 DESCRIPTOR = AppearanceSettings(mode="descriptor", max_distance=250.0, ratio=0.85)

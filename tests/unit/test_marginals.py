@@ -11,7 +11,6 @@ import pytest
 from factor_checks import assert_near, random_covariance, random_pose
 from simulated import RIG, points_in_view
 
-from fgslam import geometry as g
 from fgslam.backend.marginals import (
     ChainMarginals,
     DenseMarginals,
@@ -19,14 +18,15 @@ from fgslam.backend.marginals import (
     LinearSystem,
     marginals_of,
 )
-from fgslam.errors import EstimatorError
+from fgslam.core import geometry as g
+from fgslam.core.errors import EstimatorError
+from fgslam.core.floor import Floor
+from fgslam.core.types import FloatArray, Odometry, Prediction
 from fgslam.factors.cameras import RawPixelFactors
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior
 from fgslam.factors.noise import Whitening
 from fgslam.factors.stereo import StereoFactors
-from fgslam.floor import Floor
-from fgslam.types import FloatArray, Odometry, Prediction
 
 Whole = type[GraphMarginals] | type[ChainMarginals]
 BOTH: list[Whole] = [GraphMarginals, ChainMarginals]

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam import geometry as g
-from fgslam.errors import MeasurementLogError
-from fgslam.measurement_log import MeasurementLog, load_arrays
-from fgslam.runs.checkpoint import save_log, write_arrays
-from fgslam.types import (
+from fgslam.core import geometry as g
+from fgslam.core.errors import MeasurementLogError
+from fgslam.core.measurement_log import MeasurementLog, load_arrays
+from fgslam.core.types import (
     CameraRig,
     Increment,
     LoopClosure,
@@ -23,6 +22,7 @@ from fgslam.types import (
     Odometry,
     RangeBearingSensor,
 )
+from fgslam.runs.checkpoint import save_log, write_arrays
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 

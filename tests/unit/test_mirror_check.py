@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
+from fgslam.core.types import Image
 from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
 from fgslam.omni_cameras.radial import MirrorFrame
 from fgslam.runs.homing.mirror_check import open_checked
 from fgslam.settings.omni_cameras import EquirectangularSettings, HyperbolicMirrorSettings
 from fgslam.settings.omni_datasets import OmniPathSettings
-from fgslam.types import Image
 
 SIZE = (320, 240)
 CENTRE = (162.0, 118.0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import polynomial
 
-from fgslam.errors import CalibrationError
+from fgslam.core.errors import CalibrationError
 from fgslam.omni_cameras.bearing_measurement import angles_of
 from fgslam.omni_cameras.ocamcalib import OCamCalibration, read_ocamcalib
 

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.errors import CalibrationError
+from fgslam.core.errors import CalibrationError
+from fgslam.core.types import FloatArray, Image
 from fgslam.frontend.omni.calibration import calibrate_from_rings, find_mirror_circle, mirror_offset
 from fgslam.frontend.omni.straightness import upright_edges
 from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
@@ -14,7 +15,6 @@ from fgslam.omni_cameras.panoramas import Cylinder
 from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.omni_cameras.radial import MirrorFrame
 from fgslam.omni_cameras.unwrapping import unwrap_maps
-from fgslam.types import FloatArray, Image
 
 FRAME = MirrorFrame(640, 480, (322.4, 236.7))
 MIRROR = HyperbolicMirror(FRAME, 32.0, 232.0, xi=0.92, focal_px=127.0)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.core.types import FloatArray, Image
 from fgslam.frontend.omni.colour_moments import PAIRS, PatchColours, colour_from_means
 from fgslam.settings.omni_features import ColourMomentSettings
-from fgslam.types import FloatArray, Image
 
 
 def patch(seed: int = 1) -> Image:

@@ -8,22 +8,22 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.errors import FrameError
+from fgslam.core.errors import FrameError
+from fgslam.core.homing_types import FeatureKind, OmniFeatures, UprightFeatures
+from fgslam.core.planar import wrap
+from fgslam.core.types import Image
 from fgslam.frontend.omni.features import OmniFeatureExtractor, _View
 from fgslam.frontend.omni.matching import match_features, match_sift
 from fgslam.frontend.omni.plain_sift import match_plain, plain_sift
 from fgslam.frontend.omni.sift import up_in_image, wrapping_period
-from fgslam.homing_types import FeatureKind, OmniFeatures, UprightFeatures
 from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
 from fgslam.omni_cameras.panoramas import Cylinder, Equirectangular
 from fgslam.omni_cameras.unwrapping import unwrap_maps
-from fgslam.planar import wrap
 from fgslam.settings.omni_features import (
     OmniFeatureSettings,
     OmniMatchingSettings,
     UprightSiftSettings,
 )
-from fgslam.types import Image
 
 PANORAMA = Equirectangular(513, 257)
 MIRROR = HyperbolicMirror.with_view((400, 400), 0.96, (np.radians(-55), np.radians(30)))

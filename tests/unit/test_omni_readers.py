@@ -9,12 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
+from fgslam.core.errors import CalibrationError, DatasetError, FrameError
+from fgslam.core.types import Image
 from fgslam.datasets.omni_camera_files import make_camera
 from fgslam.datasets.omni_opening import open_omni
 from fgslam.datasets.omni_recording import OmniRecording, ids_of
 from fgslam.datasets.omni_video import VideoFrames
 from fgslam.datasets.panorama_reduction import PanoramaReduction
-from fgslam.errors import CalibrationError, DatasetError, FrameError
 from fgslam.omni_cameras.bearing_measurement import angles_of
 from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
 from fgslam.omni_cameras.ocamcalib import OCamCamera
@@ -28,7 +29,6 @@ from fgslam.settings.omni_cameras import (
     RadialPolynomialSettings,
 )
 from fgslam.settings.omni_datasets import OmniPathSettings, OmniVideoSettings, PanoramasSettings
-from fgslam.types import Image
 
 HEADER = "id,file,x_m,y_m,heading_deg,room\n"
 ROWS = "3,b.png,1.5,-2,270,kitchen\n12,a.png,0,0.25,-90.5,hall\n"

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgslam.errors import EstimatorError, FrameError
+from fgslam.core.errors import EstimatorError, FrameError
+from fgslam.core.homing_types import TrackedBearings
+from fgslam.core.planar import wrap
+from fgslam.core.types import FloatArray, Image
 from fgslam.frontend.omni.tracking import BearingTracker
-from fgslam.homing_types import TrackedBearings
-from fgslam.planar import wrap
 from fgslam.settings.omni_tracking import OmniTrackingSettings
-from fgslam.types import FloatArray, Image
 from tests.textured_room import CAMERA, angles, hits, picture
 
 SETTINGS = OmniTrackingSettings()

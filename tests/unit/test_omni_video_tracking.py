@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from fgslam.core.types import Image
 from fgslam.frontend.omni.video_tracking import ReplenishedTracker
 from fgslam.omni_cameras.panoramas import Equirectangular
 from fgslam.settings.omni_tracking import OmniTrackingSettings
-from fgslam.types import Image
 
 WIDTH, HEIGHT = 361, 121
 CAMERA = Equirectangular(WIDTH, HEIGHT, np.pi / 3, -np.pi / 3)

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from fgslam.errors import CalibrationError, DatasetError
-from fgslam.planar import between, wrap
+from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.planar import between, wrap
+from fgslam.core.types import FloatArray
 from fgslam.settings.omni_worlds import (
     HouseExposureSettings,
     HouseMirrorSettings,
@@ -23,7 +24,6 @@ from fgslam.simulation.omni.reference_paths import PathPlanner
 from fgslam.simulation.omni.wheelchair import Wheelchair
 from fgslam.simulation.patches import PatchArrays, Surface, Thing, box, stack
 from fgslam.simulation.raycaster import RayCaster
-from fgslam.types import FloatArray
 
 EXACT = WheelchairSettings(
     speed_scale=0.0, turn_scale=0.0, pull_deg_m=0.0, slip_m_sqrt_m=0.0, slip_deg_sqrt_m=0.0

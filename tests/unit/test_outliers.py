@@ -10,8 +10,8 @@ import pytest
 from smoothing import SMOOTHERS, answer, ate, build, drawn, run, wrong_matches
 
 from fgslam.backend.outliers import graduated, observed_variables, solver_parameters, trimmed
+from fgslam.core.types import FloatArray
 from fgslam.settings.backend import BatchSettings, EstimatorSettings, KernelSettings
-from fgslam.types import FloatArray
 
 CAUCHY = KernelSettings("cauchy", 3.0)
 ROBUST: dict[str, EstimatorSettings] = SMOOTHERS | {

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.homing_types import HomingVector, Refusal, RefusalReason
-from fgslam.planar import compose, wrap
+from fgslam.core.homing_types import HomingVector, Refusal, RefusalReason
+from fgslam.core.planar import compose, wrap
+from fgslam.core.types import FloatArray
 from fgslam.runs.homing.pair_answers import (
     PairAnswer,
     answer_numbers,
@@ -18,7 +19,6 @@ from fgslam.runs.homing.pair_answers import (
     true_pair,
     write_pairs,
 )
-from fgslam.types import FloatArray
 
 SIGMA = np.deg2rad(1.0)
 

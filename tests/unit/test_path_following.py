@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from fgslam.backend.homing.factory import make_homing_estimator
-from fgslam.errors import ConfigError, EstimatorError
+from fgslam.core.errors import ConfigError, EstimatorError
+from fgslam.core.planar import between
 from fgslam.homing.avoidance import RangeScan
 from fgslam.homing.command import Drive, HomingState
 from fgslam.homing.drive_scores import corners, cross_track, pass_distances, slope_by_leg
 from fgslam.homing.path_following import PathFollower
 from fgslam.homing.record import STAGES, DriveRecord
-from fgslam.planar import between
 from fgslam.settings.homing_behaviour import (
     ClosedLoopSettings,
     HomingBehaviourSettings,

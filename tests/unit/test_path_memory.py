@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.errors import StoredMapError
+from fgslam.core.errors import StoredMapError
+from fgslam.core.homing_types import ColumnSegments, OmniFeatures, UprightFeatures
 from fgslam.homing.feature_file import pack_features
 from fgslam.homing.path_memory import FORMAT, PathMemory
-from fgslam.homing_types import ColumnSegments, OmniFeatures, UprightFeatures
 from tests.landmark_world import no_columns
 
 

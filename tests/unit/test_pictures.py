@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from fgslam.errors import OutputError
+from fgslam.core.errors import OutputError
+from fgslam.core.geometry import pose, se3_exp, so3_exp
+from fgslam.core.types import Features, Image
 from fgslam.export.pictures import (
     MapDrawing,
     draw_birds_eye,
@@ -27,8 +29,6 @@ from fgslam.export.pictures import (
 from fgslam.export.pictures.birds_eye import exaggeration, view_limits, world_position_covariances
 from fgslam.export.pictures.image_overlays import oriented_squares
 from fgslam.export.pictures.map_views import Viewer
-from fgslam.geometry import pose, se3_exp, so3_exp
-from fgslam.types import Features, Image
 
 YELLOW = np.array([0xF0, 0xE4, 0x42]) / 255.0
 

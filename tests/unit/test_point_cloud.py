@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.errors import DatasetError, OutputError
+from fgslam.core.errors import DatasetError, OutputError
 from fgslam.export.point_cloud import (
     MapPoints,
     read_ply,
@@ -40,7 +40,7 @@ def open3d():
         from fgslam.simulation.open3d_library import load_open3d
     except ImportError:
         return pytest.importorskip("open3d", exc_type=ImportError, reason="Open3D cannot be loaded")
-    from fgslam.errors import MissingDependencyError
+    from fgslam.core.errors import MissingDependencyError
 
     try:
         return load_open3d()

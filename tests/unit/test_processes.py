@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
 from fgslam.runs.processes import WorkerEnded, run_apart
 
 

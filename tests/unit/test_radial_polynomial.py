@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.errors import CalibrationError
+from fgslam.core.errors import CalibrationError
 from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
 from fgslam.omni_cameras.radial import MirrorFrame
 from fgslam.omni_cameras.radial_polynomial import RadialPolynomial, fit_radial_polynomial

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam import geometry
+from fgslam.core import geometry
+from fgslam.core.errors import ConfigError
 from fgslam.datasets import rendered_lab
 from fgslam.datasets.rendered_lab import RenderedLabSequence
-from fgslam.errors import ConfigError
 from fgslam.settings.lab import (
     LabDriveSettings,
     LabRigSettings,

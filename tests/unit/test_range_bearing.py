@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 from simulated import RIG, noisy_odometry_of, play
 
-from fgslam import geometry as g
 from fgslam.backend.landmark_kalman import LandmarkKalman
-from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
-from fgslam.settings.backend import LandmarkKalmanSettings
-from fgslam.settings.frontend import EgoMotionSettings
-from fgslam.types import (
+from fgslam.core import geometry as g
+from fgslam.core.types import (
     EgoMotionStatus,
     FloatArray,
     Increment,
@@ -20,6 +17,9 @@ from fgslam.types import (
     Prediction,
     RangeBearingSensor,
 )
+from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
+from fgslam.settings.backend import LandmarkKalmanSettings
+from fgslam.settings.frontend import EgoMotionSettings
 
 SENSOR = RangeBearingSensor(8.0, g.BODY_FORWARD_LEFT_UP_FROM_CAMERA)
 SIGMA = np.array([0.02, 0.02, 0.03])

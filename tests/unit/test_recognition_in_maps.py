@@ -21,14 +21,15 @@ from rings import (
 )
 from simulated import RIG, assert_same_bits
 
-from fgslam import geometry as g
 from fgslam.arrival import Arrival, take_over
 from fgslam.backend.protocol import Estimator
+from fgslam.core import geometry as g
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.saved_map import SavedMap
+from fgslam.core.types import EgoMotionStatus, Prediction
 from fgslam.factory import make_estimator
 from fgslam.frontend.ego_motion import EgoMotionSolver
 from fgslam.frontend.loops.confirmation import difference
-from fgslam.map_file import SavedMap
-from fgslam.measurement_log import MeasurementLog
 from fgslam.pipeline import FrameReport, SlamPipeline, replay_step
 from fgslam.settings.backend import (
     BatchSettings,
@@ -37,7 +38,6 @@ from fgslam.settings.backend import (
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
 )
-from fgslam.types import EgoMotionStatus, Prediction
 
 MAPPED = ROUND // 2  # frames of the drive that makes the map
 BEGIN = 22  # of it, where the second drive begins

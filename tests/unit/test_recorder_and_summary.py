@@ -8,15 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgslam.frontend.stream import FeatureFrame
-from fgslam.geometry import se3_exp
-from fgslam.measurement_log import MeasurementLog, load_arrays
-from fgslam.pipeline import FrameReport
-from fgslam.runs.checkpoint import write_arrays
-from fgslam.runs.judging import Truth
-from fgslam.runs.recorder import STAGES, FrameRow, RunRecorder
-from fgslam.runs.summary import estimator_metrics, frame_problems, run_numbers
-from fgslam.types import (
+from fgslam.core.geometry import se3_exp
+from fgslam.core.measurement_log import MeasurementLog, load_arrays
+from fgslam.core.types import (
     CameraRig,
     EgoMotion,
     EgoMotionStatus,
@@ -30,6 +24,12 @@ from fgslam.types import (
     Trajectory,
     UpdateStats,
 )
+from fgslam.frontend.stream import FeatureFrame
+from fgslam.pipeline import FrameReport
+from fgslam.runs.checkpoint import write_arrays
+from fgslam.runs.judging import Truth
+from fgslam.runs.recorder import STAGES, FrameRow, RunRecorder
+from fgslam.runs.summary import estimator_metrics, frame_problems, run_numbers
 
 RIG = CameraRig(32, 24, 30.0, 30.0, 15.5, 11.5, 0.1, None, np.eye(4))
 NO_IDS = np.empty(0, np.int64)

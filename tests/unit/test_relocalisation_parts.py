@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam import geometry
+from fgslam.core import geometry
+from fgslam.core.types import LandmarkMap, StereoFeatures
 from fgslam.frontend.relocalisation.alignment import align, align_in_space, rigid
 from fgslam.frontend.relocalisation.appearance_index import Neighbours
 from fgslam.frontend.relocalisation.known_map import KnownMap
@@ -16,7 +17,6 @@ from fgslam.frontend.relocalisation.relocaliser import Relocaliser
 from fgslam.frontend.relocalisation.residuals import Pairs, SeenPoints, log_uniform, residuals
 from fgslam.frontend.relocalisation.tentative import specific
 from fgslam.settings.relocalisation import RelocalisationSettings
-from fgslam.types import LandmarkMap, StereoFeatures
 from tests.known_places import RIG, Place, error, floor, planar, room, seen
 
 

@@ -12,19 +12,15 @@ from simulated import RIG, Drive, assert_same_bits, play, simulate
 
 from fgslam import factory
 from fgslam.backend.landmark_kalman import LandmarkKalman
-from fgslam.errors import EstimatorError, MeasurementLogError
-from fgslam.measurement_log import MeasurementLog
+from fgslam.core.errors import EstimatorError, MeasurementLogError
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.types import Estimate, Trajectory, UpdateStats
 from fgslam.runs import replay as module
 from fgslam.runs.judging import Truth, judge_replay
 from fgslam.runs.replay import Replay, memory_mb, peak_memory_mb, replay, replay_motion
-from fgslam.settings.backend import (
-    BatchSettings,
-    DeadReckoningSettings,
-    LandmarkKalmanSettings,
-)
+from fgslam.settings.backend import BatchSettings, DeadReckoningSettings, LandmarkKalmanSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import EgoMotionSettings
-from fgslam.types import Estimate, Trajectory, UpdateStats
 
 SETTINGS = LandmarkKalmanSettings(label="named")
 CONSTANT_VELOCITY: dict[str, Any] = factory.ConstantVelocityMotion(

@@ -17,7 +17,9 @@ import pytest
 from PIL import Image
 from reports import HOSTILE, estimator_report, full_report, loop, picture, without_truth
 
-from fgslam.errors import OutputError
+from fgslam.core.errors import OutputError
+from fgslam.core.geometry import so3_exp
+from fgslam.core.types import FloatArray
 from fgslam.export.report import (
     Column,
     Comparison,
@@ -34,8 +36,6 @@ from fgslam.export.report.paths import drive_from_above, level_axes, map_to_turn
 from fgslam.export.report.pictures import BUDGET_BYTES, MAX_WIDTH, embed
 from fgslam.export.report.traces import Figure, Trace, peaks, thinned
 from fgslam.export.report.words import best, headline
-from fgslam.geometry import so3_exp
-from fgslam.types import FloatArray
 
 
 class Reader(HTMLParser):

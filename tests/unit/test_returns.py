@@ -8,18 +8,10 @@ import numpy as np
 import pytest
 from simulated import RIG, assert_same_bits
 
-from fgslam import geometry as g
-from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
-from fgslam.frontend.loops.closure import close_loop
-from fgslam.frontend.loops.confirmation import Confirmation, difference, drift_allows
-from fgslam.frontend.loops.fusion import duplicates
-from fgslam.frontend.loops.memory import SightingMemory
-from fgslam.frontend.resection import Resection
-from fgslam.map_types import LandmarkAppearances, Relocalisation, Verdict
-from fgslam.measurement_log import MeasurementLog
-from fgslam.settings.frontend import AppearanceSettings, EgoMotionSettings
-from fgslam.settings.loops import LoopSettings
-from fgslam.types import (
+from fgslam.core import geometry as g
+from fgslam.core.map_types import LandmarkAppearances, Relocalisation, Verdict
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.types import (
     EgoMotionStatus,
     FloatArray,
     Increment,
@@ -29,6 +21,14 @@ from fgslam.types import (
     Observations,
     StereoFeatures,
 )
+from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
+from fgslam.frontend.loops.closure import close_loop
+from fgslam.frontend.loops.confirmation import Confirmation, difference, drift_allows
+from fgslam.frontend.loops.fusion import duplicates
+from fgslam.frontend.loops.memory import SightingMemory
+from fgslam.frontend.resection import Resection
+from fgslam.settings.frontend import AppearanceSettings, EgoMotionSettings
+from fgslam.settings.loops import LoopSettings
 
 LOOPS = LoopSettings()
 DOWN = np.array([0.0, 1.0, 0.0])

@@ -11,10 +11,10 @@ import pytest
 from scipy import ndimage
 from simulated import assert_same_bits
 
+from fgslam.core.geometry import wrap_angle
+from fgslam.core.types import Features, FloatArray, Image
 from fgslam.frontend.sift import SiftExtractor
-from fgslam.geometry import wrap_angle
 from fgslam.settings.frontend import SiftSettings
-from fgslam.types import Features, FloatArray, Image
 
 SETTINGS = SiftSettings()
 ALL_LEVELS = SiftSettings(scale_levels=64)

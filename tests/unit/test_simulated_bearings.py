@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgslam.errors import ConfigError
-from fgslam.planar import bearings, wrap
+from fgslam.core.errors import ConfigError
+from fgslam.core.planar import bearings, wrap
 from fgslam.settings.simulated_bearings import SimulatedBearingsSettings, with_outliers
 from fgslam.simulation.bearings import SimulatedHoming, simulate_homing
 

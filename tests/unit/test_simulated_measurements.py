@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 from simulated import assert_same_bits
 
-from fgslam import geometry as g
 from fgslam.backend.landmark_kalman import LandmarkKalman
 from fgslam.config import ExperimentConfig, make_config
+from fgslam.core import geometry as g
+from fgslam.core.errors import ConfigError
+from fgslam.core.recordings import MeasurementRecording
+from fgslam.core.types import CameraRig, FloatArray, IntArray, Prediction, Trajectory
 from fgslam.datasets.opening import open_measurements
-from fgslam.errors import ConfigError
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
 from fgslam.frontend.ego_motion import EgoMotionSolver
 from fgslam.localisation_config import load_experiment
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
-from fgslam.recordings import MeasurementRecording
 from fgslam.settings.backend import LandmarkKalmanSettings
 from fgslam.settings.datasets import ConstantVelocitySettings, SyntheticOdometrySettings
 from fgslam.settings.frontend import EgoMotionSettings
 from fgslam.settings.measurements import SimulatedMeasurementsSettings
 from fgslam.simulation.identities import IdentityBook
-from fgslam.types import CameraRig, FloatArray, IntArray, Prediction, Trajectory
 
 
 def settings(**values: Any) -> SimulatedMeasurementsSettings:

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.errors import DatasetError
+from fgslam.core.errors import DatasetError
 from fgslam.simulation.render_cache import RenderCache, content_hash
 
 SHAPE = (3, 12, 16)

@@ -3,7 +3,7 @@ from types import ModuleType
 
 import pytest
 
-from fgslam.errors import MissingDependencyError
+from fgslam.core.errors import MissingDependencyError
 from fgslam.simulation.open3d_library import (
     explain_missing_library,
     find_bundled_libusb,

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
 from fgslam.settings.lab import LabDriveSettings
 from fgslam.simulation.paths import Drive, plan_drive
 

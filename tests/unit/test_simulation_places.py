@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from fgslam.errors import ConfigError
-from fgslam.geometry import wrap_angle
+from fgslam.core.errors import ConfigError
+from fgslam.core.geometry import wrap_angle
 from fgslam.settings.lab import LabDriveSettings, LabRigSettings, PathName, PlaceName
 from fgslam.simulation.buildings import alike, office
 from fgslam.simulation.floor_space import FloorSpace

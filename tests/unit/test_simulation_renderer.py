@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from fgslam import geometry
+from fgslam.core import geometry
 from fgslam.simulation.lighting import flat_light
 from fgslam.simulation.mipmap import TextureBank
 from fgslam.simulation.patches import Surface, Thing, box, placed, prism, rectangle, stack

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgslam import geometry
+from fgslam.core import geometry
 from fgslam.settings.lab import LabDriveSettings, WheelOdometrySettings
 from fgslam.simulation import wheel_odometry
 from fgslam.simulation.paths import plan_drive

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from simulated import RIG
 
-from fgslam import geometry as g
+from fgslam.core import geometry as g
+from fgslam.core.types import CameraRig, Features, FloatArray, StereoFeatures
 from fgslam.frontend.stereo import StereoMatcher, measurement_map
 from fgslam.settings.frontend import AppearanceSettings, StereoSettings
-from fgslam.types import CameraRig, Features, FloatArray, StereoFeatures
 
 PAPER = AppearanceSettings(mode="paper")
 DESCRIPTOR = AppearanceSettings(mode="descriptor")

@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 from simulated import assert_same_bits
 
-from fgslam import geometry as g
 from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.core import geometry as g
+from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.recordings import MeasurementRecording
+from fgslam.core.types import CameraRig, FloatArray, Prediction
 from fgslam.datasets.opening import open_measurements
-from fgslam.errors import CalibrationError, DatasetError
 from fgslam.evaluation.trajectory import evaluate_trajectory
 from fgslam.frontend.ego_motion import EgoMotionSolver
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
-from fgslam.recordings import MeasurementRecording
 from fgslam.settings.backend import LandmarkKalmanSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import EgoMotionSettings
 from fgslam.settings.measurements import StereoTracksSettings
-from fgslam.types import CameraRig, FloatArray, Prediction
 
 FX, FY, CX, CY, B = 700.0, 710.0, 600.0, 180.0, 0.5
 POINTS = np.array([[1.0, 0.5, 10.0], [-2.0, -1.0, 8.0], [0.3, 0.2, 25.0], [3.0, -0.4, 14.0]])

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from simulated import assert_same_bits
 
-from fgslam import geometry as g
 from fgslam.backend.submaps import (
     FREE,
     Chain,
@@ -21,7 +20,8 @@ from fgslam.backend.submaps import (
     rotated,
     transported,
 )
-from fgslam.types import FloatArray
+from fgslam.core import geometry as g
+from fgslam.core.types import FloatArray
 
 COUNT = 41
 STEP = g.se3_exp(np.array([0.0, 2.0 * np.pi / 40, 0.0, 0.0, 0.0, 0.3]))

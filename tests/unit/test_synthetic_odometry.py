@@ -7,14 +7,14 @@ import pytest
 from dataset_builders import curve, image_folder, write_tum
 from scipy import stats
 
+from fgslam.core.errors import DatasetError
+from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
+from fgslam.core.recordings import Sequence
+from fgslam.core.types import FloatArray, Odometry
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.synthetic_odometry import SyntheticOdometry
-from fgslam.errors import DatasetError
-from fgslam.geometry import body_to_camera_motion, inverse, se3_log
-from fgslam.recordings import Sequence
 from fgslam.settings.datasets import ImageFolderSettings, SyntheticOdometrySettings
-from fgslam.types import FloatArray, Odometry
 
 SETTINGS = SyntheticOdometrySettings()
 FRAMES = 300

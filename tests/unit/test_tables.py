@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.errors import OutputError
+from fgslam.core.errors import OutputError
 from fgslam.export.tables import write_csv, write_json
 
 

@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from fgslam.core.homing_types import HomingVector, OmniFeatures
+from fgslam.core.types import IntArray
 from fgslam.homing.linking import Answer, Link, Pair
 from fgslam.homing.third_views import ThirdViews
 from fgslam.homing.topological_map import TopologicalMap, map_of_answers
-from fgslam.homing_types import HomingVector, OmniFeatures
 from fgslam.settings.homing_behaviour import TopologicalMapSettings
-from fgslam.types import IntArray
 from tests.landmark_world import landmark_features
 
 SETTINGS = TopologicalMapSettings()

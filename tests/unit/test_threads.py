@@ -9,7 +9,7 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from fgslam.runs.threads import one_blas_thread
+from fgslam.core.threads import one_blas_thread
 
 ROOT = Path(__file__).parents[2]
 

@@ -9,22 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.errors import StoredMapError
+from fgslam.core.errors import StoredMapError
+from fgslam.core.homing_types import HomingVector, OmniFeatures, Refusal, RefusalReason
+from fgslam.core.planar import between, wrap
+from fgslam.core.types import FloatArray
 from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
 from fgslam.homing.link_checks import LinkChecks, between_misfit, heading_residuals
 from fgslam.homing.linking import Answer, Link, link_pair
 from fgslam.homing.localisation import Localiser
 from fgslam.homing.retrieval import VisualWords, candidate_pairs
 from fgslam.homing.topological_map import TopologicalMap, build_map, map_of_answers
-from fgslam.homing_types import HomingVector, OmniFeatures, Refusal, RefusalReason
-from fgslam.planar import between, wrap
 from fgslam.settings.homing_behaviour import (
     LocalisationSettings,
     RetrievalSettings,
     TopologicalMapSettings,
 )
 from fgslam.settings.homing_vector import HomingVectorSettings
-from fgslam.types import FloatArray
 from tests.landmark_world import landmark_features, match_landmarks, numbers
 
 SETTINGS = TopologicalMapSettings()

@@ -5,19 +5,19 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from fgslam.frontend.omni.column_segments import empty_segments
-from fgslam.frontend.omni.sift import empty_features
-from fgslam.frontend.omni.trackable import move_to_trackable
-from fgslam.homing_types import (
+from fgslam.core.homing_types import (
     BearingMatches,
     ColumnSegments,
     FeatureKind,
     OmniFeatures,
     UprightFeatures,
 )
-from fgslam.planar import wrap
+from fgslam.core.planar import wrap
+from fgslam.core.types import FloatArray, Image
+from fgslam.frontend.omni.column_segments import empty_segments
+from fgslam.frontend.omni.sift import empty_features
+from fgslam.frontend.omni.trackable import move_to_trackable
 from fgslam.settings.omni_tracking import OmniTrackingSettings
-from fgslam.types import FloatArray, Image
 from tests.homing import make_matches
 from tests.textured_room import CAMERA, angles, hits, picture
 

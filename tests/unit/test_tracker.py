@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from simulated import RIG, FeatureWorld, assert_same_bits, points_in_view
 
-from fgslam import geometry as g
+from fgslam.core import geometry as g
+from fgslam.core.types import EgoMotionStatus, FloatArray, IntArray, LandmarkMap, Prediction
 from fgslam.factory import make_tracker
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracker import Association, LandmarkTracker
@@ -21,7 +22,6 @@ from fgslam.settings.frontend import (
     MapMatchingSettings,
     StereoSettings,
 )
-from fgslam.types import EgoMotionStatus, FloatArray, IntArray, LandmarkMap, Prediction
 
 COUNT = 60
 IMAGE = np.tile(np.arange(240, dtype=np.uint8)[:, None], (1, 320))  # grey value is the row

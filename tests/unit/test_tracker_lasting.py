@@ -9,7 +9,8 @@ import pytest
 from simulated import RIG, FeatureWorld
 from test_tracker import CERTAIN, IMAGE, SETTINGS
 
-from fgslam import geometry as g
+from fgslam.core import geometry as g
+from fgslam.core.types import BoolArray, FloatArray, IntArray, LandmarkMap, Prediction
 from fgslam.factory import make_tracker
 from fgslam.frontend.database import LandmarkDatabase
 from fgslam.frontend.stereo import StereoMatcher
@@ -20,7 +21,6 @@ from fgslam.settings.frontend import (
     PermanenceSettings,
     ViewpointSettings,
 )
-from fgslam.types import BoolArray, FloatArray, IntArray, LandmarkMap, Prediction
 
 DISTANCE = 3.0  # metres, from the camera to the middle of the things
 HERE = 0.0

@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.errors import DatasetError, OutputError
+from fgslam.core.errors import DatasetError, OutputError
+from fgslam.core.geometry import se3_exp
+from fgslam.core.types import Trajectory
 from fgslam.export.trajectories import (
     read_covariances,
     read_kitti,
@@ -17,8 +19,6 @@ from fgslam.export.trajectories import (
     write_trajectory,
     write_tum,
 )
-from fgslam.geometry import se3_exp
-from fgslam.types import Trajectory
 
 
 def trajectory(seed: int = 1, n: int = 50) -> Trajectory:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.core.planar import unit, wrap
+from fgslam.core.types import FloatArray
 from fgslam.frontend.omni.two_point import TwoPointSamples, TwoPointSolutions, solve_two_point
-from fgslam.planar import unit, wrap
-from fgslam.types import FloatArray
 
 poselib = pytest.importorskip("poselib", reason="the test oracle PoseLib is not installed")
 

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from fgslam import geometry as g
 from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.core import geometry as g
+from fgslam.core.errors import DatasetError
+from fgslam.core.recordings import MeasurementRecording
+from fgslam.core.types import CameraRig, FloatArray, Prediction, RangeBearingSensor, Trajectory
 from fgslam.datasets.opening import open_measurements
-from fgslam.errors import DatasetError
 from fgslam.evaluation.trajectory import evaluate_trajectory
 from fgslam.frontend.ego_motion import EgoMotionSolver
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
-from fgslam.recordings import MeasurementRecording
 from fgslam.settings.backend import LandmarkKalmanSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import EgoMotionSettings
 from fgslam.settings.measurements import UtiasRangeBearingSettings, UtiasStereoSettings
-from fgslam.types import CameraRig, FloatArray, Prediction, RangeBearingSensor, Trajectory
 
 N = 12
 STEREO_FILE = "utias_starry_night_dataset3.mat"

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fgslam.core.map_types import Verdict
+from fgslam.core.types import IntArray, LandmarkMap
 from fgslam.frontend.relocalisation.refinement import Refined
 from fgslam.frontend.relocalisation.tentative import Tentative
 from fgslam.frontend.relocalisation.verdict import judge
-from fgslam.map_types import Verdict
 from fgslam.settings.relocalisation import RelocalisationSettings
-from fgslam.types import IntArray, LandmarkMap
 
 SETTINGS = RelocalisationSettings()
 # A metre apart: each is a witness of its own. The first hundred stand at one place, and so on.

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.core.types import IntArray
 from fgslam.frontend.views import Places, ViewPool, Views
-from fgslam.types import IntArray
 
 ANGLE = np.deg2rad(20.0)
 

@@ -9,10 +9,10 @@ import pytest
 from simulated import RIG
 from test_database import database_of, landmark_map
 
-from fgslam import geometry as g
+from fgslam.core import geometry as g
+from fgslam.core.types import BoolArray, CameraRig, FloatArray
 from fgslam.frontend.visibility import FieldOfView, directions_to
 from fgslam.settings.frontend import DatabaseSettings
-from fgslam.types import BoolArray, CameraRig, FloatArray
 
 MAX_DISPARITY = 40.0
 TWO_CAMERAS = dataclasses.replace(RIG, vertical_baseline=None)

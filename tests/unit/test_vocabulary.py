@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.core.types import ByteArray
 from fgslam.frontend import views as views_module
 from fgslam.frontend import vocabulary
 from fgslam.frontend.views import ViewPool, Views
-from fgslam.types import ByteArray
 from tests.known_places import looks
 
 

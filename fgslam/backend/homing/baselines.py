@@ -14,10 +14,10 @@ from typing import ClassVar
 import numpy as np
 
 from fgslam.backend.homing.inputs import TrackedFeatures
-from fgslam.errors import EstimatorError
-from fgslam.homing_types import HomingEstimate, HomingStart, TrackedBearings
-from fgslam.planar import unit, wrap
-from fgslam.types import FloatArray
+from fgslam.core.errors import EstimatorError
+from fgslam.core.homing_types import HomingEstimate, HomingStart, TrackedBearings
+from fgslam.core.planar import unit, wrap
+from fgslam.core.types import FloatArray
 
 
 class BearingAverage:

@@ -16,17 +16,17 @@ from fgslam.backend.homing.ekf_model import (
     seen_from_target,
 )
 from fgslam.backend.homing.inputs import TrackedFeatures
-from fgslam.errors import EstimatorError
+from fgslam.core.errors import EstimatorError
+from fgslam.core.homing_types import HomingEstimate, HomingStart, TrackedBearings, among
+from fgslam.core.planar import wrap
+from fgslam.core.types import BoolArray, FloatArray
 from fgslam.factors.bearing_residuals import (
     polar_jacobians,
     polar_points,
     target_jacobian,
     target_pose,
 )
-from fgslam.homing_types import HomingEstimate, HomingStart, TrackedBearings, among
-from fgslam.planar import wrap
 from fgslam.settings.homing_estimators import HomingEkfSettings
-from fgslam.types import BoolArray, FloatArray
 
 
 class HomingEkf:

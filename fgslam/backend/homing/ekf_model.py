@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.homing_types import HomingStart
+from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.factors.bearing_residuals import (
     bearing,
     bearing_jacobians,
@@ -19,9 +21,7 @@ from fgslam.factors.bearing_residuals import (
     target_pose,
     triangulated,
 )
-from fgslam.homing_types import HomingStart
 from fgslam.settings.homing_estimators import FilterMotionSettings, HomingEkfSettings
-from fgslam.types import BoolArray, FloatArray, IntArray
 
 ROBOT, TARGET, FEATURES = slice(0, 4), slice(4, 7), slice(7, None)
 _FIRST = 7

@@ -6,7 +6,7 @@ from fgslam.backend.homing.baselines import AverageDisplacement, AverageLandmark
 from fgslam.backend.homing.ekf import HomingEkf
 from fgslam.backend.homing.graph import HomingGraph
 from fgslam.backend.homing.protocol import HomingEstimator
-from fgslam.homing_types import HomingStart
+from fgslam.core.homing_types import HomingStart
 from fgslam.settings.homing_estimators import (
     AverageLandmarkVectorSettings,
     HomingEkfSettings,

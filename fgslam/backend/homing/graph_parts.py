@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import gtsam
 import numpy as np
 
+from fgslam.core.homing_types import HomingVector
+from fgslam.core.types import FloatArray
 from fgslam.factors.bearing import (
     BearingFactors,
     leg_factor,
@@ -23,9 +25,7 @@ from fgslam.factors.bearing import (
     weak_landmark_prior,
 )
 from fgslam.factors.keys import height_key, landmark_key, pose_key, target_key, velocity_key
-from fgslam.homing_types import HomingVector
 from fgslam.settings.homing_estimators import GraphMotionSettings
-from fgslam.types import FloatArray
 
 TARGET = -1
 

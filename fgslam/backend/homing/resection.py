@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.types import FloatArray
 from fgslam.factors.bearing_residuals import bearing, bearing_jacobians
-from fgslam.types import FloatArray
 
 _ITERATIONS = 8
 _WIDTH = 2.0  # of Cauchy's kernel, in deviations

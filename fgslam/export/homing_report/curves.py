@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.core.types import FloatArray
 from fgslam.export.report.traces import Figure, Owner, Switch, Trace, peaks, trace
-from fgslam.types import FloatArray
 
 MAX_POINTS = 2_500
 

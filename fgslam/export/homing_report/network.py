@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
+from fgslam.core.types import FloatArray
 from fgslam.export.report.traces import Figure, Owner, Switch, Trace, joined, plain_texts, trace
-from fgslam.types import FloatArray
 
 _TOLD = "%{text}<extra></extra>"
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from html import escape
 from pathlib import Path
 
-from fgslam.export.atomic import write_text
+from fgslam.core.atomic_files import write_text
 from fgslam.export.homing_report.data import HomingPage, TextTable
 from fgslam.export.report import frame
 from fgslam.export.report.pictures import embed

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.export.report.traces import (
     Figure,
     Owner,
@@ -18,7 +19,6 @@ from fgslam.export.report.traces import (
     thinned,
     trace,
 )
-from fgslam.types import BoolArray, FloatArray, IntArray
 
 MAX_MOMENTS = 80
 MAX_POSES = 4_000

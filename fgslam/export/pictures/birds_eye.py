@@ -13,6 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.ticker import MaxNLocator
 
+from fgslam.core.geometry import congruence
+from fgslam.core.types import FloatArray
 from fgslam.export.pictures.style import (
     BLUE,
     GREY,
@@ -24,8 +26,6 @@ from fgslam.export.pictures.style import (
     picture,
     white_rim,
 )
-from fgslam.geometry import congruence
-from fgslam.types import FloatArray
 
 _GROUND = [0, 2]  # X and Z of the world
 _POSE_ELLIPSES = 25

@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
+from fgslam.core.types import Features, FloatArray, Image
 from fgslam.export.pictures.style import (
     INK,
     ORANGE,
@@ -23,7 +24,6 @@ from fgslam.export.pictures.style import (
     picture,
     show_image,
 )
-from fgslam.types import Features, FloatArray, Image
 
 _CAMERAS = ("Right", "Left", "Top")
 # The descriptor looks at a window of about twelve scales; a square of four stays readable.

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from fgslam.core.types import BoolArray, FloatArray
 from fgslam.export.pictures.birds_eye import (
     MapDrawing,
     add_ellipses,
@@ -19,7 +20,6 @@ from fgslam.export.pictures.birds_eye import (
     world_position_covariances,
 )
 from fgslam.export.pictures.style import BLUE, GREY, INK, ORANGE, VERMILLION, add_segments, picture
-from fgslam.types import BoolArray, FloatArray
 
 _GROUND = [0, 2]  # X and Z of the world
 _HEADING = 0.025  # length of a heading, as a share of the picture

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PathCollection
 
+from fgslam.core.types import BoolArray, FloatArray
 from fgslam.export.pictures.birds_eye import MapDrawing, dot_size, path_points
 from fgslam.export.pictures.style import (
     FAINT,
@@ -21,7 +22,6 @@ from fgslam.export.pictures.style import (
     picture,
     white_rim,
 )
-from fgslam.types import BoolArray, FloatArray
 
 _NEAR = 0.05  # share of the viewing distance in front of which nothing is drawn
 # Directions from the centre of the map to the viewer; world axes x right, y down, z ahead.

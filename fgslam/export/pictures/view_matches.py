@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import hsv_to_rgb
 
+from fgslam.core.types import BoolArray, FloatArray, Image
 from fgslam.export.pictures.style import picture
-from fgslam.types import BoolArray, FloatArray, Image
 
 _WIDTH_IN = 9.0
 _SHOWN_PX = 1100  # columns of a picture; more would not show

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgslam.types import FloatArray, LandmarkMap, Trajectory
+from fgslam.core.types import FloatArray, LandmarkMap, Trajectory
 
 
 def _no_landmarks() -> LandmarkMap:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from html import escape
 from pathlib import Path
 
-from fgslam.export.atomic import write_text
+from fgslam.core.atomic_files import write_text
 from fgslam.export.report import frame
 from fgslam.export.report.curves import error_over_time, nees_over_time, time_per_frame
 from fgslam.export.report.data import Column, Comparison, EstimatorReport, ReportData

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.core.geometry import congruence
+from fgslam.core.types import FloatArray
 from fgslam.export.pictures.birds_eye import exaggeration, world_position_covariances
 from fgslam.export.report.data import EstimatorReport, ReportData
 from fgslam.export.report.traces import (
@@ -24,8 +26,6 @@ from fgslam.export.report.traces import (
     thinned,
     trace,
 )
-from fgslam.geometry import congruence
-from fgslam.types import FloatArray
 
 MAX_POSES = 1_500
 MAX_DOTS_ABOVE = 3_000

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.frontend.ego_motion import PoseProblem
-from fgslam.frontend.loops.memory import SightingMemory
-from fgslam.frontend.resection import Resection
-from fgslam.geometry import adjoint, congruence, inverse
-from fgslam.map_types import Relocalisation
-from fgslam.settings.loops import LoopSettings
-from fgslam.types import (
+from fgslam.core.geometry import adjoint, congruence, inverse
+from fgslam.core.map_types import Relocalisation
+from fgslam.core.types import (
     EgoMotion,
     FloatArray,
     IntArray,
@@ -18,6 +14,10 @@ from fgslam.types import (
     LoopClosure,
     StereoFeatures,
 )
+from fgslam.frontend.ego_motion import PoseProblem
+from fgslam.frontend.loops.memory import SightingMemory
+from fgslam.frontend.resection import Resection
+from fgslam.settings.loops import LoopSettings
 
 
 def close_loop(

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.geometry import inverse, se3_log
+from fgslam.core.geometry import inverse, se3_log
+from fgslam.core.types import FloatArray
 from fgslam.settings.loops import LoopSettings
-from fgslam.types import FloatArray
 
 
 class Confirmation:

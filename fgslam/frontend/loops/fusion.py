@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.types import FloatArray, IntArray, LandmarkMap
 from fgslam.frontend.candidates import choose
-from fgslam.map_types import LandmarkAppearances
 from fgslam.settings.frontend import AppearanceSettings
-from fgslam.types import FloatArray, IntArray, LandmarkMap
 
 
 def duplicates(

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.sparse import lil_array
 from scipy.sparse.csgraph import dijkstra
 
-from fgslam.measurement_log import MeasurementLog
-from fgslam.types import (
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.types import (
     BoolArray,
     FloatArray,
     Increment,

@@ -7,17 +7,10 @@ from typing import Protocol
 
 import numpy as np
 
-from fgslam.frontend.loops.closure import close_loop, is_sharp
-from fgslam.frontend.loops.confirmation import Confirmation, difference, drift_allows
-from fgslam.frontend.loops.fusion import duplicates
-from fgslam.frontend.loops.memory import SightingMemory
-from fgslam.frontend.tracker import Association, LandmarkTracker, Tracked
-from fgslam.geometry import inverse
-from fgslam.map_types import LandmarkAppearances, Relocalisation
-from fgslam.measurement_log import MeasurementLog
-from fgslam.settings.frontend import AppearanceSettings
-from fgslam.settings.loops import LoopSettings, LostSettings
-from fgslam.types import (
+from fgslam.core.geometry import inverse
+from fgslam.core.map_types import LandmarkAppearances, Relocalisation
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.types import (
     FloatArray,
     Increment,
     IntArray,
@@ -28,6 +21,13 @@ from fgslam.types import (
     StereoFeatures,
     UpdateStats,
 )
+from fgslam.frontend.loops.closure import close_loop, is_sharp
+from fgslam.frontend.loops.confirmation import Confirmation, difference, drift_allows
+from fgslam.frontend.loops.fusion import duplicates
+from fgslam.frontend.loops.memory import SightingMemory
+from fgslam.frontend.tracker import Association, LandmarkTracker, Tracked
+from fgslam.settings.frontend import AppearanceSettings
+from fgslam.settings.loops import LoopSettings, LostSettings
 
 _STREAM = 11  # of random numbers, beside those of the recording
 _ONE_PLACE_M, _ONE_PLACE_DEG = 0.3, 5.0

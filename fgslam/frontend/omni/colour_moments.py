@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.core.types import FloatArray, Image, IntArray
 from fgslam.settings.omni_features import ColourMomentSettings
-from fgslam.types import FloatArray, Image, IntArray
 
 Float32Image: TypeAlias = npt.NDArray[np.float32]
 

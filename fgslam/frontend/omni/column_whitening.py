@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.types import FloatArray
+from fgslam.core.types import FloatArray
 
 # fmt: off
 _DEVIATIONS = np.array(

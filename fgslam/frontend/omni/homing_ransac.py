@@ -12,6 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.homing_types import BearingMatches, HomingVector, Refusal, RefusalReason
+from fgslam.core.planar import unit, wrap
+from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.frontend.omni.epipolar import EpipolarTest
 from fgslam.frontend.omni.homing_refinement import HomingRefinement, Refined, RefinementPrior
 from fgslam.frontend.omni.match_odds import (
@@ -21,10 +24,7 @@ from fgslam.frontend.omni.match_odds import (
     right_probability,
 )
 from fgslam.frontend.omni.two_point import TwoPointSamples, solve_two_point
-from fgslam.homing_types import BearingMatches, HomingVector, Refusal, RefusalReason
-from fgslam.planar import unit, wrap
 from fgslam.settings.homing_vector import HomingVectorSettings
-from fgslam.types import BoolArray, FloatArray, IntArray
 
 _BATCH = 50  # samples between two looks at the confidence
 _MAX_LOG_RATIO_SIGMA = 0.7  # of ln rho: matches near the horizon support, but are not sampled

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.homing_types import BearingMatches, HomingVector, LocalMap
-from fgslam.types import BoolArray, FloatArray
+from fgslam.core.homing_types import BearingMatches, HomingVector, LocalMap
+from fgslam.core.types import BoolArray, FloatArray
 
 
 def triangulate(matches: BearingMatches, direction: float, rotation: float) -> FloatArray:

@@ -14,16 +14,16 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.frontend.omni.column_whitening import whitened
-from fgslam.homing_types import (
+from fgslam.core.homing_types import (
     BearingMatches,
     ColumnSegments,
     FeatureKind,
     OmniFeatures,
     UprightFeatures,
 )
+from fgslam.core.types import ByteArray, FloatArray, IntArray
+from fgslam.frontend.omni.column_whitening import whitened
 from fgslam.settings.omni_features import OmniMatchingSettings
-from fgslam.types import ByteArray, FloatArray, IntArray
 
 Float32Array = npt.NDArray[np.float32]
 

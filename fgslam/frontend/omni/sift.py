@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+from fgslam.core.homing_types import UprightFeatures
+from fgslam.core.planar import wrap
+from fgslam.core.types import BoolArray, ByteArray, FloatArray, Image, IntArray
 from fgslam.frontend.omni.colour_moments import PatchColours
-from fgslam.homing_types import UprightFeatures
 from fgslam.omni_cameras.bearing_measurement import measure
 from fgslam.omni_cameras.protocol import OmniCamera
-from fgslam.planar import wrap
 from fgslam.settings.omni_features import ColourMomentSettings, UprightSiftSettings
-from fgslam.types import BoolArray, ByteArray, FloatArray, Image, IntArray
 
 _STEP = 1e-3
 """Radians of elevation over which directions in the image are taken."""

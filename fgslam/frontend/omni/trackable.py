@@ -13,11 +13,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from fgslam.homing_types import BearingMatches, FeatureKind, OmniFeatures
+from fgslam.core.homing_types import BearingMatches, FeatureKind, OmniFeatures
+from fgslam.core.planar import wrap
+from fgslam.core.types import BoolArray, FloatArray, Image, IntArray
 from fgslam.omni_cameras.panoramas import Equirectangular
-from fgslam.planar import wrap
 from fgslam.settings.omni_tracking import OmniTrackingSettings
-from fgslam.types import BoolArray, FloatArray, Image, IntArray
 
 
 def move_to_trackable(

@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.errors import EstimatorError
+from fgslam.core.errors import EstimatorError
+from fgslam.core.homing_types import TrackedBearings
+from fgslam.core.types import BoolArray, FloatArray, Image, IntArray
 from fgslam.frontend.omni.anchored_patches import AnchoredPatches, align, anchor
 from fgslam.frontend.omni.steady_view import SteadyImage, SteadyView
-from fgslam.homing_types import TrackedBearings
 from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.settings.omni_tracking import OmniTrackingSettings
-from fgslam.types import BoolArray, FloatArray, Image, IntArray
 
 Float32 = npt.NDArray[np.float32]
 

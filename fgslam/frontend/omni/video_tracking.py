@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from fgslam.core.homing_types import TrackedBearings
+from fgslam.core.types import FloatArray, Image, IntArray
 from fgslam.frontend.omni.tracking import BearingTracker
-from fgslam.homing_types import TrackedBearings
 from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.settings.omni_tracking import OmniTrackingSettings
-from fgslam.types import FloatArray, Image, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.core.map_types import Words
+from fgslam.core.types import ByteArray, FloatArray, IntArray
 from fgslam.frontend.vocabulary import nearest_words, vocabulary, words_of
-from fgslam.map_types import Words
-from fgslam.types import ByteArray, FloatArray, IntArray
 
 _CHUNK = 4096  # descriptors compared at a time; their distances stay in the cache
 _EXACT = 6000  # contents up to here are compared in full, which costs no more

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.floor import Floor
+from fgslam.core.floor import Floor
+from fgslam.core.types import FloatArray, IntArray
 from fgslam.frontend.relocalisation.alignment import align_planar, floor_axes
 from fgslam.frontend.relocalisation.least_squares import refine
 from fgslam.frontend.relocalisation.proposals import Evidence, Proposals
 from fgslam.settings.relocalisation import RelocalisationSettings
-from fgslam.types import FloatArray, IntArray
 
 _POLISH = 6  # Newton steps from a bin's mean to the least squares of its matches
 _KERNEL_WIDTH = 3.0

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.geometry import project, transform_to_camera
+from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.types import CameraRig, FloatArray, IntArray, LandmarkMap
 from fgslam.frontend.relocalisation.appearance_index import AppearanceIndex
-from fgslam.geometry import project, transform_to_camera
-from fgslam.map_types import LandmarkAppearances
-from fgslam.types import CameraRig, FloatArray, IntArray, LandmarkMap
 
 _NEAREST_DEPTH_M = 0.3
 _ROUNDING_M = 1e-6  # of depths computed in two ways, with thousands of kilometres to spare

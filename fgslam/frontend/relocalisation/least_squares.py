@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.floor import Floor
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import inverse_spd3, so3_exp
+from fgslam.core.types import CameraRig, FloatArray, IntArray
 from fgslam.frontend.relocalisation.residuals import Pairs, residuals
-from fgslam.geometry import inverse_spd3, so3_exp
-from fgslam.types import CameraRig, FloatArray, IntArray
 
 _HOPELESS = 1e-12  # of the reduced Hessian's reciprocal condition
 

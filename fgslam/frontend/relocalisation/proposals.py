@@ -6,13 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.frontend.relocalisation.residuals import (
-    Pairs,
-    log_likelihoods,
-    residuals,
-)
+from fgslam.core.types import BoolArray, CameraRig, FloatArray, IntArray
+from fgslam.frontend.relocalisation.residuals import Pairs, log_likelihoods, residuals
 from fgslam.frontend.relocalisation.tentative import Tentative
-from fgslam.types import BoolArray, CameraRig, FloatArray, IntArray
 
 _AT_ONCE = 40_000  # residuals computed together; a few megabytes
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.floor import Floor
+from fgslam.core.floor import Floor
+from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.frontend.relocalisation.alignment import align, rigid, sample_size
 from fgslam.frontend.relocalisation.least_squares import refine
 from fgslam.frontend.relocalisation.proposals import Evidence, Proposals
 from fgslam.frontend.relocalisation.residuals import Pairs
 from fgslam.settings.relocalisation import RelocalisationSettings
-from fgslam.types import BoolArray, FloatArray, IntArray
 
 _POLISH = 3  # Newton steps of a sample: from the closed form to the image's metric
 

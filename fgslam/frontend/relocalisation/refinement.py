@@ -6,19 +6,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fgslam.floor import Floor
+from fgslam.core.floor import Floor
+from fgslam.core.types import BoolArray, ByteArray, CameraRig, FloatArray, IntArray, StereoFeatures
 from fgslam.frontend.relocalisation.known_map import KnownMap
 from fgslam.frontend.relocalisation.least_squares import refine
 from fgslam.frontend.relocalisation.proposals import Evidence, Proposals
-from fgslam.frontend.relocalisation.residuals import (
-    Pairs,
-    SeenPoints,
-    residuals,
-    squared_distances,
-)
+from fgslam.frontend.relocalisation.residuals import Pairs, SeenPoints, residuals, squared_distances
 from fgslam.frontend.relocalisation.tentative import gated
 from fgslam.settings.relocalisation import RelocalisationSettings
-from fgslam.types import BoolArray, ByteArray, CameraRig, FloatArray, IntArray, StereoFeatures
 
 _ROUNDS = 4  # of choosing matches and solving; the choice rests after two or three
 _STEPS = 6

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.errors import ConfigError
-from fgslam.floor import Floor
+from fgslam.core.errors import ConfigError
+from fgslam.core.floor import Floor
+from fgslam.core.map_types import LandmarkAppearances, Relocalisation
+from fgslam.core.types import CameraRig, LandmarkMap, StereoFeatures
 from fgslam.frontend.relocalisation import hough, ransac
 from fgslam.frontend.relocalisation.known_map import KnownMap
 from fgslam.frontend.relocalisation.proposals import Evidence, Proposals, apart, distinct
@@ -13,9 +15,7 @@ from fgslam.frontend.relocalisation.refinement import Refined, Refiner
 from fgslam.frontend.relocalisation.residuals import Pairs, SeenPoints, log_uniform
 from fgslam.frontend.relocalisation.tentative import Tentative, gated, specific, unspecific
 from fgslam.frontend.relocalisation.verdict import judge
-from fgslam.map_types import LandmarkAppearances, Relocalisation
 from fgslam.settings.relocalisation import RelocalisationSettings
-from fgslam.types import CameraRig, LandmarkMap, StereoFeatures
 
 _MAX_DISPARITY_PX = 40.0  # of mistakes, spread evenly; the scores hardly depend on it
 

@@ -12,13 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.geometry import (
-    inverse_spd3,
-    point_pose_jacobian,
-    project,
-    projection_jacobian,
-)
-from fgslam.types import (
+from fgslam.core.geometry import inverse_spd3, point_pose_jacobian, project, projection_jacobian
+from fgslam.core.types import (
     BoolArray,
     CameraRig,
     FloatArray,

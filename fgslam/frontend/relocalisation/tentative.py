@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.floor import Floor
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import wrap_angle
+from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.types import BoolArray, FloatArray, IntArray, LandmarkMap, StereoFeatures
 from fgslam.frontend.candidates import pairs_within
 from fgslam.frontend.relocalisation.appearance_index import Neighbours
-from fgslam.geometry import wrap_angle
-from fgslam.map_types import LandmarkAppearances
 from fgslam.settings.relocalisation import RelocalisationSettings
-from fgslam.types import BoolArray, FloatArray, IntArray, LandmarkMap, StereoFeatures
 
 _GATE_SIGMAS = 3.0  # of sizes and heights; what their covariances allow
 

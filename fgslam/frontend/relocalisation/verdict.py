@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.map_types import Relocalisation, Verdict
+from fgslam.core.types import LandmarkMap
 from fgslam.frontend.relocalisation.refinement import Refined
 from fgslam.frontend.relocalisation.tentative import Tentative
-from fgslam.map_types import Relocalisation, Verdict
 from fgslam.settings.relocalisation import RelocalisationSettings
-from fgslam.types import LandmarkMap
 
 
 def judge(

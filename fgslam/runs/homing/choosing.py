@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from fgslam.config_reading import apply_overrides
-from fgslam.errors import ConfigError
+from fgslam.core.errors import ConfigError
 from fgslam.homing_config import HomingExperiment, parse_homing
 from fgslam.runs.choosing import Choice
 from fgslam.settings.homing_estimators import (

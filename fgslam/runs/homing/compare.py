@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.bearing_log import BearingLog
-from fgslam.errors import ConfigError, DatasetError, OutputError
+from fgslam.core.bearing_log import BearingLog
+from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.evaluation.homing import HomingErrors, homing_errors, summarise_homings
 from fgslam.export.atomic import RUN_MARKER, ExistingFolder, is_run_folder
 from fgslam.export.homing_report import TextTable

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.bearing_log import BearingLog
+from fgslam.core.bearing_log import BearingLog
+from fgslam.core.homing_types import HomingTruth
+from fgslam.core.planar import between, wrap
+from fgslam.core.types import FloatArray
 from fgslam.export.homing_report.plan import Drive
 from fgslam.export.tables import Cell, write_csv
 from fgslam.homing.command import HomingState
 from fgslam.homing.drive_scores import cross_track, pass_distances
 from fgslam.homing.record import DriveRecord, HomingLog
-from fgslam.homing_types import HomingTruth
-from fgslam.planar import between, wrap
 from fgslam.runs.homing.logs import save_bearing_logs
-from fgslam.types import FloatArray
 
 LEGS_FILE = "legs.csv"
 COMMANDS_FILE = "commands.csv"

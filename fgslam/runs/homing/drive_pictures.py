@@ -9,14 +9,14 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from fgslam.export.atomic import make_subfolder
+from fgslam.core.atomic_files import make_subfolder
+from fgslam.core.homing_types import TrackedBearings
+from fgslam.core.types import ByteArray, FloatArray
 from fgslam.export.pictures.view_tracks import draw_view_tracks
 from fgslam.export.report.data import Picture
 from fgslam.homing.command import Command
 from fgslam.homing.path_following import PathFollower
 from fgslam.homing.underway import HomingUnderWay
-from fgslam.homing_types import TrackedBearings
-from fgslam.types import ByteArray, FloatArray
 
 FOLDER = "pictures"
 _TRAIL = 15  # images

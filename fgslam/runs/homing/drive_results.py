@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.planar import between
+from fgslam.core.types import FloatArray
 from fgslam.export.homing_report import Column, TextTable
 from fgslam.export.homing_report.curves import Line, curve_figure
 from fgslam.export.homing_report.local_map import local_map_figure
@@ -26,7 +28,6 @@ from fgslam.homing.drive_scores import (
 )
 from fgslam.homing.record import STAGES, DriveRecord
 from fgslam.homing_config import DrivingConfig
-from fgslam.planar import between
 from fgslam.runs.homing.drive_files import (
     bearing_log,
     drive_of,
@@ -38,7 +39,6 @@ from fgslam.runs.homing.drive_pictures import draw_leg_views
 from fgslam.runs.homing.driven import DrivenSeed
 from fgslam.runs.homing.replay import replay_homing
 from fgslam.runs.homing.results import HomingResult, Status, write_document, write_page
-from fgslam.types import FloatArray
 
 MEMORY_FILE = "path_memory.npz"
 _UNKNOWN = "-"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from fgslam.core.types import FloatArray
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.record import DriveRecord
 from fgslam.runs.homing.drive_pictures import LegView
-from fgslam.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

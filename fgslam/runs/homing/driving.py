@@ -11,7 +11,8 @@ from typing import Protocol, TypeAlias
 import numpy as np
 
 from fgslam.backend.homing.factory import make_homing_estimator
-from fgslam.errors import OutputError
+from fgslam.core.errors import OutputError
+from fgslam.core.types import FloatArray, Image
 from fgslam.export.atomic import ExistingFolder
 from fgslam.homing.avoidance import make_avoider
 from fgslam.homing.closed_loop import Driver, World, follow
@@ -25,7 +26,6 @@ from fgslam.runs.homing.drive_results import finish_drives
 from fgslam.runs.homing.driven import DrivenSeed
 from fgslam.runs.homing.results import HomingResult, Progress, Status, Stopped, begin, jobs_of
 from fgslam.runs.processes import WorkerEnded, run_apart
-from fgslam.types import FloatArray, Image
 
 _TRIES = 50  # places drawn for a start that is free
 

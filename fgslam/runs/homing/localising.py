@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.homing_types import HomingVector, OmniFeatures, Refusal
 from fgslam.export.metrics import JsonValue
 from fgslam.export.tables import write_csv
 from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
@@ -18,7 +19,6 @@ from fgslam.homing.retrieval import VisualWords
 from fgslam.homing.third_views import InlierRows
 from fgslam.homing.topological_map import map_of_answers
 from fgslam.homing_config import TopologicalMapConfig
-from fgslam.homing_types import HomingVector, OmniFeatures, Refusal
 from fgslam.runs.homing.results import Progress, Stopped
 
 LOCALISATION_FILE = "localisation.csv"

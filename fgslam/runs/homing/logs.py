@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from fgslam.bearing_log import BearingLog
-from fgslam.errors import DatasetError
-from fgslam.export.atomic import make_subfolder
+from fgslam.core.atomic_files import make_subfolder
+from fgslam.core.bearing_log import BearingLog
+from fgslam.core.errors import DatasetError
 from fgslam.runs.checkpoint import write_arrays
 
 LOG_FOLDER = "logs"

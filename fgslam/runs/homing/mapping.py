@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.errors import ConfigError, StoredMapError
+from fgslam.core.errors import ConfigError, StoredMapError
+from fgslam.core.homing_types import OmniFeatures
 from fgslam.export.atomic import ExistingFolder
 from fgslam.export.homing_report import Column, TextTable
 from fgslam.export.homing_report.network import Links, network_figure, unfolded
@@ -21,7 +22,6 @@ from fgslam.homing.linking import Answer, Link, Pair
 from fgslam.homing.third_views import InlierRows
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
 from fgslam.homing_config import TopologicalMapConfig
-from fgslam.homing_types import OmniFeatures
 from fgslam.runs.homing.localising import Localised, localise, localised_numbers, write_localised
 from fgslam.runs.homing.pair_answers import PairAnswer
 from fgslam.runs.homing.pair_pictures import draw_pair

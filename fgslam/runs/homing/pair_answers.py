@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
+from fgslam.core.homing_types import HomingVector, Refusal, RefusalReason
+from fgslam.core.planar import wrap
+from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.export.metrics import JsonValue
 from fgslam.export.tables import Cell, write_csv
-from fgslam.homing_types import HomingVector, Refusal, RefusalReason
-from fgslam.planar import wrap
-from fgslam.types import BoolArray, FloatArray, IntArray
 
 PAIR_COLUMNS = (
     "from",

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.export.atomic import make_subfolder
+from fgslam.core.atomic_files import make_subfolder
+from fgslam.core.homing_types import BearingMatches, FeatureKind, HomingVector
+from fgslam.core.types import FloatArray
 from fgslam.export.pictures.view_matches import MatchedPixels, draw_view_matches
 from fgslam.export.report.data import Picture
-from fgslam.homing_types import BearingMatches, FeatureKind, HomingVector
 from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.runs.homing.pair_answers import PairAnswer, PairErrors
 from fgslam.runs.homing.pair_search import PairSearch, answer_pair
 from fgslam.runs.homing.views import Views
-from fgslam.types import FloatArray
 
 FOLDER = "pictures"
 

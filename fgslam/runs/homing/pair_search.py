@@ -8,15 +8,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.homing_types import (
+    BearingMatches,
+    FeatureKind,
+    HomingVector,
+    OmniFeatures,
+    Refusal,
+)
+from fgslam.core.types import IntArray
 from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
 from fgslam.frontend.omni.matching import match_features
-from fgslam.homing_types import BearingMatches, FeatureKind, HomingVector, OmniFeatures, Refusal
 from fgslam.runs.homing.pair_answers import PairAnswer
 from fgslam.runs.homing.results import Progress, Stopped
 from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.settings.homing_vector import HomingVectorSettings
 from fgslam.settings.omni_features import OmniMatchingSettings
-from fgslam.types import IntArray
 
 PLAIN_MATCHING = OmniMatchingSettings(
     ratio=0.8, root=False, max_colour_distance=1e9, planar_gates=False

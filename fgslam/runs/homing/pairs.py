@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.types import FloatArray
 from fgslam.export.atomic import ExistingFolder
 from fgslam.export.homing_report import Column, TextTable
 from fgslam.export.homing_report.curves import claimed_against_true, sorted_errors
@@ -43,7 +44,6 @@ from fgslam.runs.homing.results import (
     write_page,
 )
 from fgslam.runs.homing.views import Views, extract_features, open_views
-from fgslam.types import FloatArray
 
 PAIRS_FILE = "pairs.csv"
 REFERENCE_FILE = "reference_pairs.csv"

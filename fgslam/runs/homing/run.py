@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fgslam.errors import ConfigError, OutputError
+from fgslam.core.errors import ConfigError, OutputError
+from fgslam.core.threads import one_blas_thread
 from fgslam.export.atomic import ExistingFolder, is_run_folder
 from fgslam.homing_config import (
     HomingConfig,
@@ -22,7 +23,6 @@ from fgslam.runs.homing.pairs import run_homing_pairs
 from fgslam.runs.homing.results import HomingResult, Progress, Stopped
 from fgslam.runs.homing.trials import run_homing_trials
 from fgslam.runs.homing.video import run_omni_video
-from fgslam.runs.threads import one_blas_thread
 
 
 @one_blas_thread()

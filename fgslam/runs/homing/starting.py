@@ -6,11 +6,11 @@ import dataclasses
 
 import numpy as np
 
+from fgslam.core.homing_types import BearingMatches, HomingStart, Refusal
+from fgslam.core.types import IntArray
 from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
 from fgslam.frontend.omni.local_map import make_local_map
-from fgslam.homing_types import BearingMatches, HomingStart, Refusal
 from fgslam.settings.homing_vector import HomingVectorSettings
-from fgslam.types import IntArray
 
 
 def start_from_matches(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fgslam.bearing_log import BearingLog
+from fgslam.core.bearing_log import BearingLog
+from fgslam.core.types import FloatArray
 from fgslam.evaluation.homing import HomingErrors
-from fgslam.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,8 +9,10 @@ from time import perf_counter
 
 import numpy as np
 
+from fgslam.core.atomic_files import make_subfolder
+from fgslam.core.types import FloatArray
 from fgslam.datasets.omni_recording import OmniRecording
-from fgslam.export.atomic import ExistingFolder, make_subfolder
+from fgslam.export.atomic import ExistingFolder
 from fgslam.export.homing_report import Column, TextTable
 from fgslam.export.homing_report.curves import Line, curve_figure
 from fgslam.export.metrics import JsonValue, UpdateTime
@@ -29,7 +31,6 @@ from fgslam.runs.homing.results import (
     write_document,
     write_page,
 )
-from fgslam.types import FloatArray
 
 FRAMES_FILE = "frames.csv"
 TRACKS_FILE = "tracks.csv"

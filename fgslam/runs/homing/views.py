@@ -6,19 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from fgslam.core.errors import OutputError
+from fgslam.core.homing_types import OmniFeatures
+from fgslam.core.types import FloatArray
 from fgslam.datasets.omni_opening import open_omni
 from fgslam.datasets.omni_recording import OmniRecording
-from fgslam.errors import OutputError
 from fgslam.frontend.omni.column_segments import empty_segments
 from fgslam.frontend.omni.features import OmniFeatureExtractor
 from fgslam.frontend.omni.plain_sift import plain_sift
-from fgslam.homing_types import OmniFeatures
 from fgslam.runs.homing.mirror_check import open_checked
 from fgslam.runs.homing.results import Progress, Stopped
 from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.settings.omni_datasets import OmniDatasetSettings
 from fgslam.settings.omni_features import OmniFeatureSettings
-from fgslam.types import FloatArray
 
 _VIEWS_A_BLOCK = 4
 

@@ -10,21 +10,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.errors import ConfigError, MapError
+from fgslam.core.errors import ConfigError, MapError
+from fgslam.core.floor import Floor
+from fgslam.core.map_types import Relocalisation
+from fgslam.core.recordings import Sequence
+from fgslam.core.saved_map import require_rig
+from fgslam.core.types import FloatArray, LandmarkMap
 from fgslam.factory import make_relocaliser, make_stereo_matcher, make_stream
-from fgslam.floor import Floor
 from fgslam.frontend.relocalisation.relocaliser import Relocaliser
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.localisation_config import LocalisationConfig
-from fgslam.map_file import require_rig
-from fgslam.map_types import Relocalisation
-from fgslam.recordings import Sequence
 from fgslam.runs.localisation.sights import Sighted, TrueSights
 from fgslam.runs.localisation.submap import Window, submap_features
 from fgslam.runs.localisation.truth import TruthInMap, truth_in_map
 from fgslam.runs.map_entry import GivenMap, trusted
-from fgslam.types import FloatArray, LandmarkMap
 
 Progress = Callable[[str, int, int], None]
 """Called with what is under way, how much is done, and of how much."""

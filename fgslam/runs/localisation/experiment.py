@@ -6,12 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fgslam.errors import ConfigError, OutputError
+from fgslam.core.errors import ConfigError, OutputError
+from fgslam.core.recordings import Sequence
+from fgslam.core.saved_map import require_rig
+from fgslam.core.threads import one_blas_thread
 from fgslam.export.atomic import ExistingFolder, create_run_folder, is_run_folder
 from fgslam.factory import open_sequence
 from fgslam.localisation_config import LocalisationConfig
-from fgslam.map_file import require_rig
-from fgslam.recordings import Sequence
 from fgslam.runs.experiment import run_experiment
 from fgslam.runs.localisation.asking import Progress, ask_all, nothing_asked
 from fgslam.runs.localisation.files import write_results
@@ -19,7 +20,6 @@ from fgslam.runs.localisation.results import LocalisationResult, result_of
 from fgslam.runs.map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map
 from fgslam.runs.mapping import first_config
 from fgslam.runs.outputs import write_config
-from fgslam.runs.threads import one_blas_thread
 
 
 @one_blas_thread()

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.atomic_files import make_subfolder
+from fgslam.core.geometry import yaw_pitch_roll
 from fgslam.evaluation.localisation import Bounds, LocalisationScore, Spread
-from fgslam.export.atomic import make_subfolder
 from fgslam.export.homing_report import HomingPage, write_homing_report
 from fgslam.export.metrics import JsonValue
 from fgslam.export.pictures.located import LocatedDrawing, draw_located
 from fgslam.export.report.data import Picture
 from fgslam.export.tables import Cell, write_csv, write_json
-from fgslam.geometry import yaw_pitch_roll
 from fgslam.runs.localisation.results import (
     LocalisationResult,
     Scored,

@@ -10,6 +10,9 @@ from typing import Literal
 
 import numpy as np
 
+from fgslam.core.geometry import yaw_pitch_roll
+from fgslam.core.map_types import Relocalisation
+from fgslam.core.types import FloatArray
 from fgslam.evaluation.localisation import (
     Answers,
     Bounds,
@@ -21,11 +24,8 @@ from fgslam.evaluation.localisation import (
     score,
 )
 from fgslam.export.homing_report import Column, TextTable
-from fgslam.geometry import yaw_pitch_roll
 from fgslam.localisation_config import LocalisationConfig
-from fgslam.map_types import Relocalisation
 from fgslam.runs.localisation.asking import Asked, Attempt
-from fgslam.types import FloatArray
 
 _UNKNOWN = "-"
 

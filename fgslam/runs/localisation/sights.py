@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.recordings import Sequence
+from fgslam.core.saved_map import SavedMap
+from fgslam.core.types import FloatArray, LandmarkMap
 from fgslam.frontend.database import LandmarkDatabase
-from fgslam.map_file import SavedMap
-from fgslam.recordings import Sequence
 from fgslam.runs.rendered_truth import TrueDepth
 from fgslam.settings.frontend import FrontendSettings
-from fgslam.types import FloatArray, LandmarkMap
 
 _BEHIND = 1.05  # times the rendered depth, plus the next: what is farther off is hidden
 _BEHIND_M = 0.05

@@ -8,36 +8,29 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.factory import make_pipeline
-from fgslam.frontend.stream import FeatureFrame
-from fgslam.geometry import (
+from fgslam.core.geometry import (
     congruence,
     project,
     projection_jacobian,
     rotate_covariances,
     transform_to_camera,
 )
-from fgslam.map_types import LandmarkAppearances
+from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.recordings import Sequence
+from fgslam.core.types import CameraRig, FloatArray, Frame, Odometry, StereoFeatures, Trajectory
+from fgslam.factory import make_pipeline
+from fgslam.frontend.stream import FeatureFrame
 from fgslam.pipeline import SlamPipeline
-from fgslam.recordings import Sequence
 from fgslam.settings.backend import LandmarkKalmanSettings
 from fgslam.settings.datasets import OdometrySettings
 from fgslam.settings.frontend import FrontendSettings
-from fgslam.types import (
-    CameraRig,
-    FloatArray,
-    Frame,
-    Odometry,
-    StereoFeatures,
-    Trajectory,
-)
 
 _NEAREST_M = 0.1  # of the last camera's plane: nearer ones have no size in its image
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Consecutive frames of a recording as one of its own; a :class:`fgslam.recordings.Sequence`.
+    """Consecutive frames of a recording as one of its own; a :class:`fgslam.core.recordings.Sequence`.
 
     Attributes:
         whole: the recording.

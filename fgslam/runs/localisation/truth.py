@@ -9,17 +9,17 @@ import numpy as np
 
 from fgslam.config import ExperimentConfig
 from fgslam.config_reading import Reader
+from fgslam.core.errors import FgslamError
+from fgslam.core.geometry import inverse, pose, transform_to_world
+from fgslam.core.recordings import Sequence
+from fgslam.core.saved_map import SavedMap
+from fgslam.core.types import FloatArray
 from fgslam.datasets.rendered_lab import RenderedLabSequence
-from fgslam.errors import FgslamError
 from fgslam.evaluation.trajectory import align, associate
 from fgslam.factory import open_sequence
-from fgslam.geometry import inverse, pose, transform_to_world
-from fgslam.map_file import SavedMap
-from fgslam.recordings import Sequence
 from fgslam.settings.lab import RenderedLabSettings
 from fgslam.simulation.places import PlaceChoice, plan_in_place
 from fgslam.simulation.world import make_rig
-from fgslam.types import FloatArray
 
 _SAME_TIME_S = 1e-3
 _MOST_SLACK_RAD = 0.5  # of positions whose errors are all made of it: at most, not likely

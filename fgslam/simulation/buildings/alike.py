@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.types import FloatArray
 from fgslam.simulation import furniture
 from fgslam.simulation.buildings.floor_plan import DOOR_HEIGHT, HEIGHT
 from fgslam.simulation.patches import Patch, Surface, Thing, box, placed, rectangle
-from fgslam.types import FloatArray
 
 SECTION, SECTIONS = 6.0, 4
 SIDE = SECTION * SECTIONS

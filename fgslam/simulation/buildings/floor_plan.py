@@ -11,8 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from fgslam.core.types import FloatArray
 from fgslam.simulation.patches import Patch, Surface, Thing, box, rectangle
-from fgslam.types import FloatArray
 
 HEIGHT = 2.7
 DOOR_HEIGHT = 2.1

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.types import FloatArray
 from fgslam.simulation import furniture
 from fgslam.simulation.buildings.fitting import FittingStyle, RoomFitter
 from fgslam.simulation.buildings.floor_plan import (
@@ -22,7 +23,6 @@ from fgslam.simulation.buildings.floor_plan import (
 )
 from fgslam.simulation.buildings.wall_textures import PICTURES
 from fgslam.simulation.patches import Patch, Surface, Thing, placed
-from fgslam.types import FloatArray
 
 WIDTH, DEPTH = 36.0, 24.0
 _DOOR_WIDTH, _FIRE_DOOR_WIDTH = 1.3, 1.9

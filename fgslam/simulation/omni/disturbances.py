@@ -7,13 +7,9 @@ import copy
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.settings.omni_worlds import (
-    HouseExposureSettings,
-    HouseLightSettings,
-    HouseTiltSettings,
-)
+from fgslam.core.types import FloatArray
+from fgslam.settings.omni_worlds import HouseExposureSettings, HouseLightSettings, HouseTiltSettings
 from fgslam.simulation.renderer import Layer
-from fgslam.types import FloatArray
 
 Float32 = npt.NDArray[np.float32]
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.types import FloatArray
 from fgslam.simulation import furniture
 from fgslam.simulation.buildings.fitting import FittingStyle, RoomFitter
 from fgslam.simulation.buildings.floor_plan import (
@@ -25,7 +26,6 @@ from fgslam.simulation.omni.colour_textures import PAINTINGS
 from fgslam.simulation.omni.floor_plan import house_plan
 from fgslam.simulation.patches import Patch, Surface, Thing, placed
 from fgslam.simulation.texture_library import PHOTOGRAPHS, POSTERS
-from fgslam.types import FloatArray
 
 _LAMP_SPACING = 3.2
 _ROOMY = FittingStyle(

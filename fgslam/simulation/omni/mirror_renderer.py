@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.simulation.omni.colour_bank import ColourBank
 from fgslam.simulation.renderer import LEAST_INVERSE_DEPTH, Layer, light_at
-from fgslam.types import BoolArray, FloatArray, IntArray
 
 Float32 = npt.NDArray[np.float32]
 Int32 = npt.NDArray[np.int32]

@@ -11,6 +11,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
+from fgslam.core.types import BoolArray, FloatArray, Image
 from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.settings.omni_worlds import OmniHouseSettings
 from fgslam.simulation.floor_space import FloorSpace
@@ -29,7 +30,6 @@ from fgslam.simulation.omni.wheelchair import Wheelchair
 from fgslam.simulation.patches import stack
 from fgslam.simulation.raycaster import RayCaster
 from fgslam.simulation.renderer import Layer
-from fgslam.types import BoolArray, FloatArray, Image
 
 # Coarser than in the lab: the mirror's pixels are wider.
 _LIGHT_SPACING_M = 0.2

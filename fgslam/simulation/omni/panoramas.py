@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.types import BoolArray, FloatArray, Image
 from fgslam.simulation.omni.floor_plan import room_at
 from fgslam.simulation.omni.omni_world import OmniWorld
-from fgslam.types import BoolArray, FloatArray, Image
 
 # A place's surroundings are taken at these elevations for judging what two places share, degrees.
 _ELEVATIONS_DEG = (-25.0, -12.0, 0.0, 10.0)

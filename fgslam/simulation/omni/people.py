@@ -7,7 +7,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.planar import unit
+from fgslam.core.planar import unit
+from fgslam.core.types import BoolArray, FloatArray
 from fgslam.simulation.lighting import flat_light
 from fgslam.simulation.omni.colour_bank import ColourBank
 from fgslam.simulation.omni.colour_textures import SHIRTS
@@ -16,7 +17,6 @@ from fgslam.simulation.patches import Patch, Surface, Thing, stack
 from fgslam.simulation.person import Stance, person
 from fgslam.simulation.raycaster import RayCaster
 from fgslam.simulation.renderer import Layer
-from fgslam.types import BoolArray, FloatArray
 
 PERSON_RADIUS = 0.3
 _BODY_RADIUS = 0.6

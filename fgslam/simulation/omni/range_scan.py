@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.planar import unit, wrap
+from fgslam.core.planar import unit, wrap
+from fgslam.core.types import FloatArray
 from fgslam.settings.omni_worlds import RangeSensorSettings
 from fgslam.simulation.raycaster import RayCaster
-from fgslam.types import FloatArray
 
 
 class RangeSensor:

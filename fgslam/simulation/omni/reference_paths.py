@@ -14,12 +14,12 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
-from fgslam.errors import DatasetError
-from fgslam.planar import unit, wrap
+from fgslam.core.errors import DatasetError
+from fgslam.core.planar import unit, wrap
+from fgslam.core.types import FloatArray, IntArray
 from fgslam.simulation.buildings.floor_plan import Room
 from fgslam.simulation.floor_space import FloorSpace
 from fgslam.simulation.omni.floor_plan import ROOMS
-from fgslam.types import FloatArray, IntArray
 
 # A closed walk through the house: every room, and the corridor twice.
 _TOUR = ("hall", "office", "corridor", "studio", "workshop", "library", "corridor")

@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fgslam.planar import wrap
+from fgslam.core.planar import wrap
+from fgslam.core.types import FloatArray
 from fgslam.settings.omni_worlds import WheelchairSettings
-from fgslam.types import FloatArray
 
 _STEP_S = 0.01
 

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.errors import MeasurementLogError
-from fgslam.types import (
+from fgslam.core.errors import MeasurementLogError
+from fgslam.core.types import (
     BoolArray,
     CameraRig,
     FloatArray,

@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.errors import MapError, MeasurementLogError
-from fgslam.map_types import LandmarkAppearances
-from fgslam.measurement_log import load_arrays
-from fgslam.types import (
+from fgslam.core.atomic_files import replacing
+from fgslam.core.errors import MapError, MeasurementLogError
+from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.measurement_log import load_arrays
+from fgslam.core.types import (
     BoolArray,
     ByteArray,
     CameraRig,
@@ -29,7 +30,6 @@ from fgslam.types import (
     StateArrays,
     Trajectory,
 )
-from fgslam.whole_files import replacing
 
 FORMAT = "fgslam map"
 VERSION = 1

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from fgslam.measurement_log import MeasurementLog
-from fgslam.types import CameraRig, FloatArray, Frame, IntArray, Odometry, Trajectory
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.types import CameraRig, FloatArray, Frame, IntArray, Odometry, Trajectory
 
 
 @runtime_checkable

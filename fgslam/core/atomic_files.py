@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from fgslam.errors import OutputError
+from fgslam.core.errors import OutputError
 
 _MENDS = {
     errno.ENOSPC: "the disk is full; free some space or choose another folder",
@@ -88,3 +88,11 @@ def _remove_quietly(path: Path) -> None:
         path.unlink(missing_ok=True)
     except OSError:
         return
+
+
+def make_subfolder(run: Path, name: str) -> Path:
+    """A folder inside the run folder, created when absent. Raises OutputError."""
+    folder = run / name
+    with clear_output_errors(folder):
+        folder.mkdir(exist_ok=True)
+    return folder

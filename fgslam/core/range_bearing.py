@@ -1,15 +1,15 @@
-"""The range-bearing sensor's equations; :mod:`fgslam.geometry` chooses between the sensors.
+"""The range-bearing sensor's equations; :mod:`fgslam.core.geometry` chooses between the sensors.
 
 Points are (n, 3) in the sensor's frame, axes as a camera's (x right, y down, z forward), metres;
 measurements (azimuth, elevation, range), radians and metres, as in
-:class:`fgslam.types.RangeBearingSensor`. Derived in docs/derivations/range_bearing.md.
+:class:`fgslam.core.types.RangeBearingSensor`. Derived in docs/derivations/range_bearing.md.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from fgslam.types import FloatArray
+from fgslam.core.types import FloatArray
 
 
 def project(points: FloatArray) -> FloatArray:

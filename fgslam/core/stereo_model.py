@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.types import CameraRig, FloatArray
+from fgslam.core.types import CameraRig, FloatArray
 
 
 def vertical_to_horizontal(rig: CameraRig) -> float:

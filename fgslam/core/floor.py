@@ -12,8 +12,8 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from fgslam.geometry import congruence, pose, so3_exp
-from fgslam.types import FloatArray, Sensor
+from fgslam.core.geometry import congruence, pose, so3_exp
+from fgslam.core.types import FloatArray, Sensor
 
 DegreesOfFreedom: TypeAlias = Literal[3, 5, 6]
 

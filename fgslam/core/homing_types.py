@@ -4,7 +4,7 @@ Frames: the robot's axes are x forward, y left, z up. Bearings are counter-clock
 robot's heading, elevations up, both in radians. The *start* is the robot's pose when a homing
 begins, at the origin with heading 0; the *target* is where the target image was taken. Lengths are
 in units of the distance from start to target (R = 1, section III-B), unless said otherwise.
-Planar poses and their covariances are as in :mod:`fgslam.planar`.
+Planar poses and their covariances are as in :mod:`fgslam.core.planar`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from enum import Enum
 
 import numpy as np
 
-from fgslam.planar import between, rotation, wrap
-from fgslam.types import BoolArray, ByteArray, FloatArray, IntArray
+from fgslam.core.planar import between, rotation, wrap
+from fgslam.core.types import BoolArray, ByteArray, FloatArray, IntArray
 
 
 def among(ids: IntArray, others: IntArray) -> BoolArray:

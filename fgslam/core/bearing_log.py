@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.errors import MeasurementLogError
-from fgslam.homing_types import (
+from fgslam.core.errors import MeasurementLogError
+from fgslam.core.homing_types import (
     BearingMatches,
     HomingStart,
     HomingTruth,
@@ -24,8 +24,8 @@ from fgslam.homing_types import (
     LocalMap,
     TrackedBearings,
 )
-from fgslam.measurement_log import load_arrays
-from fgslam.types import StateArrays
+from fgslam.core.measurement_log import load_arrays
+from fgslam.core.types import StateArrays
 
 FORMAT = "fgslam bearing log"
 VERSION = 1

@@ -8,7 +8,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.types import ByteArray, FloatArray, IntArray
+from fgslam.core.types import ByteArray, FloatArray, IntArray
 
 Words = npt.NDArray[np.int16]
 """(v,) the cell of the vocabulary that each descriptor lies in (:mod:`fgslam.frontend.vocabulary`).
