@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.types import FloatArray
-from fgslam.omni_cameras.panoramas import Equirectangular
 from fgslam.simulation.lighting import flat_light
 from fgslam.simulation.omni.colour_bank import ColourBank
 from fgslam.simulation.patches import Surface, Thing, rectangle, stack

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.types import FloatArray, Image
-from fgslam.omni_cameras.panoramas import Equirectangular
 
 CAMERA = Equirectangular(601, 181, np.deg2rad(54.0), np.deg2rad(-54.0))
 HALF = 3.0

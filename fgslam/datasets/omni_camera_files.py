@@ -7,15 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.core.errors import CalibrationError
-from fgslam.datasets.tables import read_lines
-from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
-from fgslam.omni_cameras.ocamcalib import read_ocamcalib
-from fgslam.omni_cameras.panoramas import Equirectangular
-from fgslam.omni_cameras.protocol import OmniCamera
-from fgslam.omni_cameras.radial import MirrorFrame
-from fgslam.omni_cameras.radial_polynomial import RadialPolynomial, fit_radial_polynomial
-from fgslam.settings.omni_cameras import (
+from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.ocamcalib import read_ocamcalib
+from fgslam.cameras.omni.panoramas import Equirectangular
+from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.cameras.omni.radial import MirrorFrame
+from fgslam.cameras.omni.radial_polynomial import RadialPolynomial, fit_radial_polynomial
+from fgslam.cameras.omni.settings import (
     BloggieSettings,
     EquirectangularSettings,
     HyperbolicMirrorSettings,
@@ -24,6 +22,8 @@ from fgslam.settings.omni_cameras import (
     OmniCameraSettings,
     RadialPolynomialSettings,
 )
+from fgslam.core.errors import CalibrationError
+from fgslam.datasets.tables import read_lines
 
 Size = tuple[int, int]
 

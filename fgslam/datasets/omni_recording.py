@@ -12,10 +12,10 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.types import FloatArray, Image, IntArray
 from fgslam.datasets.images import IMAGE_SUFFIXES
-from fgslam.omni_cameras.protocol import OmniCamera
 
 ColourLoader: TypeAlias = Callable[[int], Image]
 """Picture (height, width, 3) in R, G, B by place in the recording; raises FrameError."""

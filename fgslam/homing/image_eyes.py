@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.homing_types import (
     BearingMatches,
     HomingStart,
@@ -24,7 +25,6 @@ from fgslam.frontend.omni.trackable import move_to_trackable
 from fgslam.frontend.omni.tracking import BearingTracker
 from fgslam.homing.eyes import Sighting
 from fgslam.homing.soundness import parallax
-from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.settings.homing_vector import HomingVectorSettings
 from fgslam.settings.omni_features import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.settings.omni_tracking import OmniTrackingSettings

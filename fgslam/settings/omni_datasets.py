@@ -7,14 +7,14 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT
-from fgslam.settings.datasets import RecordingSettings
-from fgslam.settings.omni_cameras import (
+from fgslam.cameras.omni.settings import (
     BloggieSettings,
     EquirectangularSettings,
     HyperbolicMirrorSettings,
     OmniCameraSettings,
 )
+from fgslam.core.settings import STRICT
+from fgslam.settings.datasets import RecordingSettings
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -8,17 +8,17 @@ import cv2
 import numpy as np
 import pytest
 
+from fgslam.cameras.omni.ocamcalib import OCamCamera
+from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
+from fgslam.cameras.omni.radial import RadialCamera
+from fgslam.cameras.omni.ring_calibration import find_mirror_circle, mirror_offset
+from fgslam.cameras.omni.settings import OCamCalibSettings
+from fgslam.cameras.omni.straightness import upright_edges
+from fgslam.cameras.omni.unwrapping import unwrap_maps
 from fgslam.core.types import FloatArray, Image
 from fgslam.datasets.images import read_colour_image
 from fgslam.datasets.omni_opening import open_omni
 from fgslam.datasets.omni_recording import OmniRecording
-from fgslam.frontend.omni.calibration import find_mirror_circle, mirror_offset
-from fgslam.frontend.omni.straightness import upright_edges
-from fgslam.omni_cameras.ocamcalib import OCamCamera
-from fgslam.omni_cameras.panoramas import Cylinder, Equirectangular
-from fgslam.omni_cameras.radial import RadialCamera
-from fgslam.omni_cameras.unwrapping import unwrap_maps
-from fgslam.settings.omni_cameras import OCamCalibSettings
 from fgslam.settings.omni_datasets import OmniPathSettings, OmniVideoSettings, PanoramasSettings
 
 pytestmark = pytest.mark.data

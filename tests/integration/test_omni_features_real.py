@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.homing_types import BearingMatches
 from fgslam.core.planar import between
 from fgslam.core.types import BoolArray, FloatArray
@@ -16,7 +17,6 @@ from fgslam.frontend.omni.epipolar import EpipolarTest
 from fgslam.frontend.omni.features import OmniFeatureExtractor
 from fgslam.frontend.omni.matching import match_features
 from fgslam.frontend.omni.plain_sift import match_plain, plain_sift
-from fgslam.omni_cameras.panoramas import Equirectangular
 from fgslam.settings.omni_features import OmniFeatureSettings
 
 pytestmark = pytest.mark.data

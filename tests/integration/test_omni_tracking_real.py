@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fgslam.cameras.omni.ring_calibration import find_mirror_circle
+from fgslam.cameras.omni.settings import HyperbolicMirrorSettings
 from fgslam.core.homing_types import FeatureKind, HomingVector
 from fgslam.datasets.images import read_colour_image
 from fgslam.datasets.omni_camera_files import make_camera
 from fgslam.datasets.omni_opening import open_omni
-from fgslam.frontend.omni.calibration import find_mirror_circle
 from fgslam.frontend.omni.features import OmniFeatureExtractor
 from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
 from fgslam.frontend.omni.matching import match_features
 from fgslam.frontend.omni.video_tracking import ReplenishedTracker
 from fgslam.settings.homing_vector import HomingVectorSettings
-from fgslam.settings.omni_cameras import HyperbolicMirrorSettings
 from fgslam.settings.omni_datasets import OmniVideoSettings
 from fgslam.settings.omni_features import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.settings.omni_tracking import OmniTrackingSettings

@@ -6,12 +6,12 @@ import numpy as np
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from fgslam.cameras.omni.bearing_measurement import angles_of, measure
+from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
+from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.cameras.omni.radial import MirrorFrame
 from fgslam.core.planar import wrap
-from fgslam.omni_cameras.bearing_measurement import angles_of, measure
-from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
-from fgslam.omni_cameras.panoramas import Cylinder, Equirectangular
-from fgslam.omni_cameras.protocol import OmniCamera
-from fgslam.omni_cameras.radial import MirrorFrame
 
 frames = st.builds(
     MirrorFrame,

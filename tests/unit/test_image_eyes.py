@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.homing_types import FeatureKind, Refusal, RefusalReason
 from fgslam.homing.image_eyes import EyesSettings, ImageEyes, mixed_with_wrong, surest_all_around
-from fgslam.omni_cameras.panoramas import Equirectangular
 from fgslam.settings.homing_vector import HomingVectorSettings
 from fgslam.settings.omni_features import OmniFeatureSettings
 from fgslam.settings.omni_tracking import OmniTrackingSettings

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
+from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.radial import MirrorFrame
+from fgslam.cameras.omni.settings import EquirectangularSettings, HyperbolicMirrorSettings
 from fgslam.core.types import Image
-from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
-from fgslam.omni_cameras.radial import MirrorFrame
 from fgslam.runs.homing.mirror_check import open_checked
-from fgslam.settings.omni_cameras import EquirectangularSettings, HyperbolicMirrorSettings
 from fgslam.settings.omni_datasets import OmniPathSettings
 
 SIZE = (320, 240)

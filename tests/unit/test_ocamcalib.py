@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.polynomial import polynomial
 
+from fgslam.cameras.omni.bearing_measurement import angles_of
+from fgslam.cameras.omni.ocamcalib import OCamCalibration, read_ocamcalib
 from fgslam.core.errors import CalibrationError
-from fgslam.omni_cameras.bearing_measurement import angles_of
-from fgslam.omni_cameras.ocamcalib import OCamCalibration, read_ocamcalib
 
 DIRECT = (-266.588, 0.0, 1.220001e-3, -5.78173e-7, 2.003631e-9)
 RING = (235.0, 530.0)

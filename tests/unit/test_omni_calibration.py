@@ -6,15 +6,19 @@ import cv2
 import numpy as np
 import pytest
 
+from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.panoramas import Cylinder
+from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.cameras.omni.radial import MirrorFrame
+from fgslam.cameras.omni.ring_calibration import (
+    calibrate_from_rings,
+    find_mirror_circle,
+    mirror_offset,
+)
+from fgslam.cameras.omni.straightness import upright_edges
+from fgslam.cameras.omni.unwrapping import unwrap_maps
 from fgslam.core.errors import CalibrationError
 from fgslam.core.types import FloatArray, Image
-from fgslam.frontend.omni.calibration import calibrate_from_rings, find_mirror_circle, mirror_offset
-from fgslam.frontend.omni.straightness import upright_edges
-from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
-from fgslam.omni_cameras.panoramas import Cylinder
-from fgslam.omni_cameras.protocol import OmniCamera
-from fgslam.omni_cameras.radial import MirrorFrame
-from fgslam.omni_cameras.unwrapping import unwrap_maps
 
 FRAME = MirrorFrame(640, 480, (322.4, 236.7))
 MIRROR = HyperbolicMirror(FRAME, 32.0, 232.0, xi=0.92, focal_px=127.0)

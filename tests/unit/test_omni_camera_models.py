@@ -6,14 +6,14 @@ import gtsam
 import numpy as np
 import pytest
 
+from fgslam.cameras.omni.bearing_measurement import angles_of
+from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
+from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.cameras.omni.radial import MirrorFrame
 from fgslam.core.errors import CalibrationError
 from fgslam.core.planar import wrap
 from fgslam.core.types import FloatArray
-from fgslam.omni_cameras.bearing_measurement import angles_of
-from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
-from fgslam.omni_cameras.panoramas import Cylinder, Equirectangular
-from fgslam.omni_cameras.protocol import OmniCamera
-from fgslam.omni_cameras.radial import MirrorFrame
 
 
 def mirror(**changes: float) -> HyperbolicMirror:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.cameras.omni.panoramas import Cylinder
 from fgslam.core.homing_types import ColumnSegments
 from fgslam.core.planar import wrap
 from fgslam.core.types import FloatArray, Image
 from fgslam.frontend.omni.column_segments import ColumnSegmentFinder, dct_rows
 from fgslam.frontend.omni.column_whitening import COVARIANCE, whitened
 from fgslam.frontend.omni.matching import consistent_tangents, match_columns, nearest_segments
-from fgslam.omni_cameras.panoramas import Cylinder
 from fgslam.settings.omni_features import (
     ColourMomentSettings,
     ColumnSegmentSettings,

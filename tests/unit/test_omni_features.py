@@ -8,6 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
+from fgslam.cameras.omni.unwrapping import unwrap_maps
 from fgslam.core.errors import FrameError
 from fgslam.core.homing_types import FeatureKind, OmniFeatures, UprightFeatures
 from fgslam.core.planar import wrap
@@ -16,9 +19,6 @@ from fgslam.frontend.omni.features import OmniFeatureExtractor, _View
 from fgslam.frontend.omni.matching import match_features, match_sift
 from fgslam.frontend.omni.plain_sift import match_plain, plain_sift
 from fgslam.frontend.omni.sift import up_in_image, wrapping_period
-from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
-from fgslam.omni_cameras.panoramas import Cylinder, Equirectangular
-from fgslam.omni_cameras.unwrapping import unwrap_maps
 from fgslam.settings.omni_features import (
     OmniFeatureSettings,
     OmniMatchingSettings,

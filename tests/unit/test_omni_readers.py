@@ -9,6 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
+from fgslam.cameras.omni.bearing_measurement import angles_of
+from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.ocamcalib import OCamCamera
+from fgslam.cameras.omni.panoramas import Equirectangular
+from fgslam.cameras.omni.radial_polynomial import RadialPolynomial
+from fgslam.cameras.omni.settings import (
+    BloggieSettings,
+    EquirectangularSettings,
+    HyperbolicMirrorSettings,
+    OCamCalibSettings,
+    RadialPolynomialSettings,
+)
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.types import Image
 from fgslam.datasets.omni_camera_files import make_camera
@@ -16,18 +28,6 @@ from fgslam.datasets.omni_opening import open_omni
 from fgslam.datasets.omni_recording import OmniRecording, ids_of
 from fgslam.datasets.omni_video import VideoFrames
 from fgslam.datasets.panorama_reduction import PanoramaReduction
-from fgslam.omni_cameras.bearing_measurement import angles_of
-from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
-from fgslam.omni_cameras.ocamcalib import OCamCamera
-from fgslam.omni_cameras.panoramas import Equirectangular
-from fgslam.omni_cameras.radial_polynomial import RadialPolynomial
-from fgslam.settings.omni_cameras import (
-    BloggieSettings,
-    EquirectangularSettings,
-    HyperbolicMirrorSettings,
-    OCamCalibSettings,
-    RadialPolynomialSettings,
-)
 from fgslam.settings.omni_datasets import OmniPathSettings, OmniVideoSettings, PanoramasSettings
 
 HEADER = "id,file,x_m,y_m,heading_deg,room\n"

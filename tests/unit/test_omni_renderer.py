@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
-from fgslam.omni_cameras.protocol import OmniCamera
+from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.simulation.lighting import flat_light
 from fgslam.simulation.mipmap import TextureBank
 from fgslam.simulation.omni.colour_bank import ColourBank

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.types import Image
 from fgslam.frontend.omni.video_tracking import ReplenishedTracker
-from fgslam.omni_cameras.panoramas import Equirectangular
 from fgslam.settings.omni_tracking import OmniTrackingSettings
 
 WIDTH, HEIGHT = 361, 121

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.radial import MirrorFrame
+from fgslam.cameras.omni.radial_polynomial import RadialPolynomial, fit_radial_polynomial
 from fgslam.core.errors import CalibrationError
-from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
-from fgslam.omni_cameras.radial import MirrorFrame
-from fgslam.omni_cameras.radial_polynomial import RadialPolynomial, fit_radial_polynomial
 
 FRAME = MirrorFrame(320, 240, (159.5, 119.5))
 

@@ -19,11 +19,11 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.homing_types import ColumnSegments
 from fgslam.core.types import BoolArray, FloatArray, Image, IntArray
 from fgslam.frontend.omni.colour_moments import colour_from_means, moment_images
 from fgslam.frontend.omni.sift import inner_part, wrapping_period
-from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.settings.omni_features import ColourMomentSettings, ColumnSegmentSettings
 
 PROFILE_SAMPLES = 32

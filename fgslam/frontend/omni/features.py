@@ -5,15 +5,15 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from fgslam.cameras.omni.bearing_measurement import unit_rays
+from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
+from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.cameras.omni.unwrapping import unwrap_maps
 from fgslam.core.errors import FrameError
 from fgslam.core.homing_types import ColumnSegments, OmniFeatures, UprightFeatures
 from fgslam.core.types import Image
 from fgslam.frontend.omni.column_segments import ColumnSegmentFinder, empty_segments
 from fgslam.frontend.omni.sift import UprightSift, empty_features, up_in_image, wrapping_period
-from fgslam.omni_cameras.bearing_measurement import unit_rays
-from fgslam.omni_cameras.panoramas import Cylinder, Equirectangular
-from fgslam.omni_cameras.protocol import OmniCamera
-from fgslam.omni_cameras.unwrapping import unwrap_maps
 from fgslam.settings.omni_features import OmniFeatureSettings
 
 

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.cameras.omni.bearing_measurement import unit_rays
 from fgslam.core.homing_types import BearingMatches
 from fgslam.core.planar import wrap
 from fgslam.core.types import BoolArray, FloatArray
 from fgslam.frontend.omni.epipolar import in_front, ray_derivatives
 from fgslam.frontend.omni.match_odds import COMMON_CHANCE, gain, right_probability
-from fgslam.omni_cameras.bearing_measurement import unit_rays
 
 _WIDENED = (4.0, 3.0, 2.0, 1.5)
 """Inliers' threshold in the first iterations: a hypothesis from two matches is a few degrees off,

@@ -5,12 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from fgslam.cameras.omni.bearing_measurement import measure
+from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.homing_types import BearingMatches, UprightFeatures
 from fgslam.core.types import Image
 from fgslam.frontend.omni.matching import match_sift
 from fgslam.frontend.omni.sift import up_in_image
-from fgslam.omni_cameras.bearing_measurement import measure
-from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.settings.omni_features import OmniMatchingSettings
 
 _NO_COLOUR_LIMIT = 1e9

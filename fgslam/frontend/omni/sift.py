@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+from fgslam.cameras.omni.bearing_measurement import measure
+from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.homing_types import UprightFeatures
 from fgslam.core.planar import wrap
 from fgslam.core.types import BoolArray, ByteArray, FloatArray, Image, IntArray
 from fgslam.frontend.omni.colour_moments import PatchColours
-from fgslam.omni_cameras.bearing_measurement import measure
-from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.settings.omni_features import ColourMomentSettings, UprightSiftSettings
 
 _STEP = 1e-3

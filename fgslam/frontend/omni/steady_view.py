@@ -15,13 +15,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import next_fast_len
 
+from fgslam.cameras.omni.panoramas import Equirectangular
+from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.cameras.omni.unwrapping import Float32, unwrap_maps
 from fgslam.core.errors import FrameError
 from fgslam.core.types import FloatArray, Image
 from fgslam.frontend.omni.features import pixels_a_radian
 from fgslam.frontend.omni.sift import wrapping_period
-from fgslam.omni_cameras.panoramas import Equirectangular
-from fgslam.omni_cameras.protocol import OmniCamera
-from fgslam.omni_cameras.unwrapping import Float32, unwrap_maps
 
 _BANDS = 8  # of rows, averaged, that tell the common shift
 _PROBED = np.deg2rad(np.arange(-89.0, 90.0, 1.0))

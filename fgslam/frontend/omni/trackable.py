@@ -13,10 +13,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.homing_types import BearingMatches, FeatureKind, OmniFeatures
 from fgslam.core.planar import wrap
 from fgslam.core.types import BoolArray, FloatArray, Image, IntArray
-from fgslam.omni_cameras.panoramas import Equirectangular
 from fgslam.settings.omni_tracking import OmniTrackingSettings
 
 

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing_types import TrackedBearings
 from fgslam.core.types import BoolArray, FloatArray, Image, IntArray
 from fgslam.frontend.omni.anchored_patches import AnchoredPatches, align, anchor
 from fgslam.frontend.omni.steady_view import SteadyImage, SteadyView
-from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.settings.omni_tracking import OmniTrackingSettings
 
 Float32 = npt.NDArray[np.float32]

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.homing_types import TrackedBearings
 from fgslam.core.types import FloatArray, Image, IntArray
 from fgslam.frontend.omni.tracking import BearingTracker
-from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.settings.omni_tracking import OmniTrackingSettings
 
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from fgslam.cameras.omni.radial import RadialCamera
+from fgslam.cameras.omni.ring_calibration import MirrorCircle, find_mirror_circle
 from fgslam.core.errors import CalibrationError
 from fgslam.core.types import Image
 from fgslam.datasets.omni_opening import open_omni
 from fgslam.datasets.omni_recording import OmniRecording
-from fgslam.frontend.omni.calibration import MirrorCircle, find_mirror_circle
-from fgslam.omni_cameras.radial import RadialCamera
 from fgslam.settings.omni_datasets import OmniDatasetSettings
 
 _PICTURES = 3  # the rim may be as dark as its holder in one of them

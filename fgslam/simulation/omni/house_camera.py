@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.omni_cameras.hyperbolic import HyperbolicMirror
-from fgslam.omni_cameras.panoramas import Equirectangular
-from fgslam.omni_cameras.protocol import OmniCamera
+from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.panoramas import Equirectangular
+from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.settings.omni_worlds import HouseCameraSettings, HousePanoramaSettings
 
 _MARGIN_PX = 0.5

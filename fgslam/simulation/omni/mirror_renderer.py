@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.types import BoolArray, FloatArray, IntArray
-from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.simulation.omni.colour_bank import ColourBank
 from fgslam.simulation.renderer import LEAST_INVERSE_DEPTH, Layer, light_at
 

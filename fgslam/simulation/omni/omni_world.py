@@ -11,8 +11,8 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
+from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.types import BoolArray, FloatArray, Image
-from fgslam.omni_cameras.protocol import OmniCamera
 from fgslam.settings.omni_worlds import OmniHouseSettings
 from fgslam.simulation.floor_space import FloorSpace
 from fgslam.simulation.lighting import bake

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 from numpy.polynomial import polynomial
 
+from fgslam.cameras.omni.monotone import MonotoneInverse
+from fgslam.cameras.omni.radial import AHEAD_IS_UP, MirrorFrame, RadialCamera
 from fgslam.core.errors import CalibrationError
 from fgslam.core.types import FloatArray
-from fgslam.omni_cameras.monotone import MonotoneInverse
-from fgslam.omni_cameras.radial import AHEAD_IS_UP, MirrorFrame, RadialCamera
 
 _MAX_TERMS = 32
 # The file's two polynomials are fits of one another: further apart, one of them is damaged.

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.cameras.omni.radial import AHEAD_IS_UP, MirrorFrame, RadialCamera
 from fgslam.core.errors import CalibrationError
 from fgslam.core.types import FloatArray
-from fgslam.omni_cameras.radial import AHEAD_IS_UP, MirrorFrame, RadialCamera
 
 
 @dataclass(frozen=True)

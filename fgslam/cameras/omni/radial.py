@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.cameras.omni.bearing_measurement import unit_rays
+from fgslam.cameras.omni.image_bounds import inside, require_size
 from fgslam.core.errors import CalibrationError
 from fgslam.core.types import FloatArray
-from fgslam.omni_cameras.bearing_measurement import unit_rays
-from fgslam.omni_cameras.image_bounds import inside, require_size
 
 # Relative: what a round trip may lose at the very rim.
 _RIM = 1e-9
@@ -118,14 +118,14 @@ class RadialCamera(ABC):
         return self.frame.height
 
     def rays(self, pixels: FloatArray) -> FloatArray:
-        """(n, 3) unit rays; see :class:`fgslam.omni_cameras.protocol.OmniCamera`."""
+        """(n, 3) unit rays; see :class:`fgslam.cameras.omni.protocol.OmniCamera`."""
         pixels = inside(np.asarray(pixels, dtype=np.float64), self.width, self.height)
         radius, bearing = self.frame.polar(pixels)
         elevation = self.elevation(self._within(radius))
         return unit_rays(bearing, elevation)
 
     def pixels(self, rays: FloatArray) -> FloatArray:
-        """(n, 2) pixels; see :class:`fgslam.omni_cameras.protocol.OmniCamera`."""
+        """(n, 2) pixels; see :class:`fgslam.cameras.omni.protocol.OmniCamera`."""
         rays = np.asarray(rays, dtype=np.float64)
         elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
         bearing = np.arctan2(rays[:, 1], rays[:, 0])

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.cameras.omni.radial import MirrorFrame, RadialCamera
+from fgslam.cameras.omni.radial_polynomial import PAPER_DEGREE, RadialFit, fit_radial_polynomial
 from fgslam.core.errors import CalibrationError
 from fgslam.core.types import FloatArray, Image, IntArray
-from fgslam.omni_cameras.radial import MirrorFrame, RadialCamera
-from fgslam.omni_cameras.radial_polynomial import PAPER_DEGREE, RadialFit, fit_radial_polynomial
 
 Float32 = npt.NDArray[np.float32]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.omni_cameras.protocol import OmniCamera
+from fgslam.cameras.omni.protocol import OmniCamera
 
 Float32 = npt.NDArray[np.float32]
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.polynomial import polynomial
 
+from fgslam.cameras.omni.monotone import MonotoneInverse
+from fgslam.cameras.omni.radial import MirrorFrame, RadialCamera
 from fgslam.core.errors import CalibrationError
 from fgslam.core.types import FloatArray
-from fgslam.omni_cameras.monotone import MonotoneInverse
-from fgslam.omni_cameras.radial import MirrorFrame, RadialCamera
 
 PAPER_DEGREE = 5
 
