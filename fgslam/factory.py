@@ -53,8 +53,8 @@ from fgslam.settings.datasets import (
     SyntheticOdometrySettings,
 )
 from fgslam.settings.frontend import EgoMotionSettings, FrontendSettings
-from fgslam.settings.lab import RenderedLabSettings
 from fgslam.settings.measurements import MeasurementDatasetSettings
+from fgslam.worlds.lab_settings import RenderedLabSettings
 
 
 def open_sequence(

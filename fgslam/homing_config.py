@@ -32,8 +32,8 @@ from fgslam.settings.homing_vector import HomingVectorSettings
 from fgslam.settings.omni_datasets import OmniDatasetSettings
 from fgslam.settings.omni_features import OmniFeatureSettings
 from fgslam.settings.omni_tracking import OmniTrackingSettings
-from fgslam.settings.omni_worlds import OmniHouseSettings
-from fgslam.settings.simulated_bearings import SimulatedBearingsSettings
+from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
+from fgslam.worlds.house.settings import OmniHouseSettings
 
 _TAKEN_FOLDERS = ("pictures", "compare", "logs", "runs")
 _GROUPS_OF_KINDS = ("dataset", "estimator")

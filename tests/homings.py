@@ -11,8 +11,8 @@ from fgslam.core.types import BoolArray
 from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
 from fgslam.frontend.omni.local_map import make_local_map
 from fgslam.settings.homing_vector import HomingVectorSettings
-from fgslam.settings.simulated_bearings import SimulatedBearingsSettings
-from fgslam.simulation.bearings import simulate_homing
+from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
+from fgslam.worlds.simulated.bearings import simulate_homing
 
 LEVEL = HomingVectorSettings(tilt_sigma_deg=0.0, height_sigma=0.0, max_direction_sigma_deg=15.0)
 """The simulated camera neither tilts nor rises; sparse rooms are to be answered, too."""

@@ -6,11 +6,11 @@ import numpy as np
 
 from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.types import FloatArray
-from fgslam.simulation.lighting import flat_light
-from fgslam.simulation.omni.colour_bank import ColourBank
-from fgslam.simulation.patches import Surface, Thing, rectangle, stack
-from fgslam.simulation.raycaster import RayCaster
-from fgslam.simulation.renderer import Layer
+from fgslam.worlds.rendering.colour_bank import ColourBank
+from fgslam.worlds.rendering.lighting import flat_light
+from fgslam.worlds.rendering.patches import Surface, Thing, rectangle, stack
+from fgslam.worlds.rendering.pinhole import Layer
+from fgslam.worlds.rendering.raycaster import RayCaster
 
 PANORAMA = Equirectangular(512, 256)
 

@@ -34,7 +34,7 @@ from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
 from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import EgoMotionSettings
-from fgslam.simulation.identities import IdentityBook
+from fgslam.worlds.simulated.identities import IdentityBook
 
 RIG = CameraRig(
     width=320,

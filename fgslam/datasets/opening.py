@@ -24,11 +24,11 @@ from fgslam.settings.datasets import (
 )
 from fgslam.settings.measurements import (
     MeasurementDatasetSettings,
-    SimulatedMeasurementsSettings,
     StereoTracksSettings,
     UtiasRangeBearingSettings,
     UtiasStereoSettings,
 )
+from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 
 FileRecordingSettings: TypeAlias = (
     ImageFolderSettings | KittiSettings | EurocSettings | LightFieldSettings

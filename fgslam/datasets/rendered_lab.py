@@ -17,15 +17,15 @@ import numpy as np
 from fgslam.core import geometry
 from fgslam.core.errors import ConfigError, FrameError
 from fgslam.core.types import CameraRig, FloatArray, Frame, Image, IntArray, Odometry, Trajectory
-from fgslam.settings.lab import LabSettings
-from fgslam.simulation import wheel_odometry
-from fgslam.simulation.image_effects import apply_effects, is_blocked
-from fgslam.simulation.paths import PosesInTime
-from fgslam.simulation.person import Stance, make_walk
-from fgslam.simulation.places import PlaceChoice, first_pose, plan_in_place
-from fgslam.simulation.render_cache import RenderCache, content_hash
-from fgslam.simulation.renderer import Layer
-from fgslam.simulation.world import World, camera_offsets, make_rig, open_room
+from fgslam.worlds import wheel_odometry
+from fgslam.worlds.lab_settings import LabSettings
+from fgslam.worlds.paths import PosesInTime
+from fgslam.worlds.person import Stance, make_walk
+from fgslam.worlds.places import PlaceChoice, first_pose, plan_in_place
+from fgslam.worlds.rendering.cache import RenderCache, content_hash
+from fgslam.worlds.rendering.image_effects import apply_effects, is_blocked
+from fgslam.worlds.rendering.pinhole import Layer
+from fgslam.worlds.world import World, camera_offsets, make_rig, open_room
 
 RENDER_VERSION = 7
 """Part of the cache's key: raised whenever the same settings give other pixels."""

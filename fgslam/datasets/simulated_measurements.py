@@ -8,9 +8,9 @@ from dataclasses import asdict
 from fgslam.core.recordings import LandmarkTruth, MeasurementRecording
 from fgslam.datasets.measurement_files import make_log
 from fgslam.settings.datasets import OdometrySettings
-from fgslam.settings.measurements import SimulatedMeasurementsSettings
-from fgslam.simulation.measurements import SimulatedMeasurements, simulate_measurements
-from fgslam.simulation.render_cache import content_hash
+from fgslam.worlds.rendering.cache import content_hash
+from fgslam.worlds.simulated.measurements import SimulatedMeasurements, simulate_measurements
+from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 
 SIMULATION_VERSION = 1
 """Part of the identity: raised whenever the same settings and seed give other measurements."""

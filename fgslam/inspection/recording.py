@@ -13,8 +13,8 @@ from fgslam.factory import open_sequence
 from fgslam.inspection.matches import judge_matches, look_at_frames, match_facts
 from fgslam.inspection.report import Facts, render_report
 from fgslam.settings.datasets import KittiSettings
-from fgslam.settings.lab import RenderedLabSettings
 from fgslam.settings.measurements import MeasurementDatasetSettings
+from fgslam.worlds.lab_settings import RenderedLabSettings
 
 Progress = Callable[[str, int, int], None]
 """Called with what is under way, how much is done, and of how much."""

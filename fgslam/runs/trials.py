@@ -27,9 +27,9 @@ from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.runs.replay import replay
 from fgslam.runs.trial_results import TrialSummary, summarise, write_trials
 from fgslam.settings.backend import EstimatorSettings
-from fgslam.settings.lab import RenderedLabSettings
-from fgslam.settings.measurements import SimulatedMeasurementsSettings
 from fgslam.settings.output import OutputSettings
+from fgslam.worlds.lab_settings import RenderedLabSettings
+from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 
 DEFAULT_FOLDER = "trials"
 _OUTPUT = OutputSettings(pictures=False, report=False, checkpoint_seconds=1e9)

@@ -12,8 +12,8 @@ from fgslam.settings.datasets import (
     KittiSettings,
     LightFieldSettings,
 )
-from fgslam.settings.lab import RenderedLabSettings
 from fgslam.settings.measurements import MeasurementDatasetSettings
+from fgslam.worlds.lab_settings import RenderedLabSettings
 
 DatasetSettings: TypeAlias = Annotated[
     RenderedLabSettings

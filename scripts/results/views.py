@@ -11,10 +11,10 @@ from fgslam.core.geometry import inverse, pose, so3_exp
 from fgslam.core.types import CameraRig, Features, FloatArray, Frame, Odometry, Trajectory
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.sift import SiftExtractor
-from fgslam.settings.lab import RenderedLabSettings
-from fgslam.simulation import wheel_odometry
-from fgslam.simulation.image_effects import apply_effects
-from fgslam.simulation.world import World, camera_offsets, open_room
+from fgslam.worlds import wheel_odometry
+from fgslam.worlds.lab_settings import RenderedLabSettings
+from fgslam.worlds.rendering.image_effects import apply_effects
+from fgslam.worlds.world import World, camera_offsets, open_room
 
 FORWARD_M = 0.10
 CLOCKWISE_DEG = 5.0

@@ -15,8 +15,8 @@ from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.runs.experiment import RunResult, run_experiment
 from fgslam.runs.map_entry import MAP_FILE
 from fgslam.runs.mapping import first_config
-from fgslam.simulation.lab import build_lab
-from fgslam.simulation.patches import Thing
+from fgslam.worlds.lab import build_lab
+from fgslam.worlds.rendering.patches import Thing
 from scripts.results.report import Table
 from scripts.results.runs import experiment, say
 

@@ -31,8 +31,8 @@ from fgslam.settings.homing_estimators import (
 from fgslam.settings.homing_vector import HomingVectorSettings
 from fgslam.settings.omni_features import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.settings.omni_tracking import OmniTrackingSettings
-from fgslam.settings.omni_worlds import HousePathSettings, OmniHouseSettings
-from fgslam.simulation.omni.omni_world import OmniWorld
+from fgslam.worlds.house.omni_world import OmniWorld
+from fgslam.worlds.house.settings import HousePathSettings, OmniHouseSettings
 from tests.benchmark.drives import cpu_seconds, interleaved
 
 LIMITS = {

@@ -22,7 +22,7 @@ from fgslam.settings.homing_estimators import (
     HomingGraphSettings,
     SnapshotSettings,
 )
-from fgslam.settings.simulated_bearings import SimulatedBearingsSettings
+from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
 
 EVERY: list[HomingEstimatorSettings] = [
     PAPER,

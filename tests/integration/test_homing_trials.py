@@ -19,7 +19,7 @@ from fgslam.settings.homing_estimators import (
     HomingEstimatorSettings,
     HomingGraphSettings,
 )
-from fgslam.settings.simulated_bearings import SimulatedBearingsSettings, with_outliers
+from fgslam.worlds.bearing_settings import SimulatedBearingsSettings, with_outliers
 
 GRAPH = HomingGraphSettings()
 

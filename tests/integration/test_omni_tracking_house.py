@@ -14,8 +14,8 @@ from fgslam.frontend.omni.trackable import move_to_trackable
 from fgslam.frontend.omni.tracking import BearingTracker
 from fgslam.settings.omni_features import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.settings.omni_tracking import OmniTrackingSettings
-from fgslam.settings.omni_worlds import HousePathSettings, OmniHouseSettings
-from fgslam.simulation.omni.omni_world import OmniWorld
+from fgslam.worlds.house.omni_world import OmniWorld
+from fgslam.worlds.house.settings import HousePathSettings, OmniHouseSettings
 
 SETTINGS = OmniTrackingSettings()
 STEPS = 20

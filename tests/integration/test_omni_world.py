@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.settings.omni_worlds import (
+from fgslam.worlds.house.omni_world import OmniWorld
+from fgslam.worlds.house.panoramas import render_panoramas
+from fgslam.worlds.house.settings import (
     HouseLightSettings,
     HousePanoramaSettings,
     HousePathSettings,
     HouseTiltSettings,
     OmniHouseSettings,
 )
-from fgslam.simulation.omni.omni_world import OmniWorld
-from fgslam.simulation.omni.panoramas import render_panoramas
 
 SETTINGS = OmniHouseSettings(path=HousePathSettings(legs=3, spacing_m=2.0))
 DISTURBED = replace(SETTINGS, people=3, tilt=HouseTiltSettings(constant_deg=1.0, sway_deg=1.0))

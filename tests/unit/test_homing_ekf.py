@@ -16,7 +16,7 @@ from fgslam.core.errors import EstimatorError
 from fgslam.core.homing_types import HomingStart, HomingVector, LocalMap, TrackedBearings
 from fgslam.core.planar import bearings, wrap
 from fgslam.settings.homing_estimators import PAPER, FilterMotionSettings, HomingEkfSettings
-from fgslam.settings.simulated_bearings import SimulatedBearingsSettings
+from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
 
 
 def test_deleting_features_is_marginalising_them() -> None:

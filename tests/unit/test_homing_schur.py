@@ -19,7 +19,7 @@ from fgslam.core.planar import wrap
 from fgslam.core.types import FloatArray
 from fgslam.settings.backend import KernelSettings
 from fgslam.settings.homing_estimators import HomingGraphSettings
-from fgslam.settings.simulated_bearings import SimulatedBearingsSettings
+from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
 
 NONE, CAUCHY, HUBER = (
     KernelSettings("none"),

@@ -5,14 +5,14 @@ import pytest
 
 from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
 from fgslam.cameras.omni.protocol import OmniCamera
-from fgslam.simulation.lighting import flat_light
-from fgslam.simulation.mipmap import TextureBank
-from fgslam.simulation.omni.colour_bank import ColourBank
-from fgslam.simulation.omni.disturbances import camera_pose
-from fgslam.simulation.omni.mirror_renderer import Body, MirrorRenderer, surface_points, visible
-from fgslam.simulation.patches import Surface, Thing, box, stack
-from fgslam.simulation.raycaster import RayCaster
-from fgslam.simulation.renderer import Layer
+from fgslam.worlds.house.disturbances import camera_pose
+from fgslam.worlds.rendering.colour_bank import ColourBank
+from fgslam.worlds.rendering.lighting import flat_light
+from fgslam.worlds.rendering.mipmap import TextureBank
+from fgslam.worlds.rendering.omnidirectional import Body, MirrorRenderer, surface_points, visible
+from fgslam.worlds.rendering.patches import Surface, Thing, box, stack
+from fgslam.worlds.rendering.pinhole import Layer
+from fgslam.worlds.rendering.raycaster import RayCaster
 from tests.omni_house import PANORAMA, plain, room
 
 GREY, RED = (100, 100, 100), (250, 20, 30)

@@ -6,24 +6,24 @@ import pytest
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.planar import between, wrap
 from fgslam.core.types import FloatArray
-from fgslam.settings.omni_worlds import (
+from fgslam.worlds.floor_space import FloorSpace
+from fgslam.worlds.house.disturbances import CameraTilt, camera_pose, exposed, noisy
+from fgslam.worlds.house.floor_plan import DEPTH, WIDTH, room_at
+from fgslam.worlds.house.house import House, build_house
+from fgslam.worlds.house.house_camera import make_house_camera
+from fgslam.worlds.house.people import Walker
+from fgslam.worlds.house.range_scan import RangeSensor
+from fgslam.worlds.house.reference_paths import PathPlanner
+from fgslam.worlds.house.settings import (
     HouseExposureSettings,
     HouseMirrorSettings,
     HouseTiltSettings,
     RangeSensorSettings,
     WheelchairSettings,
 )
-from fgslam.simulation.floor_space import FloorSpace
-from fgslam.simulation.omni.disturbances import CameraTilt, camera_pose, exposed, noisy
-from fgslam.simulation.omni.floor_plan import DEPTH, WIDTH, room_at
-from fgslam.simulation.omni.house import House, build_house
-from fgslam.simulation.omni.house_camera import make_house_camera
-from fgslam.simulation.omni.people import Walker
-from fgslam.simulation.omni.range_scan import RangeSensor
-from fgslam.simulation.omni.reference_paths import PathPlanner
-from fgslam.simulation.omni.wheelchair import Wheelchair
-from fgslam.simulation.patches import PatchArrays, Surface, Thing, box, stack
-from fgslam.simulation.raycaster import RayCaster
+from fgslam.worlds.house.wheelchair import Wheelchair
+from fgslam.worlds.rendering.patches import PatchArrays, Surface, Thing, box, stack
+from fgslam.worlds.rendering.raycaster import RayCaster
 
 EXACT = WheelchairSettings(
     speed_scale=0.0, turn_scale=0.0, pull_deg_m=0.0, slip_m_sqrt_m=0.0, slip_deg_sqrt_m=0.0

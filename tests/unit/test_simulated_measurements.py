@@ -25,8 +25,8 @@ from fgslam.pipeline import replay_step
 from fgslam.settings.backend import LandmarkKalmanSettings
 from fgslam.settings.datasets import ConstantVelocitySettings, SyntheticOdometrySettings
 from fgslam.settings.frontend import EgoMotionSettings
-from fgslam.settings.measurements import SimulatedMeasurementsSettings
-from fgslam.simulation.identities import IdentityBook
+from fgslam.worlds.simulated.identities import IdentityBook
+from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 
 
 def settings(**values: Any) -> SimulatedMeasurementsSettings:

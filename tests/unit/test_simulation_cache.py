@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import DatasetError
-from fgslam.simulation.render_cache import RenderCache, content_hash
+from fgslam.worlds.rendering.cache import RenderCache, content_hash
 
 SHAPE = (3, 12, 16)
 

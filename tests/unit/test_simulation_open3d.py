@@ -4,7 +4,7 @@ from types import ModuleType
 import pytest
 
 from fgslam.core.errors import MissingDependencyError
-from fgslam.simulation.open3d_library import (
+from fgslam.worlds.rendering.open3d_library import (
     explain_missing_library,
     find_bundled_libusb,
     load_open3d,

@@ -8,15 +8,12 @@ import pytest
 
 from fgslam.core.errors import ConfigError
 from fgslam.core.geometry import wrap_angle
-from fgslam.settings.lab import LabDriveSettings, LabRigSettings, PathName, PlaceName
-from fgslam.simulation.buildings import alike, office
-from fgslam.simulation.floor_space import FloorSpace
-from fgslam.simulation.lab import build_lab
-from fgslam.simulation.lighting import bake
-from fgslam.simulation.mipmap import TextureBank
-from fgslam.simulation.patches import Surface, Thing, box, rectangle, stack
-from fgslam.simulation.paths import Drive, round_corners
-from fgslam.simulation.places import (
+from fgslam.worlds.buildings import alike, office
+from fgslam.worlds.floor_space import FloorSpace
+from fgslam.worlds.lab import build_lab
+from fgslam.worlds.lab_settings import LabDriveSettings, LabRigSettings, PathName, PlaceName
+from fgslam.worlds.paths import Drive, round_corners
+from fgslam.worlds.places import (
     PATHS,
     PlaceChoice,
     build_place,
@@ -24,9 +21,12 @@ from fgslam.simulation.places import (
     place_path,
     plan_in_place,
 )
-from fgslam.simulation.raycaster import RayCaster
-from fgslam.simulation.renderer import Layer, Pinhole, Renderer
-from fgslam.simulation.world import make_rig
+from fgslam.worlds.rendering.lighting import bake
+from fgslam.worlds.rendering.mipmap import TextureBank
+from fgslam.worlds.rendering.patches import Surface, Thing, box, rectangle, stack
+from fgslam.worlds.rendering.pinhole import Layer, Pinhole, Renderer
+from fgslam.worlds.rendering.raycaster import RayCaster
+from fgslam.worlds.world import make_rig
 
 RIG = make_rig(LabRigSettings(width=80, height=60))
 ROOMS = PlaceChoice("rooms", 0, 1, identical_posters=False)

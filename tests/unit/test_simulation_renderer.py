@@ -3,11 +3,11 @@ import pytest
 from scipy import ndimage
 
 from fgslam.core import geometry
-from fgslam.simulation.lighting import flat_light
-from fgslam.simulation.mipmap import TextureBank
-from fgslam.simulation.patches import Surface, Thing, box, placed, prism, rectangle, stack
-from fgslam.simulation.raycaster import RayCaster
-from fgslam.simulation.renderer import Layer, Pinhole, Renderer
+from fgslam.worlds.rendering.lighting import flat_light
+from fgslam.worlds.rendering.mipmap import TextureBank
+from fgslam.worlds.rendering.patches import Surface, Thing, box, placed, prism, rectangle, stack
+from fgslam.worlds.rendering.pinhole import Layer, Pinhole, Renderer
+from fgslam.worlds.rendering.raycaster import RayCaster
 
 CAMERA = Pinhole(64, 48, 60.0, 31.5, 23.5)
 

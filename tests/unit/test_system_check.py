@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from fgslam import system_check
+from fgslam.worlds.rendering import system_check
 
 ROOT = Path(__file__).parents[2]
 # What a surrounding `make test FGSLAM_PYTHON=...` hands down must not steer the runs in here.

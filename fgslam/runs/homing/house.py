@@ -7,7 +7,7 @@ import numpy as np
 from fgslam.homing.image_eyes import EyesSettings, ImageEyes
 from fgslam.homing_config import DrivingConfig
 from fgslam.runs.homing.driving import Opened
-from fgslam.simulation.omni.omni_world import OmniWorld
+from fgslam.worlds.house.omni_world import OmniWorld
 
 
 def open_house_drive(config: DrivingConfig, seed: int) -> Opened:

@@ -21,8 +21,8 @@ from fgslam.runs.homing.starting import start_from_matches
 from fgslam.runs.homing.trial_data import HomingTrial, TriedEstimator
 from fgslam.runs.homing.trial_results import finish_trials
 from fgslam.runs.processes import WorkerEnded, run_apart
-from fgslam.settings.simulated_bearings import with_outliers
-from fgslam.simulation.bearings import simulate_homing
+from fgslam.worlds.bearing_settings import with_outliers
+from fgslam.worlds.simulated.bearings import simulate_homing
 
 _BLOCK = 20  # trials a process: starting one takes as long as some trials
 

@@ -17,9 +17,9 @@ from fgslam.core.types import FloatArray
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.evaluation.trajectory import align, associate
 from fgslam.factory import open_sequence
-from fgslam.settings.lab import RenderedLabSettings
-from fgslam.simulation.places import PlaceChoice, plan_in_place
-from fgslam.simulation.world import make_rig
+from fgslam.worlds.lab_settings import RenderedLabSettings
+from fgslam.worlds.places import PlaceChoice, plan_in_place
+from fgslam.worlds.world import make_rig
 
 _SAME_TIME_S = 1e-3
 _MOST_SLACK_RAD = 0.5  # of positions whose errors are all made of it: at most, not likely

@@ -1,0 +1,132 @@
+"""Furniture, each piece standing on z = 0 with its front towards -y and its middle at x = 0."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.worlds.rendering.patches import Patch, Surface, box, placed, prism, rectangle
+from fgslam.worlds.rendering.texture_library import BINDER_ROWS, BOOK_ROWS, CARTONS, SCREENS
+
+_METAL = Surface("metal_dark", 0.8)
+_BLACK = Surface("plain_dark", 0.6)
+
+
+def _pick(rng: np.random.Generator, family: str, count: int) -> str:
+    return f"{family}_{int(rng.integers(0, count))}"
+
+
+def table(width: float, depth: float, height: float, top: Surface) -> list[Patch]:
+    """A table top on four legs."""
+    w, d = width / 2, depth / 2
+    out = box((-w, -d, height - 0.035), (w, d, height), top)
+    for x in (-w + 0.05, w - 0.05):
+        for y in (-d + 0.05, d - 0.05):
+            out += prism((x, y, 0.0), (x, y, height - 0.035), 0.025, _METAL, sides=6)
+    return out
+
+
+def computer(rng: np.random.Generator) -> list[Patch]:
+    """A monitor on its foot, with a keyboard before it and a mug beside it."""
+    picture = Surface(_pick(rng, "screen", SCREENS), None, glow=0.95)
+    out = box((-0.24, -0.02, 0.12), (0.24, 0.04, 0.46), _BLACK, front=picture)
+    out += box((-0.03, 0.0, 0.0), (0.03, 0.03, 0.12), _BLACK)
+    out += box((-0.13, -0.08, 0.0), (0.13, 0.10, 0.015), _BLACK)
+    out += box((-0.22, -0.33, 0.0), (0.22, -0.18, 0.02), _BLACK, top=Surface("keyboard"))
+    mug = Surface(_pick(rng, "carton", CARTONS), 0.2)
+    return out + prism((0.33, -0.2, 0.0), (0.33, -0.2, 0.1), 0.04, mug, sides=8)
+
+
+def desk(rng: np.random.Generator, width: float, screens: int) -> list[Patch]:
+    """A table with computers, books, papers and a drawer unit below."""
+    top = Surface(str(rng.choice(["wood_light", "wood_desk", "wood_dark"])), 0.9)
+    out = table(width, 0.75, 0.74, top)
+    for k in range(screens):
+        x = (k + 0.5) / screens * width - width / 2
+        out += placed(computer(rng), x, 0.12, 0.74, float(rng.uniform(-12, 12)))
+    for _ in range(2):
+        x, y = rng.uniform(-width / 2 + 0.2, width / 2 - 0.2), rng.uniform(-0.25, -0.1)
+        paper = Surface(f"poster_{int(rng.integers(0, 8))}")
+        sheet = rectangle((-0.1, 0.14, 0.002), (0.2, 0, 0), (0, -0.28, 0), paper)
+        out += placed([sheet], float(x), float(y), 0.74, float(rng.uniform(-40, 40)))
+    books = Surface(_pick(rng, "books", BOOK_ROWS))
+    row = box((-0.3, -0.09, 0.0), (0.3, 0.09, 0.25), Surface("wood_dark", 0.8), front=books)
+    out += placed(row, width / 2 - 0.34, 0.26, 0.74, float(rng.uniform(-10, 10)))
+    drawers = box((-0.2, -0.3, 0.0), (0.2, 0.3, 0.6), _METAL, front=Surface("metal"))
+    return out + placed(drawers, width / 2 - 0.32, 0.0, 0.0, 0.0)
+
+
+def carton(rng: np.random.Generator, size: tuple[float, float, float]) -> list[Patch]:
+    """A cardboard box."""
+    w, d, h = size
+    sides = [Surface(_pick(rng, "carton", CARTONS)) for _ in range(3)]
+    return box((-w / 2, -d / 2, 0), (w / 2, d / 2, h), sides[0], front=sides[1], top=sides[2])
+
+
+def shelf(rng: np.random.Generator, width: float, height: float, depth: float) -> list[Patch]:
+    """An open shelf with rows of books and some boxes; its back is closed."""
+    frame = Surface(str(rng.choice(["wood_light", "wood_dark"])), 0.8)
+    w = width / 2
+    out = box((-w, -depth, 0), (-w + 0.03, 0, height), frame)
+    out += box((w - 0.03, -depth, 0), (w, 0, height), frame)
+    out += box((-w, -0.02, 0), (w, 0, height), Surface("wood_dark", 0.8))
+    levels = max(int(height / 0.42), 1)
+    for level in range(levels + 1):
+        z = level * (height - 0.03) / levels
+        out += box((-w + 0.03, -depth, z), (w - 0.03, -0.02, z + 0.03), frame)
+        if level < levels:
+            room = (height - 0.03) / levels - 0.03
+            out += placed(_shelf_load(rng, width - 0.08, room, depth), 0, 0, z + 0.03, 0)
+    return out
+
+
+def _shelf_load(rng: np.random.Generator, width: float, room: float, depth: float) -> list[Patch]:
+    if rng.random() < 0.25:
+        out = []
+        for k in range(2):
+            w, h = rng.uniform(0.3, 0.45) * width, rng.uniform(0.5, 0.95) * room
+            x = (k - 0.5) * width / 2 + float(rng.uniform(-0.02, 0.02))
+            size = (float(w), 0.7 * depth, float(h))
+            out += placed(carton(rng, size), x, -depth / 2, 0, float(rng.uniform(-8, 8)))
+        return out
+    books = rng.random() < 0.5
+    row = Surface(_pick(rng, "books", BOOK_ROWS) if books else _pick(rng, "binders", BINDER_ROWS))
+    front = -depth + float(rng.uniform(0.02, 0.09))
+    w = width / 2
+    return [rectangle((-w, front, room * 0.96), (width, 0, 0), (0, 0, -room * 0.96), row)]
+
+
+def cabinet(width: float, height: float, depth: float, surface: Surface) -> list[Patch]:
+    """A closed cabinet."""
+    front = Surface(surface.texture)
+    return box((-width / 2, -depth, 0), (width / 2, 0, height), surface, front=front)
+
+
+def chair() -> list[Patch]:
+    """An office chair: seat, back, pole and five feet."""
+    fabric = Surface("cloth", 0.35)
+    out = box((-0.24, -0.24, 0.44), (0.24, 0.24, 0.51), fabric)
+    out += box((-0.22, 0.2, 0.6), (0.22, 0.26, 1.08), fabric)
+    out += box((-0.03, 0.22, 0.48), (0.03, 0.25, 0.62), _BLACK)
+    out += prism((0, 0, 0.08), (0, 0, 0.44), 0.03, _METAL)
+    for k in range(5):
+        angle = 2 * np.pi * k / 5
+        foot = (0.3 * float(np.cos(angle)), 0.3 * float(np.sin(angle)), 0.05)
+        out += prism((0, 0, 0.1), foot, 0.02, _METAL, sides=6)
+    return out
+
+
+def sofa(width: float, cover: str) -> list[Patch]:
+    """Seat, back and two arms."""
+    cloth, w = Surface(cover, 0.6), width / 2
+    out = box((-w, -0.85, 0.05), (w, 0.0, 0.42), cloth)
+    out += box((-w, -0.22, 0.42), (w, 0.0, 0.85), cloth)
+    for side in (-w, w - 0.18):
+        out += box((side, -0.85, 0.42), (side + 0.18, -0.22, 0.6), cloth)
+    return out
+
+
+def hanging(width: float, height: float, surface: Surface) -> list[Patch]:
+    """A flat board, its lower edge at z = 0, just before y = 0: posters, windows, doors."""
+    gap = 0.004
+    upright = rectangle((-width / 2, -gap, height), (width, 0, 0), (0, 0, -height), surface)
+    return [upright]

@@ -1,0 +1,101 @@
+"""The furnished house: what stands along its walls, hangs on them and stands free, and its lamps.
+
+Furniture and pictures are laid out from a seed: every free stretch of wall is filled in turn. Some
+pictures hang in several rooms, so that places can be mistaken for one another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.core.types import FloatArray
+from fgslam.worlds import furniture
+from fgslam.worlds.buildings.fitting import FittingStyle, RoomFitter
+from fgslam.worlds.buildings.floor_plan import (
+    HALF_WALL,
+    HEIGHT,
+    Opening,
+    ceiling_lamps,
+    lamp_things,
+    shell,
+)
+from fgslam.worlds.house import home_furniture as home
+from fgslam.worlds.house.floor_plan import house_plan
+from fgslam.worlds.rendering.colour_textures import PAINTINGS
+from fgslam.worlds.rendering.patches import Patch, Surface, Thing, placed
+from fgslam.worlds.rendering.texture_library import PHOTOGRAPHS, POSTERS
+
+_LAMP_SPACING = 3.2
+_ROOMY = FittingStyle(
+    ("shelf", "shelf", "desk", "cabinet", "sofa", "gap", "gap"),
+    cloths=("cloth", "cloth_red", "cloth_green"),
+)
+_NARROW = FittingStyle(("gap", "cabinet"), (0.8, 0.2), cabinet_depth=0.3)
+# Hung in every room: the same picture does not mean the same place.
+_COMMON_PICTURES = ("painting_0", "poster_0")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class House:
+    """Everything that does not move.
+
+    Attributes:
+        things: with their patches.
+        lamps: (k, 3, 3) corner and two edges of the lamps in the ceilings, metres.
+        doors: openings between rooms.
+    """
+
+    things: tuple[Thing, ...]
+    lamps: FloatArray
+    doors: tuple[Opening, ...]
+
+
+def build_house(rng: np.random.Generator, door_width: float) -> House:
+    """The house with all its furniture.
+
+    Args:
+        rng: for layout and small things.
+        door_width: of the openings, metres.
+    """
+    plan = house_plan(door_width)
+    lamps = ceiling_lamps(plan, _LAMP_SPACING)
+    things = [*shell(plan), *lamp_things(lamps)]
+    for room in plan.rooms:
+        style = _NARROW if room.name == "corridor" else _ROOMY
+        things += RoomFitter(room, plan.doors, rng, style, _pictures(rng)).things()
+    return House((*things, *_islands(rng)), lamps, plan.doors)
+
+
+def _pictures(rng: np.random.Generator) -> list[str]:
+    """Those of one room; they are taken from the end, so the common ones first."""
+    photos = [f"photo_{name}" for name in PHOTOGRAPHS]
+    prints = [f"poster_{i}" for i in range(1, POSTERS)]
+    paintings = [f"painting_{i}" for i in range(1, PAINTINGS)]
+    shuffled = rng.permutation(np.array([*photos, *prints, *paintings]))
+    return [*(str(name) for name in shuffled), *_COMMON_PICTURES]
+
+
+def _islands(rng: np.random.Generator) -> list[Thing]:
+    """What stands free, low enough to see over but for the pillars."""
+    pieces: list[tuple[str, list[Patch], float, float, float]] = [
+        ("pillar_1", home.pillar(0.35, HEIGHT, "bricks"), 5.2, 5.6, 0.0),
+        ("pillar_2", home.pillar(0.35, HEIGHT, "bricks"), 5.2, 1.9, 0.0),
+        ("dining_table", home.dining_table(rng, 1.6), 3.0, 3.7, 15.0),
+        ("rug_hall", home.rug(2.4, 2.0, "painting_5"), 7.9, 3.6, 30.0),
+        ("plant_1", home.plant(rng), 6.9, 1.7, 0.0),
+        ("island_desk", furniture.desk(rng, 2.0, 2), 15.9, 3.2, 90.0),
+        ("rug_office", home.rug(2.0, 1.6, "painting_9"), 13.2, 5.2, -20.0),
+        ("plant_2", home.plant(rng), 18.6, 5.9, 0.0),
+        ("pillar_3", home.pillar(0.3, HEIGHT, "wood_light"), 13.0, 2.2, 0.0),
+        ("island_shelf", furniture.shelf(rng, 1.6, 1.1, 0.35), 2.9, 13.1, 180.0),
+        ("workbench", furniture.table(1.6, 0.8, 0.85, Surface("metal", 0.8)), 9.2, 13.6, 0.0),
+        ("cartons", furniture.carton(rng, (0.6, 0.5, 0.5)), 12.3, 11.1, 25.0),
+        ("bed", home.bed("cloth_red"), 17.9, 13.4, -90.0),
+        ("rug_studio", home.rug(1.8, 1.4, "painting_12"), 15.6, 11.6, 10.0),
+        ("chair_office", furniture.chair(), 14.7, 3.0, 75.0),
+        ("chair_studio", furniture.chair(), 15.0, 13.9, 200.0),
+        ("extinguisher", home.extinguisher(), 13.4, 7.5 + 2.4 - HALF_WALL, 0.0),
+    ]
+    return [Thing(name, tuple(placed(p, x, y, 0.0, yaw))) for name, p, x, y, yaw in pieces]

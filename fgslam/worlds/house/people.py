@@ -1,0 +1,227 @@
+"""People who walk to and fro in the house; they wait for the robot, turn back or step aside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
+import numpy as np
+
+from fgslam.core.planar import unit
+from fgslam.core.types import BoolArray, FloatArray
+from fgslam.worlds.person import Stance, person
+from fgslam.worlds.rendering.colour_bank import ColourBank
+from fgslam.worlds.rendering.colour_textures import SHIRTS
+from fgslam.worlds.rendering.lighting import flat_light
+from fgslam.worlds.rendering.omnidirectional import Body
+from fgslam.worlds.rendering.patches import Patch, Surface, Thing, stack
+from fgslam.worlds.rendering.pinhole import Layer
+from fgslam.worlds.rendering.raycaster import RayCaster
+
+PERSON_RADIUS = 0.3
+_BODY_RADIUS = 0.6
+_SPEED = 0.8
+_STRIDE_M = 1.3
+_PHASES = 16
+# Nearer to the robot a person stops, and after waiting that long turns back.
+_POLITE_M, _PATIENCE_S = 1.1, 2.0
+_AHEAD_M = 0.3
+# With less way back than this a person steps aside: not through the robot (a radius each, and a
+# margin), straight for at most 1.8 m, to where it is that much farther; and comes back when it is
+# gone.
+_WAY_BACK_M, _BODIES_M, _WORTH_M, _GONE_M = 1.5, 0.75, 0.2, 2.0
+_STEPS_M = 0.2 * np.arange(1, 10)
+_WAYS = unit(2.0 * np.pi * np.arange(24) / 24)
+
+
+Free: TypeAlias = Callable[[FloatArray], BoolArray]
+"""Which of places (n, 2) a person can stand at."""
+
+
+def _anywhere(places: FloatArray) -> BoolArray:
+    return np.ones(len(places), dtype=np.bool_)
+
+
+class Walker:
+    """One person on a polyline, walking to its end and back for ever.
+
+    Who meets the robot stops, and after a while turns back. Who has no way back, as the route ends
+    there, steps aside, off the route, and comes back when the robot is gone.
+    """
+
+    def __init__(self, route: FloatArray, start: float, free: Free = _anywhere) -> None:
+        """On ``route`` (n, 2), ``start`` metres from its beginning; ``free`` tells the floor."""
+        self._route, self._free = route, free
+        self._length = np.concatenate(
+            [[0.0], np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1))]
+        )
+        self._at, self._sign = float(start % self._length[-1]), 1.0
+        self._walked, self._waited = 0.0, 0.0
+        self._here = self._place(self._at)
+        self._trail: list[FloatArray] = []  # the way back to the route, its end last
+        self._aside: FloatArray | None = None  # a place to step aside to
+        ahead = self._next() - self._here
+        self._heading = float(np.arctan2(ahead[1], ahead[0]))
+
+    def stance(self) -> Stance:
+        """Where the person is now."""
+        x, y = self._here
+        return Stance(float(x), float(y), self._heading, self._walked)
+
+    def advance(self, seconds: float, robot: FloatArray) -> None:
+        """Walks on unless the robot (2,) is in the way."""
+        self._move(seconds, robot)
+        ahead = self._next() - self._here
+        if np.any(ahead != 0.0):
+            self._heading = float(np.arctan2(ahead[1], ahead[0]))
+
+    def _move(self, seconds: float, robot: FloatArray) -> None:
+        if self._hindered(robot):
+            self._waited += seconds
+            if self._waited > _PATIENCE_S:
+                self._waited = 0.0
+                self._give_way(robot)
+            return
+        self._waited = 0.0
+        if self._aside is None and self._trail and self._near(self._trail[-1], robot, _GONE_M):
+            return  # stands aside until the robot is gone
+        step = _SPEED * seconds
+        self._walked += step
+        if self._aside is not None:
+            self._aside = self._walk_to(self._aside, step)
+        elif self._trail:
+            self._trail[-1:] = [p for p in [self._walk_to(self._trail[-1], step)] if p is not None]
+        else:
+            self._walk_on(step)
+
+    def _hindered(self, robot: FloatArray) -> bool:
+        """Whether the robot is near, and nearer still in the next moment."""
+        ahead, here = self._next(), self._here
+        if self._aside is None and self._trail:
+            return self._near(here, robot, _POLITE_M)
+        far, nearing = np.linalg.norm(ahead - robot), np.linalg.norm(here - robot)
+        return bool(far < _POLITE_M and far <= nearing)
+
+    @staticmethod
+    def _near(place: FloatArray, robot: FloatArray, limit: float) -> bool:
+        return bool(np.linalg.norm(place - robot) < limit)
+
+    def _give_way(self, robot: FloatArray) -> None:
+        back = self._at if self._sign > 0.0 else self._length[-1] - self._at
+        if not self._trail and back >= _WAY_BACK_M:
+            self._sign = -self._sign
+            return
+        place = self._place_aside(robot)
+        if place is not None:
+            self._trail.append(self._here.copy())
+            self._aside = place
+        elif not self._trail:
+            self._sign = -self._sign
+
+    def _place_aside(self, robot: FloatArray) -> FloatArray | None:
+        """(2,) farthest from the robot of what can be walked to straight, not through it."""
+        now = float(np.linalg.norm(self._here - robot))
+        way = self._here + _STEPS_M[:, None, None] * _WAYS  # (steps, ways, 2)
+        far = np.linalg.norm(way - robot, axis=2)
+        open_ = self._free(way.reshape(-1, 2)).reshape(far.shape)
+        open_ &= far >= min(now, _BODIES_M)
+        reached = np.logical_and.accumulate(open_, axis=0)
+        worth = np.where(reached, far, -np.inf)
+        best = np.unravel_index(int(np.argmax(worth)), worth.shape)
+        return way[best] if worth[best] > now + _WORTH_M else None
+
+    def _walk_to(self, goal: FloatArray, step: float) -> FloatArray | None:
+        """One step; the goal, or None once it is reached."""
+        way = goal - self._here
+        left = float(np.linalg.norm(way))
+        if left <= step:
+            self._here = goal
+            return None
+        self._here = self._here + step / left * way
+        return goal
+
+    def _walk_on(self, step: float) -> None:
+        self._at += step * self._sign
+        if not 0.0 <= self._at <= self._length[-1]:
+            self._at = float(np.clip(self._at, 0.0, self._length[-1]))
+            self._sign = -self._sign
+        self._here = self._place(self._at)
+
+    def _next(self) -> FloatArray:
+        """(2,) a little ahead."""
+        goal = self._aside if self._aside is not None or not self._trail else self._trail[-1]
+        if goal is None:
+            return self._place(self._at + _AHEAD_M * self._sign)
+        way = goal - self._here
+        return self._here + way * min(1.0, _AHEAD_M / max(float(np.linalg.norm(way)), 1e-9))
+
+    def _place(self, at: float) -> FloatArray:
+        return np.array([np.interp(at, self._length, self._route[:, k]) for k in (0, 1)])
+
+
+class People:
+    """All who walk about; the renderer's bodies and the range sensor's discs."""
+
+    def __init__(
+        self,
+        routes: Sequence[FloatArray],
+        rng: np.random.Generator,
+        bank: ColourBank,
+        free: Free = _anywhere,
+    ) -> None:
+        """One person on each route (n, 2), starting somewhere on it; ``free`` tells the floor."""
+        self._free = free
+        self._starts = [(route, float(rng.uniform(0.0, 100.0))) for route in routes]
+        self._shirts = [int(k) for k in rng.integers(0, SHIRTS, len(routes))]
+        self._bank = bank
+        self._layers: dict[tuple[int, int], Layer] = {}
+        self.restart()
+
+    def restart(self) -> None:
+        """Everybody is again where the first walk began."""
+        self._walkers = [Walker(route, start, self._free) for route, start in self._starts]
+
+    def advance(self, seconds: float, robot: FloatArray) -> None:
+        """Everybody walks on."""
+        for walker in self._walkers:
+            walker.advance(seconds, robot)
+
+    def places(self) -> FloatArray:
+        """(n, 2) where they are."""
+        stances = [walker.stance() for walker in self._walkers]
+        return np.array([[s.x, s.y] for s in stances]).reshape(-1, 2)
+
+    def bodies(self) -> list[Body]:
+        """As the renderer takes them."""
+        out = []
+        for walker, shirt in zip(self._walkers, self._shirts, strict=True):
+            stance = walker.stance()
+            phase = int(stance.way / _STRIDE_M * _PHASES) % _PHASES
+            out.append(Body(self._layer(phase, shirt), _pose(stance), _BODY_RADIUS))
+        return out
+
+    def _layer(self, phase: int, shirt: int) -> Layer:
+        """The body in its own frame at one of the gait's phases; kept, as building it is slow."""
+        if (phase, shirt) not in self._layers:
+            thing = person(Stance(0.0, 0.0, 0.0, phase * _STRIDE_M / _PHASES))
+            dressed = tuple(_dressed(patch, shirt) for patch in thing.patches)
+            patches = stack([Thing("person", dressed)])
+            light = flat_light(patches, np.array([0.0, 0.0, 1.0]))
+            layer = Layer(patches, RayCaster(patches), light, self._bank)
+            self._layers[phase, shirt] = layer
+        return self._layers[phase, shirt]
+
+
+def _dressed(patch: Patch, shirt: int) -> Patch:
+    if patch.surface.texture != "shirt":
+        return patch
+    surface = Surface(f"shirt_{shirt}", patch.surface.tile_m)
+    return Patch(patch.corner, patch.edge_u, patch.edge_v, surface)
+
+
+def _pose(stance: Stance) -> FloatArray:
+    out = np.eye(4)
+    c, s = np.cos(stance.heading), np.sin(stance.heading)
+    out[:2, :2] = [[c, -s], [s, c]]
+    out[:2, 3] = stance.x, stance.y
+    return out

@@ -1,0 +1,107 @@
+"""A wheelchair: a unicycle with limits, latency, slip, and a body that walls stop."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from fgslam.core.planar import wrap
+from fgslam.core.types import FloatArray
+from fgslam.worlds.house.settings import WheelchairSettings
+
+_STEP_S = 0.01
+
+Blocked = Callable[[FloatArray], bool]
+"""Whether the wheelchair, its middle at a place (2,), would touch something."""
+
+
+class Wheelchair:
+    """True motion under commands.
+
+    Attributes:
+        pose: (3,) true planar pose.
+        speed, turn_rate: as the wheels turn now, before slip; m/s and rad/s.
+        time: seconds since the start.
+        collided: whether an obstacle stopped it in the last :meth:`advance`.
+        collisions: how often it has run into something.
+    """
+
+    def __init__(
+        self,
+        settings: WheelchairSettings,
+        pose: FloatArray,
+        rng: np.random.Generator,
+        blocked: Blocked | None = None,
+    ) -> None:
+        """Stands still at ``pose``; the errors of this drive are drawn from ``rng``."""
+        self._settings, self._rng = settings, rng
+        self._blocked: Blocked = blocked or (lambda _place: False)
+        self.pose = np.array(pose, dtype=np.float64)
+        self.speed, self.turn_rate, self.time = 0.0, 0.0, 0.0
+        self.collided, self.collisions = False, 0
+        drawn = rng.standard_normal(3)
+        self._speed_scale = 1.0 + settings.speed_scale * drawn[0]
+        self._turn_scale = 1.0 + settings.turn_scale * drawn[1]
+        self._pull = np.deg2rad(settings.pull_deg_m) * drawn[2]
+        self._pending: deque[tuple[float, float, float]] = deque()
+        self._aim = (0.0, 0.0)
+        self._steps, self._asked = 0, 0.0
+
+    def command(self, speed: float, turn_rate: float) -> None:
+        """Asks for a speed (m/s) and turn rate (rad/s); it takes effect after the latency.
+
+        Raises:
+            ValueError: a number is not finite.
+        """
+        if not (np.isfinite(speed) and np.isfinite(turn_rate)):
+            raise ValueError(f"command ({speed}, {turn_rate}) is not finite")
+        s = self._settings
+        top = np.deg2rad(s.max_turn_deg_s)
+        limited = float(np.clip(speed, -s.max_speed_m_s, s.max_speed_m_s))
+        turn = float(np.clip(turn_rate, -top, top))
+        self._pending.append((self.time + s.latency_s, limited, turn))
+
+    def advance(self, seconds: float) -> None:
+        """Moves on, in steps of a hundredth of a second; what is left over is made up for later.
+
+        Raises:
+            ValueError: the time does not go forwards.
+        """
+        if not seconds > 0.0:
+            raise ValueError(f"time must go forwards, got a step of {seconds} s")
+        touched = False
+        self._asked += seconds
+        for _ in range(round(self._asked / _STEP_S) - self._steps):
+            touched |= self._step()
+        self.collisions += int(touched and not self.collided)
+        self.collided = touched
+
+    def _step(self) -> bool:
+        while self._pending and self._pending[0][0] <= self.time + 1e-9:
+            self._aim = self._pending.popleft()[1:]
+        s = self._settings
+        gain = s.max_acceleration_m_s2 * _STEP_S
+        turn_gain = np.deg2rad(s.max_turn_acceleration_deg_s2) * _STEP_S
+        self.speed += float(np.clip(self._aim[0] - self.speed, -gain, gain))
+        self.turn_rate += float(np.clip(self._aim[1] - self.turn_rate, -turn_gain, turn_gain))
+        self._steps += 1
+        self.time = self._steps * _STEP_S
+        way, turn = self._slipped(self.speed * _STEP_S, self.turn_rate * _STEP_S)
+        middle = self.pose[2] + 0.5 * turn
+        place = self.pose[:2] + way * np.array([np.cos(middle), np.sin(middle)])
+        self.pose[2] = wrap(self.pose[2] + turn)
+        if way != 0.0 and self._blocked(place):
+            self.speed = 0.0
+            return True
+        self.pose[:2] = place
+        return False
+
+    def _slipped(self, way: float, turn: float) -> tuple[float, float]:
+        """What the floor makes of a small motion of the wheels."""
+        s, noise = self._settings, self._rng.standard_normal(2)
+        root = np.sqrt(abs(way))
+        true_way = way * self._speed_scale + s.slip_m_sqrt_m * root * noise[0]
+        drift = self._pull * abs(way) + np.deg2rad(s.slip_deg_sqrt_m) * root * noise[1]
+        return float(true_way), float(turn * self._turn_scale + drift)

@@ -1,0 +1,72 @@
+"""What happens to clean images on their way out of the camera: gain, noise, a cover.
+
+Each frame has its own random generator, so that any frame can be had alone and always the same.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from fgslam.core.types import Image
+from fgslam.worlds.lab_settings import LabEffectsSettings, LabExposureSettings
+
+_COVER_SEED = 7
+
+
+def exposure_gain(settings: LabExposureSettings | None, index: int) -> float:
+    """Gain of frame ``index``: a slow wave, and a factor from the jump on."""
+    if settings is None:
+        return 1.0
+    wave = 1.0 + settings.wave * np.sin(2.0 * np.pi * index / settings.wave_period_frames)
+    return float(wave * (settings.jump if index >= settings.jump_frame else 1.0))
+
+
+def is_blocked(settings: LabEffectsSettings, index: int) -> bool:
+    """Whether the cover is on the cameras in frame ``index``."""
+    blocked = settings.blocked_frames
+    return blocked is not None and blocked[0] <= index < blocked[1]
+
+
+def cover(shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
+    """A dark cloth right before the lens: nearly black, blurred blotches; images (k, h, w)."""
+    rng = np.random.default_rng(_COVER_SEED)
+    coarse = rng.random((shape[0], 4, 5)).astype(np.float32)
+    rows = np.linspace(0, 2.999, shape[1], dtype=np.float32)
+    columns = np.linspace(0, 3.999, shape[2], dtype=np.float32)
+    r, c = rows.astype(int), columns.astype(int)
+    fr, fc = (rows - r)[None, :, None], (columns - c)[None, None, :]
+    upper = coarse[:, r][:, :, c] * (1 - fc) + coarse[:, r][:, :, c + 1] * fc
+    lower = coarse[:, r + 1][:, :, c] * (1 - fc) + coarse[:, r + 1][:, :, c + 1] * fc
+    return np.asarray(6.0 + 9.0 * (upper * (1 - fr) + lower * fr), dtype=np.float32)
+
+
+def apply_effects(
+    clean: Image, settings: LabEffectsSettings, index: int, seed: int
+) -> tuple[Image, ...]:
+    """Images as the camera delivers them.
+
+    Args:
+        clean: (k, h, w) rendered images of one frame.
+        settings: the effects; motion blur and the person are in the render already.
+        index: the recording's frame number.
+        seed: of the recording; frame and seed together determine the noise.
+    """
+    gain = exposure_gain(settings.exposure, index)
+    if is_blocked(settings, index):
+        grey = cover(clean.shape)
+    elif gain == 1.0 and settings.noise_grey == 0.0:
+        return tuple(clean)
+    else:
+        grey = clean.astype(np.float32)
+    if gain != 1.0:
+        grey *= np.float32(gain)
+    if settings.noise_grey > 0.0:
+        rng = np.random.Generator(np.random.SFC64([seed, index, 0]))
+        noise = rng.standard_normal(grey.shape, dtype=np.float32)
+        noise *= np.float32(settings.noise_grey)
+        grey += noise
+    # Adding one half before the cut to integers rounds; it is faster than np.rint and clip.
+    grey += np.float32(0.5)
+    np.clip(grey, 0.0, 255.0, out=grey)
+    return tuple(grey.astype(np.uint8))

@@ -1,0 +1,87 @@
+"""Opening Open3D on machines that lack one of its system libraries.
+
+Open3D's wheel links against libusb, OpenGL, X11 and others even where only its ray caster is
+used. libusb also lives on PyPI, so its absence is mended here; for the others the user is told
+what to install.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import importlib
+import importlib.util
+import re
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+from fgslam.core.errors import MissingDependencyError
+from fgslam.worlds.rendering.system_check import DEBIAN_PACKAGES
+
+_LIBUSB = "libusb-1.0.so.0"
+
+
+def load_open3d(
+    import_module: Callable[[str], ModuleType] = importlib.import_module,
+    load_library: Callable[[str], object] | None = None,
+    bundled_libusb: Callable[[], Path | None] | None = None,
+) -> ModuleType:
+    """The open3d module, imported at the first call (about one second).
+
+    The arguments exist for tests and stand for the import system, the dynamic loader, and the
+    finder of the libusb that the ``libusb_package`` wheel holds.
+
+    Raises:
+        MissingDependencyError: Open3D or a system library it needs is absent.
+    """
+    load = load_library or _load_globally
+    try:
+        _provide_libusb(load, bundled_libusb or find_bundled_libusb)
+        return import_module("open3d")
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError(
+            "the rendered lab needs Open3D, which is not installed: pip install open3d"
+        ) from error
+    except (ImportError, OSError) as error:
+        raise MissingDependencyError(explain_missing_library(str(error))) from error
+
+
+def find_bundled_libusb() -> Path | None:
+    """Path of the shared object inside the ``libusb_package`` wheel, or None where it is absent."""
+    spec = importlib.util.find_spec("libusb_package")
+    if spec is None or not spec.submodule_search_locations:
+        return None
+    folder = Path(next(iter(spec.submodule_search_locations)))
+    return next(iter(sorted(folder.glob("libusb-1.0.so*"))), None)
+
+
+def explain_missing_library(message: str) -> str:
+    """One line for the user: which shared object the loader missed, and how to install it."""
+    found = re.search(r"(lib[\w.+-]+?\.so[\w.]*)", message)
+    if found is None:
+        return (
+            f"Open3D cannot be loaded: {message.splitlines()[0] if message else 'no reason given'}"
+        )
+    library = found.group(1)
+    package = DEBIAN_PACKAGES.get(library)
+    if package is None:
+        return f"Open3D needs the system library {library}: install the package that holds it"
+    return f"Open3D needs the system library {library}: sudo apt-get install -y {package}"
+
+
+def _load_globally(name: str) -> object:
+    return ctypes.CDLL(name, mode=ctypes.RTLD_GLOBAL)
+
+
+def _provide_libusb(load: Callable[[str], object], bundled: Callable[[], Path | None]) -> None:
+    """Preloads the wheel's libusb where the system has none.
+
+    The loader matches by SONAME, so an object already loaded satisfies Open3D's own request.
+    """
+    try:
+        load(_LIBUSB)
+    except OSError:
+        path = bundled()
+        if path is not None:
+            load(str(path))

@@ -1,0 +1,166 @@
+"""TODO worlds.simulated.settings."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, TypeAlias
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fgslam.core.settings import STRICT, MeasurementSelection
+from fgslam.worlds.lab_settings import LabRigSettings, WheelOdometrySettings
+
+Correlation: TypeAlias = Annotated[float, Field(gt=-1.0, lt=1.0)]
+
+
+@dataclass(frozen=True, config=STRICT)
+class MeasurementWorldSettings:
+    """Landmarks without appearance, on the surfaces of a place."""
+
+    place: Annotated[
+        Literal["room", "corridor"],
+        Field(
+            description="`room`: the rendered lab's walls and furniture, 10 m x 10 m; `corridor`: "
+            "walls along the way, a closed round for path `laps`, else never the same place twice"
+        ),
+    ] = "room"
+    landmarks: Annotated[
+        int, Field(ge=10, le=1_000_000, description="points in the room, or in 100 m of corridor")
+    ] = 2500
+    world_seed: Annotated[
+        int, Field(ge=0, description="where the points lie; the run's seed changes noise only")
+    ] = 0
+
+
+@dataclass(frozen=True, config=STRICT)
+class MeasurementDriveSettings:
+    """The robot's path and speed."""
+
+    path: Annotated[
+        Literal["lab_loop", "laps", "sharp_turns", "exploring"],
+        Field(
+            description="`lab_loop` the paper's drive around the chair; `laps` round after round; "
+            "`sharp_turns` turns on the spot and tight bends; `exploring` on and on through "
+            "corridors"
+        ),
+    ] = "lab_loop"
+    frames: Annotated[
+        Annotated[int, Field(ge=2, le=100_000)] | None,
+        Field(
+            description="exact number of frames (the speed is scaled down to fit; `sharp_turns` "
+            "repeats its round); null: one way at nine tenths of the speed limits"
+        ),
+    ] = 249
+    frame_rate_hz: Annotated[float, Field(gt=0.0, le=120.0, description="frames a second")] = 2.0
+    max_speed_m_s: Annotated[float, Field(gt=0.0, le=5.0, description="limit, metres a second")] = (
+        0.40
+    )
+    max_turn_deg_s: Annotated[
+        float, Field(gt=0.0, le=180.0, description="limit, degrees a second")
+    ] = 10.0
+    laps: Annotated[int, Field(ge=1, le=1000, description="rounds, for `laps`")] = 1
+    length_m: Annotated[
+        float, Field(ge=30.0, le=10_000.0, description="least way, metres, for `exploring`")
+    ] = 200.0
+    turn_deg_per_frame: Annotated[
+        float, Field(gt=0.0, le=45.0, description="turn a frame, degrees, for `sharp_turns`")
+    ] = 12.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class DetectionSettings:
+    """Which landmarks are measured, how well, and how long they keep their identity."""
+
+    pixel_sigma: Annotated[
+        float,
+        Field(gt=0.0, description="noise of one coordinate in each image, as stereo.pixel_sigma"),
+    ] = 0.2
+    noise_scale: Annotated[
+        float,
+        Field(ge=0.0, description="drawn over stated noise, of pixels and odometry; 0: exact"),
+    ] = 1.0
+    features: Annotated[
+        int, Field(ge=1, le=10_000, description="most landmarks measured in a frame")
+    ] = 100
+    probability: Annotated[
+        float, Field(gt=0.0, le=1.0, description="that a landmark in view is found in a frame")
+    ] = 0.85
+    max_range_m: Annotated[
+        float, Field(gt=0.1, description="landmarks farther than this are not in view, metres")
+    ] = 8.0
+    min_range_m: Annotated[
+        float, Field(ge=0.05, description="nor those nearer than this, metres")
+    ] = 0.4
+    oblique_deg: Annotated[
+        float,
+        Field(gt=0.0, le=180.0, description="seen up to this angle off its surface's normal"),
+    ] = 75.0
+    prune_after_misses: Annotated[
+        int, Field(ge=1, description="consecutive misses in view until an identity is dropped")
+    ] = 20
+
+
+@dataclass(frozen=True, config=STRICT)
+class WhiteWheelOdometrySettings(WheelOdometrySettings):
+    """The rendered lab's wheels, by default without scale errors: each step errs by itself."""
+
+    distance_scale: Annotated[
+        float, Field(ge=0.0, le=0.5, description="constant relative error of distance, per drive")
+    ] = 0.0
+    turn_scale: Annotated[
+        float, Field(ge=0.0, le=0.5, description="constant relative error of turns, per drive")
+    ] = 0.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class OdometryFaultSettings:
+    """Wheels that report the wrong motion for a while, flagged nowhere."""
+
+    start: Annotated[int, Field(ge=1, description="first step with the fault (into this frame)")]
+    frames: Annotated[int, Field(ge=1, description="how many steps")] = 10
+    scale: Annotated[
+        float, Field(ge=-2.0, le=5.0, description="reported over true motion, way and turn")
+    ] = 0.5
+
+
+@dataclass(frozen=True, config=STRICT)
+class BlackoutSettings:
+    """Blocked cameras: frames without any observation."""
+
+    start: Annotated[int, Field(ge=1, description="first blocked frame")]
+    frames: Annotated[int, Field(ge=1, description="how many frames")] = 30
+
+
+@dataclass(frozen=True, config=STRICT)
+class MovedLandmarksSettings:
+    """Landmarks that are somewhere else from one frame on."""
+
+    frame: Annotated[int, Field(ge=1, description="from this frame on")]
+    fraction: Annotated[float, Field(gt=0.0, le=1.0, description="of all landmarks")] = 0.1
+    distance_m: Annotated[
+        float, Field(gt=0.0, description="moved so far, level, in any direction")
+    ] = 0.5
+
+
+@dataclass(frozen=True, config=STRICT)
+class SimulatedMeasurementsSettings(MeasurementSelection):
+    """A simulated drive without images (docs/datasets/simulated_measurements.md)."""
+
+    kind: Literal["simulated_measurements"] = "simulated_measurements"
+    world: MeasurementWorldSettings = MeasurementWorldSettings()
+    drive: MeasurementDriveSettings = MeasurementDriveSettings()
+    rig: LabRigSettings = LabRigSettings()
+    detection: DetectionSettings = DetectionSettings()
+    odometry: WhiteWheelOdometrySettings = WhiteWheelOdometrySettings()
+    outlier_fraction: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            le=0.9,
+            description="of matched observations that are wrong: another landmark's measurement, "
+            "or anything in the image, half each; flagged nowhere",
+        ),
+    ] = 0.0
+    odometry_fault: OdometryFaultSettings | None = None
+    blackout: BlackoutSettings | None = None
+    moved: MovedLandmarksSettings | None = None

@@ -1,0 +1,81 @@
+"""Wheel odometry of a planar robot: a stated drift model, sampled, with its exact covariance.
+
+Of a true motion between two frames with way ``l`` and turn ``a`` the wheels report
+``motion * Exp(xi)``, where ``xi`` [rotation, translation], tangent at the new body pose, is
+
+* zero-mean noise, independent between frames, whose variances grow with ``l`` and ``|a|``, and
+* two scale errors, drawn once a drive: a fraction of the distance and a fraction of the turn.
+
+The covariance stated with each increment is that of ``xi`` over all drives (noise and scale
+together). Truth has neither height, pitch nor roll; their noise is what an inertial unit would add.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.core import geometry
+from fgslam.core.types import FloatArray, Odometry
+from fgslam.worlds.lab_settings import WheelOdometrySettings
+
+_YAW, _ALONG = 2, 3
+
+
+def increment_variances(
+    settings: WheelOdometrySettings, way: FloatArray, turn: FloatArray
+) -> FloatArray:
+    """Variances (n, 6) of the noise that is independent between frames.
+
+    Args:
+        settings: the drift model.
+        way: (n,) metres driven in each increment.
+        turn: (n,) radians turned.
+    """
+    out = np.empty((len(way), 6))
+    tilt, yaw_m, yaw_rad = np.deg2rad(
+        [settings.tilt_deg_sqrt_m, settings.yaw_deg_sqrt_m, settings.yaw_deg_sqrt_rad]
+    )
+    out[:, :2] = (tilt**2 * way)[:, None]
+    out[:, _YAW] = yaw_m**2 * way + yaw_rad**2 * np.abs(turn)
+    sides = (settings.distance_m_sqrt_m, settings.sideways_m_sqrt_m, settings.height_m_sqrt_m)
+    out[:, 3:] = way[:, None] * np.square(sides)
+    out[:, :3] += np.deg2rad(settings.floor_deg) ** 2
+    out[:, 3:] += settings.floor_m**2
+    return out
+
+
+def simulate(
+    settings: WheelOdometrySettings, body_poses: FloatArray, rng: np.random.Generator
+) -> list[Odometry]:
+    """Odometry between consecutive body poses (n, 4, 4): n - 1 increments.
+
+    Args:
+        settings: the drift model.
+        body_poses: true ``wTb``, planar.
+        rng: source of the noise; one drive's worth is drawn.
+    """
+    motions = geometry.inverse(body_poses[:-1]) @ body_poses[1:]
+    scale = rng.standard_normal(2) * (settings.turn_scale, settings.distance_scale)
+    noise = rng.standard_normal((len(motions), 6))
+    turn = np.arctan2(motions[:, 1, 0], motions[:, 0, 0])
+    way = np.linalg.norm(motions[:, :3, 3], axis=1)
+    variances = increment_variances(settings, way, turn)
+    out = []
+    for motion, angle, unit, variance in zip(motions, turn, noise, variances, strict=True):
+        by_turn, by_distance = _scale_directions(motion, float(angle))
+        xi = unit * np.sqrt(variance) + scale[0] * by_turn + scale[1] * by_distance
+        covariance = (
+            np.diag(variance)
+            + settings.turn_scale**2 * np.outer(by_turn, by_turn)
+            + settings.distance_scale**2 * np.outer(by_distance, by_distance)
+        )
+        out.append(Odometry(np.asarray(motion @ geometry.se3_exp(xi)), covariance))
+    return out
+
+
+def _scale_directions(motion: FloatArray, turn: float) -> tuple[FloatArray, FloatArray]:
+    """Tangent vectors (6,) at the new pose of a unit relative error of turn and of distance."""
+    by_turn, by_distance = np.zeros(6), np.zeros(6)
+    by_turn[_YAW] = turn
+    by_distance[_ALONG:] = motion[:3, :3].T @ motion[:3, 3]
+    return by_turn, by_distance
