@@ -24,15 +24,16 @@ from fgslam.core.types import CameraRig, MeasurementType, Prediction, Sensor
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.datasets.synthetic_odometry import SyntheticOdometry
-from fgslam.frontend.database import LandmarkDatabase
-from fgslam.frontend.ego_motion import EgoMotionSolver
-from fgslam.frontend.loops.recognition import PlaceRecognition, RecognitionParts
-from fgslam.frontend.map_matching import MapMatcher
-from fgslam.frontend.relocalisation.relocaliser import Relocaliser
-from fgslam.frontend.sift import SiftExtractor
-from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.features.sift import SiftExtractor
+from fgslam.frontend.places.loops.recognition import PlaceRecognition, RecognitionParts
+from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
+from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.stream import FeatureStream
-from fgslam.frontend.tracker import LandmarkTracker
+from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.map_matching import MapMatcher
+from fgslam.frontend.tracking.settings import EgoMotionSettings
+from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
 from fgslam.pipeline import SlamPipeline
 from fgslam.settings.backend import (
@@ -52,7 +53,7 @@ from fgslam.settings.datasets import (
     RecordedOdometrySettings,
     SyntheticOdometrySettings,
 )
-from fgslam.settings.frontend import EgoMotionSettings, FrontendSettings
+from fgslam.settings.frontend import FrontendSettings
 from fgslam.settings.measurements import MeasurementDatasetSettings
 from fgslam.worlds.lab_settings import RenderedLabSettings
 

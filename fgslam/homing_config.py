@@ -21,6 +21,9 @@ from fgslam.config_reading import (
     with_default_kind,
 )
 from fgslam.core.errors import ConfigError
+from fgslam.frontend.features.omni_settings import OmniFeatureSettings
+from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from fgslam.settings.homing_behaviour import (
     HomingBehaviourSettings,
     LocalisationSettings,
@@ -28,10 +31,7 @@ from fgslam.settings.homing_behaviour import (
 )
 from fgslam.settings.homing_estimators import HomingEstimatorSettings, HomingGraphSettings
 from fgslam.settings.homing_output import HomingOutputSettings
-from fgslam.settings.homing_vector import HomingVectorSettings
 from fgslam.settings.omni_datasets import OmniDatasetSettings
-from fgslam.settings.omni_features import OmniFeatureSettings
-from fgslam.settings.omni_tracking import OmniTrackingSettings
 from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
 from fgslam.worlds.house.settings import OmniHouseSettings
 

@@ -27,12 +27,12 @@ from fgslam.core.types import (
     StereoFeatures,
     UpdateStats,
 )
-from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
-from fgslam.frontend.loops.recognition import PlaceRecognition
-from fgslam.frontend.resection import Resection
-from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.places.loops.recognition import PlaceRecognition
+from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.stream import FeatureFrame
-from fgslam.frontend.tracker import Association, LandmarkTracker
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
+from fgslam.frontend.tracking.resection import Resection
+from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
 from fgslam.motion import MotionModel
 
 

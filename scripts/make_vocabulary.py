@@ -14,8 +14,8 @@ import numpy as np
 from fgslam.config import load_config
 from fgslam.core.types import FloatArray
 from fgslam.factory import open_sequence
-from fgslam.frontend.sift import SiftExtractor
-from fgslam.frontend.vocabulary import VOCABULARY_FILE
+from fgslam.frontend.features.sift import SiftExtractor
+from fgslam.frontend.features.vocabulary import VOCABULARY_FILE
 
 _WORDS = 256
 _ROUNDS = 25

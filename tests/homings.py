@@ -8,9 +8,9 @@ import numpy as np
 
 from fgslam.core.homing_types import HomingStart, HomingTruth, HomingVector, TrackedBearings
 from fgslam.core.types import BoolArray
-from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
-from fgslam.frontend.omni.local_map import make_local_map
-from fgslam.settings.homing_vector import HomingVectorSettings
+from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
+from fgslam.frontend.homing.local_map import make_local_map
+from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
 from fgslam.worlds.simulated.bearings import simulate_homing
 

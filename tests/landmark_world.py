@@ -25,6 +25,7 @@ from fgslam.core.homing_types import (
 )
 from fgslam.core.planar import bearings, compose, wrap
 from fgslam.core.types import ByteArray, FloatArray, IntArray
+from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.homing.avoidance import NoAvoidance, ObstacleAvoider
 from fgslam.homing.closed_loop import Driver, follow
 from fgslam.homing.eyes import Sighting
@@ -35,7 +36,6 @@ from fgslam.homing.steering import Steering
 from fgslam.runs.homing.starting import start_from_matches
 from fgslam.settings.homing_behaviour import HomingBehaviourSettings
 from fgslam.settings.homing_estimators import HomingEkfSettings, HomingEstimatorSettings
-from fgslam.settings.homing_vector import HomingVectorSettings
 
 DARK = np.zeros((1, 1, 3), dtype=np.uint8)
 

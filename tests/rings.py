@@ -12,14 +12,15 @@ from fgslam.arrival import Arrival, take_over
 from fgslam.core import geometry as g
 from fgslam.core.types import Features, FloatArray, Frame, Increment, Odometry
 from fgslam.factory import make_estimator, make_places, make_tracker
-from fgslam.frontend.loops.confirmation import difference
-from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.places.loops.confirmation import difference
+from fgslam.frontend.places.settings import LoopSettings, LostSettings
+from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.stream import FeatureFrame
+from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import OdometryMotion
 from fgslam.pipeline import FrameReport, SlamPipeline
 from fgslam.settings.backend import EstimatorSettings, LandmarkKalmanSettings
-from fgslam.settings.frontend import EgoMotionSettings, FrontendSettings
-from fgslam.settings.loops import LoopSettings, LostSettings
+from fgslam.settings.frontend import FrontendSettings
 
 IMAGES = (np.zeros((240, 320), np.uint8),) * 3
 RADIUS = 3.0

@@ -25,7 +25,7 @@ from fgslam.core.geometry import (
 from fgslam.core.types import CameraRig, FloatArray, LandmarkMap, Observations, Prediction
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.stereo import FROM_MEASUREMENT
-from fgslam.settings.frontend import EgoMotionSettings
+from fgslam.frontend.tracking.settings import EgoMotionSettings
 
 _POSE = pose_key(0)
 _CONVERGED = 1e-9  # radians and metres; as the front-end's, which does not take that step either

@@ -37,8 +37,8 @@ from fgslam.core.types import (
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.noise import Whitening
 from fgslam.factors.stereo import StereoFactors
+from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.settings.backend import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
-from fgslam.settings.frontend import EgoMotionSettings
 
 _POSE, _LANDMARK = pose_key(0), landmark_key(0)
 

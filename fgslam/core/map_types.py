@@ -11,7 +11,7 @@ import numpy.typing as npt
 from fgslam.core.types import ByteArray, FloatArray, IntArray
 
 Words = npt.NDArray[np.int16]
-"""(v,) the cell of the vocabulary that each descriptor lies in (:mod:`fgslam.frontend.vocabulary`).
+"""(v,) the cell of the vocabulary that each descriptor lies in (:mod:`fgslam.frontend.features.vocabulary`).
 """
 
 

@@ -17,17 +17,17 @@ from fgslam.core.homing_types import (
     TrackedBearings,
 )
 from fgslam.core.types import ByteArray, FloatArray, IntArray
-from fgslam.frontend.omni.features import OmniFeatureExtractor
-from fgslam.frontend.omni.homing_ransac import estimate_homing_vector, paired_anew
-from fgslam.frontend.omni.local_map import make_local_map, triangulable
-from fgslam.frontend.omni.matching import joined, match_features
-from fgslam.frontend.omni.trackable import move_to_trackable
-from fgslam.frontend.omni.tracking import BearingTracker
+from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
+from fgslam.frontend.homing.homing_ransac import estimate_homing_vector, paired_anew
+from fgslam.frontend.homing.local_map import make_local_map, triangulable
+from fgslam.frontend.homing.matching import joined, match_features
+from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.trackable import move_to_trackable
+from fgslam.frontend.homing.tracking import BearingTracker
+from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from fgslam.homing.eyes import Sighting
 from fgslam.homing.soundness import parallax
-from fgslam.settings.homing_vector import HomingVectorSettings
-from fgslam.settings.omni_features import OmniFeatureSettings, OmniMatchingSettings
-from fgslam.settings.omni_tracking import OmniTrackingSettings
 
 _SECTORS = 8  # of 45 degrees
 _DARK = 8.0  # mean grey value of what the camera sees

@@ -28,10 +28,11 @@ from fgslam.datasets.match_checks import (
     check_stereo_counts,
     fit_turn,
 )
-from fgslam.frontend.descriptor_matching import mutual_nearest
-from fgslam.frontend.sift import SiftExtractor
-from fgslam.frontend.stereo import StereoMatcher
-from fgslam.settings.frontend import FrontendSettings, StereoSettings
+from fgslam.frontend.features.descriptor_matching import mutual_nearest
+from fgslam.frontend.features.sift import SiftExtractor
+from fgslam.frontend.stereo.matching import StereoMatcher
+from fgslam.frontend.stereo.settings import StereoSettings
+from fgslam.settings.frontend import FrontendSettings
 
 _FEWEST_FOR_MEDIAN = 10
 _NEAR_LINE_PX = 2.0

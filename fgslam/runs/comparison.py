@@ -16,6 +16,7 @@ from fgslam.export.landmark_truth import LANDMARK_TRUTH_FILE, read_landmark_trut
 from fgslam.export.metrics import EstimatorMetrics
 from fgslam.export.point_cloud import MapPoints, read_ply
 from fgslam.export.trajectories import read_tum
+from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.runs.checkpoint import LOG_FILE
 from fgslam.runs.estimator_files import write_replay
 from fgslam.runs.judging import Truth, judge_replay, seen_often
@@ -23,7 +24,6 @@ from fgslam.runs.map_entry import arrival_of
 from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.runs.replay import replay
 from fgslam.settings.backend import EstimatorSettings
-from fgslam.settings.frontend import EgoMotionSettings
 
 COMPARISON_FILE = "comparison.csv"
 GROUND_TRUTH_FILE = "ground_truth.tum"

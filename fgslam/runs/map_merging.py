@@ -9,9 +9,9 @@ import numpy as np
 from fgslam.core.errors import MapError
 from fgslam.core.geometry import so3_log
 from fgslam.core.saved_map import load_map, require_rig, save_map
-from fgslam.frontend.map_alignment import align_maps
-from fgslam.frontend.map_fusion import merge_maps
-from fgslam.settings.maps import MergeSettings
+from fgslam.frontend.places.map_alignment import align_maps
+from fgslam.frontend.places.map_fusion import merge_maps
+from fgslam.frontend.places.settings import MergeSettings
 
 _SEED = 0  # the same maps give the same bytes
 

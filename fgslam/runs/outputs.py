@@ -30,7 +30,7 @@ from fgslam.export.metrics import (
 )
 from fgslam.export.point_cloud import MapPoints
 from fgslam.export.trajectories import write_tum
-from fgslam.frontend.database import LandmarkDatabase
+from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.homing_config import HomingExperiment
 from fgslam.localisation_config import LocalisationConfig
 from fgslam.pipeline import SlamPipeline

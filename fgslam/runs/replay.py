@@ -29,12 +29,12 @@ from fgslam.core.types import (
     Trajectory,
 )
 from fgslam.factory import make_estimator
-from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import ReplayedFrame, replay_frame
 from fgslam.settings.backend import EstimatorSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
-from fgslam.settings.frontend import EgoMotionSettings
 
 ESTIMATOR_FAULTS = (
     FgslamError,

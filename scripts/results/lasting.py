@@ -10,9 +10,9 @@ import numpy as np
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.types import BoolArray, FloatArray, IntArray
-from fgslam.frontend.permanence import reliable, seen_past
+from fgslam.frontend.tracking.permanence import reliable, seen_past
+from fgslam.frontend.tracking.settings import PermanenceSettings
 from fgslam.pipeline import FrameReport, SlamPipeline
-from fgslam.settings.frontend import PermanenceSettings
 from scripts.results.person import position_errors
 from scripts.results.report import Cell, Table
 from scripts.results.runs import (

@@ -10,7 +10,7 @@ from fgslam.core.geometry import inverse, transform_to_camera
 from fgslam.core.recordings import Sequence
 from fgslam.core.types import BoolArray, CameraRig, FloatArray, IntArray, Observations
 from fgslam.datasets.rendered_lab import RenderedLabSequence
-from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.stereo.matching import StereoMatcher
 from scripts.results.report import Cell, Table
 from scripts.results.runs import FoundFeatures, experiment, find_features, make_system, process, say
 

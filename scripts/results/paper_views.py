@@ -10,10 +10,11 @@ from fgslam.config import ExperimentConfig
 from fgslam.core.types import EgoMotion, FloatArray, Trajectory
 from fgslam.evaluation.trajectory import end_pose
 from fgslam.factory import make_pipeline
-from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.features.settings import AppearanceSettings
+from fgslam.frontend.stereo.matching import StereoMatcher
+from fgslam.frontend.stereo.settings import StereoSettings
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.pipeline import FrameReport
-from fgslam.settings.frontend import AppearanceSettings, StereoSettings
 from scripts.results.report import Cell, Table
 from scripts.results.runs import experiment, say
 from scripts.results.views import LabViews, View, ViewPair, make_pair

@@ -15,7 +15,7 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.types import BoolArray, CameraRig, FloatArray, LandmarkMap, StereoFeatures
 from fgslam.evaluation.trajectory import rotation_angles
 from fgslam.factory import make_relocaliser, make_stereo_matcher, make_stream, open_sequence
-from fgslam.frontend.relocalisation.relocaliser import Relocaliser
+from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.localisation_config import LocalisationConfig, load_experiment
 from fgslam.runs.localisation.experiment import run_localisation

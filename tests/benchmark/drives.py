@@ -25,11 +25,11 @@ from fgslam.core.types import (
 )
 from fgslam.datasets.opening import open_measurements
 from fgslam.factory import make_estimator
-from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.pipeline import replay_frame
 from fgslam.runs.replay import replay_motion
 from fgslam.settings.backend import EstimatorSettings
-from fgslam.settings.frontend import EgoMotionSettings
 from fgslam.settings.measurements import MeasurementDatasetSettings
 
 

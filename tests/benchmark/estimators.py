@@ -20,7 +20,7 @@ from fgslam.backend.outliers import solver_parameters
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import FloatArray, LandmarkMap
 from fgslam.factory import make_estimator
-from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.pipeline import replay_frame
 from fgslam.runs.replay import replay_motion
 from fgslam.settings.backend import (

@@ -18,7 +18,10 @@ from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.core.homing_types import OmniFeatures, TrackedBearings
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import FloatArray, Image
-from fgslam.frontend.omni.features import OmniFeatureExtractor
+from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
+from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from fgslam.homing.controller import HomingController
 from fgslam.homing.eyes import HomingEyes
 from fgslam.homing.image_eyes import EyesSettings, ImageEyes
@@ -28,9 +31,6 @@ from fgslam.settings.homing_estimators import (
     HomingEstimatorSettings,
     HomingGraphSettings,
 )
-from fgslam.settings.homing_vector import HomingVectorSettings
-from fgslam.settings.omni_features import OmniFeatureSettings, OmniMatchingSettings
-from fgslam.settings.omni_tracking import OmniTrackingSettings
 from fgslam.worlds.house.omni_world import OmniWorld
 from fgslam.worlds.house.settings import HousePathSettings, OmniHouseSettings
 from tests.benchmark.drives import cpu_seconds, interleaved

@@ -27,14 +27,14 @@ from fgslam.core.types import (
     Trajectory,
 )
 from fgslam.factory import make_tracker
-from fgslam.frontend.database import LandmarkDatabase
-from fgslam.frontend.tracker import LandmarkTracker
-from fgslam.settings.frontend import (
+from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.frontend.tracking.settings import (
     DatabaseSettings,
-    FrontendSettings,
     PermanenceSettings,
     ViewpointSettings,
 )
+from fgslam.frontend.tracking.tracker import LandmarkTracker
+from fgslam.settings.frontend import FrontendSettings
 
 SIZES = (1_000, 10_000, 100_000)
 FRAMES = 30

@@ -40,12 +40,12 @@ from fgslam.factory import (
     make_tracker,
     open_sequence,
 )
-from fgslam.frontend.loops.recognition import PlaceRecognition
-from fgslam.frontend.sift import SiftExtractor
+from fgslam.frontend.features.sift import SiftExtractor
+from fgslam.frontend.places.loops.recognition import PlaceRecognition
+from fgslam.frontend.places.settings import LostSettings
 from fgslam.frontend.stream import FeatureFrame
-from fgslam.frontend.tracker import LandmarkTracker
+from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.settings.frontend import FrontendSettings
-from fgslam.settings.loops import LostSettings
 
 SIZES = (1_000, 3_000, 10_000, 30_000, 100_000)
 FRAMES, EVERY = 120, 8

@@ -33,7 +33,8 @@ from fgslam.core.types import (
     UpdateStats,
 )
 from fgslam.factory import make_estimator
-from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
 from fgslam.settings.backend import (
@@ -47,7 +48,6 @@ from fgslam.settings.backend import (
     LandmarkKalmanSettings,
 )
 from fgslam.settings.datasets import ConstantVelocitySettings
-from fgslam.settings.frontend import EgoMotionSettings
 
 SETTINGS: dict[str, EstimatorSettings] = {
     "odometry": DeadReckoningSettings(),

@@ -26,14 +26,15 @@ from fgslam.backend.protocol import Estimator
 from fgslam.core import geometry as g
 from fgslam.core.types import FloatArray, Frame, Odometry, Prediction
 from fgslam.factory import make_estimator, make_tracker
-from fgslam.frontend.ego_motion import EgoMotionSolver
-from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.stream import FeatureFrame
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import ConstantVelocityMotion, OdometryMotion
 from fgslam.pipeline import FrameReport, SlamPipeline, replay_step
 from fgslam.settings.backend import EstimatorSettings, FixedLagSettings, Isam2Settings
 from fgslam.settings.datasets import ConstantVelocitySettings
-from fgslam.settings.frontend import EgoMotionSettings, FrontendSettings
+from fgslam.settings.frontend import FrontendSettings
 
 DRIVE = Drive(frames=10)
 SIXDOF = EgoMotionSettings(dof=6)

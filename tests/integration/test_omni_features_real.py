@@ -13,11 +13,11 @@ from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.homing_types import BearingMatches
 from fgslam.core.planar import between
 from fgslam.core.types import BoolArray, FloatArray
-from fgslam.frontend.omni.epipolar import EpipolarTest
-from fgslam.frontend.omni.features import OmniFeatureExtractor
-from fgslam.frontend.omni.matching import match_features
-from fgslam.frontend.omni.plain_sift import match_plain, plain_sift
-from fgslam.settings.omni_features import OmniFeatureSettings
+from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni_settings import OmniFeatureSettings
+from fgslam.frontend.homing.epipolar import EpipolarTest
+from fgslam.frontend.homing.matching import match_features
+from fgslam.frontend.homing.plain_sift import match_plain, plain_sift
 
 pytestmark = pytest.mark.data
 

@@ -8,12 +8,12 @@ import pytest
 from fgslam.core.homing_types import BearingMatches
 from fgslam.core.planar import wrap
 from fgslam.core.types import FloatArray, Image
-from fgslam.frontend.omni.features import OmniFeatureExtractor
-from fgslam.frontend.omni.matching import match_features
-from fgslam.frontend.omni.trackable import move_to_trackable
-from fgslam.frontend.omni.tracking import BearingTracker
-from fgslam.settings.omni_features import OmniFeatureSettings, OmniMatchingSettings
-from fgslam.settings.omni_tracking import OmniTrackingSettings
+from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
+from fgslam.frontend.homing.matching import match_features
+from fgslam.frontend.homing.trackable import move_to_trackable
+from fgslam.frontend.homing.tracking import BearingTracker
+from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from fgslam.worlds.house.omni_world import OmniWorld
 from fgslam.worlds.house.settings import HousePathSettings, OmniHouseSettings
 

@@ -13,14 +13,14 @@ from fgslam.core.homing_types import FeatureKind, HomingVector
 from fgslam.datasets.images import read_colour_image
 from fgslam.datasets.omni_camera_files import make_camera
 from fgslam.datasets.omni_opening import open_omni
-from fgslam.frontend.omni.features import OmniFeatureExtractor
-from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
-from fgslam.frontend.omni.matching import match_features
-from fgslam.frontend.omni.video_tracking import ReplenishedTracker
-from fgslam.settings.homing_vector import HomingVectorSettings
+from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
+from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
+from fgslam.frontend.homing.matching import match_features
+from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
+from fgslam.frontend.homing.video_tracking import ReplenishedTracker
 from fgslam.settings.omni_datasets import OmniVideoSettings
-from fgslam.settings.omni_features import OmniFeatureSettings, OmniMatchingSettings
-from fgslam.settings.omni_tracking import OmniTrackingSettings
 
 pytestmark = pytest.mark.data
 

@@ -15,7 +15,7 @@ from fgslam.config import ExperimentConfig, parse_config
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import Estimate
 from fgslam.export.trajectories import write_tum
-from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.pipeline import replay_step
 
 

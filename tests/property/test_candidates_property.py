@@ -8,8 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from fgslam.frontend.candidates import alike, choose, descriptor_distance, pairs_within, unambiguous
-from fgslam.settings.frontend import AppearanceSettings
+from fgslam.frontend.features.candidates import (
+    alike,
+    choose,
+    descriptor_distance,
+    pairs_within,
+    unambiguous,
+)
+from fgslam.frontend.features.settings import AppearanceSettings
 
 # Halves and quarters: sums and differences are exact, so borders are met exactly.
 quarters = st.integers(-40, 40).map(lambda n: n / 4.0)

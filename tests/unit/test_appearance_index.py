@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from fgslam.core.types import ByteArray
-from fgslam.frontend import vocabulary
-from fgslam.frontend.relocalisation import appearance_index
-from fgslam.frontend.relocalisation.appearance_index import AppearanceIndex, Neighbours
+from fgslam.frontend.features import vocabulary
+from fgslam.frontend.places.relocalisation import appearance_index
+from fgslam.frontend.places.relocalisation.appearance_index import AppearanceIndex, Neighbours
 from tests.known_places import blurred, looks
 
 

@@ -10,9 +10,9 @@ import yaml
 
 from fgslam.config import ExperimentConfig, load_config, parse_config
 from fgslam.core.errors import ConfigError
+from fgslam.frontend.places.settings import LoopSettings
 from fgslam.homing_config import is_homing
 from fgslam.settings.datasets import ConstantVelocitySettings, ImageFolderSettings
-from fgslam.settings.loops import LoopSettings
 from fgslam.worlds.lab_settings import RenderedLabSettings
 
 EXPERIMENTS = [

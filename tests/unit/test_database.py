@@ -18,9 +18,9 @@ from fgslam.core.types import (
     Prediction,
     StereoFeatures,
 )
-from fgslam.frontend.database import LandmarkDatabase
-from fgslam.frontend.visibility import predicted_covariance
-from fgslam.settings.frontend import DatabaseSettings
+from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.frontend.tracking.settings import DatabaseSettings
+from fgslam.frontend.tracking.visibility import predicted_covariance
 
 NO_BORDER = DatabaseSettings(border_px=0.0)
 BORDER = DatabaseSettings(border_px=8.0)

@@ -21,8 +21,8 @@ from fgslam.core.types import (
     Observations,
     Prediction,
 )
-from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
-from fgslam.settings.frontend import EgoMotionSettings
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
+from fgslam.frontend.tracking.settings import EgoMotionSettings
 
 SIGMA = np.array([0.3, 0.3, 0.2])
 PRIOR_SIGMA = np.array([0.01, 0.01, 0.01, 0.03, 0.03, 0.03])

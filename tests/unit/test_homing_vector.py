@@ -11,11 +11,11 @@ from scipy.stats import chi2
 from fgslam.core.homing_types import BearingMatches, HomingVector, LocalMap, Refusal, RefusalReason
 from fgslam.core.planar import wrap
 from fgslam.core.types import FloatArray
-from fgslam.frontend.omni.epipolar import EpipolarTest
-from fgslam.frontend.omni.homing_ransac import _cells, estimate_homing_vector
-from fgslam.frontend.omni.homing_refinement import HomingRefinement, RefinementPrior
-from fgslam.frontend.omni.local_map import make_local_map, triangulable, triangulate
-from fgslam.settings.homing_vector import HomingVectorSettings
+from fgslam.frontend.homing.epipolar import EpipolarTest
+from fgslam.frontend.homing.homing_ransac import _cells, estimate_homing_vector
+from fgslam.frontend.homing.homing_refinement import HomingRefinement, RefinementPrior
+from fgslam.frontend.homing.local_map import make_local_map, triangulable, triangulate
+from fgslam.frontend.homing.settings import HomingVectorSettings
 from tests.homing import TwoViews, make_matches, two_views
 
 HALF_DEGREE = np.deg2rad(0.5)

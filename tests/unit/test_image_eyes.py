@@ -9,10 +9,10 @@ import pytest
 
 from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.homing_types import FeatureKind, Refusal, RefusalReason
+from fgslam.frontend.features.omni_settings import OmniFeatureSettings
+from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from fgslam.homing.image_eyes import EyesSettings, ImageEyes, mixed_with_wrong, surest_all_around
-from fgslam.settings.homing_vector import HomingVectorSettings
-from fgslam.settings.omni_features import OmniFeatureSettings
-from fgslam.settings.omni_tracking import OmniTrackingSettings
 from tests.homing import two_views
 
 

@@ -27,7 +27,7 @@ from fgslam.datasets.match_checks import (
     check_stereo_counts,
     fit_turn,
 )
-from fgslam.frontend.descriptor_matching import mutual_nearest
+from fgslam.frontend.features.descriptor_matching import mutual_nearest
 from fgslam.inspection.recording import inspect_recording
 from fgslam.inspection.report import render_report
 from fgslam.settings.datasets import ImageFolderSettings, RecordedOdometrySettings

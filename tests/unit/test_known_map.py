@@ -8,7 +8,7 @@ import pytest
 from fgslam.core.geometry import project, transform_to_camera
 from fgslam.core.map_types import LandmarkAppearances
 from fgslam.core.types import FloatArray, IntArray, LandmarkMap
-from fgslam.frontend.relocalisation.known_map import KnownMap
+from fgslam.frontend.places.relocalisation.known_map import KnownMap
 from tests.known_places import RIG, looks, planar
 
 SIGMA_M = 0.02

@@ -13,8 +13,12 @@ from fgslam.core.errors import MapError
 from fgslam.core.map_types import LandmarkAppearances
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.types import FloatArray, IntArray, Trajectory
-from fgslam.frontend.database import LandmarkDatabase
-from fgslam.settings.frontend import DatabaseSettings, PermanenceSettings, ViewpointSettings
+from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.frontend.tracking.settings import (
+    DatabaseSettings,
+    PermanenceSettings,
+    ViewpointSettings,
+)
 
 PLACES = at_pixels([(80, 60, 8), (100, 110, 12), (120, 90, 10), (150, 100, 9)])
 LASTING = DatabaseSettings(

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from fgslam.core.types import FloatArray, StereoFeatures
-from fgslam.frontend.map_matching import MapMatcher, MapMatches
-from fgslam.frontend.visibility import ExpectedLandmarks
-from fgslam.settings.frontend import AppearanceSettings, MapMatchingSettings
+from fgslam.frontend.features.settings import AppearanceSettings
+from fgslam.frontend.tracking.map_matching import MapMatcher, MapMatches
+from fgslam.frontend.tracking.settings import MapMatchingSettings
+from fgslam.frontend.tracking.visibility import ExpectedLandmarks
 
 PAPER = AppearanceSettings(mode="paper")
 DESCRIPTOR = AppearanceSettings(mode="descriptor", max_distance=250.0, ratio=0.85)

@@ -13,11 +13,11 @@ from fgslam.core.errors import MapError
 from fgslam.core.map_types import LandmarkAppearances
 from fgslam.core.saved_map import SavedMap, load_map, save_map
 from fgslam.core.types import ByteArray, CameraRig, FloatArray, IntArray, LandmarkMap, Trajectory
-from fgslam.frontend import map_alignment
-from fgslam.frontend.map_alignment import Alignment, align_maps, tentative_pairs
-from fgslam.frontend.map_fusion import merge_maps
+from fgslam.frontend.places import map_alignment
+from fgslam.frontend.places.map_alignment import Alignment, align_maps, tentative_pairs
+from fgslam.frontend.places.map_fusion import merge_maps
+from fgslam.frontend.places.settings import MergeSettings
 from fgslam.runs.map_merging import merge_files
-from fgslam.settings.maps import MergeSettings
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 BTA = g.se3_exp(np.array([0.02, 0.7, -0.01, 1.5, 0.1, -2.0]))

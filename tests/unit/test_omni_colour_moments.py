@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fgslam.core.types import FloatArray, Image
-from fgslam.frontend.omni.colour_moments import PAIRS, PatchColours, colour_from_means
-from fgslam.settings.omni_features import ColourMomentSettings
+from fgslam.frontend.features.colour_moments import PAIRS, PatchColours, colour_from_means
+from fgslam.frontend.features.omni_settings import ColourMomentSettings
 
 
 def patch(seed: int = 1) -> Image:

@@ -9,14 +9,14 @@ from fgslam.cameras.omni.panoramas import Cylinder
 from fgslam.core.homing_types import ColumnSegments
 from fgslam.core.planar import wrap
 from fgslam.core.types import FloatArray, Image
-from fgslam.frontend.omni.column_segments import ColumnSegmentFinder, dct_rows
-from fgslam.frontend.omni.column_whitening import COVARIANCE, whitened
-from fgslam.frontend.omni.matching import consistent_tangents, match_columns, nearest_segments
-from fgslam.settings.omni_features import (
+from fgslam.frontend.features.column_segments import ColumnSegmentFinder, dct_rows
+from fgslam.frontend.features.column_whitening import COVARIANCE, whitened
+from fgslam.frontend.features.omni_settings import (
     ColourMomentSettings,
     ColumnSegmentSettings,
     OmniMatchingSettings,
 )
+from fgslam.frontend.homing.matching import consistent_tangents, match_columns, nearest_segments
 
 VIEW = Cylinder(401, 401, -1.0, 1.0)
 POSTS = 16

@@ -15,15 +15,15 @@ from fgslam.core.errors import FrameError
 from fgslam.core.homing_types import FeatureKind, OmniFeatures, UprightFeatures
 from fgslam.core.planar import wrap
 from fgslam.core.types import Image
-from fgslam.frontend.omni.features import OmniFeatureExtractor, _View
-from fgslam.frontend.omni.matching import match_features, match_sift
-from fgslam.frontend.omni.plain_sift import match_plain, plain_sift
-from fgslam.frontend.omni.sift import up_in_image, wrapping_period
-from fgslam.settings.omni_features import (
+from fgslam.frontend.features.colour_sift import up_in_image, wrapping_period
+from fgslam.frontend.features.omni_features import OmniFeatureExtractor, _View
+from fgslam.frontend.features.omni_settings import (
     OmniFeatureSettings,
     OmniMatchingSettings,
     UprightSiftSettings,
 )
+from fgslam.frontend.homing.matching import match_features, match_sift
+from fgslam.frontend.homing.plain_sift import match_plain, plain_sift
 
 PANORAMA = Equirectangular(513, 257)
 MIRROR = HyperbolicMirror.with_view((400, 400), 0.96, (np.radians(-55), np.radians(30)))

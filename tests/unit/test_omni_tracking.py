@@ -11,8 +11,8 @@ from fgslam.core.errors import EstimatorError, FrameError
 from fgslam.core.homing_types import TrackedBearings
 from fgslam.core.planar import wrap
 from fgslam.core.types import FloatArray, Image
-from fgslam.frontend.omni.tracking import BearingTracker
-from fgslam.settings.omni_tracking import OmniTrackingSettings
+from fgslam.frontend.homing.tracking import BearingTracker
+from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from tests.textured_room import CAMERA, angles, hits, picture
 
 SETTINGS = OmniTrackingSettings()

@@ -7,8 +7,8 @@ from scipy import ndimage
 
 from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.types import Image
-from fgslam.frontend.omni.video_tracking import ReplenishedTracker
-from fgslam.settings.omni_tracking import OmniTrackingSettings
+from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
+from fgslam.frontend.homing.video_tracking import ReplenishedTracker
 
 WIDTH, HEIGHT = 361, 121
 CAMERA = Equirectangular(WIDTH, HEIGHT, np.pi / 3, -np.pi / 3)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.frontend.permanence import is_blind, reliable, seen_past
-from fgslam.frontend.visibility import ExpectedLandmarks
-from fgslam.settings.frontend import PermanenceSettings
+from fgslam.frontend.tracking.permanence import is_blind, reliable, seen_past
+from fgslam.frontend.tracking.settings import PermanenceSettings
+from fgslam.frontend.tracking.visibility import ExpectedLandmarks
 
 
 @pytest.mark.parametrize(

@@ -17,9 +17,9 @@ from fgslam.core.types import (
     Prediction,
     RangeBearingSensor,
 )
-from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
+from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.settings.backend import LandmarkKalmanSettings
-from fgslam.settings.frontend import EgoMotionSettings
 
 SENSOR = RangeBearingSensor(8.0, g.BODY_FORWARD_LEFT_UP_FROM_CAMERA)
 SIGMA = np.array([0.02, 0.02, 0.03])

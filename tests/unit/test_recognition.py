@@ -25,14 +25,14 @@ from fgslam.core import geometry as g
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import EgoMotionStatus, FloatArray
 from fgslam.factory import make_estimator
-from fgslam.frontend.ego_motion import EgoMotionSolver
-from fgslam.frontend.loops.confirmation import difference
-from fgslam.frontend.loops.recognition import PlaceRecognition
+from fgslam.frontend.places.loops.confirmation import difference
+from fgslam.frontend.places.loops.recognition import PlaceRecognition
+from fgslam.frontend.places.settings import LostSettings
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import FrameReport, SlamPipeline, _observe, replay_step
 from fgslam.settings.backend import LandmarkKalmanSettings, LoopCorrectionSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
-from fgslam.settings.loops import LostSettings
 
 # -- the return ------------------------------------------------------------------------------
 

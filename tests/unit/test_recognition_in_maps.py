@@ -28,8 +28,8 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.types import EgoMotionStatus, Prediction
 from fgslam.factory import make_estimator
-from fgslam.frontend.ego_motion import EgoMotionSolver
-from fgslam.frontend.loops.confirmation import difference
+from fgslam.frontend.places.loops.confirmation import difference
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.pipeline import FrameReport, SlamPipeline, replay_step
 from fgslam.settings.backend import (
     BatchSettings,

@@ -7,16 +7,21 @@ import pytest
 
 from fgslam.core import geometry
 from fgslam.core.types import LandmarkMap, StereoFeatures
-from fgslam.frontend.relocalisation.alignment import align, align_in_space, rigid
-from fgslam.frontend.relocalisation.appearance_index import Neighbours
-from fgslam.frontend.relocalisation.known_map import KnownMap
-from fgslam.frontend.relocalisation.least_squares import refine
-from fgslam.frontend.relocalisation.proposals import Evidence, Proposals, distinct
-from fgslam.frontend.relocalisation.refinement import Refiner, covered, crowd, witnesses
-from fgslam.frontend.relocalisation.relocaliser import Relocaliser
-from fgslam.frontend.relocalisation.residuals import Pairs, SeenPoints, log_uniform, residuals
-from fgslam.frontend.relocalisation.tentative import specific
-from fgslam.settings.relocalisation import RelocalisationSettings
+from fgslam.frontend.places.relocalisation.alignment import align, align_in_space, rigid
+from fgslam.frontend.places.relocalisation.appearance_index import Neighbours
+from fgslam.frontend.places.relocalisation.known_map import KnownMap
+from fgslam.frontend.places.relocalisation.least_squares import refine
+from fgslam.frontend.places.relocalisation.proposals import Evidence, Proposals, distinct
+from fgslam.frontend.places.relocalisation.refinement import Refiner, covered, crowd, witnesses
+from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
+from fgslam.frontend.places.relocalisation.residuals import (
+    Pairs,
+    SeenPoints,
+    log_uniform,
+    residuals,
+)
+from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
+from fgslam.frontend.places.relocalisation.tentative import specific
 from tests.known_places import RIG, Place, error, floor, planar, room, seen
 
 

@@ -11,8 +11,8 @@ from fgslam.core.errors import ConfigError
 from fgslam.core.geometry import pose, so3_exp
 from fgslam.core.map_types import Relocalisation, Verdict
 from fgslam.core.types import FloatArray, StereoFeatures
-from fgslam.frontend.relocalisation.relocaliser import Relocaliser
-from fgslam.settings.relocalisation import RelocalisationSettings
+from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
+from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
 from tests.known_places import RIG, Place, error, floor, planar, room, seen, things
 
 DEFAULTS = RelocalisationSettings(map_sigma_m=0.001, view_sigma_px=0.0)

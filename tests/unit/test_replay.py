@@ -15,12 +15,12 @@ from fgslam.backend.landmark_kalman import LandmarkKalman
 from fgslam.core.errors import EstimatorError, MeasurementLogError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import Estimate, Trajectory, UpdateStats
+from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.runs import replay as module
 from fgslam.runs.judging import Truth, judge_replay
 from fgslam.runs.replay import Replay, memory_mb, peak_memory_mb, replay, replay_motion
 from fgslam.settings.backend import BatchSettings, DeadReckoningSettings, LandmarkKalmanSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
-from fgslam.settings.frontend import EgoMotionSettings
 
 SETTINGS = LandmarkKalmanSettings(label="named")
 CONSTANT_VELOCITY: dict[str, Any] = factory.ConstantVelocityMotion(

@@ -21,14 +21,15 @@ from fgslam.core.types import (
     Observations,
     StereoFeatures,
 )
-from fgslam.frontend.ego_motion import EgoMotionSolver, PoseProblem
-from fgslam.frontend.loops.closure import close_loop
-from fgslam.frontend.loops.confirmation import Confirmation, difference, drift_allows
-from fgslam.frontend.loops.fusion import duplicates
-from fgslam.frontend.loops.memory import SightingMemory
-from fgslam.frontend.resection import Resection
-from fgslam.settings.frontend import AppearanceSettings, EgoMotionSettings
-from fgslam.settings.loops import LoopSettings
+from fgslam.frontend.features.settings import AppearanceSettings
+from fgslam.frontend.places.loops.closure import close_loop
+from fgslam.frontend.places.loops.confirmation import Confirmation, difference, drift_allows
+from fgslam.frontend.places.loops.fusion import duplicates
+from fgslam.frontend.places.loops.memory import SightingMemory
+from fgslam.frontend.places.settings import LoopSettings
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
+from fgslam.frontend.tracking.resection import Resection
+from fgslam.frontend.tracking.settings import EgoMotionSettings
 
 LOOPS = LoopSettings()
 DOWN = np.array([0.0, 1.0, 0.0])

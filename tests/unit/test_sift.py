@@ -13,8 +13,8 @@ from simulated import assert_same_bits
 
 from fgslam.core.geometry import wrap_angle
 from fgslam.core.types import Features, FloatArray, Image
-from fgslam.frontend.sift import SiftExtractor
-from fgslam.settings.frontend import SiftSettings
+from fgslam.frontend.features.settings import SiftSettings
+from fgslam.frontend.features.sift import SiftExtractor
 
 SETTINGS = SiftSettings()
 ALL_LEVELS = SiftSettings(scale_levels=64)

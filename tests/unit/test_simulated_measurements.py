@@ -18,13 +18,13 @@ from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.types import CameraRig, FloatArray, IntArray, Prediction, Trajectory
 from fgslam.datasets.opening import open_measurements
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
-from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.localisation_config import load_experiment
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
 from fgslam.settings.backend import LandmarkKalmanSettings
 from fgslam.settings.datasets import ConstantVelocitySettings, SyntheticOdometrySettings
-from fgslam.settings.frontend import EgoMotionSettings
 from fgslam.worlds.simulated.identities import IdentityBook
 from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 

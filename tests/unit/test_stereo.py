@@ -10,8 +10,9 @@ from simulated import RIG
 
 from fgslam.core import geometry as g
 from fgslam.core.types import CameraRig, Features, FloatArray, StereoFeatures
-from fgslam.frontend.stereo import StereoMatcher, measurement_map
-from fgslam.settings.frontend import AppearanceSettings, StereoSettings
+from fgslam.frontend.features.settings import AppearanceSettings
+from fgslam.frontend.stereo.matching import StereoMatcher, measurement_map
+from fgslam.frontend.stereo.settings import StereoSettings
 
 PAPER = AppearanceSettings(mode="paper")
 DESCRIPTOR = AppearanceSettings(mode="descriptor")

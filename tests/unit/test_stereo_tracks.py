@@ -18,12 +18,12 @@ from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.types import CameraRig, FloatArray, Prediction
 from fgslam.datasets.opening import open_measurements
 from fgslam.evaluation.trajectory import evaluate_trajectory
-from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
 from fgslam.settings.backend import LandmarkKalmanSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
-from fgslam.settings.frontend import EgoMotionSettings
 from fgslam.settings.measurements import StereoTracksSettings
 
 FX, FY, CX, CY, B = 700.0, 710.0, 600.0, 180.0, 0.5

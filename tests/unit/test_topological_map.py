@@ -13,7 +13,8 @@ from fgslam.core.errors import StoredMapError
 from fgslam.core.homing_types import HomingVector, OmniFeatures, Refusal, RefusalReason
 from fgslam.core.planar import between, wrap
 from fgslam.core.types import FloatArray
-from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
+from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
+from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.homing.link_checks import LinkChecks, between_misfit, heading_residuals
 from fgslam.homing.linking import Answer, Link, link_pair
 from fgslam.homing.localisation import Localiser
@@ -24,7 +25,6 @@ from fgslam.settings.homing_behaviour import (
     RetrievalSettings,
     TopologicalMapSettings,
 )
-from fgslam.settings.homing_vector import HomingVectorSettings
 from tests.landmark_world import landmark_features, match_landmarks, numbers
 
 SETTINGS = TopologicalMapSettings()

@@ -14,10 +14,10 @@ from fgslam.core.homing_types import (
 )
 from fgslam.core.planar import wrap
 from fgslam.core.types import FloatArray, Image
-from fgslam.frontend.omni.column_segments import empty_segments
-from fgslam.frontend.omni.sift import empty_features
-from fgslam.frontend.omni.trackable import move_to_trackable
-from fgslam.settings.omni_tracking import OmniTrackingSettings
+from fgslam.frontend.features.colour_sift import empty_features
+from fgslam.frontend.features.column_segments import empty_segments
+from fgslam.frontend.homing.trackable import move_to_trackable
+from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from tests.homing import make_matches
 from tests.textured_room import CAMERA, angles, hits, picture
 

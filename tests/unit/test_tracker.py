@@ -12,16 +12,16 @@ from simulated import RIG, FeatureWorld, assert_same_bits, points_in_view
 from fgslam.core import geometry as g
 from fgslam.core.types import EgoMotionStatus, FloatArray, IntArray, LandmarkMap, Prediction
 from fgslam.factory import make_tracker
-from fgslam.frontend.stereo import StereoMatcher
-from fgslam.frontend.tracker import Association, LandmarkTracker
-from fgslam.settings.frontend import (
-    AppearanceSettings,
+from fgslam.frontend.features.settings import AppearanceSettings
+from fgslam.frontend.stereo.matching import StereoMatcher
+from fgslam.frontend.stereo.settings import StereoSettings
+from fgslam.frontend.tracking.settings import (
     DatabaseSettings,
     EgoMotionSettings,
-    FrontendSettings,
     MapMatchingSettings,
-    StereoSettings,
 )
+from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
+from fgslam.settings.frontend import FrontendSettings
 
 COUNT = 60
 IMAGE = np.tile(np.arange(240, dtype=np.uint8)[:, None], (1, 320))  # grey value is the row

@@ -12,15 +12,15 @@ from test_tracker import CERTAIN, IMAGE, SETTINGS
 from fgslam.core import geometry as g
 from fgslam.core.types import BoolArray, FloatArray, IntArray, LandmarkMap, Prediction
 from fgslam.factory import make_tracker
-from fgslam.frontend.database import LandmarkDatabase
-from fgslam.frontend.stereo import StereoMatcher
-from fgslam.frontend.tracker import Association
-from fgslam.settings.frontend import (
+from fgslam.frontend.stereo.matching import StereoMatcher
+from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.frontend.tracking.settings import (
     DatabaseSettings,
-    FrontendSettings,
     PermanenceSettings,
     ViewpointSettings,
 )
+from fgslam.frontend.tracking.tracker import Association
+from fgslam.settings.frontend import FrontendSettings
 
 DISTANCE = 3.0  # metres, from the camera to the middle of the things
 HERE = 0.0

@@ -7,7 +7,7 @@ import pytest
 
 from fgslam.core.planar import unit, wrap
 from fgslam.core.types import FloatArray
-from fgslam.frontend.omni.two_point import TwoPointSamples, TwoPointSolutions, solve_two_point
+from fgslam.frontend.homing.two_point import TwoPointSamples, TwoPointSolutions, solve_two_point
 
 poselib = pytest.importorskip("poselib", reason="the test oracle PoseLib is not installed")
 

@@ -16,12 +16,12 @@ from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.types import CameraRig, FloatArray, Prediction, RangeBearingSensor, Trajectory
 from fgslam.datasets.opening import open_measurements
 from fgslam.evaluation.trajectory import evaluate_trajectory
-from fgslam.frontend.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
 from fgslam.settings.backend import LandmarkKalmanSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
-from fgslam.settings.frontend import EgoMotionSettings
 from fgslam.settings.measurements import UtiasRangeBearingSettings, UtiasStereoSettings
 
 N = 12

@@ -9,10 +9,10 @@ import pytest
 
 from fgslam.core.map_types import Verdict
 from fgslam.core.types import IntArray, LandmarkMap
-from fgslam.frontend.relocalisation.refinement import Refined
-from fgslam.frontend.relocalisation.tentative import Tentative
-from fgslam.frontend.relocalisation.verdict import judge
-from fgslam.settings.relocalisation import RelocalisationSettings
+from fgslam.frontend.places.relocalisation.refinement import Refined
+from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
+from fgslam.frontend.places.relocalisation.tentative import Tentative
+from fgslam.frontend.places.relocalisation.verdict import judge
 
 SETTINGS = RelocalisationSettings()
 # A metre apart: each is a witness of its own. The first hundred stand at one place, and so on.

@@ -11,8 +11,8 @@ from test_database import database_of, landmark_map
 
 from fgslam.core import geometry as g
 from fgslam.core.types import BoolArray, CameraRig, FloatArray
-from fgslam.frontend.visibility import FieldOfView, directions_to
-from fgslam.settings.frontend import DatabaseSettings
+from fgslam.frontend.tracking.settings import DatabaseSettings
+from fgslam.frontend.tracking.visibility import FieldOfView, directions_to
 
 MAX_DISPARITY = 40.0
 TWO_CAMERAS = dataclasses.replace(RIG, vertical_baseline=None)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from fgslam.core.types import ByteArray
-from fgslam.frontend import views as views_module
-from fgslam.frontend import vocabulary
-from fgslam.frontend.views import ViewPool, Views
+from fgslam.frontend.features import vocabulary
+from fgslam.frontend.tracking import views as views_module
+from fgslam.frontend.tracking.views import ViewPool, Views
 from tests.known_places import looks
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from fgslam.core.homing_types import HomingVector, OmniFeatures, Refusal
 from fgslam.export.metrics import JsonValue
 from fgslam.export.tables import write_csv
-from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
-from fgslam.frontend.omni.matching import match_features
+from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
+from fgslam.frontend.homing.matching import match_features
 from fgslam.homing.linking import Answer, Pair
 from fgslam.homing.localisation import Localiser
 from fgslam.homing.retrieval import VisualWords

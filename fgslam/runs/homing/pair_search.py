@@ -16,13 +16,13 @@ from fgslam.core.homing_types import (
     Refusal,
 )
 from fgslam.core.types import IntArray
-from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
-from fgslam.frontend.omni.matching import match_features
+from fgslam.frontend.features.omni_settings import OmniMatchingSettings
+from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
+from fgslam.frontend.homing.matching import match_features
+from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.runs.homing.pair_answers import PairAnswer
 from fgslam.runs.homing.results import Progress, Stopped
 from fgslam.runs.processes import WorkerEnded, run_apart
-from fgslam.settings.homing_vector import HomingVectorSettings
-from fgslam.settings.omni_features import OmniMatchingSettings
 
 PLAIN_MATCHING = OmniMatchingSettings(
     ratio=0.8, root=False, max_colour_distance=1e9, planar_gates=False

@@ -8,9 +8,9 @@ import numpy as np
 
 from fgslam.core.homing_types import BearingMatches, HomingStart, Refusal
 from fgslam.core.types import IntArray
-from fgslam.frontend.omni.homing_ransac import estimate_homing_vector
-from fgslam.frontend.omni.local_map import make_local_map
-from fgslam.settings.homing_vector import HomingVectorSettings
+from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
+from fgslam.frontend.homing.local_map import make_local_map
+from fgslam.frontend.homing.settings import HomingVectorSettings
 
 
 def start_from_matches(

@@ -19,7 +19,7 @@ from fgslam.export.metrics import JsonValue, UpdateTime
 from fgslam.export.pictures.view_tracks import draw_view_tracks
 from fgslam.export.report.data import Picture
 from fgslam.export.tables import write_csv
-from fgslam.frontend.omni.video_tracking import ReplenishedTracker, TrackedImage
+from fgslam.frontend.homing.video_tracking import ReplenishedTracker, TrackedImage
 from fgslam.homing_config import OmniVideoConfig
 from fgslam.runs.homing.mirror_check import open_checked
 from fgslam.runs.homing.results import (

@@ -11,14 +11,14 @@ from fgslam.core.homing_types import OmniFeatures
 from fgslam.core.types import FloatArray
 from fgslam.datasets.omni_opening import open_omni
 from fgslam.datasets.omni_recording import OmniRecording
-from fgslam.frontend.omni.column_segments import empty_segments
-from fgslam.frontend.omni.features import OmniFeatureExtractor
-from fgslam.frontend.omni.plain_sift import plain_sift
+from fgslam.frontend.features.column_segments import empty_segments
+from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni_settings import OmniFeatureSettings
+from fgslam.frontend.homing.plain_sift import plain_sift
 from fgslam.runs.homing.mirror_check import open_checked
 from fgslam.runs.homing.results import Progress, Stopped
 from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.settings.omni_datasets import OmniDatasetSettings
-from fgslam.settings.omni_features import OmniFeatureSettings
 
 _VIEWS_A_BLOCK = 4
 

@@ -17,8 +17,8 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import require_rig
 from fgslam.core.types import FloatArray, LandmarkMap
 from fgslam.factory import make_relocaliser, make_stereo_matcher, make_stream
-from fgslam.frontend.relocalisation.relocaliser import Relocaliser
-from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
+from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.localisation_config import LocalisationConfig
 from fgslam.runs.localisation.sights import Sighted, TrueSights

@@ -9,7 +9,7 @@ import numpy as np
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.types import FloatArray, LandmarkMap
-from fgslam.frontend.database import LandmarkDatabase
+from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.runs.rendered_truth import TrueDepth
 from fgslam.settings.frontend import FrontendSettings
 

@@ -1,0 +1,116 @@
+"""Candidate pairs between two sets and the choice among them; shared by stereo and map matching."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.core.geometry import wrap_angle
+from fgslam.core.types import BoolArray, ByteArray, FloatArray, IntArray
+from fgslam.frontend.features.settings import AppearanceSettings
+
+
+def pairs_within(
+    center: FloatArray, reach: FloatArray | float, values: FloatArray
+) -> tuple[IntArray, IntArray]:
+    """All pairs (i, j) with ``|values[j] - center[i]| <= reach[i]``.
+
+    Args:
+        center: (n,) centre of each window.
+        reach: (n,) or scalar half width.
+        values: (m,) in any order.
+
+    Returns:
+        Indices (k,) into ``center``, ascending, and (k,) into ``values``.
+    """
+    order = np.argsort(values, kind="stable")
+    ordered = values[order]
+    first = np.searchsorted(ordered, center - reach, side="left")
+    counts = np.searchsorted(ordered, center + reach, side="right") - first
+    i = np.repeat(np.arange(len(center)), counts)
+    starts = np.cumsum(counts) - counts
+    j = np.arange(len(i)) - np.repeat(starts - first, counts)
+    return i, order[j]
+
+
+def alike(
+    scale: tuple[FloatArray, FloatArray],
+    orientation: tuple[FloatArray, FloatArray],
+    max_scale_ratio: float,
+    max_angle: float,
+) -> BoolArray:
+    """Whether the pairs' scales and orientations agree within the gates (Se et al. 2.2)."""
+    a, b = scale
+    close = (a <= b * max_scale_ratio) & (b <= a * max_scale_ratio)
+    return np.asarray(close & (np.abs(wrap_angle(orientation[0] - orientation[1])) <= max_angle))
+
+
+def descriptor_distance(a: ByteArray, b: ByteArray) -> FloatArray:
+    """Euclidean distances (k,) of descriptors (k, 128); a SIFT descriptor's norm is 512."""
+    # float32 represents every sum of 128 squared byte differences exactly (below 2^24).
+    difference = a.astype(np.float32) - b.astype(np.float32)
+    squared = np.einsum("ij,ij->i", difference, difference)
+    return np.asarray(np.sqrt(squared.astype(np.float64)))
+
+
+def unambiguous(i: IntArray, j: IntArray) -> BoolArray:
+    """Pairs both of whose members occur in no other pair (Se et al. 2.2: ambiguity discards)."""
+    if not len(i):
+        return np.zeros(0, np.bool_)
+    return np.asarray((np.bincount(i)[i] == 1) & (np.bincount(j)[j] == 1))
+
+
+def _wins(group: IntArray, cost: FloatArray, ratio: float) -> BoolArray:
+    """Pairs that are the cheapest of their group, at most ``ratio`` times the next."""
+    order = np.lexsort((cost, group))
+    first = np.ones(len(order), np.bool_)
+    first[1:] = group[order][1:] != group[order][:-1]
+    runner_up = np.full(len(order), np.inf)
+    has_next = first[:-1] & ~first[1:]
+    runner_up[:-1][has_next] = cost[order][1:][has_next]
+    wins = np.zeros(len(order), np.bool_)
+    wins[order] = first & (cost[order] <= ratio * runner_up)
+    return wins
+
+
+def resembling(
+    i: IntArray,
+    j: IntArray,
+    descriptors: tuple[ByteArray, ByteArray],
+    settings: AppearanceSettings,
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """The pairs (k,) whose descriptors are close enough, and their distances.
+
+    In `paper` mode there are no descriptors: every pair stays, at distance zero.
+    """
+    if settings.mode == "paper":
+        return i, j, np.zeros(len(i))
+    cost = descriptor_distance(descriptors[0][i], descriptors[1][j])
+    near = cost <= settings.max_distance
+    return i[near], j[near], cost[near]
+
+
+def pick(
+    pairs: tuple[IntArray, IntArray, FloatArray], settings: AppearanceSettings
+) -> tuple[IntArray, IntArray]:
+    """One-to-one matches among resembling pairs, ascending in the first set.
+
+    `paper` keeps unambiguous pairs; `descriptor` the mutually closest ones that beat the runner-up.
+    """
+    i, j, cost = pairs
+    if settings.mode == "paper":
+        keep = unambiguous(i, j)
+    elif not len(i):
+        return i, j
+    else:
+        keep = _wins(i, cost, settings.ratio) & _wins(j, cost, settings.ratio)
+    return i[keep], j[keep]
+
+
+def choose(
+    i: IntArray,
+    j: IntArray,
+    descriptors: tuple[ByteArray, ByteArray],
+    settings: AppearanceSettings,
+) -> tuple[IntArray, IntArray]:
+    """One-to-one matches among candidate pairs (k,) that passed every other gate."""
+    return pick(resembling(i, j, descriptors, settings), settings)

@@ -1,0 +1,133 @@
+"""Both kinds of features of one image: all that is kept of a path image (Goedemé III-A)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from fgslam.cameras.omni.bearing_measurement import unit_rays
+from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
+from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.cameras.omni.unwrapping import unwrap_maps
+from fgslam.core.errors import FrameError
+from fgslam.core.homing_types import ColumnSegments, OmniFeatures, UprightFeatures
+from fgslam.core.types import Image
+from fgslam.frontend.features.colour_sift import (
+    UprightSift,
+    empty_features,
+    up_in_image,
+    wrapping_period,
+)
+from fgslam.frontend.features.column_segments import ColumnSegmentFinder, empty_segments
+from fgslam.frontend.features.omni_settings import OmniFeatureSettings
+
+
+class _View:
+    """Another camera's picture of what one camera sees."""
+
+    def __init__(self, source: OmniCamera, target: OmniCamera) -> None:
+        self.camera = target
+        self._maps = unwrap_maps(source, target)
+        seen = self._maps[0] > -1.0
+        self.seen = None if seen.all() else seen
+
+    def of(self, image: Image) -> Image:
+        """The picture, black where the source does not see.
+
+        A panorama's seam needs no care: its last column repeats the first.
+        """
+        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR))
+
+
+class OmniFeatureExtractor:
+    """Extracts both kinds of features from the colour images of one camera."""
+
+    def __init__(self, camera: OmniCamera, settings: OmniFeatureSettings) -> None:
+        """Prepares views and detectors; panoramas need no unwrapping for SIFT."""
+        self._camera, self._kinds = camera, settings.kinds
+        resolution = pixels_a_radian(camera)
+        self._sift_view = self._view_for_sift(settings, resolution)
+        described = self._sift_view.camera if self._sift_view else camera
+        seen = self._sift_view.seen if self._sift_view else None
+        self._sift = UprightSift(described, settings.sift, settings.colour, seen)
+        columns = settings.columns
+        width = min(columns.max_width, round(2.0 * np.pi * resolution))
+        height = round(2.0 * columns.max_tangent * width / (2.0 * np.pi)) + 1
+        cylinder = Cylinder(width, height, -columns.max_tangent, columns.max_tangent)
+        self._cylinder = _View(camera, cylinder)
+        self._columns = ColumnSegmentFinder(cylinder, columns, settings.colour, self._cylinder.seen)
+
+    def extract(self, image: Image) -> OmniFeatures:
+        """Features of an image (height, width, 3) in R, G, B.
+
+        A blank or dark image has none. Raises FrameError where the image is not this camera's.
+        """
+        return OmniFeatures(self.extract_sift(image), self.extract_columns(image))
+
+    def extract_sift(self, image: Image) -> UprightFeatures:
+        """Upright SIFT features alone; none where the settings exclude them."""
+        self._check(image)
+        if self._kinds == "columns":
+            return empty_features()
+        if self._sift_view is None:
+            return self._sift.extract(image)
+        found = self._sift.extract(self._sift_view.of(image))
+        return self._in_given_image(found)
+
+    def extract_columns(self, image: Image) -> ColumnSegments:
+        """Column segments alone; none where the settings exclude them."""
+        self._check(image)
+        if self._kinds == "sift":
+            return empty_segments()
+        return self._columns.extract(self._cylinder.of(image))
+
+    def _check(self, image: Image) -> None:
+        wanted = (self._camera.height, self._camera.width, 3)
+        if image.shape != wanted or image.dtype != np.uint8:
+            raise FrameError(
+                f"an image is {image.dtype} {image.shape}, but the camera's are uint8 {wanted} "
+                "(rows, columns, R G B); take the calibration of this camera at this size"
+            )
+
+    def _view_for_sift(self, settings: OmniFeatureSettings, resolution: float) -> _View | None:
+        if wrapping_period(self._camera) is not None or settings.sift.view == "raw":
+            return None
+        width = min(settings.sift.max_view_width, round(2.0 * np.pi * resolution))
+        limits = np.deg2rad([settings.sift.max_elevation_deg, settings.sift.min_elevation_deg])
+        height = round((limits[0] - limits[1]) * width / (2.0 * np.pi)) + 1
+        view = Equirectangular(width, height, float(limits[0]), float(limits[1]))
+        return _View(self._camera, view)
+
+    def _in_given_image(self, found: UprightFeatures) -> UprightFeatures:
+        if not len(found):
+            return found
+        pixels = self._camera.pixels(unit_rays(found.bearing, found.elevation))
+        seen = np.isfinite(pixels).all(axis=1)
+        return UprightFeatures(
+            pixels[seen],
+            found.bearing[seen],
+            found.elevation[seen],
+            found.covariance[seen],
+            found.scale[seen],
+            found.descriptors[seen],
+            found.colour[seen],
+        )
+
+
+def pixels_a_radian(camera: OmniCamera) -> float:
+    """Finer of both resolutions at the horizon, or near it where the camera does not see that far.
+
+    Pixels a radian; the median around the camera.
+    """
+    around = np.linspace(-np.pi, np.pi, 72, endpoint=False)
+    for elevation in np.deg2rad([0.0, -5.0, 5.0, -15.0, 15.0, -30.0, 30.0]):
+        rays = np.column_stack(
+            [np.cos(around), np.sin(around), np.full(len(around), np.tan(elevation))]
+        )
+        pixels = camera.pixels(rays)
+        seen = np.isfinite(pixels).all(axis=1)
+        if seen.sum() >= 3:
+            up = up_in_image(camera, pixels[seen])
+            along = np.hypot(*np.diff(pixels[seen], axis=0).T) / np.diff(around[seen])
+            return float(max(np.nanmedian(np.hypot(up[:, 0], up[:, 1])), np.nanmedian(along)))
+    raise FrameError("the camera sees nothing within 30 degrees of the horizon; check its model")

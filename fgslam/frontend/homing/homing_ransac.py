@@ -1,0 +1,371 @@
+"""The homing vector from wide-baseline matches: RANSAC over pairs, refinement, honest refusal.
+
+Section III-B of Goedemé et al. (2005). Samples of two matches give one or two hypotheses each
+(:mod:`two_point`); each is supported by the matches that keep the epipolar constraint with positive
+distances; the best is refined on its inliers. An answer is given only if its support cannot be
+chance and no different solution comes near it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.core.homing_types import BearingMatches, HomingVector, Refusal, RefusalReason
+from fgslam.core.planar import unit, wrap
+from fgslam.core.types import BoolArray, FloatArray, IntArray
+from fgslam.frontend.homing.epipolar import EpipolarTest
+from fgslam.frontend.homing.homing_refinement import HomingRefinement, Refined, RefinementPrior
+from fgslam.frontend.homing.match_odds import (
+    COMMON_CHANCE,
+    gain,
+    log_likelihood_ratio,
+    right_probability,
+)
+from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.two_point import TwoPointSamples, solve_two_point
+
+_BATCH = 50  # samples between two looks at the confidence
+_MAX_LOG_RATIO_SIGMA = 0.7  # of ln rho: matches near the horizon support, but are not sampled
+_SHUFFLES = 10  # times the matches are paired wrongly to learn what chance supports
+_REFINED = 8  # different hypotheses that are refined, the best supported first
+_ALIKE = np.deg2rad(5.0)  # hypotheses closer than this lead to the same refined solution, mostly
+_SAME = np.deg2rad(0.2)  # refined solutions closer than this are one
+_TEMPER = 2.0  # residuals have common causes: so many of them count as one, see `covariance`
+_CELLS_AROUND = 180  # of 2 degrees: matches within one cell in both views are one witness
+_TURNED = 3.0  # times the median's limit: what is explained by the turn alone
+_LEAST_SPREAD = 0.25  # of directions; half a turn has 0.31, all around 0.71
+
+
+def estimate_homing_vector(
+    matches: BearingMatches, settings: HomingVectorSettings, rng: np.random.Generator
+) -> HomingVector | Refusal:
+    """The homing vector that the matches support best, or why there is none.
+
+    Args:
+        matches: tentative ones, wrong ones among them.
+        settings: number of samples, thresholds.
+        rng: chooses the samples; the same generator state gives the same answer.
+    """
+    if len(matches) < settings.min_inliers:
+        return Refusal(
+            RefusalReason.TOO_FEW_MATCHES,
+            f"{len(matches)} matches, of {settings.min_inliers} needed",
+        )
+    search = _Search(matches, settings, rng)
+    candidates = search.candidates()
+    if not candidates:
+        return Refusal(
+            RefusalReason.TOO_FEW_INLIERS, "no pair of matches agrees on any homing vector"
+        )
+    refined = search.refined(candidates)
+    best = refined[0]
+    at_target = search.turn_at_target(best)
+    if at_target is not None:
+        return at_target
+    rivals = [r for r in refined[1:] if search.differ(r, best)]
+    covariance = search.covariance(refined)
+    refusal = search.refusal(best, rivals, float(np.sqrt(covariance[0, 0])))
+    if refusal is not None:
+        return refusal
+    theta, psi = (float(v) for v in best.parameters[:2])
+    support = max((search.witnesses(r.inliers) for r in rivals), default=0)
+    floor = np.deg2rad([settings.direction_floor_deg, settings.rotation_floor_deg])
+    return HomingVector(theta, psi, covariance + np.diag(floor**2), best.inliers, support)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate:
+    direction: float
+    rotation: float
+
+
+class _Search:
+    """One search: matches prepared for sampling, testing and refining."""
+
+    def __init__(
+        self, matches: BearingMatches, settings: HomingVectorSettings, rng: np.random.Generator
+    ) -> None:
+        self._matches = matches
+        self._settings = settings
+        self._rng = rng
+        self._least_parallax = np.deg2rad(settings.least_parallax_deg)
+        tilt = np.deg2rad(settings.tilt_sigma_deg)
+        self._test = EpipolarTest.of(matches, tilt)
+        self._refinement = HomingRefinement(
+            matches,
+            RefinementPrior(tilt, settings.height_sigma),
+            settings.inlier_sigmas,
+            self._least_parallax,
+        )
+        self._cells = _cells(matches)
+        self._tilt = tilt
+        self._right = right_probability(matches)
+
+    # ----------------------------------------------------------------------------------------
+    # Sampling
+
+    def candidates(self) -> list[_Candidate]:
+        """The best supported hypotheses that differ from each other, best first."""
+        log_ratio, sigma_log, eligible = _log_ratios(self._matches, self._tilt)
+        if len(eligible) < 2:
+            return []
+        found: list[FloatArray] = []
+        drawn, best = 0, 0.0
+        while drawn < self._settings.samples and drawn < self._needed(best):
+            count = min(_BATCH, self._settings.samples - drawn)
+            pairs = eligible[_distinct_pairs(self._right[eligible], count, self._rng)]
+            solutions = self._hypotheses(pairs, log_ratio, sigma_log)
+            drawn += count
+            if solutions.shape[1]:
+                found.append(solutions)
+                best = max(best, float(np.max(solutions[2])))
+        return self._different(np.hstack(found)) if found else []
+
+    def _needed(self, share: float) -> float:
+        """Samples until one of two inliers was drawn with the wanted confidence.
+
+        ``share`` is that of the inliers, each counted as often as it is drawn.
+        """
+        if share <= 0.0:
+            return np.inf
+        if share >= 1.0:
+            return 1.0
+        return float(np.log(1.0 - self._settings.confidence) / np.log1p(-(share**2)))
+
+    def _hypotheses(
+        self, pairs: IntArray, log_ratio: FloatArray, sigma_log: FloatArray
+    ) -> FloatArray:
+        """(4, c) direction, rotation, share of the inliers, and score, see :meth:`_score`."""
+        m = self._matches
+        bearing_sigma = np.sqrt(0.5 * (m.sigma[:, 0] ** 2 + m.sigma[:, 2] ** 2))
+        solved = solve_two_point(
+            TwoPointSamples(
+                m.bearing_a[pairs],
+                m.bearing_b[pairs],
+                log_ratio[pairs],
+                bearing_sigma[pairs],
+                sigma_log[pairs],
+            )
+        )
+        direction, rotation = solved.direction[solved.valid], solved.rotation[solved.valid]
+        inliers, residuals = self._test.inliers(
+            direction, rotation, self._settings.inlier_sigmas, self._least_parallax
+        )
+        share = self._right @ inliers / np.sum(self._right)
+        return np.stack([direction, rotation, share, self._score(inliers, residuals)])
+
+    def _score(self, inliers: BoolArray, residuals: FloatArray) -> FloatArray:
+        """(c,) log-likelihoods of hypotheses, up to a constant, of (n, c) residuals."""
+        gains = gain(residuals, self._settings.inlier_sigmas, COMMON_CHANCE)
+        odds = (self._right / (1.0 - self._right))[:, None]
+        return np.asarray(np.sum(np.where(inliers, np.log1p(odds * gains), 0.0), axis=0))
+
+    def _different(self, hypotheses: FloatArray) -> list[_Candidate]:
+        """The best of each group of like hypotheses."""
+        ordered = hypotheses[:, np.argsort(-hypotheses[3], kind="stable")]
+        chosen: list[_Candidate] = []
+        open_ = np.ones(ordered.shape[1], dtype=np.bool_)
+        while len(chosen) < _REFINED and np.any(open_):
+            k = int(np.argmax(open_))
+            chosen.append(_Candidate(float(ordered[0, k]), float(ordered[1, k])))
+            open_ &= _angle_apart(ordered[:2], ordered[:2, k : k + 1]) > _ALIKE
+        return chosen
+
+    # ----------------------------------------------------------------------------------------
+    # Refining and judging
+
+    def refined(self, candidates: list[_Candidate]) -> list[Refined]:
+        """The candidates after least squares, the best score first, each solution once."""
+        starts = np.array([(c.direction, c.rotation) for c in candidates])
+        found = self._refinement.refine(starts[:, 0], starts[:, 1])
+        found.sort(key=lambda r: -self._score_of(r))
+        out: list[Refined] = []
+        for solution in found:
+            if all(_apart(solution, known) > _SAME for known in out):
+                out.append(solution)
+        return out
+
+    def _score_of(self, solution: Refined) -> float:
+        return float(self._score(solution.inliers[:, None], solution.residuals[:, None])[0])
+
+    def covariance(self, refined: list[Refined]) -> FloatArray:
+        """(2, 2) of the best solution, widened by those near it that fit nearly as well.
+
+        Features all on one side leave a valley with several minima. Each solution within the
+        rivals' angle weighs by its likelihood, tempered since residuals have common causes.
+        """
+        best = refined[0]
+        near = [r for r in refined if not self.differ(r, best)]
+        lost = np.array([self._score_of(best) - self._score_of(r) for r in near])
+        weights = np.exp(-lost / _TEMPER)
+        offsets = wrap(np.array([r.parameters[:2] for r in near]) - best.parameters[:2])
+        spread = np.array([r.covariance[:2, :2] for r in near])
+        spread = spread + offsets[:, :, None] * offsets[:, None, :]
+        return np.asarray(np.tensordot(weights / np.sum(weights), spread, axes=1))
+
+    def differ(self, one: Refined, other: Refined) -> bool:
+        """Whether two solutions are not one and the same."""
+        return _apart(one, other) > float(np.deg2rad(self._settings.rival_angle_deg))
+
+    def witnesses(self, which: BoolArray) -> int:
+        """Number of inliers that are independent of each other."""
+        return len(np.unique(self._cells[which]))
+
+    def turn_at_target(self, best: Refined) -> Refusal | None:
+        """Both views from one place (D6): there is a turn, but no direction.
+
+        That must be as well supported as any answer, and from enough sides: a single thing looks
+        alike from anywhere, and like turned when it is another one of its kind.
+        """
+        m, limit = self._matches, np.deg2rad(self._settings.at_target_parallax_deg)
+        if not np.any(best.inliers):
+            return None
+        turns = wrap(m.bearing_a - m.bearing_b)
+        psi = float(np.angle(np.mean(np.exp(1j * turns[best.inliers]))))
+        parallaxes = np.abs(wrap(turns - psi))
+        parallax = float(np.median(parallaxes[best.inliers]))
+        if parallax >= limit:
+            return None
+        turned = best.inliers & (parallaxes < _TURNED * limit)
+        if (
+            self.witnesses(turned) < self._settings.min_inliers
+            or _spread(m.bearing_a[turned]) < _LEAST_SPREAD
+        ):
+            return None
+        return Refusal(
+            RefusalReason.AT_TARGET,
+            f"median parallax {np.rad2deg(parallax):.2f} deg: both views are from one place",
+            psi,
+        )
+
+    def _undecided(self, best: Refined, rival: Refined) -> bool:
+        return self._score_of(best) - self._score_of(rival) < self._settings.rival_log_odds
+
+    def refusal(
+        self, best: Refined, rivals: list[Refined], direction_sigma: float
+    ) -> Refusal | None:
+        """Why the best solution is no answer, or None."""
+        s = self._settings
+        support = self.witnesses(best.inliers)
+        alarms = self._log_false_alarms(best)
+        if support < s.min_inliers:
+            reason, text = (
+                RefusalReason.TOO_FEW_INLIERS,
+                f"{support} inliers of {len(self._matches)}",
+            )
+        elif alarms > np.log(s.max_false_alarms):
+            reason = RefusalReason.TOO_FEW_INLIERS
+            text = (
+                f"{support} inliers of {len(self._matches)} matches may be chance "
+                f"(1e{alarms / np.log(10.0):.1f} expected)"
+            )
+        elif undecided := [r for r in rivals if self._undecided(best, r)]:
+            reason = RefusalReason.AMBIGUOUS
+            other = self.witnesses(undecided[0].inliers)
+            text = f"{support} inliers, {other} for a different solution"
+        elif direction_sigma > np.deg2rad(s.max_direction_sigma_deg):
+            reason = RefusalReason.UNCERTAIN
+            text = f"direction is uncertain by {np.rad2deg(direction_sigma):.1f} deg"
+        else:
+            return None
+        return Refusal(reason, text)
+
+    def _log_false_alarms(self, best: Refined) -> float:
+        """Log of the number of equally supported hypotheses expected if all matches were wrong.
+
+        How often a wrong match agrees with this hypothesis is read off wrong matches: the same
+        features paired by lot (an *a contrario* test, Moisan and Stival 2004).
+        """
+        n, sigmas = len(self._matches), self._settings.inlier_sigmas
+        shuffled = np.concatenate([self._rng.permutation(n) for _ in range(_SHUFFLES)])
+        every = np.tile(np.arange(n), _SHUFFLES)
+        wrong = EpipolarTest.of(paired_anew(self._matches, every, shuffled), self._tilt)
+        good, _ = wrong.inliers(
+            best.parameters[:1], best.parameters[1:2], sigmas, self._least_parallax
+        )
+        chance = (np.count_nonzero(good) + 1.0) / (len(good) + 2.0)
+        gains = np.where(best.inliers, gain(best.residuals, sigmas, chance), 0.0)
+        witnesses = _one_a_cell(gains, self._cells)
+        tests = float(np.log(n * (n - 1.0)))  # two solutions for each pair
+        return tests - log_likelihood_ratio(gains[witnesses], self._right[witnesses])
+
+
+def _spread(bearing: FloatArray) -> float:
+    """How well bearings (n,) would show a short leg, whichever way it goes.
+
+    A leg of length r shifts what is at distance d by r / d times the sine of its bearing from the
+    leg; what is the same for all is taken for a turn. So the measure is the standard deviation of
+    unit vectors along the direction where it is least.
+    """
+    return float(np.sqrt(max(np.linalg.eigvalsh(np.cov(unit(bearing).T, bias=True))[0], 0.0)))
+
+
+def _one_a_cell(gains: FloatArray, cells: IntArray) -> IntArray:
+    """(m,) of each cell the match that agrees best: the others say the same again."""
+    order = np.lexsort((-gains, cells))
+    first = np.ones(len(order), dtype=np.bool_)
+    first[1:] = cells[order][1:] != cells[order][:-1]
+    return np.asarray(order[first], dtype=np.int64)
+
+
+def _distinct_pairs(weights: FloatArray, count: int, rng: np.random.Generator) -> IntArray:
+    """(count, 2) of two different indices, drawn in proportion to weights (n,), n at least 2."""
+    n, ends = len(weights), np.cumsum(weights)
+    first = np.searchsorted(ends, rng.uniform(0.0, ends[-1], count), side="right")
+    # The second is drawn from what is left when the first one's interval is cut out.
+    rest = rng.uniform(0.0, 1.0, count) * (ends[-1] - weights[first])
+    rest = np.where(rest < ends[first] - weights[first], rest, rest + weights[first])
+    second = np.searchsorted(ends, rest, side="right")
+    return np.asarray(np.minimum(np.column_stack([first, second]), n - 1), dtype=np.int64)
+
+
+def _apart(one: Refined, other: Refined) -> float:
+    """Larger of the differences in direction and rotation."""
+    return float(_angle_apart(one.parameters[:2, None], other.parameters[:2, None])[0])
+
+
+def _angle_apart(one: FloatArray, other: FloatArray) -> FloatArray:
+    """(c,) larger of the differences in direction and rotation, of (2, c) hypotheses."""
+    return np.asarray(np.max(np.abs(wrap(one - other)), axis=0))
+
+
+def _log_ratios(
+    matches: BearingMatches, tilt_sigma: float
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """(n,) ln rho and its standard deviation, and which matches may be sampled (D6).
+
+    sigma(ln tan alpha) = 2 sigma / sin(2 alpha): it explodes towards the horizon and the zenith.
+    Where both elevations have different signs there is no ratio (D1).
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.tan(matches.elevation_a) / np.tan(matches.elevation_b)
+        log_ratio = np.log(np.where(ratio > 0.0, ratio, np.nan))
+        sigma_a = (
+            2.0 * np.hypot(matches.sigma[:, 1], tilt_sigma) / np.sin(2.0 * matches.elevation_a)
+        )
+        sigma_b = (
+            2.0 * np.hypot(matches.sigma[:, 3], tilt_sigma) / np.sin(2.0 * matches.elevation_b)
+        )
+    sigma = np.hypot(sigma_a, sigma_b)
+    eligible = np.flatnonzero(np.isfinite(log_ratio) & (sigma < _MAX_LOG_RATIO_SIGMA))
+    return log_ratio, sigma, eligible
+
+
+def _cells(matches: BearingMatches) -> IntArray:
+    """(n,) number of the cell of both views that a match lies in: one cell, one witness."""
+    angles = [matches.bearing_a, matches.bearing_b, matches.elevation_a, matches.elevation_b]
+    grid = np.round(np.column_stack(angles) * (_CELLS_AROUND / (2.0 * np.pi)))
+    grid[:, :2] %= _CELLS_AROUND  # both sides of the seam are one cell
+    _, cells = np.unique(grid, axis=0, return_inverse=True)
+    return np.asarray(cells.ravel(), dtype=np.int64)
+
+
+def paired_anew(matches: BearingMatches, first: IntArray, second: IntArray) -> BearingMatches:
+    """(m) features of the first view, of matches (m,), each with one of the second view."""
+    a, b = matches.taken(first), matches.taken(second)
+    return BearingMatches(
+        a.kind, a.index_a, b.index_b, a.bearing_a, a.elevation_a, b.bearing_b, b.elevation_b,
+        np.column_stack([a.sigma[:, :2], b.sigma[:, 2:]]), a.quality,
+    )  # fmt: skip

@@ -1,0 +1,220 @@
+"""Least-squares refinement of a homing vector on its inliers, with covariance.
+
+The planar constraint supposes level cameras at one height. Real ones tilt by a fraction of a degree
+(D6: "estimate or inflate"), which bends elevations alike over whole sides of the view; so each
+view's roll and pitch and the difference of heights are estimated along with theta and psi, held by
+a prior. The residual is the epipolar one with general rotations, a weighted first-order (Sampson)
+distance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.cameras.omni.bearing_measurement import unit_rays
+from fgslam.core.homing_types import BearingMatches
+from fgslam.core.planar import wrap
+from fgslam.core.types import BoolArray, FloatArray
+from fgslam.frontend.homing.epipolar import in_front, ray_derivatives
+from fgslam.frontend.homing.match_odds import COMMON_CHANCE, gain, right_probability
+
+_WIDENED = (4.0, 3.0, 2.0, 1.5)
+"""Inliers' threshold in the first iterations: a hypothesis from two matches is a few degrees off,
+and the matches that would pull it right are its outliers (D7: 1 to 2 degrees)."""
+_ITERATIONS = 15
+_CONVERGED = 1e-7  # radians; a thousandth of the best covariance's square root
+_MAD_TO_SIGMA = 1.4826
+_DAMPING = 1e-3  # of the information: a handful of inliers may leave a direction open
+_LEAST_SIGMA = 1e-6  # of a parameter that is not to be estimated; less spoils the conditioning
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refined:
+    """A refined solution.
+
+    Attributes:
+        parameters: (7,) theta, psi, roll and pitch of a, roll and pitch of b (radians, about each
+            camera's x and y axis), height of b above a in legs.
+        covariance: (7, 7), widened by the residuals' scatter where that exceeds the stated noise.
+        residuals: (n,) of all matches, normalised.
+        inliers: (n,).
+    """
+
+    parameters: FloatArray
+    covariance: FloatArray
+    residuals: FloatArray
+    inliers: BoolArray
+
+
+@dataclass(frozen=True, slots=True)
+class RefinementPrior:
+    """Standard deviations of the nuisance parameters: tilt in radians, height in legs."""
+
+    tilt_sigma: float
+    height_sigma: float
+
+    def information(self) -> FloatArray:
+        """(7,) diagonal; theta and psi have none."""
+        held = np.array([*[self.tilt_sigma] * 4, self.height_sigma])
+        return np.concatenate([np.zeros(2), 1.0 / np.maximum(held, _LEAST_SIGMA) ** 2])
+
+
+class HomingRefinement:
+    """The matches, prepared for refining any number of hypotheses."""
+
+    def __init__(
+        self,
+        matches: BearingMatches,
+        prior: RefinementPrior,
+        inlier_sigmas: float,
+        least_parallax: float,
+    ) -> None:
+        a = unit_rays(matches.bearing_a, matches.elevation_a)
+        b = unit_rays(matches.bearing_b, matches.elevation_b)
+        by_a = ray_derivatives(matches.bearing_a, matches.elevation_a)
+        by_b = ray_derivatives(matches.bearing_b, matches.elevation_b)
+        # a^T E b is linear in E: one product of matrices gives all residuals and derivatives.
+        self._outer = _outer(a, b)
+        noisy = [_outer(d * matches.sigma[:, k, None], b) for k, d in enumerate(by_a)]
+        noisy += [_outer(a, d * matches.sigma[:, k + 2, None]) for k, d in enumerate(by_b)]
+        self._noisy = np.concatenate(noisy)
+        self._bearings = matches.bearing_a, matches.bearing_b
+        self._prior = prior.information()
+        right = right_probability(matches)
+        self._odds = right / (1.0 - right)
+        self._sigmas = inlier_sigmas
+        self._least_parallax = least_parallax
+
+    def refine(self, directions: FloatArray, rotations: FloatArray) -> list[Refined]:
+        """Gauss-Newton from hypotheses (c,), side by side; inliers are chosen anew each time."""
+        parameters = np.zeros((len(directions), 7))
+        parameters[:, 0], parameters[:, 1] = directions, rotations
+        going = np.arange(len(parameters))
+        for k in range(_ITERATIONS):
+            widened = _WIDENED[k] if k < len(_WIDENED) else 1.0
+            step = self._step(parameters[going], widened)
+            parameters[going] += np.clip(step, -0.3, 0.3)
+            if k >= len(_WIDENED):
+                going = going[np.max(np.abs(step), axis=1) >= _CONVERGED]
+            if not len(going):
+                break
+        parameters[:, :2] = wrap(parameters[:, :2])
+        return self._finished(parameters)
+
+    def _step(self, parameters: FloatArray, widened: float) -> FloatArray:
+        """(c, 7) the damped Gauss-Newton step from (c, 7)."""
+        residuals, jacobian = self._linearised(parameters)
+        weights = self._weights(parameters, residuals, widened)
+        information = self._information(jacobian, weights) + _DAMPING * np.eye(7)
+        gradient = (jacobian @ (weights * residuals)[:, :, None])[:, :, 0]
+        gradient += self._prior * parameters
+        return np.asarray(np.linalg.solve(information, -gradient[:, :, None])[:, :, 0])
+
+    def _information(self, jacobian: FloatArray, weights: FloatArray) -> FloatArray:
+        """(c, 7, 7) of Jacobians (c, 7, n) and weights (c, n), with the prior's."""
+        weighted = jacobian * weights[:, None]
+        return np.asarray(weighted @ jacobian.transpose(0, 2, 1) + np.diag(self._prior))
+
+    def _finished(self, parameters: FloatArray) -> list[Refined]:
+        residuals, jacobian = self._linearised(parameters)
+        inliers = self._inliers(parameters, residuals)
+        information = self._information(jacobian, self._weights(parameters, residuals))
+        covariances = np.linalg.pinv(information, hermitian=True)
+        return [
+            Refined(p, covariance * max(1.0, _scatter(r[kept])) ** 2, r, kept)
+            for p, covariance, r, kept in zip(
+                parameters, covariances, residuals, inliers, strict=True
+            )
+        ]
+
+    def _weights(
+        self, parameters: FloatArray, residuals: FloatArray, widened: float = 1.0
+    ) -> FloatArray:
+        """(c, n) probability that each match is right, given how it fits."""
+        inliers = self._inliers(parameters, residuals, widened)
+        likely = self._odds * gain(residuals / widened, self._sigmas, COMMON_CHANCE)
+        return inliers * likely / (1.0 + likely)
+
+    def _inliers(
+        self, parameters: FloatArray, residuals: FloatArray, widened: float = 1.0
+    ) -> BoolArray:
+        """(c, n), of (c, n) residuals."""
+        theta, psi = parameters[:, 0], parameters[:, 1]
+        ahead = in_front(self._bearings, theta, psi, self._least_parallax).T
+        return np.asarray((np.abs(residuals) < widened * self._sigmas) & ahead)
+
+    def _linearised(self, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(c, n) normalised residuals, their (c, 7, n) Jacobians, noise held at the estimate."""
+        essential, derivatives = _essential(parameters)
+        count = len(parameters)
+        flat = essential.reshape(count, 9)
+        residual = flat @ self._outer.T
+        by = (derivatives.reshape(-1, 9) @ self._outer.T).reshape(count, 7, -1)
+        noise = (flat @ self._noisy.T).reshape(count, 4, -1)
+        sigma = np.sqrt(np.maximum(np.einsum("ckn,ckn->cn", noise, noise), 1e-24))
+        return residual / sigma, by / sigma[:, None]
+
+
+def _scatter(residuals: FloatArray) -> float:
+    """Robust standard deviation of inliers' residuals; 1 where there are none."""
+    return _MAD_TO_SIGMA * float(np.median(np.abs(residuals))) if len(residuals) else 1.0
+
+
+def _outer(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(n, 9) products of all coordinates of two rays (n, 3)."""
+    return np.asarray((a[:, :, None] * b[:, None, :]).reshape(len(a), 9))
+
+
+def _essential(p: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """E (c, 3, 3) of parameters (c, 7), with a^T E b = 0, and its (c, 7, 3, 3) derivatives.
+
+    E = A^T [t]x Rz(psi) B, with tilts A and B. Their derivatives are taken as if by a further small
+    tilt, exact where the tilt itself vanishes.
+    """
+    c, s, none = np.cos(p[:, 0]), np.sin(p[:, 0]), np.zeros(len(p))
+    tilt_a, tilt_b = _tilt(p[:, 2:4]).transpose(0, 2, 1), _tilt(p[:, 4:6])
+    turn = _turn(p[:, 1])
+    skew = _skew(np.column_stack([c, s, p[:, 6]]))
+    right, left = turn @ tilt_b, tilt_a @ skew
+    middle, turned = skew @ right, left @ turn
+    derivatives = np.stack(
+        [
+            tilt_a @ _skew(np.column_stack([-s, c, none])) @ right,
+            turned @ _AXES[2] @ tilt_b,
+            -tilt_a @ _AXES[0] @ middle,
+            -tilt_a @ _AXES[1] @ middle,
+            turned @ _AXES[0] @ tilt_b,
+            turned @ _AXES[1] @ tilt_b,
+            tilt_a @ _AXES[2] @ right,
+        ],
+        axis=1,
+    )
+    return left @ right, derivatives
+
+
+def _skew(v: FloatArray) -> FloatArray:
+    """(c, 3, 3) matrices of the cross product with (c, 3)."""
+    return np.asarray((v @ _CROSS).reshape(-1, 3, 3))
+
+
+# The matrices of the axes, row by row: they are added up by a vector's coordinates.
+_CROSS = np.array([[0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0],
+                   [0, -1, 0, 1, 0, 0, 0, 0, 0]])  # fmt: skip
+_AXES = _skew(np.eye(3))
+
+
+def _turn(angle: FloatArray) -> FloatArray:
+    """(c, 3, 3) rotations about the vertical."""
+    c, s = np.cos(angle)[:, None, None], np.sin(angle)[:, None, None]
+    return np.asarray(np.eye(3) + s * _AXES[2] + (1.0 - c) * (_AXES[2] @ _AXES[2]))
+
+
+def _tilt(vector: FloatArray) -> FloatArray:
+    """(c, 3, 3) rotations by small vectors (roll, pitch, 0), (c, 2): Rodrigues' formula."""
+    angle = np.hypot(vector[:, 0], vector[:, 1])[:, None, None]
+    cross = _skew(np.column_stack([vector, np.zeros(len(vector))]))
+    # sin(x) / x and (1 - cos(x)) / x^2, also where x vanishes.
+    first, half = np.sinc(angle / np.pi), np.sinc(0.5 * angle / np.pi)
+    return np.asarray(np.eye(3) + first * cross + 0.5 * half**2 * (cross @ cross))

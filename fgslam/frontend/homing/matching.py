@@ -1,0 +1,247 @@
+"""Tentative correspondences of two omnidirectional images (Goedemé et al. III-A).
+
+SIFT features: the nearest descriptor, clearly nearer than the second, mutually; then the colour
+filter of eq. 1. Column segments: the nearest of the whitened vectors, likewise.
+
+Both images are taken on one plane. What no motion on it explains is left out *before* the nearest
+are sought, so it does not count as a rival either: elevations of opposite sign (design D1), and
+apparent sizes that disagree with the elevations. A thing at height z and distance r has size ~ 1/r
+and sin(elevation) = z/r, so s_a / s_b = sin(e_a) / sin(e_b).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from fgslam.core.homing_types import (
+    BearingMatches,
+    ColumnSegments,
+    FeatureKind,
+    OmniFeatures,
+    UprightFeatures,
+)
+from fgslam.core.types import ByteArray, FloatArray, IntArray
+from fgslam.frontend.features.column_whitening import whitened
+from fgslam.frontend.features.omni_settings import OmniMatchingSettings
+
+Float32Array = npt.NDArray[np.float32]
+
+
+_ROUNDING = 1e-6
+"""Of squared distances of unit vectors in float32, some times over."""
+
+
+def match_features(
+    a: OmniFeatures, b: OmniFeatures, settings: OmniMatchingSettings
+) -> BearingMatches:
+    """Matches of both kinds: SIFT first, then column segments; each ascending in ``index_a``.
+
+    Args:
+        a: features of the present image.
+        b: of the target image.
+        settings: thresholds.
+    """
+    sift = match_sift(a.sift, b.sift, settings)
+    return joined(sift, match_columns(a.columns, b.columns, settings))
+
+
+def joined(first: BearingMatches, second: BearingMatches) -> BearingMatches:
+    """Both lists, one after the other."""
+    return BearingMatches(
+        np.concatenate([first.kind, second.kind]),
+        np.concatenate([first.index_a, second.index_a]),
+        np.concatenate([first.index_b, second.index_b]),
+        np.concatenate([first.bearing_a, second.bearing_a]),
+        np.concatenate([first.elevation_a, second.elevation_a]),
+        np.concatenate([first.bearing_b, second.bearing_b]),
+        np.concatenate([first.elevation_b, second.elevation_b]),
+        np.concatenate([first.sigma, second.sigma]),
+        np.concatenate([first.quality, second.quality]),
+    )
+
+
+# --------------------------------------------------------------------------------------------
+# SIFT
+
+
+def match_sift(
+    a: UprightFeatures, b: UprightFeatures, settings: OmniMatchingSettings
+) -> BearingMatches:
+    """Mutual nearest descriptors that are distinct, planar and of one colour."""
+    if not len(a) or not len(b):
+        return _sift_matches(a, b, np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
+    squared = _squared_distances(a.descriptors, b.descriptors, settings.root)
+    if settings.planar_gates:
+        _forbid_impossible(squared, a, b, settings)
+    i, j, ratio = _mutual_nearest(squared)
+    colour = np.linalg.norm(a.colour[i] - b.colour[j], axis=1)
+    keep = (ratio < settings.ratio) & (colour < settings.max_colour_distance)
+    return _sift_matches(a, b, i[keep], j[keep], 1.0 - ratio[keep])
+
+
+def _squared_distances(a: ByteArray, b: ByteArray, root: bool) -> Float32Array:
+    x, y = _comparable(a, root), _comparable(b, root)
+    norms = np.einsum("ij,ij->i", y, y)
+    squared = x @ y.T
+    squared *= -2.0
+    squared += norms
+    squared += np.einsum("ij,ij->i", x, x)[:, None]
+    return np.asarray(squared, np.float32)
+
+
+def _comparable(descriptors: ByteArray, root: bool) -> Float32Array:
+    values = descriptors.astype(np.float32)
+    if not root:
+        return values
+    total = np.maximum(values.sum(axis=1, keepdims=True), 1.0)
+    return np.asarray(np.sqrt(values / total), np.float32)
+
+
+def _forbid_impossible(
+    squared: Float32Array, a: UprightFeatures, b: UprightFeatures, settings: OmniMatchingSettings
+) -> None:
+    """Sets distances of candidates to infinity that no planar motion explains."""
+    margin = np.deg2rad(settings.horizon_margin_deg)
+    side_a, side_b = _side(a.elevation, margin), _side(b.elevation, margin)
+    apart = _height_in_sizes(a, margin)[:, None] - _height_in_sizes(b, margin)
+    impossible = np.abs(apart, out=apart) > np.float32(np.log(settings.max_scale_ratio))
+    # Near the horizon in both views the elevations tell nothing about the sizes.
+    impossible &= (side_a != 0)[:, None] | (side_b != 0)
+    impossible |= side_a[:, None] * side_b < 0
+    np.putmask(squared, impossible, np.inf)
+
+
+def _side(elevation: FloatArray, margin: float) -> npt.NDArray[np.int8]:
+    return np.where(np.abs(elevation) > margin, np.sign(elevation), 0.0).astype(np.int8)
+
+
+def _height_in_sizes(features: UprightFeatures, margin: float) -> Float32Array:
+    """(n,) log of |sin(elevation)| over the apparent size, the same from everywhere."""
+    height = np.maximum(np.abs(np.sin(features.elevation)), np.sin(max(margin, 1e-3)))
+    return np.log(height / features.scale).astype(np.float32)
+
+
+def _mutual_nearest(squared: Float32Array) -> tuple[IntArray, IntArray, FloatArray]:
+    """Rows, columns, and nearest over second nearest distance of mutual nearest pairs.
+
+    A candidate without a rival at all has ratio 0. The distances are used up.
+    """
+    every = np.arange(len(squared))
+    j = squared.argmin(axis=1)
+    mutual = squared.argmin(axis=0)[j] == every
+    best = squared[every, j].astype(np.float64)
+    squared[every, j] = np.inf
+    second = squared.min(axis=1).astype(np.float64)
+    keep = mutual & np.isfinite(best)
+    # Equal descriptors differ by rounding; two equal ones in a row are rivals all the same.
+    best, second = (np.maximum(d[keep], 0.0) + _ROUNDING for d in (best, second))
+    return every[keep], j[keep], np.minimum(np.sqrt(best / second), 1.0)
+
+
+def _sift_matches(
+    a: UprightFeatures, b: UprightFeatures, i: IntArray, j: IntArray, quality: FloatArray
+) -> BearingMatches:
+    variances = [
+        c[k, axis, axis] for c, k in ((a.covariance, i), (b.covariance, j)) for axis in (0, 1)
+    ]
+    return BearingMatches(
+        kind=np.full(len(i), int(FeatureKind.SIFT), np.int64),
+        index_a=i,
+        index_b=j,
+        bearing_a=a.bearing[i],
+        elevation_a=a.elevation[i],
+        bearing_b=b.bearing[j],
+        elevation_b=b.elevation[j],
+        sigma=np.sqrt(np.column_stack(variances)),
+        quality=quality,
+    )
+
+
+# --------------------------------------------------------------------------------------------
+# Column segments
+
+
+def match_columns(
+    a: ColumnSegments, b: ColumnSegments, settings: OmniMatchingSettings
+) -> BearingMatches:
+    """Mutual nearest whitened vectors that are distinct."""
+    none = np.zeros(0, np.int64)
+    if len(a) < 2 or len(b) < 2:
+        return _column_matches(a, b, none, none, np.zeros(0))
+    i, j, distance, ratio = nearest_segments(whitened(a.descriptors), whitened(b.descriptors))
+    keep = (ratio < settings.column_ratio) & (distance < settings.max_column_distance)
+    return _column_matches(a, b, i[keep], j[keep], 1.0 - ratio[keep])
+
+
+def nearest_segments(
+    a: FloatArray, b: FloatArray
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Mutual nearest of vectors (n, k) and (m, k), n and m at least 2.
+
+    Returns:
+        Indices (k,) into ``a``, ascending, and into ``b``, the distance, and its ratio to that of
+        the second nearest in ``b``.
+    """
+    # In as many dimensions as segments have elements a product of matrices outruns any tree. It
+    # finds who is near; how near, down to no distance at all, is then taken from the vectors.
+    squared = np.einsum("ij,ij->i", b, b) - 2.0 * (a @ b.T)
+    i = np.arange(len(a))
+    j = squared.argmin(axis=1)
+    back = (squared + np.einsum("ij,ij->i", a, a)[:, None]).argmin(axis=0)
+    squared[i, j] = np.inf
+    other = squared.argmin(axis=1)
+    i = np.flatnonzero(back[j] == i)
+    best, second = (np.linalg.norm(a[i] - b[k[i]], axis=1) for k in (j, other))
+    # A second one just as near, be it at no distance at all, is a full rival.
+    ratio = np.ones(len(i))
+    np.divide(best, second, out=ratio, where=second > best)
+    return i, j[i], best, ratio
+
+
+def _column_matches(
+    a: ColumnSegments, b: ColumnSegments, i: IntArray, j: IntArray, quality: FloatArray
+) -> BearingMatches:
+    tangents_a, tangents_b, factor = consistent_tangents(a.tangents[i], b.tangents[j])
+    sigma_a = factor * a.sigma_tangents[i].mean(axis=1) / (1.0 + tangents_a**2)
+    sigma_b = factor * b.sigma_tangents[j].mean(axis=1) / (1.0 + tangents_b**2)
+    return BearingMatches(
+        kind=np.full(len(i), int(FeatureKind.COLUMN), np.int64),
+        index_a=i,
+        index_b=j,
+        bearing_a=a.bearing[i],
+        elevation_a=np.arctan(tangents_a),
+        bearing_b=b.bearing[j],
+        elevation_b=np.arctan(tangents_b),
+        sigma=np.column_stack([a.sigma_bearing[i], sigma_a, b.sigma_bearing[j], sigma_b]),
+        quality=quality,
+    )
+
+
+def consistent_tangents(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """One tangent of each view, their ratio the best estimate of e / d from both ends (D1, B1).
+
+    The ends (low, high) of a segment are a vector that grows and shrinks with 1 / distance: a and b
+    (n, 2) are parallel. With c the unit vector of their common direction, c.a / c.b is the ratio
+    that both ends support most, also where one is at the horizon. The tangents that are returned
+    are near the end that is further from the horizon, where something is to be seen.
+
+    Returns:
+        (n,) tangents in a and in b, and (n,) by what their standard deviation is that of an end.
+    """
+    along_a = np.hypot(a[:, 0], a[:, 1])
+    along_b = np.hypot(b[:, 0], b[:, 1])
+    common = a / along_a[:, None] + b / along_b[:, None]
+    norm = np.hypot(common[:, 0], common[:, 1])
+    common = common / np.maximum(norm, 1e-12)[:, None]
+    end = _far_end(common)
+    share = common[np.arange(len(a)), end]
+    return (
+        np.einsum("ij,ij->i", a, common) * share,
+        np.einsum("ij,ij->i", b, common) * share,
+        np.abs(share),
+    )
+
+
+def _far_end(tangents: FloatArray) -> IntArray:
+    return np.asarray(np.argmax(np.abs(tangents), axis=1), np.int64)

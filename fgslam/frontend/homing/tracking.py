@@ -1,0 +1,183 @@
+"""Tracking of features from image to image: KLT on a steady view (Goedemé et al. IV-A, G21-G23).
+
+Eq. 2's matrix is summed over the window (E-G8). A point is lost for good when it cannot be tracked
+back to where it came from, when it no longer looks as it did when its tracking began
+(:mod:`fgslam.frontend.homing.anchored_patches`), or when it leaves the view.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.core.errors import EstimatorError
+from fgslam.core.homing_types import TrackedBearings
+from fgslam.core.types import BoolArray, FloatArray, Image, IntArray
+from fgslam.frontend.homing.anchored_patches import AnchoredPatches, align, anchor
+from fgslam.frontend.homing.steady_view import SteadyImage, SteadyView
+from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
+
+Float32 = npt.NDArray[np.float32]
+
+_GAIN = (0.2, 5.0)  # from one exposure to the next
+_SAME_GAIN, _SAME_LEVEL = 0.02, 1.0  # less is left as it is: rounding would be worse
+_MAX_TURN = np.deg2rad(60.0)  # between two images; 40 deg/s of a wheelchair seen 5 times a second
+
+
+class BearingTracker:
+    """Tracks points of one camera's images and tells their bearings."""
+
+    def __init__(self, camera: OmniCamera, settings: OmniTrackingSettings) -> None:
+        self._settings = settings
+        self.steady = SteadyView(
+            camera, settings.max_view_width, settings.window_px, settings.pyramid_levels
+        )
+        self._last: SteadyImage | None = None
+        self._places: FloatArray = np.empty((0, 2))
+        self._patches: AnchoredPatches | None = None
+        self._ids: IntArray = np.empty(0, dtype=np.int64)
+        self._time = -np.inf
+
+    @property
+    def view(self) -> OmniCamera:
+        """The camera whose pixels the tracked points are."""
+        return self.steady.view
+
+    def start(self, image: Image, time: float, ids: IntArray, pixels: FloatArray) -> None:
+        """Tracks these points from now on, instead of any before.
+
+        Args:
+            image: (h, w, 3) that they are seen in.
+            time: seconds.
+            ids: (n,) ascending.
+            pixels: (n, 2) in the view.
+        """
+        self._last = self.steady.make(image, None, 0.0)
+        self._places = self.steady.to_steady(pixels, self._last)
+        self._patches = self._anchored(self._last, self._places)
+        self._ids, self._time = ids.copy(), time
+
+    def add(self, ids: IntArray, pixels: FloatArray) -> None:
+        """Tracks these points of the last image, too; identities above those before."""
+        if self._last is None or self._patches is None:
+            raise EstimatorError("no image was tracked yet: start before adding points")
+        places = self.steady.to_steady(pixels, self._last)
+        self._patches = self._patches.joined(self._anchored(self._last, places))
+        self._places = np.vstack([self._places, places])
+        self._ids = np.concatenate([self._ids, ids])
+
+    def track(self, image: Image, time: float) -> TrackedBearings:
+        """Finds the points in the next image; those not found are forgotten.
+
+        Raises:
+            EstimatorError: tracking was not started, or time does not increase.
+            FrameError: the image is not the camera's.
+        """
+        if self._last is None or self._patches is None:
+            raise EstimatorError("no image was tracked yet: start before tracking")
+        if not time > self._time:
+            raise EstimatorError(
+                f"an image at {time:.9f} s follows one at {self._time:.9f} s; give images in order"
+            )
+        turn = _MAX_TURN * self.steady.period / (2.0 * np.pi)
+        now = self.steady.make(image, self._last, turn)
+        if len(self._ids):
+            places, kept = self._follow(self._last, now)
+            self._settle(now, places[kept], self._ids[kept], self._patches.taken(kept))
+        self._last, self._time = now, time
+        return self._bearings(time)
+
+    def bearings(self) -> TrackedBearings:
+        """The points as the last image shows them."""
+        return self._bearings(self._time)
+
+    def pixels(self) -> FloatArray:
+        """(n, 2) where the points are in the view of the last image."""
+        if self._last is None:
+            return np.empty((0, 2))
+        return self.steady.from_steady(self._places, self._last)
+
+    def _anchored(self, image: SteadyImage, places: FloatArray) -> AnchoredPatches:
+        s = self._settings
+        return anchor(image.grey, places, s.patch_px, s.patch_noise_grey, s.patch_deformation)
+
+    def _settle(
+        self, now: SteadyImage, places: FloatArray, ids: IntArray, patches: AnchoredPatches
+    ) -> None:
+        """Aligns each point with its first patch, and keeps those that look like it."""
+        patches, places, correlation = align(patches, now.grey, places)
+        s = self._settings
+        kept = (correlation >= s.min_correlation) & (patches.deformation() <= s.max_deformation)
+        kept &= self._inside(places)
+        self._places, self._ids = self._centred(places[kept]), ids[kept]
+        self._patches = patches.taken(kept)
+
+    def _centred(self, places: FloatArray) -> FloatArray:
+        """Places between the margins; who crossed the seam goes on at the other end."""
+        margin, period = self.steady.margin, self.steady.period
+        return np.column_stack([(places[:, 0] - margin) % period + margin, places[:, 1]])
+
+    def _follow(self, before: SteadyImage, now: SteadyImage) -> tuple[FloatArray, BoolArray]:
+        """(n, 2) places in the new view, and (n,) whether they are to be trusted."""
+        s = self._settings
+        origin = self._places.astype(np.float32)
+        window = (s.window_px, s.window_px)
+        kinds = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT
+        criteria = (kinds, s.iterations, s.precision_px)
+        start = np.empty_like(origin)  # not read without the flag
+        alike = _in_light_of(before.grey, now.grey)
+        found, good, _ = cv2.calcOpticalFlowPyrLK(
+            before.grey, alike, origin, start, None, None,
+            window, s.pyramid_levels, criteria, 0, s.min_eigenvalue,
+        )  # fmt: skip
+        # The way back starts at its end, so that the finest level alone does: it costs a third.
+        back, good_back, _ = cv2.calcOpticalFlowPyrLK(
+            alike, before.grey, found, origin.copy(), None, None,
+            window, 0, criteria, cv2.OPTFLOW_USE_INITIAL_FLOW, s.min_eigenvalue,
+        )  # fmt: skip
+        ends = np.asarray(found, np.float32)
+        missed = np.hypot(*(np.asarray(back, np.float32) - origin).T)
+        kept = np.asarray((good[:, 0] == 1) & (good_back[:, 0] == 1) & (missed <= s.max_back_px))
+        kept &= self._inside(ends)
+        return ends.astype(np.float64), kept
+
+    def _inside(self, places: Float32 | FloatArray) -> BoolArray:
+        """(n,) whether a point's window lies mostly in the view; rows have no continuation."""
+        rim, rows = self._settings.window_px / 4.0, self.steady.view.height
+        good = (places[:, 1] >= rim) & (places[:, 1] <= rows - 1 - rim)
+        columns = 2 * self.steady.margin + self.steady.period
+        return np.asarray(good & (places[:, 0] >= 0.0) & (places[:, 0] <= columns - 1.0))
+
+    def _bearings(self, time: float) -> TrackedBearings:
+        s, view = self._settings, self.steady.view
+        pixels = self.pixels()
+        a_column = 2.0 * np.pi / self.steady.period
+        a_row = (view.top_elevation - view.bottom_elevation) / (view.height - 1)
+        deformation = np.empty(0) if self._patches is None else self._patches.deformation()
+        sigma = np.hypot(s.sigma_px, s.sigma_deformed_px * deformation)
+        return TrackedBearings(
+            time=time,
+            ids=self._ids.copy(),
+            bearing=np.pi - pixels[:, 0] * a_column,
+            sigma_bearing=sigma * a_column,
+            elevation=view.top_elevation - pixels[:, 1] * a_row,
+            sigma_elevation=sigma * a_row,
+        )
+
+
+def _in_light_of(before: Image, now: Image) -> Image:
+    """The present view with mean and contrast of the one before.
+
+    OpenCV's tracker takes a brighter exposure for motion wherever contrast is low.
+    """
+    (mean, spread), (mean_now, spread_now) = (
+        (float(m[0, 0]), float(s[0, 0])) for m, s in map(cv2.meanStdDev, (before, now))
+    )
+    gain = float(np.clip(spread / max(spread_now, 1.0), *_GAIN))
+    offset = mean - gain * mean_now
+    if abs(gain - 1.0) < _SAME_GAIN and abs(offset + (gain - 1.0) * mean_now) < _SAME_LEVEL:
+        return now
+    levels = np.clip(np.round(gain * np.arange(256) + offset), 0, 255).astype(np.uint8)
+    return np.asarray(cv2.LUT(now, levels), dtype=np.uint8)

@@ -1,0 +1,97 @@
+"""Tracking through a whole recording: points that are lost are replaced by new ones (G21, G22)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.core.homing_types import TrackedBearings
+from fgslam.core.types import FloatArray, Image, IntArray
+from fgslam.frontend.homing.tracking import BearingTracker
+from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackedImage:
+    """One image of a recording.
+
+    Attributes:
+        tracked: the points after replenishing.
+        survivors: points of the image before that were found again.
+        added: (k,) identities of the new ones.
+    """
+
+    tracked: TrackedBearings
+    survivors: int
+    added: IntArray
+
+
+class ReplenishedTracker:
+    """A tracker that always follows enough points."""
+
+    def __init__(
+        self, camera: OmniCamera, settings: OmniTrackingSettings, least: int, most: int
+    ) -> None:
+        """Fills up to ``most`` points whenever fewer than ``least`` are left."""
+        self._tracker = BearingTracker(camera, settings)
+        self._settings, self._least, self._most = settings, least, most
+        self._next = 0
+        self._started = False
+
+    def take(self, image: Image, time: float) -> TrackedImage:
+        """Tracks into the next image (h, w, 3), and adds points where too few are left.
+
+        Raises:
+            EstimatorError: time does not increase.
+            FrameError: the image is not the camera's.
+        """
+        if not self._started:
+            none = np.empty(0, np.int64)
+            self._tracker.start(image, time, none, np.empty((0, 2)))
+            self._started = True
+            survivors = 0
+            tracked = None
+        else:
+            tracked = self._tracker.track(image, time)
+            survivors = len(tracked)
+        added = self._fill(image) if survivors < self._least else np.empty(0, np.int64)
+        if tracked is None or len(added):
+            tracked = self._tracker.bearings()
+        return TrackedImage(tracked, survivors, added)
+
+    def pixels(self) -> FloatArray:
+        """(n, 2) where the points are in the view (:meth:`view`) of the last image."""
+        return self._tracker.pixels()
+
+    def view(self, image: Image) -> Image:
+        """(height, width) the unwrapped grey view of an image (h, w, 3)."""
+        return self._tracker.steady.grey(image)
+
+    def _fill(self, image: Image) -> IntArray:
+        """(k,) identities of the strongest corners away from the points that there are."""
+        present = self._tracker.pixels()
+        corners = self._corners(self._tracker.steady.grey(image), present)
+        ids = self._next + np.arange(len(corners), dtype=np.int64)
+        self._next += len(corners)
+        self._tracker.add(ids, corners)
+        return ids
+
+    def _corners(self, grey: Image, present: FloatArray) -> FloatArray:
+        """(k, 2) in the view; k fills up what is missing, where there is so much to see."""
+        s = self._settings
+        mask = np.full(grey.shape, 255, np.uint8)
+        rim = s.window_px // 2 + 1
+        mask[:rim] = mask[-rim:] = 0
+        for column, row in np.round(present).astype(int).tolist():
+            cv2.circle(mask, (column, row), s.window_px // 2, 0, -1)
+        wanted = self._most - len(present)
+        if wanted <= 0:
+            return np.empty((0, 2))
+        found = cv2.goodFeaturesToTrack(
+            grey, wanted, 0.005, max(s.distinct_px, s.window_px / 3.0), mask=mask,
+            blockSize=s.window_px,
+        )  # fmt: skip
+        return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)

@@ -1,0 +1,329 @@
+"""Place recognition beside the loop: the return to a mapped place, and oneself when lost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from fgslam.core.geometry import inverse
+from fgslam.core.map_types import LandmarkAppearances, Relocalisation
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.types import (
+    FloatArray,
+    Increment,
+    IntArray,
+    LandmarkMap,
+    LoopClosure,
+    Prediction,
+    StateArrays,
+    StereoFeatures,
+    UpdateStats,
+)
+from fgslam.frontend.features.settings import AppearanceSettings
+from fgslam.frontend.places.loops.closure import close_loop, is_sharp
+from fgslam.frontend.places.loops.confirmation import Confirmation, difference, drift_allows
+from fgslam.frontend.places.loops.fusion import duplicates
+from fgslam.frontend.places.loops.memory import SightingMemory
+from fgslam.frontend.places.settings import LoopSettings, LostSettings
+from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
+
+_STREAM = 11  # of random numbers, beside those of the recording
+_ONE_PLACE_M, _ONE_PLACE_DEG = 0.3, 5.0
+"""What matching around a pose found in the whole map may change of it: several times what such a
+pose may be off (frontend.relocalisation.max_sigma_*)."""
+_WORDS_EVERY = 16
+"""Frames after which the words of new and renewed views are found, half a millisecond's work: the
+first look after a long time would find them all at once."""
+_NOBODY: IntArray = np.empty(0, np.int64)
+_NO_PAIRS: IntArray = np.empty((0, 2), np.int64)
+
+
+class Locator(Protocol):
+    """Finds a frame in a map without a prior; :mod:`fgslam.frontend.places.relocalisation` is one."""
+
+    def learn(self, landmarks: LandmarkMap, appearances: LandmarkAppearances) -> None:
+        """Makes these landmarks the ones to be found."""
+        ...
+
+    def locate(self, features: StereoFeatures, rng: np.random.Generator) -> Relocalisation:
+        """The frame's pose among them, or why there is none to be believed."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecognitionParts:
+    """What place recognition works with; loops or lost None where it is not wanted."""
+
+    loops: LoopSettings | None
+    lost: LostSettings | None
+    appearance: AppearanceSettings
+    relocaliser: Locator
+    seed: int
+
+
+class PlaceRecognition:
+    """Remembers who saw what, looks for returns, and finds the camera when it is lost.
+
+    All of it happens at fixed frames and with random numbers of the frame's own: the same recording
+    gives the same closures, interrupted or not.
+    """
+
+    def __init__(self, parts: RecognitionParts, tracker: LandmarkTracker) -> None:
+        """Nothing is remembered yet; the tracker is the run's own, with the map it begins in."""
+        self._parts = parts
+        self._tracker = tracker
+        self._memory = SightingMemory(int(tracker.database.ids.max(initial=-1)))
+        self._confirmation = None if parts.loops is None else Confirmation(parts.loops)
+        self._lost = 0
+        self._offered = -1  # frame of the last closure, taken or not
+        self._merging = _NO_PAIRS  # landmarks that are one, by the closure just taken
+        self._fuse_since = -1  # a frame: landmarks made after it may be older ones' doubles
+        self._pose: FloatArray = np.eye(4)
+        tracker.database.find_words()
+
+    @property
+    def maps_on(self) -> bool:
+        """Whether new landmarks may enter the map: not while it is unknown where they are.
+
+        From the first frame on: with landmarks of its own a robot carried off would not know it.
+        """
+        lost = self._parts.lost
+        return lost is None or not 0 < self._lost < lost.give_up_after
+
+    @property
+    def taken(self) -> tuple[bool, ...]:
+        """Whether the estimator took the closures so far, in the log's order."""
+        return tuple(self._memory.taken)
+
+    @property
+    def ending(self) -> IntArray:
+        """(m,) landmarks that the last frame's closure showed to be older ones: they end next."""
+        return np.asarray(self._merging[:, 0])
+
+    # -- lost --------------------------------------------------------------------------------
+
+    def recover(
+        self, tracked: Tracked, landmarks: LandmarkMap, features: StereoFeatures
+    ) -> tuple[Tracked, bool]:
+        """The frame as tracked; or, when that failed for long, as found in the whole map.
+
+        Returns:
+            The result, and whether it was found without a prior.
+        """
+        lost = self._parts.lost
+        # Without any landmark yet there is nothing to be lost in.
+        located = tracked.ego_motion.status.measured or not len(landmarks)
+        self._lost = 0 if located else self._lost + 1
+        if self._astray and self._confirmation is not None:
+            self._confirmation.forget()  # its frames are to be in a row
+        if lost is None or self._lost < lost.after or not len(features):
+            return tracked, False
+        found = self._locate(landmarks, self._trusted(), features)
+        if not found.found:
+            return tracked, False
+        around = Prediction(found.wTc, found.covariance)
+        anew = self._tracker.track_anew(around, landmarks, features)
+        if not anew.ego_motion.status.measured or not _one_place(found.wTc, anew.ego_motion.wTc):
+            return tracked, False
+        self._lost = 0
+        return anew, True
+
+    # -- loops -------------------------------------------------------------------------------
+
+    def mended(
+        self,
+        tracked: Tracked,
+        prediction: Prediction,
+        landmarks: LandmarkMap,
+        features: StereoFeatures,
+    ) -> Tracked:
+        """The frame as tracked; torn between two places, as placed by recent landmarks alone.
+
+        Back at a place from which a drift has moved the estimate a little, old landmarks are found
+        among those of the way, and contradict them. Until a closure has moved the map the frame
+        belongs to the way: half way between them it would fit neither, and what it begins would
+        be misplaced.
+
+        Args:
+            tracked: the frame, placed by all landmarks.
+            prediction: where it was expected.
+            landmarks: the map.
+            features: the frame's.
+        """
+        loops = self._parts.loops
+        if loops is None or tracked.ego_motion.coherent:
+            return tracked
+        old = self._memory.unseen_for(loops.forgotten_after, landmarks.ids)
+        recent = self._tracker.track(prediction, landmarks.without(old), features)
+        found = recent.ego_motion
+        return recent if found.status.measured and found.coherent else tracked
+
+    def look(
+        self,
+        wTc: FloatArray,
+        landmarks: LandmarkMap,
+        features: StereoFeatures,
+        association: Association,
+    ) -> tuple[LoopClosure, ...]:
+        """Looks for a return, where it is time to; the closure once it is confirmed.
+
+        Whatever the estimator makes of it, a rest follows: the same place would be offered at every
+        look. What a closure means for map and memory waits for its verdict (:meth:`remember`).
+
+        Args:
+            wTc: (4, 4) the frame's pose as tracked.
+            landmarks: the map before this frame's update.
+            features: the frame's.
+            association: which landmarks they are taken for.
+        """
+        loops, confirmation = self._parts.loops, self._confirmation
+        if loops is None or confirmation is None or not self._time_to_look(loops, confirmation):
+            return ()
+        found = self._old_place(loops, landmarks, features)
+        if found is None or not self._plausible(found, wTc, landmarks, loops):
+            confirmation.forget()
+            return ()
+        if not confirmation.offer(found.wTc, wTc):
+            return ()
+        confirmation.forget()
+        closure = close_loop(
+            self._memory,
+            landmarks,
+            features,
+            found,
+            association.partners(len(features)),
+            self._tracker.resection,
+        )
+        if closure is None or not is_sharp(closure, loops):
+            return ()
+        self._offered = len(self._memory)
+        return (closure,)
+
+    def fuse(self, landmarks: LandmarkMap) -> IntArray:
+        """After a closure that was taken: makes one what it shows to be one; identities that end.
+
+        Asked before the next frame is tracked: the estimator has moved the map, and with both of
+        two landmarks in it that look alike and lie in one place, neither would be matched.
+
+        Args:
+            landmarks: the map as corrected.
+        """
+        loops, since = self._parts.loops, self._fuse_since
+        if loops is None or since < 0:
+            return _NOBODY
+        ended = self._tracker.merge(self._merging)
+        self._merging, self._fuse_since = _NO_PAIRS, -1
+        if loops.fuse_m == 0.0:
+            return ended
+        left = landmarks.ids[~np.isin(landmarks.ids, ended)]
+        new = self._memory.made_after(since, left)
+        looks = self._tracker.database.appearances()
+        sides = left[new], left[~new]
+        pairs = duplicates(landmarks, looks, sides, loops.fuse_m, self._parts.appearance)
+        return np.union1d(ended, self._tracker.merge(pairs))
+
+    # -- upkeep ------------------------------------------------------------------------------
+
+    def remember(self, increment: Increment, tracked: FloatArray, stats: UpdateStats) -> None:
+        """Books a frame, and prepares what the closures mean that the estimator took.
+
+        Args:
+            increment: its measurements.
+            tracked: (4, 4) its pose before any loop was closed in it.
+            stats: the estimator's pose and verdicts.
+        """
+        taken = [loop for loop, so in zip(increment.loops, stats.closed, strict=True) if so]
+        if taken:
+            self._merging = np.concatenate([loop.merged for loop in taken])
+            since = [self._memory.last_seen(loop.observations.ids) for loop in taken]
+            self._fuse_since = min(since)
+        step = inverse(self._pose) @ tracked if len(self._memory) else np.eye(4)
+        self._memory.add(increment, step, stats.closed)
+        self._pose = stats.wTc
+        if len(self._memory) % _WORDS_EVERY == 0:
+            self._tracker.database.find_words()
+
+    def state(self) -> StateArrays:
+        """All but what the log tells."""
+        confirmation = self._confirmation
+        return self._memory.state() | {
+            "counts": np.array(
+                [
+                    self._lost,
+                    self._offered,
+                    self._fuse_since,
+                    0 if confirmation is None else confirmation.count,
+                ]
+            ),
+            "offset": np.eye(4) if confirmation is None else confirmation.offset,
+            "merging": self._merging,
+            "pose": self._pose,
+        }
+
+    def restore(self, state: StateArrays, log: MeasurementLog) -> None:
+        """Continues from :meth:`state` and the log of as many frames."""
+        self._memory.restore(state, log)
+        self._lost, self._offered, self._fuse_since, count = state["counts"].tolist()
+        self._merging, self._pose = state["merging"], state["pose"]
+        if self._confirmation is not None:
+            self._confirmation.count, self._confirmation.offset = count, state["offset"]
+        self._tracker.database.find_words()
+
+    # ----------------------------------------------------------------------------------------
+
+    @property
+    def _astray(self) -> bool:
+        """Whether it is unknown where the frame is, so that no return would be believed.
+
+        Outside a map that is left as it is, nothing but the odometry ever tells; where nobody
+        searches the whole map for the lost, the return to it is a loop like any other.
+        """
+        outside = self._tracker.keeps_map and self._parts.lost is None
+        return self._lost > 0 and not outside
+
+    def _time_to_look(self, loops: LoopSettings, confirmation: Confirmation) -> bool:
+        frame = len(self._memory)
+        if self._astray or (self._offered >= 0 and frame - self._offered <= loops.rest):
+            return False
+        return confirmation.hopeful or frame % loops.every == 0
+
+    def _old_place(
+        self, loops: LoopSettings, landmarks: LandmarkMap, features: StereoFeatures
+    ) -> Relocalisation | None:
+        """The frame located by landmarks not seen for long, or never; None where it is not."""
+        trusted = self._trusted()
+        known = trusted[np.isin(trusted, landmarks.ids)]
+        old = self._memory.unseen_for(loops.forgotten_after, known)
+        if not len(old) or not len(features):
+            return None
+        found = self._locate(landmarks, old, features)
+        return found if found.found else None
+
+    def _trusted(self) -> IntArray:
+        """Landmarks seen often enough to be there (Se et al. 6.1)."""
+        database = self._tracker.database
+        return database.ids[database.valid]
+
+    def _plausible(
+        self, found: Relocalisation, wTc: FloatArray, landmarks: LandmarkMap, loops: LoopSettings
+    ) -> bool:
+        earlier = self._memory.best_view_of(found.ids, landmarks)
+        if earlier < 0:
+            return False
+        return drift_allows(found.wTc, wTc, self._memory.way_since(earlier), loops)
+
+    def _locate(
+        self, landmarks: LandmarkMap, among: IntArray, features: StereoFeatures
+    ) -> Relocalisation:
+        rng = np.random.default_rng([self._parts.seed, _STREAM, len(self._memory)])
+        chosen = landmarks.select(np.flatnonzero(np.isin(landmarks.ids, among)))
+        looks = self._tracker.database.appearances(chosen.ids, with_words=True)
+        self._parts.relocaliser.learn(chosen, looks)
+        return self._parts.relocaliser.locate(features, rng)
+
+
+def _one_place(a: FloatArray, b: FloatArray) -> bool:
+    metres, degrees = difference(a, b)
+    return metres <= _ONE_PLACE_M and degrees <= _ONE_PLACE_DEG

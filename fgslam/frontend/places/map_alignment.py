@@ -1,0 +1,346 @@
+"""Lays one map onto another by what their landmarks look like and where they are (design B4).
+
+Tentative matches by appearance, RANSAC over triples, least squares weighted by both covariances,
+then every landmark that the alignment brings near one that looks like it. The verdict refuses
+rather than guesses. docs/derivations/map_alignment.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from fgslam.core.errors import MapError
+from fgslam.core.geometry import (
+    congruence,
+    inverse_spd3,
+    point_pose_jacobian,
+    se3_exp,
+    so3_log,
+    transform_to_world,
+)
+from fgslam.core.saved_map import SavedMap
+from fgslam.core.types import BoolArray, FloatArray, IntArray
+from fgslam.frontend.places.relocalisation.alignment import align_in_space
+from fgslam.frontend.places.relocalisation.appearance_index import AppearanceIndex
+from fgslam.frontend.places.settings import MergeSettings
+
+_NEIGHBOURS = 6  # views asked for: enough to pass over a place's own and reach the next
+_HYPOTHESES = 400  # rigid triples that are scored
+_RIVALS = 8  # of the hypotheses elsewhere that are refined: the best ones
+_LEAST_SPREAD_M = 0.3  # smaller triangles turn the map by more than least squares mends
+_ROUNDS = 8  # of least squares and choosing anew
+_AT_ONCE = 8192  # pairs of views compared together; their bytes stay in the cache
+_AMONG_M = 0.5  # a landmark this near to one of the other map's lies among them
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """The second map's place in the first one.
+
+    Attributes:
+        aTb: (4, 4) takes points from the second map's world to the first one's.
+        covariance: (6, 6) in the tangent space at it, [rotation, translation].
+        pairs: (k, 2) rows of the same landmark in both maps, each at most once.
+        residual_m: root mean square distance of the pairs.
+        residual_sigmas: the same, normalised per number: 1 as the covariances say.
+        candidates: tentative matches; ``agreeing`` of them agree with the alignment.
+        second: those that agree with the second-best alignment elsewhere.
+        among: trusted landmarks of the second map that lie among the first one's; ``found`` of
+            them are in pairs.
+    """
+
+    aTb: FloatArray
+    covariance: FloatArray
+    pairs: IntArray
+    residual_m: float
+    residual_sigmas: float
+    candidates: int
+    agreeing: int
+    second: int
+    among: int
+    found: int
+
+
+def align_maps(
+    a: SavedMap, b: SavedMap, settings: MergeSettings, rng: np.random.Generator, names: str
+) -> Alignment:
+    """Where ``b`` lies in ``a``.
+
+    Args:
+        a: the map whose world it shall be.
+        b: the other one.
+        settings: gates and bounds.
+        rng: draws the samples.
+        names: of both maps, for messages.
+
+    Raises:
+        MapError: they do not overlap, or there are several ways to lay them onto each other.
+    """
+    tentative = tentative_pairs(a, b, settings)
+    n = len(tentative)
+    if n < settings.min_pairs:
+        raise MapError(
+            f"{names}: only {n} landmarks look alike, {settings.min_pairs} are needed; the maps do "
+            "not overlap"
+        )
+    problem = _Points.of(a, b, tentative, settings.slack_m)
+    poses = _hypotheses(problem, settings, rng)
+    counts = np.array([int(problem.within(aTb, settings.gate_sigmas).sum()) for aTb in poses])
+    if not len(counts) or counts.max() < settings.min_pairs // 2:
+        most = int(counts.max()) if len(counts) else 0
+        raise MapError(
+            f"{names}: {n} landmarks look alike, but at most {most} of them lie alike; the maps "
+            "do not overlap, or too little"
+        )
+    best, _ = _refined(problem, poses[int(np.argmax(counts))], settings.gate_sigmas)
+    agreeing = int(problem.within(best, settings.gate_sigmas).sum())
+    second = _second(problem, best, poses[np.argsort(-counts, kind="stable")], settings)
+    if second >= settings.ambiguous_share * agreeing:
+        raise MapError(
+            f"{names}: ambiguous: {agreeing} landmarks agree with one alignment, {second} with "
+            "another one; drive through the place that both share once more"
+        )
+    return _completed(a, b, best, (n, agreeing, second), settings, names)
+
+
+# --------------------------------------------------------------------------------------------
+# By appearance
+
+
+def tentative_pairs(a: SavedMap, b: SavedMap, settings: MergeSettings) -> IntArray:
+    """Rows (k, 2) of confirmed landmarks that look alike and like no other place; b's ascending."""
+    mine, yours = _trusted_views(a), _trusted_views(b)
+    if not len(mine) or not len(yours):
+        return np.empty((0, 2), np.int64)
+    index = AppearanceIndex(a.appearances.descriptors[mine])
+    found = index.query(b.appearances.descriptors[yours], _NEIGHBOURS)
+    known = found.rows >= 0
+    views = mine[np.where(known, found.rows, 0)]
+    owners = a.landmarks.rows(a.appearances.ids[views].ravel()).reshape(views.shape)
+    places = a.landmarks.positions[owners]
+    other = known & (np.linalg.norm(places - places[:, :1], axis=2) > settings.same_place_m)
+    next_place = np.where(other, found.distances, np.inf).min(axis=1)
+    near = found.distances[:, 0]
+    size = np.log(a.appearances.size[views[:, 0]] / b.appearances.size[yours])
+    keep = known[:, 0] & (near <= settings.max_distance) & (near <= settings.ratio * next_place)
+    keep &= np.abs(size) <= np.log(settings.size_ratio)
+    rows = b.landmarks.rows(b.appearances.ids[yours[keep]])
+    return _nearest_of_each(rows, owners[keep, 0], near[keep])
+
+
+def _trusted_views(saved: SavedMap) -> IntArray:
+    """Indices of the views of landmarks that were seen again after their first frames."""
+    trusted = saved.landmarks.ids[saved.permanent | (saved.hits >= 3)]
+    return np.flatnonzero(np.isin(saved.appearances.ids, trusted))
+
+
+def _nearest_of_each(rows: IntArray, owners: IntArray, distances: FloatArray) -> IntArray:
+    """One pair (owner, row) for each row: that of the nearest view."""
+    order = np.lexsort((owners, distances, rows))
+    first = order[np.unique(rows[order], return_index=True)[1]]
+    return np.column_stack([owners[first], rows[first]])
+
+
+# --------------------------------------------------------------------------------------------
+# By geometry
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Points:
+    """Matched landmarks: positions (n, 3) and covariances (n, 3, 3) in both maps' worlds."""
+
+    a: FloatArray
+    b: FloatArray
+    a_covariance: FloatArray
+    b_covariance: FloatArray
+
+    @staticmethod
+    def of(a: SavedMap, b: SavedMap, pairs: IntArray, slack_m: float) -> _Points:
+        slack = slack_m**2 * np.eye(3)
+        mine, yours = pairs[:, 0], pairs[:, 1]
+        return _Points(
+            a.landmarks.positions[mine],
+            b.landmarks.positions[yours],
+            a.landmarks.covariances[mine] + slack,
+            b.landmarks.covariances[yours],
+        )
+
+    def select(self, keep: BoolArray) -> _Points:
+        return _Points(self.a[keep], self.b[keep], self.a_covariance[keep], self.b_covariance[keep])
+
+    def residuals(self, aTb: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Differences (n, 3) in a's world, and the inverse of their covariances (n, 3, 3)."""
+        both = self.a_covariance + congruence(aTb[:3, :3], self.b_covariance)
+        return self.a - transform_to_world(aTb, self.b), inverse_spd3(both)
+
+    def squared(self, aTb: FloatArray) -> FloatArray:
+        """(n,) normalised distances, squared."""
+        residual, weight = self.residuals(aTb)
+        return np.asarray(np.einsum("ni,nij,nj->n", residual, weight, residual))
+
+    def within(self, aTb: FloatArray, gate: float) -> BoolArray:
+        """(n,) which agree with an alignment."""
+        return np.asarray(self.squared(aTb) <= gate**2)
+
+
+def _hypotheses(problem: _Points, settings: MergeSettings, rng: np.random.Generator) -> FloatArray:
+    """Alignments (h, 4, 4) from triples whose sides are as long in both maps."""
+    triples = rng.integers(0, len(problem.a), (settings.samples, 3))
+    mine, yours = problem.a[triples], problem.b[triples]
+    variance = np.trace(problem.a_covariance + problem.b_covariance, axis1=1, axis2=2) / 3.0
+    keep = np.ones(len(triples), np.bool_)
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        own = np.linalg.norm(mine[:, i] - mine[:, j], axis=1)
+        other = np.linalg.norm(yours[:, i] - yours[:, j], axis=1)
+        sigma = np.sqrt(variance[triples[:, i]] + variance[triples[:, j]])
+        keep &= np.abs(own - other) <= settings.gate_sigmas * sigma
+    area = np.linalg.norm(np.cross(mine[:, 1] - mine[:, 0], mine[:, 2] - mine[:, 0]), axis=1)
+    chosen = np.flatnonzero(keep & (area >= _LEAST_SPREAD_M**2))[:_HYPOTHESES]
+    return align_in_space(yours[chosen], mine[chosen])
+
+
+def _refined(problem: _Points, aTb: FloatArray, gate: float) -> tuple[FloatArray, FloatArray]:
+    """Weighted least squares over what agrees, chosen anew until it stays; with covariance."""
+    before = np.zeros(len(problem.a), np.bool_)
+    information = np.eye(6)
+    for _ in range(_ROUNDS):
+        keep = problem.within(aTb, gate)
+        if np.array_equal(keep, before) or keep.sum() < 3:
+            break
+        before, chosen = keep, problem.select(keep)
+        residual, weight = chosen.residuals(aTb)
+        jacobian = -aTb[:3, :3] @ point_pose_jacobian(chosen.b)
+        weighted = np.swapaxes(jacobian, 1, 2) @ weight
+        information = (weighted @ jacobian).sum(axis=0)
+        step = np.linalg.solve(information, np.einsum("nij,nj->i", weighted, residual))
+        aTb = aTb @ se3_exp(step)
+    return aTb, np.asarray(np.linalg.inv(information))
+
+
+def _second(problem: _Points, best: FloatArray, poses: FloatArray, settings: MergeSettings) -> int:
+    """Matches that agree with the best alignment elsewhere; ``poses`` with the best ones first."""
+    centre, most = problem.b.mean(axis=0), 0
+    for pose in poses[_apart(poses, best, centre, settings)][:_RIVALS]:
+        # What merely starts elsewhere comes to the best one itself.
+        rival, _ = _refined(problem, pose, settings.gate_sigmas)
+        if _apart(rival[None], best, centre, settings)[0]:
+            most = max(most, int(problem.within(rival, settings.gate_sigmas).sum()))
+    return most
+
+
+def _apart(
+    poses: FloatArray, best: FloatArray, centre: FloatArray, settings: MergeSettings
+) -> BoolArray:
+    """Which alignments put the second map's centre, or its heading, elsewhere than the best."""
+    here = transform_to_world(best, centre[None])[0]
+    shift = poses[:, :3, :3] @ centre + poses[:, :3, 3] - here
+    turns = np.array([np.linalg.norm(so3_log(best[:3, :3].T @ pose[:3, :3])) for pose in poses])
+    far = np.linalg.norm(shift, axis=1) > settings.elsewhere_m
+    return np.asarray(far | (turns > np.deg2rad(settings.elsewhere_deg)))
+
+
+# --------------------------------------------------------------------------------------------
+# All landmarks, and the verdict
+
+
+def _completed(
+    a: SavedMap,
+    b: SavedMap,
+    aTb: FloatArray,
+    matches: tuple[int, int, int],
+    settings: MergeSettings,
+    names: str,
+) -> Alignment:
+    """The alignment over all landmarks that it brings together; refused where most stay alone."""
+    for _ in range(2):
+        pairs = _same(a, b, aTb, settings)
+        problem = _Points.of(a, b, pairs, settings.slack_m)
+        aTb, covariance = _refined(problem, aTb, settings.gate_sigmas)
+    pairs = _same(a, b, aTb, settings)
+    problem = _Points.of(a, b, pairs, settings.slack_m)
+    trusted = b.permanent | (b.hits >= 3)
+    tree = cKDTree(a.landmarks.positions[a.permanent | (a.hits >= 3)])
+    near, _ = tree.query(transform_to_world(aTb, b.landmarks.positions))
+    among = trusted & (near <= _AMONG_M)
+    found = among & np.isin(np.arange(len(b)), pairs[:, 1])
+    counts = (int(among.sum()), int(found.sum()))
+    if len(pairs) < settings.min_pairs or counts[1] < settings.overlap_share * counts[0]:
+        raise MapError(
+            f"{names}: {len(pairs)} landmarks agree with the best alignment, but of {counts[0]} "
+            f"that then lie among the other map's only {counts[1]} are found there; the maps do "
+            "not overlap"
+        )
+    offsets = problem.a - transform_to_world(aTb, problem.b)
+    return Alignment(
+        aTb=aTb,
+        covariance=covariance,
+        pairs=pairs,
+        residual_m=float(np.sqrt(np.mean((offsets**2).sum(axis=1)))),
+        residual_sigmas=float(np.sqrt(problem.squared(aTb).mean() / 3.0)),
+        candidates=matches[0],
+        agreeing=matches[1],
+        second=matches[2],
+        among=counts[0],
+        found=counts[1],
+    )
+
+
+def _same(a: SavedMap, b: SavedMap, aTb: FloatArray, settings: MergeSettings) -> IntArray:
+    """Rows (k, 2) of landmarks that lie in the same place and look alike, each in one pair."""
+    points = transform_to_world(aTb, b.landmarks.positions)
+    reach = settings.gate_sigmas * np.sqrt(
+        settings.slack_m**2 + np.trace(b.landmarks.covariances, axis1=1, axis2=2)
+    )
+    near = cKDTree(a.landmarks.positions).query_ball_point(points, np.minimum(reach, _AMONG_M))
+    counts = np.array([len(rows) for rows in near])
+    yours = np.repeat(np.arange(len(b)), counts)
+    mine = np.concatenate([np.empty(0, np.int64), *(np.sort(rows) for rows in near)]).astype(int)
+    pairs = np.column_stack([mine, yours])
+    keep = _Points.of(a, b, pairs, settings.slack_m).within(aTb, settings.gate_sigmas)
+    pairs = pairs[keep]
+    distance = _descriptor_distances(a, b, pairs)
+    keep = distance <= settings.max_distance
+    return _one_to_one(pairs[keep], distance[keep])
+
+
+def _descriptor_distances(a: SavedMap, b: SavedMap, pairs: IntArray) -> FloatArray:
+    """(k,) between the nearest views of each pair; infinite where one has no view."""
+    mine, yours = _view_lists(a)[pairs[:, 0]], _view_lists(b)[pairs[:, 1]]
+    others = np.diff(yours, axis=1)[:, 0]
+    counts = np.diff(mine, axis=1)[:, 0] * others
+    pair = np.repeat(np.arange(len(pairs)), counts)
+    own, other = np.divmod(
+        np.arange(len(pair)) - (np.cumsum(counts) - counts)[pair], np.maximum(others, 1)[pair]
+    )
+    own, other = mine[pair, 0] + own, yours[pair, 0] + other
+    out = np.full(len(pairs), np.inf)
+    for start in range(0, len(pair), _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        difference = a.appearances.descriptors[own[part]].astype(np.int32)
+        difference -= b.appearances.descriptors[other[part]]
+        squared = np.einsum("ij,ij->i", difference, difference)
+        np.minimum.at(out, pair[part], np.sqrt(squared))
+    return out
+
+
+def _view_lists(saved: SavedMap) -> IntArray:
+    """(n, 2) first view of each landmark, and the one after its last."""
+    ids, views = saved.landmarks.ids, saved.appearances.ids
+    return np.column_stack([np.searchsorted(views, ids, s) for s in ("left", "right")])
+
+
+def _one_to_one(pairs: IntArray, distances: FloatArray) -> IntArray:
+    """The nearest pairs first, each landmark once; by the first map's rows."""
+    used: tuple[set[int], set[int]] = (set(), set())
+    kept = []
+    for k in np.lexsort((pairs[:, 1], pairs[:, 0], distances)).tolist():
+        i, j = pairs[k].tolist()
+        if i not in used[0] and j not in used[1]:
+            used[0].add(i)
+            used[1].add(j)
+            kept.append(k)
+    chosen = pairs[kept] if kept else np.empty((0, 2), np.int64)
+    return chosen[np.argsort(chosen[:, 0], kind="stable")]

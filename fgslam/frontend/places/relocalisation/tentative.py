@@ -1,0 +1,190 @@
+"""Tentative matches of a frame's features with landmarks anywhere in the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import wrap_angle
+from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.types import BoolArray, FloatArray, IntArray, LandmarkMap, StereoFeatures
+from fgslam.frontend.features.candidates import pairs_within
+from fgslam.frontend.places.relocalisation.appearance_index import Neighbours
+from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
+
+_GATE_SIGMAS = 3.0  # of sizes and heights; what their covariances allow
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tentative:
+    """Matches by appearance, in the order of features, then of distance.
+
+    Attributes:
+        features: (k,) indices of features, ascending; a feature may have several candidates.
+        landmarks: (k,) rows of the map.
+        distances: (k,) of descriptors.
+        places: (k,) number of different places among the feature's candidates.
+    """
+
+    features: IntArray
+    landmarks: IntArray
+    distances: FloatArray
+    places: IntArray
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+
+def gated(
+    features: StereoFeatures,
+    pairs: tuple[IntArray, IntArray],
+    landmarks: LandmarkMap,
+    looks: tuple[LandmarkAppearances, IntArray],
+    floor: Floor,
+    settings: RelocalisationSettings,
+) -> BoolArray:
+    """Which pairs (feature, view) agree in size and, on a level floor, in height and orientation.
+
+    Args:
+        features: of the frame.
+        pairs: (k,) indices of features and (k,) rows of stored views.
+        landmarks: the map.
+        looks: stored views and the map's row of each view's landmark.
+        floor: decides whether the camera is upright and at one height.
+        settings: the gates.
+    """
+    (i, v), (views, owners) = pairs, looks
+    depth = np.abs(features.position[i, 2])
+    sigma = np.sqrt(features.position_covariance[i, 2, 2]) / np.maximum(depth, 1e-6)
+    ratio = np.abs(np.log(features.scale[i] * depth / np.maximum(views.size[v], 1e-9)))
+    keep = ratio <= np.log(settings.size_ratio) + _GATE_SIGMAS * sigma
+    if floor.rigid_dof != 3:
+        return np.asarray(keep)
+    turn = np.abs(wrap_angle(features.orientation[i] - views.orientation[v]))
+    keep &= turn <= np.deg2rad(settings.orientation_deg)
+    return np.asarray(keep & _heights_agree(features, i, landmarks, owners[v], floor, settings))
+
+
+def _heights_agree(
+    features: StereoFeatures,
+    i: IntArray,
+    landmarks: LandmarkMap,
+    rows: IntArray,
+    floor: Floor,
+    settings: RelocalisationSettings,
+) -> BoolArray:
+    """Motion on a level floor leaves heights as they are (design B4)."""
+    down = floor.down
+    difference = np.abs(features.position[i] @ down - landmarks.positions[rows] @ down)
+    variance = np.einsum("i,kij,j->k", down, features.position_covariance[i], down)
+    variance += np.einsum("i,kij,j->k", down, landmarks.covariances[rows], down)
+    return np.asarray(difference <= settings.height_m + _GATE_SIGMAS * np.sqrt(variance))
+
+
+def specific(
+    neighbours: Neighbours,
+    keep: BoolArray,
+    owners: IntArray,
+    landmarks: LandmarkMap,
+    settings: RelocalisationSettings,
+) -> Tentative:
+    """Candidates of each feature, up to the first clear gap of distances between places.
+
+    A feature that looks like a few places keeps them all, as repeated texture must; one that looks
+    like many (no gap within ``candidates`` places) keeps none.
+
+    Args:
+        neighbours: (q, k) nearest views of each feature.
+        keep: (q, k) of which passed the gates.
+        owners: the map's row of each view's landmark.
+        landmarks: the map.
+        settings: distances and ratio.
+    """
+    features, rows, distances, places = [], [], [], []
+    limits = np.where(keep, neighbours.distances, np.inf)
+    for i in np.flatnonzero((limits <= settings.max_distance).any(axis=1)):
+        order = np.flatnonzero(keep[i])
+        own, far = owners[neighbours.rows[i, order]], limits[i, order]
+        place = _places(landmarks.positions[own], settings.same_place_m)
+        end, count = _gap(place, far, settings)
+        first = _first_views(own[:end], far[:end], settings.max_distance)
+        features.append(np.full(len(first), i))
+        rows.append(own[first])
+        distances.append(far[first])
+        places.append(np.full(len(first), count))
+    return _joined(features, rows, distances, places)
+
+
+def unspecific(
+    features: StereoFeatures,
+    landmarks: LandmarkMap,
+    looks: tuple[LandmarkAppearances, IntArray],
+    floor: Floor,
+    settings: RelocalisationSettings,
+) -> Tentative:
+    """Every landmark that agrees in size (on a level floor in height and orientation, too).
+
+    What features without descriptors can say; each is shared by all that it may be.
+    """
+    views, owners = looks
+    depth = np.maximum(np.abs(features.position[:, 2]), 1e-6)
+    sigma = np.sqrt(features.position_covariance[:, 2, 2]) / depth
+    size = np.log(np.maximum(features.scale * depth, 1e-9))
+    reach = np.log(settings.size_ratio) + _GATE_SIGMAS * sigma
+    i, v = pairs_within(size, reach, np.log(np.maximum(views.size, 1e-9)))
+    keep = gated(features, (i, v), landmarks, looks, floor, settings)
+    pairs = np.unique(np.column_stack([i[keep], owners[v[keep]]]), axis=0)
+    counts = np.bincount(pairs[:, 0], minlength=len(features))
+    return Tentative(pairs[:, 0], pairs[:, 1], np.zeros(len(pairs)), counts[pairs[:, 0]])
+
+
+def _places(positions: FloatArray, radius: float) -> IntArray:
+    """Each position's place: the index of the first one within ``radius`` of it."""
+    apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
+    return np.asarray(np.argmax(apart <= radius, axis=1))
+
+
+def _first_views(own: IntArray, far: FloatArray, limit: float) -> IntArray:
+    """The first view of each landmark within ``limit``, the nearest ones first."""
+    first: dict[int, int] = {}
+    for k in np.flatnonzero(far <= limit).tolist():
+        first.setdefault(int(own[k]), k)
+    return np.array(sorted(first.values(), key=lambda k: (far[k], own[k])), np.int64)
+
+
+def _gap(place: IntArray, far: FloatArray, settings: RelocalisationSettings) -> tuple[int, int]:
+    """Number of leading candidates before the first gap, and of their places; 0 without a gap."""
+    seen: list[int] = []
+    for k, p in enumerate(place):
+        if p in seen:
+            continue
+        if seen and _last(far, place, seen, k) <= settings.ratio * far[k]:
+            return k, len(seen)
+        if len(seen) == settings.candidates:
+            return 0, 0
+        seen.append(int(p))
+    return len(place), len(seen)
+
+
+def _last(far: FloatArray, place: IntArray, seen: list[int], k: int) -> float:
+    """Distance of the last of the places before ``k``: the first view of each counts."""
+    return float(max(far[:k][place[:k] == p][0] for p in seen))
+
+
+def _joined(
+    features: list[IntArray],
+    rows: list[IntArray],
+    distances: list[FloatArray],
+    places: list[IntArray],
+) -> Tentative:
+    if not features:
+        none = np.empty(0, np.int64)
+        return Tentative(none, none, np.empty(0), none)
+    return Tentative(
+        np.concatenate(features),
+        np.concatenate(rows),
+        np.concatenate(distances),
+        np.concatenate(places),
+    )

@@ -1,0 +1,199 @@
+"""The landmark database: identity, appearance and bookkeeping (Se et al. 4 and 6).
+
+Geometry (positions and covariances) belongs to the estimator; the two are joined by landmark ids.
+Each entry is [s, o, m, n, l] with a descriptor; the scale is kept as the physical size
+``s * Z``, because the image scale is inversely proportional to the depth (3.1; design E-S7). An
+entry may be permanent (6.2), and have several views (6.3).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.core.types import (
+    BoolArray,
+    ByteArray,
+    CameraRig,
+    FloatArray,
+    IntArray,
+    LandmarkMap,
+    StereoFeatures,
+)
+from fgslam.frontend.tracking.landmark_table import LandmarkTable
+from fgslam.frontend.tracking.permanence import is_blind, reliable, seen_past
+from fgslam.frontend.tracking.settings import DatabaseSettings, PermanenceSettings
+from fgslam.frontend.tracking.views import Views
+from fgslam.frontend.tracking.visibility import (
+    ExpectedLandmarks,
+    FieldOfView,
+    Wanted,
+    directions_to,
+)
+
+
+class LandmarkDatabase(LandmarkTable):
+    """The table as the frames change it: hits n, misses m, consecutive misses l."""
+
+    def __init__(self, rig: CameraRig, settings: DatabaseSettings, max_disparity_px: float) -> None:
+        """Starts empty (4.2); landmarks of more than ``max_disparity_px`` are not expected."""
+        viewpoints = settings.viewpoints
+        if viewpoints is None:
+            super().__init__(max_views=1, view_angle=0.0)
+        else:
+            super().__init__(viewpoints.max_views, float(np.deg2rad(viewpoints.view_angle_deg)))
+        self._settings = settings
+        self._field_of_view = FieldOfView(rig, settings, max_disparity_px)
+
+    @property
+    def valid(self) -> BoolArray:
+        """(n,) landmarks seen often enough to be trusted (6.1)."""
+        return np.asarray(self.hits >= self._settings.valid_hits)
+
+    @property
+    def lasting(self) -> BoolArray:
+        """(n,) landmarks that a map saved now should hold as permanent ones."""
+        if self._settings.permanence is None:
+            return self.permanent.copy()
+        return self.permanent | self._reliable(np.arange(len(self)), self._settings.permanence)
+
+    def expected(self, landmarks: LandmarkMap, wTc: FloatArray) -> ExpectedLandmarks:
+        """Landmarks of the map that should or may be in view from ``wTc`` (4.4)."""
+        least = self._settings.least_scale_px
+        wanted = None if least is None else self._larger_than(least, landmarks.ids)
+        found = self._field_of_view.select(wTc, landmarks.positions, wanted)
+        rows = self.rows(landmarks.ids[found.rows])
+        directions = directions_to(wTc, found.points) if self._pool.several else None
+        views, known = self._views_from(rows, directions)
+        return ExpectedLandmarks(
+            ids=landmarks.ids[found.rows],
+            rows=found.rows,
+            measurement=found.measurement,
+            scale=views.size / found.points[:, 2],
+            orientation=views.orientation,
+            descriptors=views.descriptors,
+            certain=found.certain & known,
+        )
+
+    def new_ids(self, count: int) -> IntArray:
+        """The identities that the next ``count`` landmarks will get."""
+        return np.arange(self._next_id, self._next_id + count)
+
+    def missing(self, expected: ExpectedLandmarks, hit: BoolArray) -> IntArray:
+        """Type II: identities expected well in view and not hit (v,); none in a blocked view."""
+        permanence = self._settings.permanence
+        if permanence is not None and is_blind(expected, hit, permanence):
+            return np.empty(0, np.int64)
+        return expected.ids[expected.certain & ~hit]
+
+    def record_hits(
+        self,
+        ids: IntArray,
+        features: StereoFeatures,
+        which: IntArray,
+        directions: FloatArray | None = None,
+    ) -> None:
+        """Type III: a match resets l and refreshes the appearance.
+
+        Args:
+            ids: (k,) landmarks.
+            features: the frame's.
+            which: (k,) the features that they match.
+            directions: (k, 3) from the camera to each, unit, world; None where nobody asks.
+        """
+        rows = self.rows(ids)
+        self.missed[rows] = 0
+        self.contradicted[rows] = 0
+        self.seen[rows] = self._frame
+        self.hits[rows] += 1
+        self._refresh(rows, Views.of(features, which, directions, self._frame))
+        permanence = self._settings.permanence
+        if permanence is not None and permanence.when == "running":
+            self.permanent[rows] |= self._reliable(rows, permanence)
+
+    def record_misses(self, ids: IntArray) -> None:
+        """Type II: expected in view and not matched."""
+        rows = self.rows(ids)
+        self.missed[rows] += 1
+        self.misses[rows] += 1
+
+    def weigh(
+        self,
+        expected: ExpectedLandmarks,
+        missing: IntArray,
+        rejected: IntArray,
+        seen: FloatArray,
+    ) -> None:
+        """What a located frame says against permanent landmarks: too often, and one is demoted.
+
+        It contradicts those missing whose match was rejected as an outlier, and those whose place
+        it sees past (:func:`fgslam.frontend.tracking.permanence.seen_past`). What hides them says nothing.
+
+        Args:
+            expected: landmarks expected in view.
+            missing: identities of those missed.
+            rejected: identities of those matched and rejected.
+            seen: (f, 3) the frame's stereo features, (column, row, disparity).
+        """
+        permanence = self._settings.permanence
+        if permanence is None or permanence.contradicted_after is None:
+            return
+        ids = missing[self.permanent[self.rows(missing)]]
+        places = expected.measurement[np.searchsorted(expected.ids, ids)]
+        against = seen_past(places, seen, permanence) | np.isin(ids, rejected)
+        ids = ids[against]
+        rows = self.rows(ids)
+        self.contradicted[rows] += 1
+        self.demote(ids[self.contradicted[rows] >= permanence.contradicted_after])
+
+    def demote(self, ids: IntArray) -> None:
+        """Permanent landmarks become ordinary ones, which go once they have been missed for long.
+
+        Only a hit can make them permanent again.
+        """
+        rows = self.rows(ids)
+        self.permanent[rows] = False
+        self.contradicted[rows] = 0
+
+    def add(
+        self,
+        features: StereoFeatures,
+        which: IntArray,
+        colour: ByteArray,
+        directions: FloatArray | None = None,
+    ) -> IntArray:
+        """Type IV: starts a track for each chosen feature (4.2); returns their identities."""
+        ids = self.new_ids(len(which))
+        self._next_id += len(which)
+        views = Views.of(features, which, directions, self._frame)
+        self._append(ids, views, colour)
+        return ids
+
+    def prune(self) -> IntArray:
+        """Ends a frame: drops landmarks missed N times in a row (4.3); returns their identities.
+
+        On request also those that were never confirmed and not seen for long, in view or not.
+        Permanent ones stay (6.2).
+        """
+        gone = self.missed >= self._settings.prune_after_misses
+        forget_after = self._settings.forget_unconfirmed_after
+        if forget_after is not None:
+            gone |= ~self.valid & (self._frame >= self.seen + forget_after)
+        gone &= ~self.permanent
+        self._frame += 1
+        pruned = self.ids[gone]
+        self._remove(gone)
+        return pruned
+
+    # ----------------------------------------------------------------------------------------
+
+    def _larger_than(self, least: float, ids: IntArray) -> Wanted:
+        """Says which landmarks of a map, by their rows and depths, look at least that large."""
+
+        def wanted(rows: IntArray, depth: FloatArray) -> BoolArray:
+            return np.asarray(self._largest_sizes(self.rows(ids[rows])) >= least * depth)
+
+        return wanted
+
+    def _reliable(self, rows: IntArray, permanence: PermanenceSettings) -> BoolArray:
+        trusted = self.hits[rows] >= self._settings.valid_hits
+        return trusted & reliable(self.hits[rows], self.misses[rows], permanence)

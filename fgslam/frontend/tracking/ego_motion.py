@@ -1,0 +1,375 @@
+"""Pose of a frame by least squares on image residuals against the map (Se et al. 3.3 and 5).
+
+Newton's method in its Gauss-Newton form with analytic Jacobians, Lowe's stabilisation towards the
+odometry (Lowe 1991; design B6), Levenberg's damping where a step would raise the cost, repeated
+after outliers are dropped, and capped.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import (
+    congruence,
+    in_front,
+    inverse,
+    inverse_spd3,
+    measurement_difference,
+    point_pose_jacobian,
+    pose,
+    project,
+    projection_jacobian,
+    reorthonormalise,
+    se3_exp,
+    se3_log,
+    se3_log_jacobian,
+    so3_exp,
+    transform_to_camera,
+)
+from fgslam.core.types import (
+    BoolArray,
+    CameraRig,
+    EgoMotion,
+    EgoMotionStatus,
+    FloatArray,
+    LandmarkMap,
+    Observations,
+    Prediction,
+    Sensor,
+)
+from fgslam.frontend.tracking.settings import EgoMotionSettings
+
+_STEP_TOLERANCE = 1e-9  # radians and metres; far below anything measurable
+_ROBUST_TOLERANCE = 1e-5  # the robust minimum only chooses the inliers for the exact one
+_REPEATS = 10  # minimisations with the remaining matches; two suffice on all recordings tried
+_EXACT_SIGMA = 1e-6  # radians and metres; stands for zero where a covariance is singular
+_MAX_DAMPING = 1e8
+_LEAST_CURVATURE = 1e-10  # of the Hessian with unit diagonal; below it the pose is undetermined
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseProblem:
+    """Matches of one frame: landmark positions and covariances, measurements and theirs.
+
+    Attributes:
+        points: (k, 3) world, metres.
+        point_covariances: (k, 3, 3).
+        measurement: (k, 3) (column, row, disparity), pixels; or (azimuth, elevation, range).
+        measurement_covariance: (k, 3, 3).
+    """
+
+    points: FloatArray
+    point_covariances: FloatArray
+    measurement: FloatArray
+    measurement_covariance: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @staticmethod
+    def of(landmarks: LandmarkMap, observed: Observations) -> PoseProblem:
+        """The observations of landmarks that are in the map. KeyError for one that is not."""
+        rows = landmarks.rows(observed.ids)
+        return PoseProblem(
+            landmarks.positions[rows],
+            landmarks.covariances[rows],
+            observed.measurement,
+            observed.covariance,
+        )
+
+    @staticmethod
+    def empty() -> PoseProblem:
+        """No match at all."""
+        vectors, matrices = np.empty((0, 3)), np.empty((0, 3, 3))
+        return PoseProblem(vectors, matrices, vectors, matrices)
+
+    def select(self, keep: BoolArray) -> PoseProblem:
+        """The chosen matches."""
+        return PoseProblem(
+            self.points[keep],
+            self.point_covariances[keep],
+            self.measurement[keep],
+            self.measurement_covariance[keep],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Minimum:
+    wTc: FloatArray
+    hessian: FloatArray
+    converged: bool
+    iterations: int
+
+
+class EgoMotionSolver:
+    """Solves for ``wTc`` from matched landmarks and a predicted pose."""
+
+    def __init__(self, sensor: Sensor, settings: EgoMotionSettings) -> None:
+        """The world's vertical is that of the robot's body in the first camera frame.
+
+        Of a range-bearing sensor, matches are judged by ``outlier_sigmas`` alone.
+        """
+        self.sensor = sensor
+        self._settings = settings
+        self.floor = Floor.under(sensor, settings.dof)
+        """Which poses are allowed."""
+
+    def solve(self, prediction: Prediction, problem: PoseProblem) -> EgoMotion:
+        """Pose with covariance, inliers, residuals and a status; the odometry's where it fails."""
+        prediction = Prediction(self.floor.constrain(prediction.wTc), prediction.covariance)
+        start = prediction.wTc
+        used = inliers = in_front(self.sensor, transform_to_camera(start, problem.points))
+        iterations = 0
+        wTc, robust = start, self._settings.kernel != "none"
+        for _ in range(_REPEATS):
+            if inliers.sum() < self._settings.min_matches:
+                return self._fall_back(prediction, problem, EgoMotionStatus.TOO_FEW_MATCHES)
+            weighted_at = wTc
+            minimum = self._minimise(wTc, prediction, problem.select(inliers), robust)
+            iterations += minimum.iterations
+            if not minimum.converged:
+                return self._fall_back(prediction, problem, EgoMotionStatus.DIVERGED)
+            wTc = minimum.wTc
+            kept = self._inliers(wTc, problem)
+            if not robust and np.array_equal(kept, inliers):
+                break
+            used, inliers, robust = inliers, kept, False
+        else:
+            inliers = used  # the set did not come to rest: the pose is that of the last one used
+        found = self._finish(prediction, problem, minimum, inliers, iterations)
+        return dataclasses.replace(found, weighted_at=weighted_at)
+
+    # ----------------------------------------------------------------------------------------
+
+    def _minimise(
+        self, start: FloatArray, prediction: Prediction, problem: PoseProblem, robust: bool
+    ) -> _Minimum:
+        information = self._information(start, problem)
+        prior = _prior_information(prediction.covariance) if self._settings.prior else None
+        best_cost, damping = np.inf, 0.0
+        tolerance = _ROBUST_TOLERANCE if robust else _STEP_TOLERANCE
+        wTc = best = start
+        hessian, gradient = np.eye(6), np.zeros(6)
+        for iteration in range(1, self._settings.max_iterations + 1):
+            cost, h, g = self._linearise(wTc, problem, information, robust)
+            if prior is not None:
+                cost, h, g = _add_prior(wTc, prediction.wTc, prior, (cost, h, g))
+            if cost <= best_cost * (1.0 + 1e-12):
+                best, best_cost, hessian, gradient = wTc, cost, h, g
+                damping *= 0.1
+            else:
+                damping = max(10.0 * damping, 1e-4)
+                if damping > _MAX_DAMPING:
+                    break
+            step = self._step(best, hessian, gradient, damping)
+            if step is None or not np.isfinite(best_cost):
+                return _Minimum(start, hessian, False, iteration)
+            if np.abs(step).max() < tolerance:
+                break
+            wTc = _retract(best, step)
+        return _Minimum(best, hessian, self._determined(best, hessian), iteration)
+
+    def _determined(self, wTc: FloatArray, hessian: FloatArray) -> bool:
+        """Whether the matches (and the prior) fix all degrees of freedom, beyond rounding."""
+        basis = self.floor.basis(wTc)
+        reduced = basis.T @ hessian @ basis
+        size = np.sqrt(np.diagonal(reduced))
+        if not (size > 0.0).all():
+            return False
+        return bool(np.linalg.eigvalsh(reduced / np.outer(size, size))[0] > _LEAST_CURVATURE)
+
+    def _information(self, wTc: FloatArray, problem: PoseProblem) -> FloatArray:
+        """Inverse covariances (k, 3, 3) of the residuals; the disparity's row 0 if unused."""
+        settings = self._settings
+        if settings.weighting == "uniform":
+            covariance = np.tile(np.eye(3), (len(problem), 1, 1))
+        else:
+            covariance = problem.measurement_covariance
+        if settings.weighting == "landmark":
+            points = transform_to_camera(wTc, problem.points)
+            jacobian = projection_jacobian(self.sensor, points) @ wTc[:3, :3].T
+            covariance = covariance + congruence(jacobian, problem.point_covariances)
+        if settings.residuals == "image_disparity":
+            return inverse_spd3(covariance)
+        out = np.zeros_like(covariance)
+        out[:, :2, :2] = np.linalg.inv(covariance[:, :2, :2])
+        return out
+
+    def _linearise(
+        self, wTc: FloatArray, problem: PoseProblem, information: FloatArray, robust: bool
+    ) -> tuple[float, FloatArray, FloatArray]:
+        """Cost, Gauss-Newton Hessian (6, 6) and gradient (6,) at ``wTc``."""
+        points = transform_to_camera(wTc, problem.points)
+        if not in_front(self.sensor, points).all():
+            return np.inf, np.eye(6), np.zeros(6)
+        residual = self._residual(points, problem.measurement)
+        jacobian = projection_jacobian(self.sensor, points) @ point_pose_jacobian(points)
+        squared = np.einsum("ki,kij,kj->k", residual, information, residual)
+        rho, weight = self._kernel(squared, robust)
+        weighted = weight[:, None, None] * (information @ jacobian)
+        flat = weighted.reshape(-1, 6)
+        hessian = flat.T @ jacobian.reshape(-1, 6)
+        return float(rho.sum()), hessian, flat.T @ residual.ravel()
+
+    def _kernel(self, squared: FloatArray, robust: bool) -> tuple[FloatArray, FloatArray]:
+        """Robust cost and weight (k,) of squared normalised residuals."""
+        if not robust:
+            return squared, np.ones_like(squared)
+        width = self._settings.kernel_width
+        if self._settings.kernel == "cauchy":
+            ratio = squared / width**2
+            return width**2 * np.log1p(ratio), 1.0 / (1.0 + ratio)
+        norm = np.sqrt(squared)
+        linear = norm > width
+        weight = np.where(linear, width / np.maximum(norm, width), 1.0)
+        return np.where(linear, width * (2.0 * norm - width), squared), weight
+
+    def _step(
+        self, wTc: FloatArray, hessian: FloatArray, gradient: FloatArray, damping: float
+    ) -> FloatArray | None:
+        """The correction (6,), to be applied on the right; None where it is undetermined."""
+        basis = self.floor.basis(wTc)
+        reduced = basis.T @ hessian @ basis
+        reduced.flat[:: len(reduced) + 1] *= 1.0 + damping
+        try:
+            return np.asarray(-(basis @ np.linalg.solve(reduced, basis.T @ gradient)))
+        except np.linalg.LinAlgError:
+            return None
+
+    @property
+    def farthest(self) -> float:
+        """Largest image residual of an inlier; of a range sensor, more than any angle."""
+        return self._settings.outlier_px if isinstance(self.sensor, CameraRig) else 2.0 * math.pi
+
+    def _residual(self, points: FloatArray, measurement: FloatArray) -> FloatArray:
+        """Predicted less measured (k, 3)."""
+        return measurement_difference(self.sensor, project(self.sensor, points), measurement)
+
+    def _inliers(self, wTc: FloatArray, problem: PoseProblem) -> BoolArray:
+        near = self.image_residuals(wTc, problem) <= self.farthest  # so in front, too
+        if self._settings.outlier_sigmas > 0.0 and self._settings.weighting != "uniform":
+            candidates = problem.select(near)
+            points = transform_to_camera(wTc, candidates.points)
+            residual = self._residual(points, candidates.measurement)
+            information = self._information(wTc, candidates)
+            squared = np.einsum("ki,kij,kj->k", residual, information, residual)
+            near[near] = squared <= self._settings.outlier_sigmas**2
+        return near
+
+    def _finish(
+        self,
+        prediction: Prediction,
+        problem: PoseProblem,
+        minimum: _Minimum,
+        inliers: BoolArray,
+        iterations: int,
+    ) -> EgoMotion:
+        correction = se3_log(inverse(prediction.wTc) @ minimum.wTc)
+        allowed = self._allowed_fraction(correction)
+        wTc, status = minimum.wTc, EgoMotionStatus.OK
+        covariance = self._covariance(wTc, minimum.hessian)
+        if allowed < 1.0:
+            status = EgoMotionStatus.CAPPED
+            wTc = self.floor.constrain(prediction.wTc @ se3_exp(allowed * correction))
+            # The matches belong to another pose; what of it was cut off is the least we may err.
+            inliers = inliers & self._inliers(wTc, problem)
+            cut_off = (1.0 - allowed) * correction
+            covariance = self.floor.allowed_part(
+                wTc, prediction.covariance + np.outer(cut_off, cut_off)
+            )
+        return EgoMotion(
+            wTc=reorthonormalise(wTc),
+            covariance=covariance,
+            inliers=inliers,
+            residuals=self.image_residuals(wTc, problem),
+            status=status,
+            iterations=iterations,
+        )
+
+    def _allowed_fraction(self, correction: FloatArray) -> float:
+        """Fraction of the correction that the cap lets through (section 5; S29)."""
+        rotation = float(np.linalg.norm(correction[:3]))
+        translation = float(np.linalg.norm(correction[3:]))
+        return float(
+            min(
+                1.0,
+                np.deg2rad(self._settings.max_correction_deg) / max(rotation, 1e-12),
+                self._settings.max_correction_m / max(translation, 1e-12),
+            )
+        )
+
+    def _covariance(self, wTc: FloatArray, hessian: FloatArray) -> FloatArray:
+        basis = self.floor.basis(wTc)
+        return congruence(basis, _inverse_spd(basis.T @ hessian @ basis))
+
+    def _fall_back(
+        self, prediction: Prediction, problem: PoseProblem, status: EgoMotionStatus
+    ) -> EgoMotion:
+        """The odometry as the frame's ego-motion (4.1); no match is used."""
+        return EgoMotion(
+            wTc=reorthonormalise(prediction.wTc),
+            covariance=self.floor.allowed_part(prediction.wTc, prediction.covariance),
+            inliers=np.zeros(len(problem), np.bool_),
+            residuals=self.image_residuals(prediction.wTc, problem),
+            status=status,
+            iterations=0,
+        )
+
+    def image_residuals(self, wTc: FloatArray, problem: PoseProblem) -> FloatArray:
+        """The paper's E (k,): distance of projection and measurement in the image; inf if behind.
+
+        Pixels; of a range-bearing sensor the angle in radians, range aside.
+        """
+        points = transform_to_camera(wTc, problem.points)
+        behind = ~in_front(self.sensor, points)
+        points[behind] = (0.0, 0.0, 1.0)
+        error = np.linalg.norm(self._residual(points, problem.measurement)[:, :2], axis=1)
+        return np.where(behind, np.inf, error)
+
+
+def unmeasured(prediction: Prediction, status: EgoMotionStatus) -> EgoMotion:
+    """The predicted pose as it stands, for a frame without matches."""
+    return EgoMotion(
+        prediction.wTc, prediction.covariance, np.empty(0, np.bool_), np.empty(0), status, 0
+    )
+
+
+def _prior_information(covariance: FloatArray) -> FloatArray:
+    """Information of the prediction; a direction known exactly counts as known to a micrometre."""
+    try:
+        return _inverse_spd(covariance)
+    except np.linalg.LinAlgError:
+        return _inverse_spd(covariance + _EXACT_SIGMA**2 * np.eye(6))
+
+
+def _inverse_spd(matrix: FloatArray) -> FloatArray:
+    inverted = np.linalg.inv(matrix)
+    return np.asarray(0.5 * (inverted + inverted.T))
+
+
+def _retract(wTc: FloatArray, step: FloatArray) -> FloatArray:
+    """Move by a tangent vector, rotation and translation apart: planar motion stays planar."""
+    return pose(wTc[:3, :3] @ so3_exp(step[:3]), wTc[:3, 3] + wTc[:3, :3] @ step[3:])
+
+
+def _add_prior(
+    wTc: FloatArray,
+    predicted: FloatArray,
+    information: FloatArray,
+    system: tuple[float, FloatArray, FloatArray],
+) -> tuple[float, FloatArray, FloatArray]:
+    """Adds ``|Log(predicted^-1 wTc)|^2`` in the prediction's metric (Lowe 1991, design B6)."""
+    cost, hessian, gradient = system
+    deviation = se3_log(inverse(predicted) @ wTc)
+    jacobian = se3_log_jacobian(deviation)
+    weighted = jacobian.T @ information
+    return (
+        cost + float(deviation @ information @ deviation),
+        hessian + weighted @ jacobian,
+        gradient + weighted @ deviation,
+    )

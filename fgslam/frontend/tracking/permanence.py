@@ -1,0 +1,46 @@
+"""Which landmarks last, and what speaks against one that is said to (Se et al. 6.2; S36)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.core.types import BoolArray, FloatArray, IntArray
+from fgslam.frontend.features.candidates import pairs_within
+from fgslam.frontend.tracking.settings import PermanenceSettings
+from fgslam.frontend.tracking.visibility import ExpectedLandmarks
+
+
+def reliable(hits: IntArray, misses: IntArray, settings: PermanenceSettings) -> BoolArray:
+    """Landmarks (n,) seen often enough, at a share of the frames in which they were expected."""
+    enough = hits >= settings.hits
+    return np.asarray(enough & (hits > settings.ratio * (hits + misses)))
+
+
+def is_blind(expected: ExpectedLandmarks, hit: BoolArray, settings: PermanenceSettings) -> bool:
+    """Whether so few of the landmarks well in view were matched (v,) that the view is blocked."""
+    certain = int(expected.certain.sum())
+    return int((hit & expected.certain).sum()) < settings.blind_below * certain
+
+
+def seen_past(places: FloatArray, seen: FloatArray, settings: PermanenceSettings) -> BoolArray:
+    """Places (m,) that the cameras see past, so that what is missed there is not there.
+
+    Near the place in the image something lies behind it, and nothing before it that might hide it.
+    That what surrounds a missed landmark is recognised says nothing: true landmarks are missed in
+    many frames in a row for their scale or direction, while others beside them are not
+    (docs/maps.md has the numbers).
+
+    Args:
+        places: (m, 3) predicted (column, row, disparity) of missed landmarks.
+        seen: (f, 3) the frame's stereo features.
+        settings: how near is near.
+    """
+    reach = settings.near_px
+    i, j = pairs_within(places[:, 1], reach, seen[:, 1])
+    near = np.hypot(*(seen[j, :2] - places[i, :2]).T) <= reach
+    i, j = i[near], j[near]
+    nearer_by = seen[j, 2] - places[i, 2]
+    hidden, past = np.zeros(len(places), np.bool_), np.zeros(len(places), np.bool_)
+    hidden[i[nearer_by > settings.apart_px]] = True
+    past[i[nearer_by < -settings.apart_px]] = True
+    return past & ~hidden

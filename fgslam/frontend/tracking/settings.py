@@ -1,0 +1,232 @@
+"""TODO frontend.tracking.settings."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fgslam.core.settings import STRICT
+
+
+@dataclass(frozen=True, config=STRICT)
+class MapMatchingSettings:
+    """Matching of features to predicted landmarks (Se et al. 3.1)."""
+
+    window_px: Annotated[
+        float,
+        Field(gt=0.0, description="side of the search window in the image; 5 in the paper"),
+    ] = 5.0
+    disparity_px: Annotated[
+        float, Field(gt=0.0, description="largest difference from the predicted disparity")
+    ] = 2.0
+    scale_ratio: Annotated[
+        float, Field(gt=1.0, description="largest ratio to the predicted scale")
+    ] = 1.5
+    orientation_deg: Annotated[
+        float, Field(gt=0.0, le=180.0, description="largest difference of orientations")
+    ] = 20.0
+    widen_sigmas: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="widen window and disparity gate by this many standard deviations of the "
+            "predicted measurement; 0 keeps the paper's fixed window",
+        ),
+    ] = 3.0
+    max_window_px: Annotated[
+        float,
+        Field(gt=0.0, description="side that widening may not exceed, also of the disparity gate"),
+    ] = 80.0
+    refine: Annotated[
+        bool,
+        Field(
+            description="after a first pose, match again around it, with the smaller uncertainty"
+        ),
+    ] = False
+    rescue: Annotated[
+        bool,
+        Field(
+            description="where too few match, search the largest window (max_window_px) by "
+            "descriptor before falling back to the odometry; needs appearance.mode descriptor"
+        ),
+    ] = False
+
+
+@dataclass(frozen=True, config=STRICT)
+class PermanenceSettings:
+    """Landmarks that are never pruned for being missed (Se et al. 6.2), and when they lose that."""
+
+    ratio: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            lt=1.0,
+            description="a landmark becomes permanent when hits / (hits + misses) exceeds this; "
+            "unstated in 6.2, chosen by measurement (docs/map_results.md)",
+        ),
+    ] = 0.3
+    hits: Annotated[
+        int,
+        Field(ge=1, description="and when it has at least so many hits, and valid_hits (6.1)"),
+    ] = 5
+    when: Annotated[
+        Literal["running", "saved"],
+        Field(
+            description="`running`: with the hit that makes it so; `saved`: all together when the "
+            "map is saved, as 6.2 does beforehand"
+        ),
+    ] = "running"
+    blind_below: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            le=1.0,
+            description="a frame that matches less than this share of the landmarks expected well "
+            "in view is blocked or lost: it tells of no landmark that it is gone; 0 believes all",
+        ),
+    ] = 0.05
+    contradicted_after: Annotated[
+        int | None,
+        Field(
+            ge=1,
+            description="frames that contradict a permanent landmark (rejected as an outlier, or "
+            "missed where the cameras see past its place), no hit between them, until it is an "
+            "ordinary one again; null: never",
+        ),
+    ] = 20
+    near_px: Annotated[
+        float,
+        Field(gt=0.0, description="what is seen past a place is this near to it in the image"),
+    ] = 40.0
+    apart_px: Annotated[
+        float,
+        Field(gt=0.0, description="before or behind it: a disparity that differs by more"),
+    ] = 2.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class ViewpointSettings:
+    """Several looks of a landmark, from different directions (Se et al. 6.3)."""
+
+    view_angle_deg: Annotated[
+        float,
+        Field(gt=0.0, lt=180.0, description="farther than this from every view: a view of its own"),
+    ] = 20.0
+    max_views: Annotated[
+        int,
+        Field(
+            ge=2,
+            le=64,
+            description="views of a landmark; a further one replaces that matched longest ago",
+        ),
+    ] = 8
+
+
+@dataclass(frozen=True, config=STRICT)
+class DatabaseSettings:
+    """Life and death of landmarks (Se et al. 4 and 6.1)."""
+
+    prune_after_misses: Annotated[
+        int, Field(ge=1, description="N: consecutive misses until a landmark goes; 20 in 4.3")
+    ] = 20
+    valid_hits: Annotated[
+        int, Field(ge=1, description="hits until a landmark counts as valid; 3 in 6.1")
+    ] = 3
+    forget_unconfirmed_after: Annotated[
+        int | None,
+        Field(
+            ge=1,
+            description="frames after which a landmark with fewer than valid_hits hits that was "
+            "not seen again is dropped, in view or not: what a passer-by leaves behind; null keeps "
+            "it until it is missed in view, as the paper",
+        ),
+    ] = None
+    field_of_view: Annotated[
+        Literal["image", "cone"],
+        Field(
+            description="`image`: expected in view within the image's bounds; `cone`: the paper's "
+            "30 degrees on both axes (4.4), which exceeds a 320x240 image's height"
+        ),
+    ] = "image"
+    cone_deg: Annotated[
+        float, Field(gt=0.0, lt=90.0, description="half angle of the cone; 30 in 4.4")
+    ] = 30.0
+    border_px: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="this near to an image's edge a landmark may be matched but is not missed",
+        ),
+    ] = 8.0
+    least_scale_px: Annotated[
+        float | None,
+        Field(
+            gt=0.0,
+            description="landmarks that would look smaller than this are not expected: SIFT's "
+            "finest scale over matching.scale_ratio, 0.8 where base_sigma_px is 2, loses no match "
+            "and keeps large maps fast; null expects them at any distance",
+        ),
+    ] = None
+    permanence: Annotated[
+        PermanenceSettings | None,
+        Field(description="permanent landmarks (6.2); null: none but those of a map loaded"),
+    ] = None
+    viewpoints: Annotated[
+        ViewpointSettings | None,
+        Field(description="several views a landmark (6.3); null: the latest one alone"),
+    ] = None
+
+
+@dataclass(frozen=True, config=STRICT)
+class EgoMotionSettings:
+    """Least-squares pose of a frame against the map (Se et al. 3.3 and 5)."""
+
+    dof: Annotated[
+        Literal[6, 5, 3],
+        Field(description="6 general; 5 height fixed (section 5); 3 planar: x, z and yaw"),
+    ] = 6
+    residuals: Annotated[
+        Literal["image_disparity", "image"],
+        Field(description="`image`: row and column, as 3.3; `image_disparity`: disparity too"),
+    ] = "image_disparity"
+    weighting: Annotated[
+        Literal["landmark", "measurement", "uniform"],
+        Field(
+            description="covariance of a residual: `uniform` as in 3.3, `measurement` from the "
+            "matching, `landmark` the landmark's own added"
+        ),
+    ] = "landmark"
+    prior: Annotated[
+        bool,
+        Field(description="stabilise towards the odometry by its covariance (Lowe 1991)"),
+    ] = True
+    outlier_px: Annotated[
+        float, Field(gt=0.0, description="drop matches with a larger image residual; 3 in 3.3")
+    ] = 3.0
+    outlier_sigmas: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="drop matches whose residual exceeds this many standard deviations of "
+            "itself as well; 0 switches it off",
+        ),
+    ] = 4.0
+    kernel: Annotated[
+        Literal["none", "huber", "cauchy"],
+        Field(description="robust kernel on the normalised residual before outliers are dropped"),
+    ] = "cauchy"
+    kernel_width: Annotated[
+        float, Field(gt=0.0, description="its width, in standard deviations")
+    ] = 2.0
+    min_matches: Annotated[
+        int, Field(ge=1, description="fewer inliers than this: the odometry is the pose (4.1)")
+    ] = 6
+    max_correction_m: Annotated[
+        float, Field(gt=0.0, description="cap on the correction of the odometry (5)")
+    ] = 0.3
+    max_correction_deg: Annotated[
+        float, Field(gt=0.0, description="cap on the correction of the odometry (5)")
+    ] = 6.0
+    max_iterations: Annotated[int, Field(ge=1, description="Newton steps a minimisation")] = 15

@@ -1,0 +1,229 @@
+"""Tracking a frame against the map and deciding each landmark's type (Se et al. 3 and 4.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgslam.core.types import (
+    BoolArray,
+    ByteArray,
+    CameraRig,
+    EgoMotion,
+    EgoMotionStatus,
+    FloatArray,
+    Image,
+    IntArray,
+    LandmarkMap,
+    Observations,
+    Prediction,
+    StereoFeatures,
+)
+from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
+from fgslam.frontend.tracking.map_matching import MapMatcher, MapMatches
+from fgslam.frontend.tracking.resection import Resection
+from fgslam.frontend.tracking.visibility import (
+    ExpectedLandmarks,
+    directions_to,
+    predicted_covariance,
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """One frame tracked: what was expected, what matched, and the pose that follows."""
+
+    expected: ExpectedLandmarks
+    matches: MapMatches
+    ego_motion: EgoMotion
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Association:
+    """The landmarks' types: III and IV as observations, II as misses; I is all others.
+
+    Attributes:
+        observations: matched, then new.
+        rejected: (k,) matched ones whose residual made them outliers; they count as misses.
+        missed_ids: landmarks expected in view and not seen.
+        pruned_ids: landmarks dropped now.
+        features: (k,) the frame's features that were observed.
+    """
+
+    observations: Observations
+    rejected: BoolArray
+    missed_ids: IntArray
+    pruned_ids: IntArray
+    features: IntArray
+
+    def partners(self, count: int) -> IntArray:
+        """The landmark that each of ``count`` features is taken for; -1 for none."""
+        out = np.full(count, -1, np.int64)
+        out[self.features[~self.rejected]] = self.observations.ids[~self.rejected]
+        return out
+
+    @staticmethod
+    def nothing() -> Association:
+        """Of a frame without images: no landmark was looked for."""
+        none = np.empty(0, np.int64)
+        observations = StereoFeatures.empty().observations(none, none, is_new=False)
+        return Association(observations, np.empty(0, np.bool_), none, none, none)
+
+
+class LandmarkTracker:
+    """Joins the database's appearance with the estimator's geometry."""
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        database: LandmarkDatabase,
+        matcher: MapMatcher,
+        ego_motion: EgoMotionSolver,
+    ) -> None:
+        """The database is shared with whoever shows or saves it.
+
+        With ``keeps_map`` nothing is booked, started or pruned: the map is only localised in.
+        """
+        self.keeps_map = False
+        self._rig = rig
+        self.database = database
+        self._matcher = matcher
+        self._ego_motion = ego_motion
+        self.resection = Resection(ego_motion)
+
+    def track(
+        self, prediction: Prediction, landmarks: LandmarkMap, features: StereoFeatures
+    ) -> Tracked:
+        """Matches expected landmarks and solves for the pose; wider or closer again if asked."""
+        around = Prediction(self._ego_motion.floor.constrain(prediction.wTc), prediction.covariance)
+        tracked = self._attempt(prediction, around, landmarks, features)
+        if self._matcher.rescues and not tracked.ego_motion.status.measured:
+            rescued = self._attempt(prediction, around, landmarks, features, anywhere=True)
+            # A failed rescue proves nothing about what is new: the first attempt stands.
+            tracked = rescued if rescued.ego_motion.status.measured else tracked
+        if self._matcher.refines and tracked.ego_motion.status.measured:
+            around = Prediction(tracked.ego_motion.wTc, tracked.ego_motion.covariance)
+            refined = self._attempt(prediction, around, landmarks, features)
+            tracked = refined if refined.ego_motion.status.measured else tracked
+        return tracked
+
+    def track_anew(
+        self, around: Prediction, landmarks: LandmarkMap, features: StereoFeatures
+    ) -> Tracked:
+        """Matches in the neighbourhood of a pose found without a prior, and solves without one."""
+        expected = self.database.expected(landmarks, around.wTc)
+        matches = self._match_around(around, expected, landmarks, features)
+        problem = PoseProblem.of(landmarks, _matched(expected, matches, features))
+        return Tracked(expected, matches, self.resection.solve(problem))
+
+    def track_blind(self, prediction: Prediction) -> EgoMotion:
+        """The odometry's pose, for a frame without images; the same that its replay will find."""
+        nothing = PoseProblem.empty()
+        found = self._ego_motion.solve(prediction, nothing)
+        return replace(found, status=EgoMotionStatus.NO_IMAGE)
+
+    def _attempt(
+        self,
+        prediction: Prediction,
+        around: Prediction,
+        landmarks: LandmarkMap,
+        features: StereoFeatures,
+        anywhere: bool = False,
+    ) -> Tracked:
+        """Matches in the neighbourhood of ``around``, then solves, stabilised to the prediction."""
+        expected = self.database.expected(landmarks, around.wTc)
+        if anywhere:
+            matches = self._matcher.match_anywhere(expected, features)
+        else:
+            matches = self._match_around(around, expected, landmarks, features)
+        problem = PoseProblem.of(landmarks, _matched(expected, matches, features))
+        return Tracked(expected, matches, self._ego_motion.solve(prediction, problem))
+
+    def _match_around(
+        self,
+        around: Prediction,
+        expected: ExpectedLandmarks,
+        landmarks: LandmarkMap,
+        features: StereoFeatures,
+    ) -> MapMatches:
+        uncertainty = self._uncertainty(around, landmarks, expected)
+        return self._matcher.match(expected, features, uncertainty)
+
+    def associate(
+        self, tracked: Tracked, features: StereoFeatures, image: Image, start_new: bool = True
+    ) -> Association:
+        """Books hits and misses, starts new tracks if it may, prunes (4.1 to 4.3)."""
+        expected, matches = tracked.expected, tracked.matches
+        inliers = tracked.ego_motion.inliers
+        matched = _matched(expected, matches, features)
+        if self.keeps_map:
+            none = np.empty(0, np.int64)
+            return Association(matched, ~inliers, none, none, matches.features)
+        hit = np.zeros(len(expected), np.bool_)
+        hit[matches.landmarks[inliers]] = True
+        missed_ids = self.database.missing(expected, hit)
+        directions = directions_to(tracked.ego_motion.wTc, features.position)
+        seen = matches.features[inliers]
+        self.database.record_hits(matched.ids[inliers], features, seen, directions[seen])
+        self.database.record_misses(missed_ids)
+        if tracked.ego_motion.status.measured:
+            rejected = matched.ids[~inliers]
+            self.database.weigh(expected, missed_ids, rejected, features.measurement)
+        fresh = np.flatnonzero(~matches.had_candidates & start_new)
+        colour = _grey_values(image, features, fresh)
+        new_ids = self.database.add(features, fresh, colour, directions[fresh])
+        new = features.observations(fresh, new_ids, is_new=True)
+        return Association(
+            observations=matched.join(new),
+            rejected=np.concatenate([~inliers, np.zeros(len(new), np.bool_)]),
+            missed_ids=missed_ids,
+            pruned_ids=self.database.prune(),
+            features=np.concatenate([matches.features, fresh]),
+        )
+
+    def merge(self, pairs: IntArray) -> IntArray:
+        """Makes landmarks found to be one into one; returns the identities that end.
+
+        Args:
+            pairs: (m, 2) (identity that ends, identity that stays); what is no longer in the
+                database, or would go to one that ends itself, is left out.
+        """
+        known = np.isin(pairs, self.database.ids).all(axis=1)
+        known &= ~np.isin(pairs[:, 1], pairs[:, 0])
+        _, first = np.unique(pairs[known, 0], return_index=True)
+        chosen = pairs[known][first]
+        if len(chosen):
+            self.database.merge(chosen)
+        return np.asarray(chosen[:, 0])
+
+    def _uncertainty(
+        self,
+        around: Prediction,
+        landmarks: LandmarkMap,
+        expected: ExpectedLandmarks,
+    ) -> FloatArray | None:
+        """Standard deviations (v, 3) of the predicted measurements, where the matcher asks."""
+        if not self._matcher.widens:
+            return None
+        rows = expected.rows
+        covariance = predicted_covariance(
+            self._rig, around, landmarks.positions[rows], landmarks.covariances[rows]
+        )
+        return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+
+
+def _matched(
+    expected: ExpectedLandmarks, matches: MapMatches, features: StereoFeatures
+) -> Observations:
+    ids = expected.ids[matches.landmarks]
+    return features.observations(matches.features, ids, is_new=False)
+
+
+def _grey_values(image: Image, features: StereoFeatures, which: IntArray) -> ByteArray:
+    """Grey values (k,) of the reference image at the features, for the map's colour."""
+    at = np.rint(features.measurement[which, :2]).astype(np.int64)
+    rows = np.clip(at[:, 1], 0, image.shape[0] - 1)
+    columns = np.clip(at[:, 0], 0, image.shape[1] - 1)
+    return image[rows, columns]
