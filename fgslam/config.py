@@ -12,9 +12,10 @@ from typing import Annotated, Any, TypeAlias, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
+from fgslam.backend.filters.settings import LandmarkKalmanSettings
+from fgslam.backend.settings import EstimatorSettings
 from fgslam.config_reading import Reader, kind_as_settings, read_mapping, with_default_kind
 from fgslam.core.errors import ConfigError
-from fgslam.settings.backend import EstimatorSettings, LandmarkKalmanSettings
 from fgslam.settings.datasets import OdometrySettings, RecordedOdometrySettings
 from fgslam.settings.frontend import FrontendSettings
 from fgslam.settings.maps import MapSettings

@@ -8,14 +8,23 @@ from collections.abc import Callable
 import numpy as np
 
 from fgslam.arrival import Arrival, take_over
-from fgslam.backend.batch import BatchSmoother
-from fgslam.backend.dead_reckoning import DeadReckoning
-from fgslam.backend.ekf import FullEkf
-from fgslam.backend.fixed_lag import FixedLagSmoother
-from fgslam.backend.isam2 import Isam2Smoother
-from fgslam.backend.landmark_kalman import LandmarkKalman
-from fgslam.backend.landmark_kalman_graph import LandmarkKalmanGraph
+from fgslam.backend.common_settings import FloorSettings
+from fgslam.backend.filters.dead_reckoning import DeadReckoning
+from fgslam.backend.filters.ekf import FullEkf
+from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
+from fgslam.backend.filters.settings import (
+    DeadReckoningSettings,
+    EkfSettings,
+    LandmarkKalmanGraphSettings,
+    LandmarkKalmanSettings,
+)
 from fgslam.backend.protocol import Estimator
+from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.smoothers.batch import BatchSmoother
+from fgslam.backend.smoothers.fixed_lag import FixedLagSmoother
+from fgslam.backend.smoothers.isam2 import Isam2Smoother
+from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.config import ExperimentConfig
 from fgslam.core.errors import ConfigError
 from fgslam.core.floor import DegreesOfFreedom, Floor
@@ -36,17 +45,6 @@ from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
 from fgslam.pipeline import SlamPipeline
-from fgslam.settings.backend import (
-    BatchSettings,
-    DeadReckoningSettings,
-    EkfSettings,
-    EstimatorSettings,
-    FixedLagSettings,
-    FloorSettings,
-    Isam2Settings,
-    LandmarkKalmanGraphSettings,
-    LandmarkKalmanSettings,
-)
 from fgslam.settings.datasets import (
     ConstantVelocitySettings,
     OdometrySettings,

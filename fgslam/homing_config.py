@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
+from fgslam.backend.homing.settings import HomingEstimatorSettings, HomingGraphSettings
 from fgslam.config import ExperimentConfig, make_config
 from fgslam.config_reading import (
     Reader,
@@ -29,7 +30,6 @@ from fgslam.settings.homing_behaviour import (
     LocalisationSettings,
     TopologicalMapSettings,
 )
-from fgslam.settings.homing_estimators import HomingEstimatorSettings, HomingGraphSettings
 from fgslam.settings.homing_output import HomingOutputSettings
 from fgslam.settings.omni_datasets import OmniDatasetSettings
 from fgslam.worlds.bearing_settings import SimulatedBearingsSettings

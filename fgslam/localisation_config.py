@@ -11,11 +11,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
+from fgslam.backend.filters.settings import LandmarkKalmanSettings
+from fgslam.backend.settings import EstimatorSettings
 from fgslam.config import ExperimentConfig
 from fgslam.config_reading import Reader, apply_overrides, read_mapping, with_default_kind
 from fgslam.core.errors import ConfigError
 from fgslam.homing_config import HomingExperiment, make_experiment
-from fgslam.settings.backend import EstimatorSettings, LandmarkKalmanSettings
 from fgslam.settings.datasets import OdometrySettings, RecordedOdometrySettings
 from fgslam.settings.frontend import FrontendSettings
 from fgslam.settings.localisation import KnownMapSettings, QuerySettings

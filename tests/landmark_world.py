@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.backend.homing.settings import HomingEkfSettings, HomingEstimatorSettings
 from fgslam.core.homing_types import (
     BearingMatches,
     ColumnSegments,
@@ -35,7 +36,6 @@ from fgslam.homing.soundness import parallax
 from fgslam.homing.steering import Steering
 from fgslam.runs.homing.starting import start_from_matches
 from fgslam.settings.homing_behaviour import HomingBehaviourSettings
-from fgslam.settings.homing_estimators import HomingEkfSettings, HomingEstimatorSettings
 
 DARK = np.zeros((1, 1, 3), dtype=np.uint8)
 

@@ -9,6 +9,8 @@ import numpy as np
 from simulated import RIG, FeatureWorld, assert_same_bits
 
 from fgslam.arrival import Arrival, take_over
+from fgslam.backend.filters.settings import LandmarkKalmanSettings
+from fgslam.backend.settings import EstimatorSettings
 from fgslam.core import geometry as g
 from fgslam.core.types import Features, FloatArray, Frame, Increment, Odometry
 from fgslam.factory import make_estimator, make_places, make_tracker
@@ -19,7 +21,6 @@ from fgslam.frontend.stream import FeatureFrame
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import OdometryMotion
 from fgslam.pipeline import FrameReport, SlamPipeline
-from fgslam.settings.backend import EstimatorSettings, LandmarkKalmanSettings
 from fgslam.settings.frontend import FrontendSettings
 
 IMAGES = (np.zeros((240, 320), np.uint8),) * 3

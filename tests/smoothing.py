@@ -9,17 +9,13 @@ import numpy as np
 from simulated import RIG, Drive, Simulation, observations, play, simulate
 
 from fgslam.backend.protocol import Estimator
+from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.core import geometry as g
 from fgslam.core.types import BoolArray, Estimate, FloatArray, Increment, Prediction, UpdateStats
 from fgslam.evaluation.consistency import Nees, landmark_nees, pose_nees
 from fgslam.factory import make_estimator
 from fgslam.frontend.tracking.settings import EgoMotionSettings
-from fgslam.settings.backend import (
-    BatchSettings,
-    EstimatorSettings,
-    FixedLagSettings,
-    Isam2Settings,
-)
 
 FREE = EgoMotionSettings(dof=6)
 """The front-end's least squares without a floor: the simulated drives leave it."""

@@ -6,9 +6,9 @@ import typing
 from dataclasses import dataclass
 from typing import Any
 
+from fgslam.backend.settings import EstimatorSettings
 from fgslam.config import ExperimentConfig, make_config
 from fgslam.core.errors import ConfigError
-from fgslam.settings.backend import EstimatorSettings
 
 _PREFIX = "estimators."
 

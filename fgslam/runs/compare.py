@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from fgslam.backend.settings import EstimatorSettings
 from fgslam.config import ExperimentConfig
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.export.atomic import ExistingFolder, create_run_folder, is_run_folder
@@ -23,7 +24,6 @@ from fgslam.runs.comparison import (
 )
 from fgslam.runs.outputs import write_config
 from fgslam.runs.report import report_from_folder
-from fgslam.settings.backend import EstimatorSettings
 
 DEFAULT_FOLDER = "compare"
 METRICS_FILE = "metrics.json"

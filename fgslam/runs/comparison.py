@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.backend.settings import EstimatorSettings
 from fgslam.config import ExperimentConfig, load_config
 from fgslam.core.errors import DatasetError
 from fgslam.core.measurement_log import MeasurementLog
@@ -23,7 +24,6 @@ from fgslam.runs.judging import Truth, judge_replay, seen_often
 from fgslam.runs.map_entry import arrival_of
 from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.runs.replay import replay
-from fgslam.settings.backend import EstimatorSettings
 
 COMPARISON_FILE = "comparison.csv"
 GROUND_TRUTH_FILE = "ground_truth.tum"

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from fgslam.arrival import Arrival, take_over
 from fgslam.backend.protocol import Estimator
+from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.errors import ConfigError, FgslamError, MeasurementLogError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.threads import one_blas_thread
@@ -33,7 +34,6 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import ReplayedFrame, replay_frame
-from fgslam.settings.backend import EstimatorSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
 
 ESTIMATOR_FAULTS = (

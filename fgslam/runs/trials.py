@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from fgslam.backend.settings import EstimatorSettings
 from fgslam.config import ExperimentConfig, load_config
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.measurement_log import MeasurementLog
@@ -26,7 +27,6 @@ from fgslam.runs.outputs import write_config
 from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.runs.replay import replay
 from fgslam.runs.trial_results import TrialSummary, summarise, write_trials
-from fgslam.settings.backend import EstimatorSettings
 from fgslam.settings.output import OutputSettings
 from fgslam.worlds.lab_settings import RenderedLabSettings
 from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.backend.protocol import Estimator
+from fgslam.backend.settings import EstimatorSettings
 from fgslam.config import load_config
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import (
@@ -29,7 +30,6 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.pipeline import replay_frame
 from fgslam.runs.replay import replay_motion
-from fgslam.settings.backend import EstimatorSettings
 from fgslam.settings.measurements import MeasurementDatasetSettings
 
 

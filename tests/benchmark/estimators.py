@@ -12,24 +12,20 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.backend.batch import BatchSmoother
-from fgslam.backend.landmark_kalman import LandmarkKalman
-from fgslam.backend.landmark_kalman_graph import LandmarkKalmanGraph
-from fgslam.backend.marginals import marginals_of
-from fgslam.backend.outliers import solver_parameters
+from fgslam.backend.common_settings import KernelSettings
+from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
+from fgslam.backend.filters.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
+from fgslam.backend.smoothers.batch import BatchSmoother
+from fgslam.backend.smoothers.marginals import marginals_of
+from fgslam.backend.smoothers.outliers import solver_parameters
+from fgslam.backend.smoothers.settings import BatchSettings, Isam2Settings
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import FloatArray, LandmarkMap
 from fgslam.factory import make_estimator
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.pipeline import replay_frame
 from fgslam.runs.replay import replay_motion
-from fgslam.settings.backend import (
-    BatchSettings,
-    Isam2Settings,
-    KernelSettings,
-    LandmarkKalmanGraphSettings,
-    LandmarkKalmanSettings,
-)
 from tests.benchmark.drives import (
     MeasuredDrive,
     Played,

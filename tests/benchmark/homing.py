@@ -15,6 +15,11 @@ import cv2
 import numpy as np
 
 from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.backend.homing.settings import (
+    HomingEkfSettings,
+    HomingEstimatorSettings,
+    HomingGraphSettings,
+)
 from fgslam.core.homing_types import OmniFeatures, TrackedBearings
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import FloatArray, Image
@@ -26,11 +31,6 @@ from fgslam.homing.controller import HomingController
 from fgslam.homing.eyes import HomingEyes
 from fgslam.homing.image_eyes import EyesSettings, ImageEyes
 from fgslam.settings.homing_behaviour import HomingControlSettings
-from fgslam.settings.homing_estimators import (
-    HomingEkfSettings,
-    HomingEstimatorSettings,
-    HomingGraphSettings,
-)
 from fgslam.worlds.house.omni_world import OmniWorld
 from fgslam.worlds.house.settings import HousePathSettings, OmniHouseSettings
 from tests.benchmark.drives import cpu_seconds, interleaved

@@ -12,17 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.backend.common_settings import KernelSettings
+from fgslam.backend.filters.settings import LandmarkKalmanSettings
+from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import Estimate
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
-from fgslam.settings.backend import (
-    BatchSettings,
-    EstimatorSettings,
-    FixedLagSettings,
-    Isam2Settings,
-    KernelSettings,
-    LandmarkKalmanSettings,
-)
 from tests.benchmark.drives import MeasuredDrive, Player, cpu_seconds, open_drive, play
 
 KEYFRAMES = Isam2Settings(keyframe_every=4, update_every=40, ordering_window=10)

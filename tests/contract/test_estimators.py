@@ -14,8 +14,16 @@ import numpy as np
 import pytest
 from simulated import RIG
 
+from fgslam.backend.filters.settings import (
+    DeadReckoningSettings,
+    EkfSettings,
+    LandmarkKalmanGraphSettings,
+    LandmarkKalmanSettings,
+)
 from fgslam.backend.protocol import Estimator
-from fgslam.backend.smoother import Smoother
+from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
+from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core import geometry as g
 from fgslam.core.errors import EstimatorError
 from fgslam.core.types import (
@@ -37,16 +45,6 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
-from fgslam.settings.backend import (
-    BatchSettings,
-    DeadReckoningSettings,
-    EkfSettings,
-    EstimatorSettings,
-    FixedLagSettings,
-    Isam2Settings,
-    LandmarkKalmanGraphSettings,
-    LandmarkKalmanSettings,
-)
 from fgslam.settings.datasets import ConstantVelocitySettings
 
 SETTINGS: dict[str, EstimatorSettings] = {

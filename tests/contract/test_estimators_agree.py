@@ -14,20 +14,18 @@ import pytest
 from simulated import RIG, play, tracked_at
 from smoothing import FREE, SMOOTHERS, answer, ate, blackout, build, drawn, run
 
-from fgslam.backend.protocol import Estimator
-from fgslam.core import geometry as g
-from fgslam.core.types import Estimate, FloatArray, Increment, Odometry, Prediction
-from fgslam.settings.backend import (
-    BatchSettings,
+from fgslam.backend.common_settings import KernelSettings
+from fgslam.backend.filters.settings import (
     DeadReckoningSettings,
     EkfSettings,
-    EstimatorSettings,
-    FixedLagSettings,
-    Isam2Settings,
-    KernelSettings,
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
 )
+from fgslam.backend.protocol import Estimator
+from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
+from fgslam.core import geometry as g
+from fgslam.core.types import Estimate, FloatArray, Increment, Odometry, Prediction
 
 PRIOR = Prediction(np.eye(4), np.diag([1e-3, 2e-3, 1e-3, 3e-3, 2e-3, 4e-3]) ** 2)
 LEAST_SQUARES = {

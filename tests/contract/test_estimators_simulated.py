@@ -23,6 +23,8 @@ from simulated import (
 from test_estimators import CORRECTING, SETTINGS
 
 from fgslam.backend.protocol import Estimator
+from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.smoothers.settings import FixedLagSettings, Isam2Settings
 from fgslam.core import geometry as g
 from fgslam.core.types import FloatArray, Frame, Odometry, Prediction
 from fgslam.factory import make_estimator, make_tracker
@@ -32,7 +34,6 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import ConstantVelocityMotion, OdometryMotion
 from fgslam.pipeline import FrameReport, SlamPipeline, replay_step
-from fgslam.settings.backend import EstimatorSettings, FixedLagSettings, Isam2Settings
 from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import FrontendSettings
 

@@ -12,9 +12,7 @@ from homings import Trial, trial
 
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.backend.homing.protocol import HomingEstimator
-from fgslam.core.errors import EstimatorError
-from fgslam.core.homing_types import HomingEstimate, TrackedBearings
-from fgslam.settings.homing_estimators import (
+from fgslam.backend.homing.settings import (
     PAPER,
     AverageLandmarkVectorSettings,
     HomingEkfSettings,
@@ -22,6 +20,8 @@ from fgslam.settings.homing_estimators import (
     HomingGraphSettings,
     SnapshotSettings,
 )
+from fgslam.core.errors import EstimatorError
+from fgslam.core.homing_types import HomingEstimate, TrackedBearings
 from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
 
 EVERY: list[HomingEstimatorSettings] = [

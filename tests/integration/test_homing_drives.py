@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from landmark_world import drive_path, make_follower, winding_path
 
+from fgslam.backend.homing.settings import HomingGraphSettings
 from fgslam.core.homing_types import TrackedBearings
 from fgslam.evaluation.homing import homing_errors
 from fgslam.homing.avoidance import NoAvoidance
@@ -30,7 +31,6 @@ from fgslam.runs.homing.logs import load_bearing_logs
 from fgslam.runs.homing.replay import replay_homing
 from fgslam.runs.homing.results import begin
 from fgslam.settings.homing_behaviour import HomingBehaviourSettings
-from fgslam.settings.homing_estimators import HomingGraphSettings
 
 EKF = {"kind": "homing_ekf"}
 

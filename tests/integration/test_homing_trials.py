@@ -12,13 +12,13 @@ import pytest
 from homings import Trial, trial
 
 from fgslam.backend.homing.factory import make_homing_estimator
-from fgslam.evaluation.homing import HomingErrors, homing_errors, summarise_homings
-from fgslam.settings.homing_estimators import (
+from fgslam.backend.homing.settings import (
     PAPER,
     HomingEkfSettings,
     HomingEstimatorSettings,
     HomingGraphSettings,
 )
+from fgslam.evaluation.homing import HomingErrors, homing_errors, summarise_homings
 from fgslam.worlds.bearing_settings import SimulatedBearingsSettings, with_outliers
 
 GRAPH = HomingGraphSettings()

@@ -83,7 +83,7 @@ LAYER_CASES = {
     ),
     "literal import_module counts": (
         "factors/b.py",
-        "import importlib\nm = importlib.import_module('fgslam.backend.isam2')\n",
+        "import importlib\nm = importlib.import_module('fgslam.backend.smoothers.isam2')\n",
         2,
     ),
     "only datasets may open a simulation": ("export/a.py", "import fgslam.worlds.lab\n", 1),

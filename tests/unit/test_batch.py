@@ -21,11 +21,11 @@ from smoothing import (
     wrong_matches,
 )
 
-from fgslam.backend import refinement
-from fgslam.backend.batch import BatchSmoother
+from fgslam.backend.smoothers import refinement
+from fgslam.backend.smoothers.batch import BatchSmoother
+from fgslam.backend.smoothers.settings import BatchSettings
 from fgslam.core.errors import EstimatorError
 from fgslam.evaluation.consistency import judge
-from fgslam.settings.backend import BatchSettings
 
 METHODS = pytest.mark.parametrize("name", ["batch", "gnc"])
 

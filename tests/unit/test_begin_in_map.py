@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 
 from fgslam.arrival import Arrival, require_map_user, take_over
-from fgslam.backend.ekf_update import FRONT, FloorMeasurement, Matches, correct
-from fgslam.backend.growing_covariance import GrowingCovariance, rows_of
+from fgslam.backend.filters.ekf_update import FRONT, FloorMeasurement, Matches, correct
+from fgslam.backend.filters.growing_covariance import GrowingCovariance, rows_of
+from fgslam.backend.filters.settings import (
+    DeadReckoningSettings,
+    EkfSettings,
+    LandmarkKalmanGraphSettings,
+    LandmarkKalmanSettings,
+)
 from fgslam.backend.protocol import Estimator, MapUser
+from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.core import geometry as g
 from fgslam.core.errors import ConfigError
 from fgslam.core.map_types import LandmarkAppearances
@@ -25,16 +33,6 @@ from fgslam.core.types import (
     Trajectory,
 )
 from fgslam.factory import make_estimator
-from fgslam.settings.backend import (
-    BatchSettings,
-    DeadReckoningSettings,
-    EkfSettings,
-    EstimatorSettings,
-    FixedLagSettings,
-    Isam2Settings,
-    LandmarkKalmanGraphSettings,
-    LandmarkKalmanSettings,
-)
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 WTC = g.se3_exp(np.array([0.02, 0.3, -0.01, 0.4, 0.02, -0.2]))

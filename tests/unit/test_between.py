@@ -9,9 +9,9 @@ import pytest
 from simulated import RIG, Simulation
 from smoothing import drawn
 
-from fgslam.backend.between import fill_between
-from fgslam.backend.graph_solution import Solution
-from fgslam.backend.segments import TrackedFrame
+from fgslam.backend.smoothers.between import fill_between
+from fgslam.backend.smoothers.graph_solution import Solution
+from fgslam.backend.smoothers.segments import TrackedFrame
 from fgslam.core import geometry as g
 from fgslam.core.floor import Floor
 from fgslam.core.types import FloatArray, Odometry

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from simulated import RIG, Drive, simulate
 
+from fgslam.backend.filters.settings import LandmarkKalmanSettings
+from fgslam.backend.smoothers.settings import Isam2Settings
 from fgslam.config import ExperimentConfig, parse_config
 from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.measurement_log import MeasurementLog
@@ -33,7 +35,6 @@ from fgslam.runs.estimator_files import points_from_log
 from fgslam.runs.judging import seen_often
 from fgslam.runs.rendered_truth import points_under
 from fgslam.runs.trial_results import summarise, together
-from fgslam.settings.backend import Isam2Settings, LandmarkKalmanSettings
 
 LAB: dict[str, Any] = {"name": "x", "dataset": {"kind": "rendered_lab"}}
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from simulated import RIG, Drive, Simulation, play, play_directly, simulate, tracked_at
 
-from fgslam.backend.dead_reckoning import DeadReckoning
+from fgslam.backend.filters.dead_reckoning import DeadReckoning
 from fgslam.core import geometry as g
 from fgslam.core.errors import EstimatorError
 from fgslam.core.types import FloatArray, Prediction, RangeBearingSensor

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from simulated import RIG, Drive, Simulation, assert_same_bits, play, simulate, tracked_at
 
-from fgslam.backend.ekf import FullEkf
-from fgslam.backend.ekf_update import DivergedError, FloorMeasurement, Matches, correct
-from fgslam.backend.growing_covariance import GrowingCovariance
+from fgslam.backend.filters.ekf import FullEkf
+from fgslam.backend.filters.ekf_update import DivergedError, FloorMeasurement, Matches, correct
+from fgslam.backend.filters.growing_covariance import GrowingCovariance
+from fgslam.backend.filters.settings import EkfSettings
 from fgslam.core import geometry as g
 from fgslam.core.errors import EstimatorError
 from fgslam.core.floor import Floor
@@ -23,7 +24,6 @@ from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior
 from fgslam.factors.noise import Whitening
 from fgslam.factors.stereo import StereoFactors
 from fgslam.frontend.tracking.settings import EgoMotionSettings
-from fgslam.settings.backend import EkfSettings
 
 FREE = Floor.under(RIG, 6)
 PRIOR = np.diag([1e-3, 2e-3, 1e-3, 3e-3, 2e-3, 4e-3]) ** 2

@@ -23,12 +23,12 @@ from smoothing import (
     unseen,
 )
 
-from fgslam.backend.fixed_lag import FixedLagSmoother
+from fgslam.backend.smoothers.fixed_lag import FixedLagSmoother
+from fgslam.backend.smoothers.settings import FixedLagSettings
 from fgslam.core.errors import EstimatorError
 from fgslam.core.types import Prediction
 from fgslam.evaluation.consistency import judge
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
-from fgslam.settings.backend import FixedLagSettings
 
 LAG = FixedLagSettings(lag_frames=5)
 

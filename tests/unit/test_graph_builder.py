@@ -22,15 +22,16 @@ from smoothing import (
     unseen,
 )
 
-from fgslam.backend.graph_builder import GraphBuilder
-from fgslam.backend.segments import TrackedFrame
+from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.smoothers.graph_builder import GraphBuilder
+from fgslam.backend.smoothers.segments import TrackedFrame
+from fgslam.backend.smoothers.settings import BatchSettings, GraphSettings
 from fgslam.core import geometry as g
 from fgslam.core.errors import EstimatorError
 from fgslam.core.floor import Floor
 from fgslam.core.types import Increment, LandmarkMap, Odometry, Prediction
 from fgslam.evaluation.consistency import judge, landmark_nees
 from fgslam.factors.keys import is_pose, landmark_key, pose_key
-from fgslam.settings.backend import BatchSettings, EstimatorSettings, GraphSettings
 
 ORIGIN = Prediction(np.eye(4), np.zeros((6, 6)))
 STEP = g.se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.1]))

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
+from fgslam.backend.homing.settings import HomingEkfSettings, HomingGraphSettings
 from fgslam.config import ExperimentConfig, load_config
 from fgslam.core.errors import ConfigError
 from fgslam.homing_config import (
@@ -20,7 +21,6 @@ from fgslam.homing_config import (
     parse_homing,
 )
 from fgslam.localisation_config import load_experiment as load_any
-from fgslam.settings.homing_estimators import HomingEkfSettings, HomingGraphSettings
 
 EXPERIMENTS = [
     path

@@ -9,6 +9,13 @@ import numpy as np
 import pytest
 
 from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.backend.homing.settings import (
+    AverageLandmarkVectorSettings,
+    HomingEkfSettings,
+    HomingEstimatorSettings,
+    HomingGraphSettings,
+    SnapshotSettings,
+)
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing_types import (
     HomingEstimate,
@@ -28,13 +35,6 @@ from fgslam.homing.eyes import Sighting
 from fgslam.homing.soundness import parallax
 from fgslam.homing.underway import HomingUnderWay
 from fgslam.settings.homing_behaviour import HomingControlSettings
-from fgslam.settings.homing_estimators import (
-    AverageLandmarkVectorSettings,
-    HomingEkfSettings,
-    HomingEstimatorSettings,
-    HomingGraphSettings,
-    SnapshotSettings,
-)
 from tests.homing import make_matches
 from tests.landmark_world import DARK, Setting, winding_path
 

@@ -12,10 +12,10 @@ from fgslam.backend.homing import ekf
 from fgslam.backend.homing.baselines import AverageDisplacement, AverageLandmarkVector
 from fgslam.backend.homing.ekf import HomingEkf
 from fgslam.backend.homing.ekf_model import FilterState, initial_state, motion
+from fgslam.backend.homing.settings import PAPER, FilterMotionSettings, HomingEkfSettings
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing_types import HomingStart, HomingVector, LocalMap, TrackedBearings
 from fgslam.core.planar import bearings, wrap
-from fgslam.settings.homing_estimators import PAPER, FilterMotionSettings, HomingEkfSettings
 from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
 
 

@@ -22,6 +22,7 @@ from fgslam.backend.homing.ekf_model import (
     seen_from_robot,
     seen_from_target,
 )
+from fgslam.backend.homing.settings import PAPER, HomingEkfSettings
 from fgslam.core.types import FloatArray
 from fgslam.factors.bearing_residuals import (
     bearing_jacobians,
@@ -30,7 +31,6 @@ from fgslam.factors.bearing_residuals import (
     target_jacobian,
     target_pose,
 )
-from fgslam.settings.homing_estimators import PAPER, HomingEkfSettings
 
 TOLERANCE = 1e-11
 HONEST = HomingEkfSettings(gate_sigmas=0.0)

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from homings import Trial, trial
 
+from fgslam.backend.common_settings import KernelSettings
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.backend.homing.schur_model import SchurModel, State
 from fgslam.backend.homing.schur_solver import SchurSolver
 from fgslam.backend.homing.schur_system import Factored
+from fgslam.backend.homing.settings import HomingGraphSettings
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing_types import HomingEstimate
 from fgslam.core.planar import wrap
 from fgslam.core.types import FloatArray
-from fgslam.settings.backend import KernelSettings
-from fgslam.settings.homing_estimators import HomingGraphSettings
 from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
 
 NONE, CAUCHY, HUBER = (

@@ -22,11 +22,11 @@ from smoothing import (
     unseen,
 )
 
-from fgslam.backend.isam2 import Isam2Smoother
+from fgslam.backend.smoothers.isam2 import Isam2Smoother
+from fgslam.backend.smoothers.settings import Isam2Settings
 from fgslam.core.errors import EstimatorError
 from fgslam.evaluation.consistency import judge
 from fgslam.factors.keys import landmark_key, pose_key
-from fgslam.settings.backend import Isam2Settings
 
 EVERY_FRAME = Isam2Settings(update_every=1)
 FAILED = """

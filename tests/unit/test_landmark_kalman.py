@@ -22,11 +22,11 @@ from simulated import (
     tracked_at,
 )
 
-from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.errors import EstimatorError
 from fgslam.core.types import FloatArray, Increment, IntArray, Prediction
-from fgslam.settings.backend import LandmarkKalmanSettings
 
 SIGMA = np.array([0.3, 0.4, 0.2])
 NO_IDS = np.empty(0, np.int64)

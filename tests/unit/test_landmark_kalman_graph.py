@@ -20,8 +20,9 @@ from simulated import (
     tracked_at,
 )
 
-from fgslam.backend.landmark_kalman import LandmarkKalman
-from fgslam.backend.landmark_kalman_graph import LandmarkKalmanGraph
+from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
+from fgslam.backend.filters.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.errors import EstimatorError
 from fgslam.core.types import (
@@ -39,7 +40,6 @@ from fgslam.factors.noise import Whitening
 from fgslam.factors.stereo import StereoFactors
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.settings import EgoMotionSettings
-from fgslam.settings.backend import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
 
 SIGMA = np.array([0.3, 0.4, 0.2])
 NO_IDS = np.empty(0, np.int64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.backend.landmark_rows import LandmarkRows
+from fgslam.backend.filters.landmark_rows import LandmarkRows
 from fgslam.core.types import IntArray, LandmarkMap
 
 

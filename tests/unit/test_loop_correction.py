@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgslam.backend.loop_correction import DriveBook
+from fgslam.backend.filters.loop_correction import DriveBook
+from fgslam.backend.filters.settings import LoopCorrectionSettings
 from fgslam.core.geometry import pose
 from fgslam.core.types import (
     EgoMotion,
@@ -17,7 +18,6 @@ from fgslam.core.types import (
     Observations,
     Odometry,
 )
-from fgslam.settings.backend import LoopCorrectionSettings
 
 _TRACKED = np.diag([1e-6] * 6)
 _WHEELS = np.diag([1e-4] * 6)

@@ -11,22 +11,20 @@ from loops import CLOSED, ROUND, Returned, Rounds, drive_rounds
 from simulated import Drive, assert_same_bits, play, play_directly, simulate
 from smoothing import FREE, PIXELS, build
 
-from fgslam.backend.protocol import Estimator
-from fgslam.core import geometry as g
-from fgslam.core.errors import EstimatorError
-from fgslam.core.types import Estimate, FloatArray, Increment, Odometry
-from fgslam.evaluation.consistency import pose_nees
-from fgslam.settings.backend import (
-    BatchSettings,
+from fgslam.backend.filters.settings import (
     DeadReckoningSettings,
     EkfSettings,
-    EstimatorSettings,
-    FixedLagSettings,
-    Isam2Settings,
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
     LoopCorrectionSettings,
 )
+from fgslam.backend.protocol import Estimator
+from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
+from fgslam.core import geometry as g
+from fgslam.core.errors import EstimatorError
+from fgslam.core.types import Estimate, FloatArray, Increment, Odometry
+from fgslam.evaluation.consistency import pose_nees
 
 CLOSING: dict[str, EstimatorSettings] = {
     "landmark_kalman": LandmarkKalmanSettings(),

@@ -11,7 +11,7 @@ import pytest
 from factor_checks import assert_near, random_covariance, random_pose
 from simulated import RIG, points_in_view
 
-from fgslam.backend.marginals import (
+from fgslam.backend.smoothers.marginals import (
     ChainMarginals,
     DenseMarginals,
     GraphMarginals,

@@ -9,9 +9,16 @@ import numpy as np
 import pytest
 from smoothing import SMOOTHERS, answer, ate, build, drawn, run, wrong_matches
 
-from fgslam.backend.outliers import graduated, observed_variables, solver_parameters, trimmed
+from fgslam.backend.common_settings import KernelSettings
+from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.smoothers.outliers import (
+    graduated,
+    observed_variables,
+    solver_parameters,
+    trimmed,
+)
+from fgslam.backend.smoothers.settings import BatchSettings
 from fgslam.core.types import FloatArray
-from fgslam.settings.backend import BatchSettings, EstimatorSettings, KernelSettings
 
 CAUCHY = KernelSettings("cauchy", 3.0)
 ROBUST: dict[str, EstimatorSettings] = SMOOTHERS | {

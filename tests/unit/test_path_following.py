@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.backend.homing.settings import HomingEkfSettings, HomingGraphSettings
 from fgslam.core.errors import ConfigError, EstimatorError
 from fgslam.core.planar import between
 from fgslam.homing.avoidance import RangeScan
@@ -21,7 +22,6 @@ from fgslam.settings.homing_behaviour import (
     HomingControlSettings,
     PathFollowingSettings,
 )
-from fgslam.settings.homing_estimators import HomingEkfSettings, HomingGraphSettings
 from tests.landmark_world import DARK, drive_path, make_follower, winding_path
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from simulated import RIG, noisy_odometry_of, play
 
-from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.types import (
     EgoMotionStatus,
@@ -19,7 +20,6 @@ from fgslam.core.types import (
 )
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.settings import EgoMotionSettings
-from fgslam.settings.backend import LandmarkKalmanSettings
 
 SENSOR = RangeBearingSensor(8.0, g.BODY_FORWARD_LEFT_UP_FROM_CAMERA)
 SIGMA = np.array([0.02, 0.02, 0.03])

@@ -21,6 +21,7 @@ from rings import (
 )
 from simulated import RIG, assert_same_bits
 
+from fgslam.backend.filters.settings import LandmarkKalmanSettings, LoopCorrectionSettings
 from fgslam.core import geometry as g
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import EgoMotionStatus, FloatArray
@@ -31,7 +32,6 @@ from fgslam.frontend.places.settings import LostSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import FrameReport, SlamPipeline, _observe, replay_step
-from fgslam.settings.backend import LandmarkKalmanSettings, LoopCorrectionSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
 
 # -- the return ------------------------------------------------------------------------------

@@ -22,7 +22,10 @@ from rings import (
 from simulated import RIG, assert_same_bits
 
 from fgslam.arrival import Arrival, take_over
+from fgslam.backend.filters.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
 from fgslam.backend.protocol import Estimator
+from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.smoothers.settings import BatchSettings, Isam2Settings
 from fgslam.core import geometry as g
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.saved_map import SavedMap
@@ -31,13 +34,6 @@ from fgslam.factory import make_estimator
 from fgslam.frontend.places.loops.confirmation import difference
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.pipeline import FrameReport, SlamPipeline, replay_step
-from fgslam.settings.backend import (
-    BatchSettings,
-    EstimatorSettings,
-    Isam2Settings,
-    LandmarkKalmanGraphSettings,
-    LandmarkKalmanSettings,
-)
 
 MAPPED = ROUND // 2  # frames of the drive that makes the map
 BEGIN = 22  # of it, where the second drive begins

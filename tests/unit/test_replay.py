@@ -11,7 +11,9 @@ from loops import CLOSED, Rounds, drive_rounds
 from simulated import RIG, Drive, assert_same_bits, play, simulate
 
 from fgslam import factory
-from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.settings import DeadReckoningSettings, LandmarkKalmanSettings
+from fgslam.backend.smoothers.settings import BatchSettings
 from fgslam.core.errors import EstimatorError, MeasurementLogError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import Estimate, Trajectory, UpdateStats
@@ -19,7 +21,6 @@ from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.runs import replay as module
 from fgslam.runs.judging import Truth, judge_replay
 from fgslam.runs.replay import Replay, memory_mb, peak_memory_mb, replay, replay_motion
-from fgslam.settings.backend import BatchSettings, DeadReckoningSettings, LandmarkKalmanSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
 
 SETTINGS = LandmarkKalmanSettings(label="named")

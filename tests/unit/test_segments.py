@@ -9,11 +9,11 @@ import pytest
 from simulated import RIG, Drive, play, simulate
 from smoothing import FREE, answer, assert_finite, ate, blackout, build, drawn, moved, nees_of
 
-from fgslam.backend.segments import Segments, TrackedFrame, summarise
+from fgslam.backend.smoothers.segments import Segments, TrackedFrame, summarise
+from fgslam.backend.smoothers.settings import Isam2Settings
 from fgslam.core import geometry as g
 from fgslam.core.types import FloatArray, LandmarkMap, Observations
 from fgslam.evaluation.consistency import judge
-from fgslam.settings.backend import Isam2Settings
 
 KEYFRAMES = Isam2Settings(keyframe_every=5)
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from simulated import assert_same_bits
 
-from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.config import ExperimentConfig, make_config
 from fgslam.core import geometry as g
 from fgslam.core.errors import ConfigError
@@ -23,7 +24,6 @@ from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.localisation_config import load_experiment
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
-from fgslam.settings.backend import LandmarkKalmanSettings
 from fgslam.settings.datasets import ConstantVelocitySettings, SyntheticOdometrySettings
 from fgslam.worlds.simulated.identities import IdentityBook
 from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from simulated import assert_same_bits
 
-from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.recordings import MeasurementRecording
@@ -22,7 +23,6 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
-from fgslam.settings.backend import LandmarkKalmanSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.measurements import StereoTracksSettings
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from simulated import assert_same_bits
 
-from fgslam.backend.submaps import (
+from fgslam.backend.filters.submaps import (
     FREE,
     Chain,
     Constraint,

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.errors import DatasetError
 from fgslam.core.recordings import MeasurementRecording
@@ -20,7 +21,6 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
-from fgslam.settings.backend import LandmarkKalmanSettings
 from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.measurements import UtiasRangeBearingSettings, UtiasStereoSettings
 

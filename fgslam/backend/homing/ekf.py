@@ -16,6 +16,7 @@ from fgslam.backend.homing.ekf_model import (
     seen_from_target,
 )
 from fgslam.backend.homing.inputs import TrackedFeatures
+from fgslam.backend.homing.settings import HomingEkfSettings
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing_types import HomingEstimate, HomingStart, TrackedBearings, among
 from fgslam.core.planar import wrap
@@ -26,7 +27,6 @@ from fgslam.factors.bearing_residuals import (
     target_jacobian,
     target_pose,
 )
-from fgslam.settings.homing_estimators import HomingEkfSettings
 
 
 class HomingEkf:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.backend.homing.settings import FilterMotionSettings, HomingEkfSettings
 from fgslam.core.homing_types import HomingStart
 from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.factors.bearing_residuals import (
@@ -21,7 +22,6 @@ from fgslam.factors.bearing_residuals import (
     target_pose,
     triangulated,
 )
-from fgslam.settings.homing_estimators import FilterMotionSettings, HomingEkfSettings
 
 ROBOT, TARGET, FEATURES = slice(0, 4), slice(4, 7), slice(7, None)
 _FIRST = 7

@@ -6,14 +6,14 @@ from fgslam.backend.homing.baselines import AverageDisplacement, AverageLandmark
 from fgslam.backend.homing.ekf import HomingEkf
 from fgslam.backend.homing.graph import HomingGraph
 from fgslam.backend.homing.protocol import HomingEstimator
-from fgslam.core.homing_types import HomingStart
-from fgslam.settings.homing_estimators import (
+from fgslam.backend.homing.settings import (
     AverageLandmarkVectorSettings,
     HomingEkfSettings,
     HomingEstimatorSettings,
     HomingGraphSettings,
     SnapshotSettings,
 )
+from fgslam.core.homing_types import HomingStart
 
 
 def make_homing_estimator(start: HomingStart, settings: HomingEstimatorSettings) -> HomingEstimator:

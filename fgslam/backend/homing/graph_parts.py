@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import gtsam
 import numpy as np
 
+from fgslam.backend.homing.settings import GraphMotionSettings
 from fgslam.core.homing_types import HomingVector
 from fgslam.core.types import FloatArray
 from fgslam.factors.bearing import (
@@ -25,7 +26,6 @@ from fgslam.factors.bearing import (
     weak_landmark_prior,
 )
 from fgslam.factors.keys import height_key, landmark_key, pose_key, target_key, velocity_key
-from fgslam.settings.homing_estimators import GraphMotionSettings
 
 TARGET = -1
 

@@ -14,11 +14,11 @@ import numpy as np
 
 from fgslam.backend.homing.graph_parts import TARGET, Beginning, NewPart, Pair, Sight
 from fgslam.backend.homing.resection import resected
+from fgslam.backend.homing.settings import GraphMotionSettings, HomingGraphSettings
 from fgslam.core.homing_types import HomingStart, TrackedBearings
 from fgslam.core.planar import compose, unit, wrap
 from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.factors.bearing_residuals import bearing, bearing_jacobians, polar_points, triangulated
-from fgslam.settings.homing_estimators import GraphMotionSettings, HomingGraphSettings
 
 _COLLAPSED = 0.1  # of the first distance from the start: gates let no error of ninety percent in
 _CONFIRMED, _SAME_SIGMAS = 3, 1.0  # agreements in a row before a waiting feature enters

@@ -12,14 +12,14 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
-from fgslam.backend.graph_builder import without_gaps
+from fgslam.backend.graphs import without_gaps
 from fgslam.backend.homing.graph_parts import GtsamParts, NewPart
 from fgslam.backend.homing.schur_solver import SchurSolver
+from fgslam.backend.homing.settings import HomingGraphSettings
 from fgslam.core.errors import EstimatorError
 from fgslam.core.types import FloatArray
 from fgslam.factors.bearing import BearingFactors, tangent_to_pose
 from fgslam.factors.keys import is_pose, landmark_key, pose_key, target_key, velocity_key
-from fgslam.settings.homing_estimators import HomingGraphSettings
 
 _RELATIVE_TOLERANCE = 1e-5  # of the cost: the estimate then moves by far less than its deviation
 

@@ -7,11 +7,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from fgslam.config_reading import apply_overrides
-from fgslam.core.errors import ConfigError
-from fgslam.homing_config import HomingExperiment, parse_homing
-from fgslam.runs.choosing import Choice
-from fgslam.settings.homing_estimators import (
+from fgslam.backend.homing.settings import (
     PAPER,
     AverageLandmarkVectorSettings,
     HomingEkfSettings,
@@ -19,6 +15,10 @@ from fgslam.settings.homing_estimators import (
     HomingGraphSettings,
     SnapshotSettings,
 )
+from fgslam.config_reading import apply_overrides
+from fgslam.core.errors import ConfigError
+from fgslam.homing_config import HomingExperiment, parse_homing
+from fgslam.runs.choosing import Choice
 
 _PREFIX = "estimators."
 VARIANTS: dict[str, HomingEstimatorSettings] = {

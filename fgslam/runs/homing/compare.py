@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.backend.homing.settings import HomingEstimatorSettings
 from fgslam.core.bearing_log import BearingLog
 from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.evaluation.homing import HomingErrors, homing_errors, summarise_homings
@@ -35,7 +36,6 @@ from fgslam.runs.homing.results import (
 )
 from fgslam.runs.homing.trial_results import TRIAL_COLUMNS, summary_numbers, trial_row
 from fgslam.runs.processes import WorkerEnded, run_apart
-from fgslam.settings.homing_estimators import HomingEstimatorSettings
 
 DEFAULT_FOLDER = "compare"
 COMPARISON_FILE = "comparison.csv"

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.backend.homing.settings import HomingEstimatorSettings
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing_types import HomingEstimate, HomingStart, TrackedBearings
 from fgslam.core.types import FloatArray
-from fgslam.settings.homing_estimators import HomingEstimatorSettings
 
 
 @dataclass(frozen=True, slots=True, eq=False)

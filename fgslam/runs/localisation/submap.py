@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.core.geometry import (
     congruence,
     project,
@@ -21,7 +22,6 @@ from fgslam.core.types import CameraRig, FloatArray, Frame, Odometry, StereoFeat
 from fgslam.factory import make_pipeline
 from fgslam.frontend.stream import FeatureFrame
 from fgslam.pipeline import SlamPipeline
-from fgslam.settings.backend import LandmarkKalmanSettings
 from fgslam.settings.datasets import OdometrySettings
 from fgslam.settings.frontend import FrontendSettings
 

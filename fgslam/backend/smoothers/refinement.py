@@ -12,9 +12,9 @@ from typing import Any, TypeAlias
 
 import gtsam
 
-from fgslam.backend.graph_builder import GraphBuilder
-from fgslam.backend.graph_solution import points_of, poses_of
-from fgslam.backend.outliers import observed_variables
+from fgslam.backend.smoothers.graph_builder import GraphBuilder
+from fgslam.backend.smoothers.graph_solution import points_of, poses_of
+from fgslam.backend.smoothers.outliers import observed_variables
 from fgslam.factors.keys import is_pose, landmark_key, number
 
 _ROUNDS = 5  # solutions until no landmark lies behind a camera any more

@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from fgslam.backend.filtered import FilteredTrajectory, FirstSights, moved
+from fgslam.backend.filters.filtered import FilteredTrajectory, FirstSights, moved
 from fgslam.core.geometry import (
     adjoint,
     congruence,

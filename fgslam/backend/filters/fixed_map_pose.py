@@ -12,7 +12,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.backend.landmark_elimination import whitening
+from fgslam.backend.filters.landmark_elimination import whitening
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     congruence,

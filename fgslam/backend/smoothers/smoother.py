@@ -14,14 +14,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from fgslam.backend.graph_builder import GraphBuilder, NewFactors, Sighting
-from fgslam.backend.graph_solution import Solution, joint_of, poses_of_frame
+from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.settings import LandmarkKalmanSettings
+from fgslam.backend.filters.submaps import FREE, Constraint
 from fgslam.backend.inputs import RecordedInputs, require_finite
-from fgslam.backend.landmark_kalman import LandmarkKalman
-from fgslam.backend.loop_closing import carried_to
-from fgslam.backend.refinement import Refined
-from fgslam.backend.segments import TrackedFrame
-from fgslam.backend.submaps import FREE, Constraint
+from fgslam.backend.smoothers.graph_builder import GraphBuilder, NewFactors, Sighting
+from fgslam.backend.smoothers.graph_solution import Solution, joint_of, poses_of_frame
+from fgslam.backend.smoothers.loop_closing import carried_to
+from fgslam.backend.smoothers.refinement import Refined
+from fgslam.backend.smoothers.segments import TrackedFrame
+from fgslam.backend.smoothers.settings import GraphSettings
 from fgslam.core.errors import EstimatorError
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
@@ -53,7 +55,6 @@ from fgslam.core.types import (
     UpdateStats,
 )
 from fgslam.factors.keys import landmark_key, pose_key
-from fgslam.settings.backend import GraphSettings, LandmarkKalmanSettings
 
 _ASTRAY_PX = 12.0  # where nothing is left out: farther off, a match speaks against its landmark
 

@@ -8,18 +8,24 @@ from typing import Any, ClassVar
 import gtsam
 import numpy as np
 
-from fgslam.backend.graph_solution import Solution, allowed_parts, poses_of_frame, solution
-from fgslam.backend.loop_closing import solved
-from fgslam.backend.outliers import graduated, solver_parameters, trimmed, with_kernel
-from fgslam.backend.refinement import Refined, refine
-from fgslam.backend.segments import TrackedFrame
-from fgslam.backend.submaps import Constraint
-from fgslam.backend.whole_graph import WholeGraphSmoother
+from fgslam.backend.common_settings import KernelSettings
+from fgslam.backend.filters.submaps import Constraint
+from fgslam.backend.smoothers.graph_solution import (
+    Solution,
+    allowed_parts,
+    poses_of_frame,
+    solution,
+)
+from fgslam.backend.smoothers.loop_closing import solved
+from fgslam.backend.smoothers.outliers import graduated, solver_parameters, trimmed, with_kernel
+from fgslam.backend.smoothers.refinement import Refined, refine
+from fgslam.backend.smoothers.segments import TrackedFrame
+from fgslam.backend.smoothers.settings import BatchSettings
+from fgslam.backend.smoothers.whole_graph import WholeGraphSmoother
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import reorthonormalise
 from fgslam.core.types import Prediction, Sensor
 from fgslam.factors.keys import pose_key
-from fgslam.settings.backend import BatchSettings, KernelSettings
 
 _RELATIVE_TOLERANCE = 1e-9  # of the cost; the estimate then moves by less than a micrometre
 

@@ -16,10 +16,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from fgslam.backend.filtered import FilteredTrajectory, moved
-from fgslam.backend.landmark_rows import LandmarkRows
-from fgslam.backend.loop_correction import DriveBook
-from fgslam.backend.submaps import Chain, changes, home_changes, rotated, transported
+from fgslam.backend.filters.filtered import FilteredTrajectory, moved
+from fgslam.backend.filters.landmark_rows import LandmarkRows
+from fgslam.backend.filters.loop_correction import DriveBook
+from fgslam.backend.filters.settings import LandmarkKalmanSettings
+from fgslam.backend.filters.submaps import Chain, changes, home_changes, rotated, transported
 from fgslam.core.geometry import (
     block_diagonal,
     congruence,
@@ -50,7 +51,6 @@ from fgslam.core.types import (
     StateArrays,
     UpdateStats,
 )
-from fgslam.settings.backend import LandmarkKalmanSettings
 
 
 class LandmarkKalman:

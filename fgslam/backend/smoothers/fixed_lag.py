@@ -13,8 +13,10 @@ from typing import Any, ClassVar
 import gtsam
 import numpy as np
 
-from fgslam.backend.graph_builder import NewFactors, without_gaps
-from fgslam.backend.graph_solution import (
+from fgslam.backend.filters.submaps import Constraint, constraint_factor, nearest_positive
+from fgslam.backend.graphs import without_gaps
+from fgslam.backend.smoothers.graph_builder import NewFactors
+from fgslam.backend.smoothers.graph_solution import (
     Solution,
     allowed_joint,
     allowed_parts,
@@ -22,11 +24,11 @@ from fgslam.backend.graph_solution import (
     poses_of_frame,
     suspect,
 )
-from fgslam.backend.loop_closing import misfit
-from fgslam.backend.marginals import DenseMarginals, UndeterminedError
-from fgslam.backend.segments import TrackedFrame
-from fgslam.backend.smoother import Smoother
-from fgslam.backend.submaps import Constraint, constraint_factor, nearest_positive
+from fgslam.backend.smoothers.loop_closing import misfit
+from fgslam.backend.smoothers.marginals import DenseMarginals, UndeterminedError
+from fgslam.backend.smoothers.segments import TrackedFrame
+from fgslam.backend.smoothers.settings import FixedLagSettings
+from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core.errors import EstimatorError
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
@@ -43,7 +45,6 @@ from fgslam.core.geometry import (
 from fgslam.core.types import FloatArray, LoopClosure, Prediction, Sensor
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 from fgslam.factors.motion import pose_prior
-from fgslam.settings.backend import FixedLagSettings
 
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
 

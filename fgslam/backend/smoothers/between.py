@@ -12,8 +12,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.backend.graph_solution import Solution, allowed_parts
-from fgslam.backend.segments import TrackedFrame
+from fgslam.backend.smoothers.graph_solution import Solution, allowed_parts
+from fgslam.backend.smoothers.segments import TrackedFrame
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     adjoint,

@@ -7,18 +7,24 @@ from typing import Any, ClassVar
 import gtsam
 import numpy as np
 
-from fgslam.backend.between import fill_between
-from fgslam.backend.graph_solution import Solution, allowed_parts, poses_of_frame, solution, suspect
-from fgslam.backend.outliers import solver_parameters, trimmed
-from fgslam.backend.refinement import Refined, refine
-from fgslam.backend.segments import Segments, TrackedFrame
-from fgslam.backend.submaps import Constraint, constraint_factor
-from fgslam.backend.whole_graph import WholeGraphSmoother
+from fgslam.backend.filters.submaps import Constraint, constraint_factor
+from fgslam.backend.smoothers.between import fill_between
+from fgslam.backend.smoothers.graph_solution import (
+    Solution,
+    allowed_parts,
+    poses_of_frame,
+    solution,
+    suspect,
+)
+from fgslam.backend.smoothers.outliers import solver_parameters, trimmed
+from fgslam.backend.smoothers.refinement import Refined, refine
+from fgslam.backend.smoothers.segments import Segments, TrackedFrame
+from fgslam.backend.smoothers.settings import Isam2Settings
+from fgslam.backend.smoothers.whole_graph import WholeGraphSmoother
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise
 from fgslam.core.types import FloatArray, Observations, Prediction, Sensor
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
-from fgslam.settings.backend import Isam2Settings
 
 _RELATIVE_TOLERANCE = 1e-9  # of the cost
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong

@@ -11,8 +11,8 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from fgslam.backend.common_settings import KernelSettings, NamedSettings
 from fgslam.core.settings import STRICT
-from fgslam.settings.backend import KernelSettings, NamedSettings
 
 
 @dataclass(frozen=True, config=STRICT)

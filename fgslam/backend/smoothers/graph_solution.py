@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from fgslam.backend.marginals import marginals_of
+from fgslam.backend.smoothers.marginals import marginals_of
 from fgslam.core.errors import EstimatorError
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import congruence

@@ -14,7 +14,9 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
-from fgslam.backend.segments import TrackedFrame
+from fgslam.backend.graphs import without_gaps
+from fgslam.backend.smoothers.segments import TrackedFrame
+from fgslam.backend.smoothers.settings import GraphSettings
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     congruence,
@@ -42,7 +44,6 @@ from fgslam.factors.motion import (
 from fgslam.factors.noise import Whitening
 from fgslam.factors.range_bearing import RangeBearingFactors
 from fgslam.factors.stereo import StereoFactors
-from fgslam.settings.backend import GraphSettings
 
 _SAME_PLACE = 16.3  # 99.9 % quantile of chi-square with three degrees of freedom
 
@@ -407,15 +408,6 @@ class GraphBuilder:
         if self._remember:
             self.graph.add(factor)
         return int(self.graph.size()) - 1
-
-
-def without_gaps(graph: Any) -> Any:
-    """A nonlinear graph without its empty slots."""
-    kept = gtsam.NonlinearFactorGraph()
-    for row in range(graph.size()):
-        if graph.exists(row):
-            kept.add(graph.at(row))
-    return kept
 
 
 def _agree(places: list[tuple[FloatArray, FloatArray]]) -> bool:

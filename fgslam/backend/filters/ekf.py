@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.stats import chi2
 
-from fgslam.backend.ekf_update import (
+from fgslam.backend.filters.ekf_update import (
     Correction,
     DivergedError,
     FloorMeasurement,
@@ -21,8 +21,9 @@ from fgslam.backend.ekf_update import (
     correct,
     correct_anew,
 )
-from fgslam.backend.filtered import FilteredTrajectory, FirstSights
-from fgslam.backend.growing_covariance import BLOCK, FRONT, GrowingCovariance, rows_of
+from fgslam.backend.filters.filtered import FilteredTrajectory, FirstSights
+from fgslam.backend.filters.growing_covariance import BLOCK, FRONT, GrowingCovariance, rows_of
+from fgslam.backend.filters.settings import EkfSettings
 from fgslam.core.errors import EstimatorError
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
@@ -52,7 +53,6 @@ from fgslam.core.types import (
     StateArrays,
     UpdateStats,
 )
-from fgslam.settings.backend import EkfSettings
 
 _UNKNOWN = 100.0  # by which a pose found without a prior is less certain before its landmarks count
 _ADMITTED = 0.999  # quantile of an innovation squared beyond which the covariance is contradicted

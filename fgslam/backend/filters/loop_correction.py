@@ -12,11 +12,11 @@ import dataclasses
 
 import numpy as np
 
-from fgslam.backend.submaps import FREE, Chain, Constraint
+from fgslam.backend.filters.settings import LoopCorrectionSettings
+from fgslam.backend.filters.submaps import FREE, Chain, Constraint
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import inverse
 from fgslam.core.types import EgoMotion, FloatArray, IntArray, LoopClosure, Odometry, StateArrays
-from fgslam.settings.backend import LoopCorrectionSettings
 
 _TIED_BY = 10  # landmarks of an old place that hold a frame there
 _OLD = 5  # submaps

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
-from fgslam.backend.growing_covariance import FRONT, GrowingCovariance, rows_of
+from fgslam.backend.filters.growing_covariance import FRONT, GrowingCovariance, rows_of
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     in_front,

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from fgslam.backend.graph_solution import poses_of_frame
-from fgslam.backend.loop_closing import first_guess, misfit, solved
-from fgslam.backend.smoother import Smoother
-from fgslam.backend.submaps import Constraint, constraint_factor
+from fgslam.backend.filters.submaps import Constraint, constraint_factor
+from fgslam.backend.smoothers.graph_solution import poses_of_frame
+from fgslam.backend.smoothers.loop_closing import first_guess, misfit, solved
+from fgslam.backend.smoothers.settings import GraphSettings
+from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core.floor import Floor
 from fgslam.core.types import IntArray, LandmarkMap, LoopClosure, Prediction, Sensor, StateArrays
-from fgslam.settings.backend import GraphSettings
 
 _AGREES = float(chi2.ppf(0.99, 6))  # 16.8: a loop that the graph meets as it is
 

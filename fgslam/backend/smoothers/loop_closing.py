@@ -2,7 +2,7 @@
 
 The graph as solved before the loop and as it must be with it lie far apart. Linearised in between,
 landmarks would fly and kernels drop what is right: so poses and landmarks are first brought to
-where backward correction (:mod:`fgslam.backend.submaps`) has them, each landmark along with the
+where backward correction (:mod:`fgslam.backend.filters.submaps`) has them, each landmark along with the
 frame that saw it first. There every observation fits as before, and what is left is small.
 """
 
@@ -14,10 +14,10 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.backend.graph_builder import GraphBuilder
-from fgslam.backend.graph_solution import poses_of_frame
-from fgslam.backend.outliers import solver_parameters
-from fgslam.backend.submaps import Chain, Constraint, changes, corrected
+from fgslam.backend.filters.submaps import Chain, Constraint, changes, corrected
+from fgslam.backend.smoothers.graph_builder import GraphBuilder
+from fgslam.backend.smoothers.graph_solution import poses_of_frame
+from fgslam.backend.smoothers.outliers import solver_parameters
 from fgslam.core.geometry import adjoint, congruence, inverse, transform_to_world
 from fgslam.core.types import EgoMotion, FloatArray, IntArray, LoopClosure
 from fgslam.factors.keys import landmark_key, pose_key

@@ -16,8 +16,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.backend.graph_solution import poses_of_frame
-from fgslam.backend.outliers import solver_parameters
+from fgslam.backend.smoothers.graph_solution import poses_of_frame
+from fgslam.backend.smoothers.outliers import solver_parameters
 from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise, se3_log, skew
 from fgslam.core.types import FloatArray, IntArray, Odometry, Prediction, StateArrays
 from fgslam.factors.keys import pose_key

@@ -1,6 +1,6 @@
 """The paper's estimator expressed as factor graphs, GTSAM doing the algebra.
 
-Equal to :class:`fgslam.backend.landmark_kalman.LandmarkKalman` up to rounding: the pose is that of
+Equal to :class:`fgslam.backend.filters.landmark_kalman.LandmarkKalman` up to rounding: the pose is that of
 a graph on fixed landmarks (Se et al. 3.3), each landmark that of a graph of its own (6.4).
 Which edges of the full graph are missing, and what that costs, is derived in
 docs/derivations/landmark_filter_as_graph.md.
@@ -14,9 +14,10 @@ from typing import ClassVar
 import gtsam
 import numpy as np
 
-from fgslam.backend.fixed_map_pose import FixedMapPose
-from fgslam.backend.landmark_elimination import Eliminated, LandmarkElimination, fused
-from fgslam.backend.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.fixed_map_pose import FixedMapPose
+from fgslam.backend.filters.landmark_elimination import Eliminated, LandmarkElimination, fused
+from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import transform_to_world, triangulate
 from fgslam.core.types import (
@@ -38,7 +39,6 @@ from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.noise import Whitening
 from fgslam.factors.stereo import StereoFactors
 from fgslam.frontend.tracking.settings import EgoMotionSettings
-from fgslam.settings.backend import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
 
 _POSE, _LANDMARK = pose_key(0), landmark_key(0)
 
