@@ -16,12 +16,12 @@ from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.config_reading import Reader, kind_as_settings, read_mapping, with_default_kind
 from fgslam.core.errors import ConfigError
-from fgslam.settings.datasets import OdometrySettings, RecordedOdometrySettings
+from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
+from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
+from fgslam.datasets.settings import DatasetSettings
 from fgslam.settings.frontend import FrontendSettings
 from fgslam.settings.maps import MapSettings
-from fgslam.settings.measurements import MeasurementDatasetSettings
 from fgslam.settings.output import OutputSettings
-from fgslam.settings.recordings import DatasetSettings
 
 ComparedEstimator: TypeAlias = Annotated[EstimatorSettings, BeforeValidator(kind_as_settings)]
 

@@ -30,6 +30,13 @@ from fgslam.core.errors import ConfigError
 from fgslam.core.floor import DegreesOfFreedom, Floor
 from fgslam.core.recordings import Sequence
 from fgslam.core.types import CameraRig, MeasurementType, Prediction, Sensor
+from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
+from fgslam.datasets.odometry_settings import (
+    ConstantVelocitySettings,
+    OdometrySettings,
+    RecordedOdometrySettings,
+    SyntheticOdometrySettings,
+)
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.datasets.synthetic_odometry import SyntheticOdometry
@@ -45,14 +52,7 @@ from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
 from fgslam.pipeline import SlamPipeline
-from fgslam.settings.datasets import (
-    ConstantVelocitySettings,
-    OdometrySettings,
-    RecordedOdometrySettings,
-    SyntheticOdometrySettings,
-)
 from fgslam.settings.frontend import FrontendSettings
-from fgslam.settings.measurements import MeasurementDatasetSettings
 from fgslam.worlds.lab_settings import RenderedLabSettings
 
 

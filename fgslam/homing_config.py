@@ -22,6 +22,7 @@ from fgslam.config_reading import (
     with_default_kind,
 )
 from fgslam.core.errors import ConfigError
+from fgslam.datasets.omni.settings import OmniDatasetSettings
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
@@ -31,7 +32,6 @@ from fgslam.settings.homing_behaviour import (
     TopologicalMapSettings,
 )
 from fgslam.settings.homing_output import HomingOutputSettings
-from fgslam.settings.omni_datasets import OmniDatasetSettings
 from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
 from fgslam.worlds.house.settings import OmniHouseSettings
 

@@ -16,14 +16,14 @@ from fgslam.backend.settings import EstimatorSettings
 from fgslam.config import ExperimentConfig
 from fgslam.config_reading import Reader, apply_overrides, read_mapping, with_default_kind
 from fgslam.core.errors import ConfigError
+from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
+from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
+from fgslam.datasets.settings import DatasetSettings
 from fgslam.homing_config import HomingExperiment, make_experiment
-from fgslam.settings.datasets import OdometrySettings, RecordedOdometrySettings
 from fgslam.settings.frontend import FrontendSettings
 from fgslam.settings.localisation import KnownMapSettings, QuerySettings
 from fgslam.settings.maps import MapSettings
-from fgslam.settings.measurements import MeasurementDatasetSettings
 from fgslam.settings.output import OutputSettings
-from fgslam.settings.recordings import DatasetSettings
 
 TASK = "localisation"
 _GROUPS_OF_KINDS = ("dataset", "odometry", "estimator")

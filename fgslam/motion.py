@@ -10,7 +10,7 @@ import numpy as np
 from fgslam.core.geometry import inverse, odometry_of_camera, se3_exp, se3_log
 from fgslam.core.recordings import Sequence
 from fgslam.core.types import FloatArray, Odometry, StateArrays
-from fgslam.settings.datasets import ConstantVelocitySettings
+from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 
 
 class MotionModel(Protocol):

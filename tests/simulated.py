@@ -29,11 +29,11 @@ from fgslam.core.types import (
     Sensor,
     UpdateStats,
 )
+from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
-from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.worlds.simulated.identities import IdentityBook
 
 RIG = CameraRig(

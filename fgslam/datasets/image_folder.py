@@ -13,6 +13,7 @@ from fgslam.core.geometry import right_from_left_camera
 from fgslam.core.types import CameraRig, FloatArray, IntArray, Odometry, Trajectory
 from fgslam.datasets.calibration import level_mounting, read_calibration, read_json_object
 from fgslam.datasets.images import list_numbered_images
+from fgslam.datasets.odometry_settings import RecordedOdometrySettings
 from fgslam.datasets.recorded_odometry import (
     motions_from_poses,
     motions_from_speed,
@@ -20,11 +21,11 @@ from fgslam.datasets.recorded_odometry import (
     read_speed_log,
 )
 from fgslam.datasets.recording import OdometrySource, Recording, recording_identity
+from fgslam.datasets.recording_settings import ImageFolderSettings
 from fgslam.datasets.selection import select_frames
 from fgslam.datasets.stereo_files import StereoFiles, check_sizes, missing_notes, require_folder
 from fgslam.datasets.tables import Table, read_table, require_increasing
 from fgslam.datasets.trajectories import read_tum_table, trajectory_at_frames
-from fgslam.settings.datasets import ImageFolderSettings, RecordedOdometrySettings
 
 TRUTH_LEFT = "gt_left_cam.txt"
 TRUTH_RIGHT = "gt_right_cam.txt"

@@ -15,6 +15,7 @@ from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, right_from_le
 from fgslam.core.types import CameraRig, FloatArray, Trajectory
 from fgslam.datasets.images import list_numbered_images
 from fgslam.datasets.recording import Recording, recording_identity
+from fgslam.datasets.recording_settings import KittiSettings
 from fgslam.datasets.selection import select_frames
 from fgslam.datasets.stereo_files import (
     StereoFiles,
@@ -24,7 +25,6 @@ from fgslam.datasets.stereo_files import (
     size,
 )
 from fgslam.datasets.tables import read_lines, read_table, require_increasing
-from fgslam.settings.datasets import KittiSettings
 
 _POSE_COLUMNS = tuple(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
 

@@ -24,10 +24,10 @@ from fgslam.core.types import CameraRig, FloatArray, Image, Trajectory
 from fgslam.datasets.calibration import pixels, read_json_object
 from fgslam.datasets.images import read_grey_image
 from fgslam.datasets.recording import Recording, recording_identity
+from fgslam.datasets.recording_settings import LightFieldSettings
 from fgslam.datasets.selection import select_frames
 from fgslam.datasets.stereo_files import require_folder
 from fgslam.datasets.tables import read_lines
-from fgslam.settings.datasets import LightFieldSettings
 
 _POSITION_COLUMNS = "file, row, column, v, u"
 

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from fgslam.core.errors import OdometryError
 from fgslam.core.geometry import inverse, rotation_angle
 from fgslam.core.types import BoolArray, FloatArray, Odometry, Trajectory
+from fgslam.datasets.odometry_settings import RecordedOdometrySettings
 from fgslam.datasets.tables import Table, read_table, require_increasing
 from fgslam.datasets.trajectories import interpolate_poses, read_tum_table
-from fgslam.settings.datasets import RecordedOdometrySettings
 
 SPEED_COLUMNS = ("time", "forward speed", "yaw rate")
 _POSE_HOLD_S = 1e-3

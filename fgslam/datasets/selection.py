@@ -8,7 +8,7 @@ import numpy as np
 
 from fgslam.core.errors import DatasetError
 from fgslam.core.types import IntArray
-from fgslam.settings.datasets import RecordingSettings
+from fgslam.datasets.recording_settings import RecordingSettings
 
 
 class Selection(Protocol):

@@ -8,8 +8,8 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.geometry import inverse, se3_exp
 from fgslam.core.recordings import Sequence
 from fgslam.core.types import CameraRig, FloatArray, Frame, Odometry, Trajectory
+from fgslam.datasets.odometry_settings import SyntheticOdometrySettings
 from fgslam.datasets.trajectories import rows_at
-from fgslam.settings.datasets import SyntheticOdometrySettings
 
 _STAMP_TOLERANCE_S = 1e-6
 

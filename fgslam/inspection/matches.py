@@ -13,9 +13,9 @@ import numpy as np
 from fgslam.core.errors import FrameError
 from fgslam.core.recordings import Sequence
 from fgslam.core.types import CameraRig, Features, FloatArray, IntArray, StereoFeatures
-from fgslam.datasets.findings import Finding, Level
-from fgslam.datasets.image_checks import spread_over
-from fgslam.datasets.match_checks import (
+from fgslam.datasets.checks.findings import Finding, Level
+from fgslam.datasets.checks.images import spread_over
+from fgslam.datasets.checks.matches import (
     LEFT_RIGHT,
     TOP_RIGHT,
     Pair,

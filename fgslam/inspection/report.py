@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from typing import TypeAlias
 
-from fgslam.datasets.findings import Finding, Level
+from fgslam.datasets.checks.findings import Finding, Level
 
 Facts: TypeAlias = tuple[tuple[str, str], ...]
 """Labels and values."""

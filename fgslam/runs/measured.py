@@ -12,6 +12,7 @@ from fgslam.config import ExperimentConfig
 from fgslam.core.errors import ConfigError
 from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.types import Estimate, LandmarkMap
+from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.opening import open_measurements
 from fgslam.export.atomic import ExistingFolder, create_run_folder
 from fgslam.export.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
@@ -34,7 +35,6 @@ from fgslam.runs.outputs import write_config
 from fgslam.runs.pictures import RunFigures, draw_run
 from fgslam.runs.replay import ReplayRow
 from fgslam.runs.summary import spread
-from fgslam.settings.measurements import MeasurementDatasetSettings
 
 
 def holds_measurements(config: ExperimentConfig) -> bool:

@@ -29,12 +29,12 @@ from fgslam.core.types import (
     MeasurementType,
     Trajectory,
 )
+from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.factory import make_estimator
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import ReplayedFrame, replay_frame
-from fgslam.settings.datasets import ConstantVelocitySettings
 
 ESTIMATOR_FAULTS = (
     FgslamError,

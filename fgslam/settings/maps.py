@@ -8,8 +8,8 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT
-from fgslam.settings.datasets import OdometrySettings, RecordedOdometrySettings
-from fgslam.settings.recordings import DatasetSettings
+from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
+from fgslam.datasets.settings import DatasetSettings
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -11,11 +11,11 @@ import numpy as np
 from fgslam.config import ExperimentConfig
 from fgslam.core.recordings import Sequence
 from fgslam.core.types import BoolArray, FloatArray, IntArray
+from fgslam.datasets.recording_settings import LightFieldSettings
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.features.settings import Appearance
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.stream import FeatureFrame
-from fgslam.settings.datasets import LightFieldSettings
 from scripts.results import epi
 from scripts.results.report import Cell, Table
 from scripts.results.runs import DATA, experiment, find_features, say

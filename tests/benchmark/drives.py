@@ -24,13 +24,13 @@ from fgslam.core.types import (
     Trajectory,
     UpdateStats,
 )
+from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.opening import open_measurements
 from fgslam.factory import make_estimator
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.pipeline import replay_frame
 from fgslam.runs.replay import replay_motion
-from fgslam.settings.measurements import MeasurementDatasetSettings
 
 
 @dataclass(frozen=True)

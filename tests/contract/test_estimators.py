@@ -40,12 +40,12 @@ from fgslam.core.types import (
     Prediction,
     UpdateStats,
 )
+from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.factory import make_estimator
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
-from fgslam.settings.datasets import ConstantVelocitySettings
 
 SETTINGS: dict[str, EstimatorSettings] = {
     "odometry": DeadReckoningSettings(),

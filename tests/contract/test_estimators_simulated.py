@@ -27,6 +27,7 @@ from fgslam.backend.settings import EstimatorSettings
 from fgslam.backend.smoothers.settings import FixedLagSettings, Isam2Settings
 from fgslam.core import geometry as g
 from fgslam.core.types import FloatArray, Frame, Odometry, Prediction
+from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.factory import make_estimator, make_tracker
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.stream import FeatureFrame
@@ -34,7 +35,6 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import ConstantVelocityMotion, OdometryMotion
 from fgslam.pipeline import FrameReport, SlamPipeline, replay_step
-from fgslam.settings.datasets import ConstantVelocitySettings
 from fgslam.settings.frontend import FrontendSettings
 
 DRIVE = Drive(frames=10)

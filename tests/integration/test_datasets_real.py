@@ -10,21 +10,20 @@ import pytest
 
 from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
 from fgslam.core.types import FloatArray
-from fgslam.datasets.checks import inspect_sequence
-from fgslam.datasets.findings import Level
+from fgslam.datasets.checks.findings import Level
+from fgslam.datasets.checks.matches import check_epipolar
+from fgslam.datasets.checks.recording import inspect_sequence
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.kitti import open_kitti
 from fgslam.datasets.light_field import open_light_field
-from fgslam.datasets.match_checks import check_epipolar
+from fgslam.datasets.odometry_settings import RecordedOdometrySettings, SyntheticOdometrySettings
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.synthetic_odometry import SyntheticOdometry
-from fgslam.settings.datasets import (
+from fgslam.datasets.recording_settings import (
     ImageFolderSettings,
     KittiSettings,
     LightFieldSettings,
-    RecordedOdometrySettings,
-    SyntheticOdometrySettings,
 )
+from fgslam.datasets.synthetic_odometry import SyntheticOdometry
 
 pytestmark = pytest.mark.data
 

@@ -17,9 +17,9 @@ from fgslam.cameras.omni.straightness import upright_edges
 from fgslam.cameras.omni.unwrapping import unwrap_maps
 from fgslam.core.types import FloatArray, Image
 from fgslam.datasets.images import read_colour_image
-from fgslam.datasets.omni_opening import open_omni
-from fgslam.datasets.omni_recording import OmniRecording
-from fgslam.settings.omni_datasets import OmniPathSettings, OmniVideoSettings, PanoramasSettings
+from fgslam.datasets.omni.opening import open_omni
+from fgslam.datasets.omni.recording import OmniRecording
+from fgslam.datasets.omni.settings import OmniPathSettings, OmniVideoSettings, PanoramasSettings
 
 pytestmark = pytest.mark.data
 

@@ -11,8 +11,9 @@ from fgslam.cameras.omni.ring_calibration import find_mirror_circle
 from fgslam.cameras.omni.settings import HyperbolicMirrorSettings
 from fgslam.core.homing_types import FeatureKind, HomingVector
 from fgslam.datasets.images import read_colour_image
-from fgslam.datasets.omni_camera_files import make_camera
-from fgslam.datasets.omni_opening import open_omni
+from fgslam.datasets.omni.camera_files import make_camera
+from fgslam.datasets.omni.opening import open_omni
+from fgslam.datasets.omni.settings import OmniVideoSettings
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
@@ -20,7 +21,6 @@ from fgslam.frontend.homing.matching import match_features
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from fgslam.frontend.homing.video_tracking import ReplenishedTracker
-from fgslam.settings.omni_datasets import OmniVideoSettings
 
 pytestmark = pytest.mark.data
 

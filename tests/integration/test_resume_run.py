@@ -36,9 +36,9 @@ from fgslam.core.measurement_log import load_arrays
 from fgslam.core.types import Odometry
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.recording import Recording
+from fgslam.datasets.recording_settings import ImageFolderSettings
 from fgslam.runs.beginning import resume_command
 from fgslam.runs.checkpoint import write_arrays
-from fgslam.settings.datasets import ImageFolderSettings
 
 
 @pytest.mark.parametrize("frames", [1, 2, 7, 11])

@@ -10,9 +10,10 @@ import yaml
 
 from fgslam.config import ExperimentConfig, load_config, parse_config
 from fgslam.core.errors import ConfigError
+from fgslam.datasets.odometry_settings import ConstantVelocitySettings
+from fgslam.datasets.recording_settings import ImageFolderSettings
 from fgslam.frontend.places.settings import LoopSettings
 from fgslam.homing_config import is_homing
-from fgslam.settings.datasets import ConstantVelocitySettings, ImageFolderSettings
 from fgslam.worlds.lab_settings import RenderedLabSettings
 
 EXPERIMENTS = [

@@ -9,19 +9,16 @@ import pytest
 from dataset_builders import curve, image_folder, picture, save, write_tum
 
 from fgslam.core.types import CameraRig
-from fgslam.datasets.checks import check_calibration, check_timing, inspect_sequence
-from fgslam.datasets.findings import Finding, Level
-from fgslam.datasets.image_checks import check_images
+from fgslam.datasets.checks.findings import Finding, Level
+from fgslam.datasets.checks.images import check_images
+from fgslam.datasets.checks.matches import check_epipolar
+from fgslam.datasets.checks.motion import check_odometry, check_odometry_against_truth, check_truth
+from fgslam.datasets.checks.recording import check_calibration, check_timing, inspect_sequence
 from fgslam.datasets.image_folder import open_image_folder
-from fgslam.datasets.match_checks import check_epipolar
-from fgslam.datasets.motion_checks import check_odometry, check_odometry_against_truth, check_truth
+from fgslam.datasets.odometry_settings import RecordedOdometrySettings, SyntheticOdometrySettings
 from fgslam.datasets.recording import Recording
+from fgslam.datasets.recording_settings import ImageFolderSettings
 from fgslam.datasets.synthetic_odometry import SyntheticOdometry
-from fgslam.settings.datasets import (
-    ImageFolderSettings,
-    RecordedOdometrySettings,
-    SyntheticOdometrySettings,
-)
 
 
 def opened(root: Path, **settings: object) -> Recording:

@@ -13,6 +13,7 @@ from fgslam.core.errors import DatasetError, OdometryError
 from fgslam.core.geometry import inverse
 from fgslam.core.types import FloatArray, Odometry
 from fgslam.datasets.image_folder import open_image_folder
+from fgslam.datasets.odometry_settings import RecordedOdometrySettings
 from fgslam.datasets.recorded_odometry import (
     SpeedLog,
     motions_from_speed,
@@ -21,7 +22,7 @@ from fgslam.datasets.recorded_odometry import (
     steps_covered,
 )
 from fgslam.datasets.recording import Recording
-from fgslam.settings.datasets import ImageFolderSettings, RecordedOdometrySettings
+from fgslam.datasets.recording_settings import ImageFolderSettings
 
 DEFAULT = RecordedOdometrySettings()
 

@@ -11,11 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from fgslam.core.errors import DatasetError
 from fgslam.core.geometry import pose
-from fgslam.datasets.clock_check import check_clock
-from fgslam.datasets.findings import Finding, Level
-from fgslam.datasets.image_folder import open_image_folder
-from fgslam.datasets.layouts import kitti_drives, recognise_layout
-from fgslam.datasets.match_checks import (
+from fgslam.datasets.checks.clock import check_clock
+from fgslam.datasets.checks.findings import Finding, Level
+from fgslam.datasets.checks.matches import (
     LEFT_RIGHT,
     TOP_RIGHT,
     Pair,
@@ -27,10 +25,13 @@ from fgslam.datasets.match_checks import (
     check_stereo_counts,
     fit_turn,
 )
+from fgslam.datasets.image_folder import open_image_folder
+from fgslam.datasets.layouts import kitti_drives, recognise_layout
+from fgslam.datasets.odometry_settings import RecordedOdometrySettings
+from fgslam.datasets.recording_settings import ImageFolderSettings
 from fgslam.frontend.features.descriptor_matching import mutual_nearest
 from fgslam.inspection.recording import inspect_recording
 from fgslam.inspection.report import render_report
-from fgslam.settings.datasets import ImageFolderSettings, RecordedOdometrySettings
 
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 

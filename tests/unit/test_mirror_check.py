@@ -13,8 +13,8 @@ from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
 from fgslam.cameras.omni.radial import MirrorFrame
 from fgslam.cameras.omni.settings import EquirectangularSettings, HyperbolicMirrorSettings
 from fgslam.core.types import Image
+from fgslam.datasets.omni.settings import OmniPathSettings
 from fgslam.runs.homing.mirror_check import open_checked
-from fgslam.settings.omni_datasets import OmniPathSettings
 
 SIZE = (320, 240)
 CENTRE = (162.0, 118.0)

@@ -23,12 +23,12 @@ from fgslam.cameras.omni.settings import (
 )
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.types import Image
-from fgslam.datasets.omni_camera_files import make_camera
-from fgslam.datasets.omni_opening import open_omni
-from fgslam.datasets.omni_recording import OmniRecording, ids_of
-from fgslam.datasets.omni_video import VideoFrames
-from fgslam.datasets.panorama_reduction import PanoramaReduction
-from fgslam.settings.omni_datasets import OmniPathSettings, OmniVideoSettings, PanoramasSettings
+from fgslam.datasets.omni.camera_files import make_camera
+from fgslam.datasets.omni.opening import open_omni
+from fgslam.datasets.omni.panorama_reduction import PanoramaReduction
+from fgslam.datasets.omni.recording import OmniRecording, ids_of
+from fgslam.datasets.omni.settings import OmniPathSettings, OmniVideoSettings, PanoramasSettings
+from fgslam.datasets.omni.video import VideoFrames
 
 HEADER = "id,file,x_m,y_m,heading_deg,room\n"
 ROWS = "3,b.png,1.5,-2,270,kitchen\n12,a.png,0,0.25,-90.5,hall\n"

@@ -25,6 +25,7 @@ from fgslam.backend.filters.settings import LandmarkKalmanSettings, LoopCorrecti
 from fgslam.core import geometry as g
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import EgoMotionStatus, FloatArray
+from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.factory import make_estimator
 from fgslam.frontend.places.loops.confirmation import difference
 from fgslam.frontend.places.loops.recognition import PlaceRecognition
@@ -32,7 +33,6 @@ from fgslam.frontend.places.settings import LostSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import FrameReport, SlamPipeline, _observe, replay_step
-from fgslam.settings.datasets import ConstantVelocitySettings
 
 # -- the return ------------------------------------------------------------------------------
 

@@ -17,11 +17,11 @@ from fgslam.backend.smoothers.settings import BatchSettings
 from fgslam.core.errors import EstimatorError, MeasurementLogError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import Estimate, Trajectory, UpdateStats
+from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.runs import replay as module
 from fgslam.runs.judging import Truth, judge_replay
 from fgslam.runs.replay import Replay, memory_mb, peak_memory_mb, replay, replay_motion
-from fgslam.settings.datasets import ConstantVelocitySettings
 
 SETTINGS = LandmarkKalmanSettings(label="named")
 CONSTANT_VELOCITY: dict[str, Any] = factory.ConstantVelocityMotion(

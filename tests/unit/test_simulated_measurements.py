@@ -17,6 +17,7 @@ from fgslam.core import geometry as g
 from fgslam.core.errors import ConfigError
 from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.types import CameraRig, FloatArray, IntArray, Prediction, Trajectory
+from fgslam.datasets.odometry_settings import ConstantVelocitySettings, SyntheticOdometrySettings
 from fgslam.datasets.opening import open_measurements
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
@@ -24,7 +25,6 @@ from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.localisation_config import load_experiment
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
-from fgslam.settings.datasets import ConstantVelocitySettings, SyntheticOdometrySettings
 from fgslam.worlds.simulated.identities import IdentityBook
 from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 

@@ -17,14 +17,14 @@ from fgslam.core import geometry as g
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.types import CameraRig, FloatArray, Prediction
+from fgslam.datasets.measurements.settings import StereoTracksSettings
+from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.datasets.opening import open_measurements
 from fgslam.evaluation.trajectory import evaluate_trajectory
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
-from fgslam.settings.datasets import ConstantVelocitySettings
-from fgslam.settings.measurements import StereoTracksSettings
 
 FX, FY, CX, CY, B = 700.0, 710.0, 600.0, 180.0, 0.5
 POINTS = np.array([[1.0, 0.5, 10.0], [-2.0, -1.0, 8.0], [0.3, 0.2, 25.0], [3.0, -0.4, 14.0]])
@@ -231,7 +231,7 @@ def test_gtsam_is_found_and_not_loaded() -> None:
     script = (
         "import sys\n"
         "from fgslam.datasets.opening import open_measurements\n"
-        "from fgslam.settings.measurements import StereoTracksSettings\n"
+        "from fgslam.datasets.measurements.settings import StereoTracksSettings\n"
         "open_measurements(StereoTracksSettings(file='large'), 0)\n"
         "print('gtsam' in sys.modules)"
     )

@@ -12,9 +12,10 @@ from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
 from fgslam.core.recordings import Sequence
 from fgslam.core.types import FloatArray, Odometry
 from fgslam.datasets.image_folder import open_image_folder
+from fgslam.datasets.odometry_settings import SyntheticOdometrySettings
 from fgslam.datasets.recording import Recording
+from fgslam.datasets.recording_settings import ImageFolderSettings
 from fgslam.datasets.synthetic_odometry import SyntheticOdometry
-from fgslam.settings.datasets import ImageFolderSettings, SyntheticOdometrySettings
 
 SETTINGS = SyntheticOdometrySettings()
 FRAMES = 300

@@ -15,14 +15,14 @@ from fgslam.core import geometry as g
 from fgslam.core.errors import DatasetError
 from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.types import CameraRig, FloatArray, Prediction, RangeBearingSensor, Trajectory
+from fgslam.datasets.measurements.settings import UtiasRangeBearingSettings, UtiasStereoSettings
+from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.datasets.opening import open_measurements
 from fgslam.evaluation.trajectory import evaluate_trajectory
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.motion import ConstantVelocityMotion
 from fgslam.pipeline import replay_step
-from fgslam.settings.datasets import ConstantVelocitySettings
-from fgslam.settings.measurements import UtiasRangeBearingSettings, UtiasStereoSettings
 
 N = 12
 STEREO_FILE = "utias_starry_night_dataset3.mat"

@@ -10,9 +10,9 @@ from fgslam.cameras.omni.radial import RadialCamera
 from fgslam.cameras.omni.ring_calibration import MirrorCircle, find_mirror_circle
 from fgslam.core.errors import CalibrationError
 from fgslam.core.types import Image
-from fgslam.datasets.omni_opening import open_omni
-from fgslam.datasets.omni_recording import OmniRecording
-from fgslam.settings.omni_datasets import OmniDatasetSettings
+from fgslam.datasets.omni.opening import open_omni
+from fgslam.datasets.omni.recording import OmniRecording
+from fgslam.datasets.omni.settings import OmniDatasetSettings
 
 _PICTURES = 3  # the rim may be as dark as its holder in one of them
 _CLEARLY_OFF = 0.025
@@ -25,7 +25,7 @@ def open_checked(settings: OmniDatasetSettings) -> OmniRecording:
     """Opens a recording, with a note where its mirror lies off the stated centre.
 
     Raises:
-        DatasetError: as :func:`fgslam.datasets.omni_opening.open_omni`.
+        DatasetError: as :func:`fgslam.datasets.omni.opening.open_omni`.
     """
     recording = open_omni(settings)
     return replace(recording, notes=recording.notes + mirror_notes(recording))

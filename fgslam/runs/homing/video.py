@@ -11,7 +11,7 @@ import numpy as np
 
 from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.types import FloatArray
-from fgslam.datasets.omni_recording import OmniRecording
+from fgslam.datasets.omni.recording import OmniRecording
 from fgslam.export.atomic import ExistingFolder
 from fgslam.export.homing_report import Column, TextTable
 from fgslam.export.homing_report.curves import Line, curve_figure

@@ -9,8 +9,9 @@ from typing import Any
 from fgslam.core.errors import OutputError
 from fgslam.core.homing_types import OmniFeatures
 from fgslam.core.types import FloatArray
-from fgslam.datasets.omni_opening import open_omni
-from fgslam.datasets.omni_recording import OmniRecording
+from fgslam.datasets.omni.opening import open_omni
+from fgslam.datasets.omni.recording import OmniRecording
+from fgslam.datasets.omni.settings import OmniDatasetSettings
 from fgslam.frontend.features.column_segments import empty_segments
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
@@ -18,7 +19,6 @@ from fgslam.frontend.homing.plain_sift import plain_sift
 from fgslam.runs.homing.mirror_check import open_checked
 from fgslam.runs.homing.results import Progress, Stopped
 from fgslam.runs.processes import WorkerEnded, run_apart
-from fgslam.settings.omni_datasets import OmniDatasetSettings
 
 _VIEWS_A_BLOCK = 4
 

@@ -14,19 +14,19 @@ from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.planar import wrap
 from fgslam.core.types import FloatArray, Image, IntArray
 from fgslam.datasets.images import IMAGE_SUFFIXES, read_colour_image
-from fgslam.datasets.omni_camera_files import make_camera
-from fgslam.datasets.omni_recording import (
+from fgslam.datasets.omni.camera_files import make_camera
+from fgslam.datasets.omni.panorama_reduction import PanoramaReduction
+from fgslam.datasets.omni.recording import (
     ColourLoader,
     OmniRecording,
     ids_of,
     no_times,
     pictures_in,
 )
-from fgslam.datasets.panorama_reduction import PanoramaReduction
+from fgslam.datasets.omni.settings import PanoramasSettings
 from fgslam.datasets.recording import recording_identity
 from fgslam.datasets.selection import select_frames
 from fgslam.datasets.stereo_files import require_folder
-from fgslam.settings.omni_datasets import PanoramasSettings
 
 POSES_FILE = "poses.csv"
 _PICTURES = "panos"

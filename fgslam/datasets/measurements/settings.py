@@ -8,7 +8,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT, MeasurementSelection
-from fgslam.settings.datasets import RecordingSettings
+from fgslam.datasets.recording_settings import RecordingSettings
 from fgslam.worlds.simulated.settings import Correlation, SimulatedMeasurementsSettings
 
 # --------------------------------------------------------------------------------------------

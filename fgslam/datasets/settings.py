@@ -6,13 +6,13 @@ from typing import Annotated, TypeAlias
 
 from pydantic import Field
 
-from fgslam.settings.datasets import (
+from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
+from fgslam.datasets.recording_settings import (
     EurocSettings,
     ImageFolderSettings,
     KittiSettings,
     LightFieldSettings,
 )
-from fgslam.settings.measurements import MeasurementDatasetSettings
 from fgslam.worlds.lab_settings import RenderedLabSettings
 
 DatasetSettings: TypeAlias = Annotated[

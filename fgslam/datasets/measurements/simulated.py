@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import asdict
 
 from fgslam.core.recordings import LandmarkTruth, MeasurementRecording
-from fgslam.datasets.measurement_files import make_log
-from fgslam.settings.datasets import OdometrySettings
+from fgslam.datasets.measurements.files import make_log
+from fgslam.datasets.odometry_settings import OdometrySettings
 from fgslam.worlds.rendering.cache import content_hash
 from fgslam.worlds.simulated.measurements import SimulatedMeasurements, simulate_measurements
 from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings

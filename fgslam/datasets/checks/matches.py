@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.types import FloatArray, IntArray
-from fgslam.datasets.findings import Finding, Level, listed
-from fgslam.datasets.image_checks import CAMERA_NAMES
+from fgslam.datasets.checks.findings import Finding, Level, listed
+from fgslam.datasets.checks.images import CAMERA_NAMES
 
 _FEWEST_MATCHES = 20
 _SIGNIFICANT_DISPARITY_PX = 0.5

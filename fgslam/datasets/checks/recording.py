@@ -1,8 +1,8 @@
 """What is in a recording, and every problem found, in words: the checks behind ``inspect``.
 
 The checks look at any Sequence and raise nothing for what is wrong with it: each problem becomes a
-:class:`~fgslam.datasets.findings.Finding`. What feature matches tell is judged in
-:mod:`fgslam.datasets.match_checks`.
+:class:`~fgslam.datasets.checks.findings.Finding`. What feature matches tell is judged in
+:mod:`fgslam.datasets.checks.matches`.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import numpy as np
 
 from fgslam.core.recordings import Sequence
 from fgslam.core.types import CameraRig, FloatArray
-from fgslam.datasets.clock_check import check_clock
-from fgslam.datasets.findings import Finding, Level, by_severity
-from fgslam.datasets.image_checks import Told, check_images
-from fgslam.datasets.motion_checks import check_odometry, check_odometry_against_truth, check_truth
+from fgslam.datasets.checks.clock import check_clock
+from fgslam.datasets.checks.findings import Finding, Level, by_severity
+from fgslam.datasets.checks.images import Told, check_images
+from fgslam.datasets.checks.motion import check_odometry, check_odometry_against_truth, check_truth
 
 _GAP_FACTOR = 1.8
 

@@ -18,16 +18,16 @@ from fgslam.core import geometry as g
 from fgslam.core.errors import DatasetError
 from fgslam.core.recordings import LandmarkTruth, MeasurementRecording
 from fgslam.core.types import BoolArray, CameraRig, FloatArray, IntArray, Odometry, Trajectory
-from fgslam.datasets.matlab_files import MatlabFile, read_matlab
-from fgslam.datasets.measurement_files import (
+from fgslam.datasets.measurements.files import (
     MeasuredFrame,
     files_identity,
     make_increments,
     make_log,
 )
+from fgslam.datasets.measurements.matlab_files import MatlabFile, read_matlab
+from fgslam.datasets.measurements.settings import UtiasStereoSettings
+from fgslam.datasets.odometry_settings import OdometrySettings
 from fgslam.datasets.selection import select_of
-from fgslam.settings.datasets import OdometrySettings
-from fgslam.settings.measurements import UtiasStereoSettings
 
 # (column, row, disparity) of the right camera, from left column and row, right column and row.
 _MEASURE: FloatArray = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.5, 0.0, 0.5], [1.0, 0.0, -1.0, 0.0]])

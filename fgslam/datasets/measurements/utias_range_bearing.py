@@ -27,16 +27,16 @@ from fgslam.core.types import (
     RangeBearingSensor,
     Trajectory,
 )
-from fgslam.datasets.matlab_files import MatlabFile, read_matlab
-from fgslam.datasets.measurement_files import (
+from fgslam.datasets.measurements.files import (
     MeasuredFrame,
     files_identity,
     make_increments,
     make_log,
 )
+from fgslam.datasets.measurements.matlab_files import MatlabFile, read_matlab
+from fgslam.datasets.measurements.settings import UtiasRangeBearingSettings
+from fgslam.datasets.odometry_settings import OdometrySettings
 from fgslam.datasets.selection import select_of
-from fgslam.settings.datasets import OdometrySettings
-from fgslam.settings.measurements import UtiasRangeBearingSettings
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,7 +14,7 @@ from fgslam.cameras.omni.settings import (
     OmniCameraSettings,
 )
 from fgslam.core.settings import STRICT
-from fgslam.settings.datasets import RecordingSettings
+from fgslam.datasets.recording_settings import RecordingSettings
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -11,7 +11,7 @@ import numpy as np
 from fgslam.core.errors import FrameError
 from fgslam.core.recordings import Sequence
 from fgslam.core.types import Frame, Image, IntArray
-from fgslam.datasets.findings import Finding, Level, listed, share
+from fgslam.datasets.checks.findings import Finding, Level, listed, share
 
 Told: TypeAlias = Callable[[int, int], None]
 """Called with how much is done, and of how much."""

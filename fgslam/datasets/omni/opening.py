@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from fgslam.datasets.omni_path import open_omni_path
-from fgslam.datasets.omni_recording import OmniRecording
-from fgslam.datasets.omni_video import open_omni_video
-from fgslam.datasets.panoramas import open_panoramas
-from fgslam.settings.omni_datasets import (
+from fgslam.datasets.omni.image_path import open_omni_path
+from fgslam.datasets.omni.panoramas import open_panoramas
+from fgslam.datasets.omni.recording import OmniRecording
+from fgslam.datasets.omni.settings import (
     OmniDatasetSettings,
     OmniPathSettings,
     OmniVideoSettings,
     PanoramasSettings,
 )
+from fgslam.datasets.omni.video import open_omni_video
 
 
 def open_omni(settings: OmniDatasetSettings) -> OmniRecording:

@@ -15,7 +15,7 @@ import numpy as np
 from fgslam.core.errors import ConfigError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import FloatArray, Increment, IntArray, Observations, Odometry, Sensor
-from fgslam.settings.datasets import (
+from fgslam.datasets.odometry_settings import (
     ConstantVelocitySettings,
     OdometrySettings,
     RecordedOdometrySettings,

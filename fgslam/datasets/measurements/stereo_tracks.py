@@ -21,16 +21,16 @@ from fgslam.core.geometry import (
 from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.stereo_model import measurement_map
 from fgslam.core.types import CameraRig, FloatArray, IntArray, Trajectory
-from fgslam.datasets.measurement_files import (
+from fgslam.datasets.measurements.files import (
     MeasuredFrame,
     files_identity,
     make_increments,
     make_log,
 )
+from fgslam.datasets.measurements.settings import StereoTracksSettings
+from fgslam.datasets.odometry_settings import OdometrySettings
 from fgslam.datasets.selection import select_of
 from fgslam.datasets.tables import Table, read_table
-from fgslam.settings.datasets import OdometrySettings
-from fgslam.settings.measurements import StereoTracksSettings
 
 _INSIDE = {"00s": "00s", "00": "00", "large": "_large"}
 _PREFIX = "VO_stereo_factors"

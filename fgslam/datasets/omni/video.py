@@ -9,11 +9,11 @@ import numpy as np
 
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.types import Image
-from fgslam.datasets.omni_camera_files import make_camera
-from fgslam.datasets.omni_recording import OmniRecording
+from fgslam.datasets.omni.camera_files import make_camera
+from fgslam.datasets.omni.recording import OmniRecording
+from fgslam.datasets.omni.settings import OmniVideoSettings
 from fgslam.datasets.recording import recording_identity
 from fgslam.datasets.selection import select_frames
-from fgslam.settings.omni_datasets import OmniVideoSettings
 
 
 def open_omni_video(settings: OmniVideoSettings) -> OmniRecording:

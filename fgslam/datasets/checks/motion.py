@@ -8,7 +8,7 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.geometry import inverse, se3_log
 from fgslam.core.recordings import Sequence
 from fgslam.core.types import FloatArray, Odometry, Trajectory
-from fgslam.datasets.findings import Finding, Level, listed, share
+from fgslam.datasets.checks.findings import Finding, Level, listed, share
 from fgslam.datasets.trajectories import rows_at
 
 _STAMP_TOLERANCE_S = 1e-3

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from fgslam.datasets.images import read_colour_image
-from fgslam.datasets.omni_camera_files import make_camera
-from fgslam.datasets.omni_recording import OmniRecording, ids_of, no_times, pictures_in
+from fgslam.datasets.omni.camera_files import make_camera
+from fgslam.datasets.omni.recording import OmniRecording, ids_of, no_times, pictures_in
+from fgslam.datasets.omni.settings import OmniPathSettings
 from fgslam.datasets.recording import recording_identity
 from fgslam.datasets.selection import select_frames
-from fgslam.settings.omni_datasets import OmniPathSettings
 
 
 def open_omni_path(settings: OmniPathSettings) -> OmniRecording:
