@@ -19,9 +19,9 @@ from fgslam.core.errors import ConfigError
 from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.datasets.settings import DatasetSettings
-from fgslam.settings.frontend import FrontendSettings
-from fgslam.settings.maps import MapSettings
 from fgslam.settings.output import OutputSettings
+from fgslam.slam.frontend_settings import FrontendSettings
+from fgslam.slam.map_settings import MapSettings
 
 ComparedEstimator: TypeAlias = Annotated[EstimatorSettings, BeforeValidator(kind_as_settings)]
 

@@ -20,10 +20,10 @@ from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.datasets.settings import DatasetSettings
 from fgslam.homing_config import HomingExperiment, make_experiment
-from fgslam.settings.frontend import FrontendSettings
 from fgslam.settings.localisation import KnownMapSettings, QuerySettings
-from fgslam.settings.maps import MapSettings
 from fgslam.settings.output import OutputSettings
+from fgslam.slam.frontend_settings import FrontendSettings
+from fgslam.slam.map_settings import MapSettings
 
 TASK = "localisation"
 _GROUPS_OF_KINDS = ("dataset", "odometry", "estimator")

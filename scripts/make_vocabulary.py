@@ -13,9 +13,9 @@ import numpy as np
 
 from fgslam.config import load_config
 from fgslam.core.types import FloatArray
-from fgslam.factory import open_sequence
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.features.vocabulary import VOCABULARY_FILE
+from fgslam.slam.factory import open_sequence
 
 _WORDS = 256
 _ROUNDS = 25

@@ -8,20 +8,20 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from simulated import RIG, FeatureWorld, assert_same_bits
 
-from fgslam.arrival import Arrival, take_over
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core import geometry as g
 from fgslam.core.types import Features, FloatArray, Frame, Increment, Odometry
-from fgslam.factory import make_estimator, make_places, make_tracker
 from fgslam.frontend.places.loops.confirmation import difference
 from fgslam.frontend.places.settings import LoopSettings, LostSettings
 from fgslam.frontend.stereo.matching import StereoMatcher
-from fgslam.frontend.stream import FeatureFrame
 from fgslam.frontend.tracking.settings import EgoMotionSettings
-from fgslam.motion import OdometryMotion
-from fgslam.pipeline import FrameReport, SlamPipeline
-from fgslam.settings.frontend import FrontendSettings
+from fgslam.slam.arrival import Arrival, take_over
+from fgslam.slam.factory import make_estimator, make_places, make_tracker
+from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.frontend_settings import FrontendSettings
+from fgslam.slam.motion import OdometryMotion
+from fgslam.slam.pipeline import FrameReport, SlamPipeline
 
 IMAGES = (np.zeros((240, 320), np.uint8),) * 3
 RADIUS = 3.0

@@ -32,8 +32,8 @@ from fgslam.core.types import (
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.settings import EgoMotionSettings
-from fgslam.motion import ConstantVelocityMotion
-from fgslam.pipeline import replay_step
+from fgslam.slam.motion import ConstantVelocityMotion
+from fgslam.slam.pipeline import replay_step
 from fgslam.worlds.simulated.identities import IdentityBook
 
 RIG = CameraRig(

@@ -14,8 +14,8 @@ from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, I
 from fgslam.core import geometry as g
 from fgslam.core.types import BoolArray, Estimate, FloatArray, Increment, Prediction, UpdateStats
 from fgslam.evaluation.consistency import Nees, landmark_nees, pose_nees
-from fgslam.factory import make_estimator
 from fgslam.frontend.tracking.settings import EgoMotionSettings
+from fgslam.slam.factory import make_estimator
 
 FREE = EgoMotionSettings(dof=6)
 """The front-end's least squares without a floor: the simulated drives leave it."""

@@ -32,7 +32,7 @@ from fgslam.frontend.features.descriptor_matching import mutual_nearest
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.stereo.settings import StereoSettings
-from fgslam.settings.frontend import FrontendSettings
+from fgslam.slam.frontend_settings import FrontendSettings
 
 _FEWEST_FOR_MEDIAN = 10
 _NEAR_LINE_PX = 2.0

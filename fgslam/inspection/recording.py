@@ -11,9 +11,9 @@ from fgslam.datasets.checks.recording import inspect_sequence
 from fgslam.datasets.layouts import kitti_drives, recognise_layout
 from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.recording_settings import KittiSettings
-from fgslam.factory import open_sequence
 from fgslam.inspection.matches import judge_matches, look_at_frames, match_facts
 from fgslam.inspection.report import Facts, render_report
+from fgslam.slam.factory import open_sequence
 from fgslam.worlds.lab_settings import RenderedLabSettings
 
 Progress = Callable[[str, int, int], None]

@@ -11,8 +11,8 @@ from fgslam.core.atomic_files import write_bytes
 from fgslam.core.errors import OutputError
 from fgslam.core.measurement_log import MeasurementLog, load_arrays
 from fgslam.core.types import StateArrays
-from fgslam.pipeline import SlamPipeline
 from fgslam.runs.recorder import RunRecorder
+from fgslam.slam.pipeline import SlamPipeline
 
 STATE_FILE = "checkpoint.npz"
 LOG_FILE = "measurements.npz"

@@ -23,7 +23,7 @@ from fgslam.runs.estimator_files import write_replay
 from fgslam.runs.judging import Truth, judge_replay, seen_often
 from fgslam.runs.map_entry import arrival_of
 from fgslam.runs.processes import WorkerEnded, run_apart
-from fgslam.runs.replay import replay
+from fgslam.slam.replay import replay
 
 COMPARISON_FILE = "comparison.csv"
 GROUND_TRUTH_FILE = "ground_truth.tum"

@@ -17,7 +17,7 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import Estimate, IntArray, LandmarkMap, Trajectory
 from fgslam.export.point_cloud import MapPoints, write_ply
 from fgslam.export.trajectories import write_covariances, write_tum
-from fgslam.runs.replay import Replay, ReplayRow
+from fgslam.slam.replay import Replay, ReplayRow
 
 FRAMES_FILE = "frames.csv"
 _VALUE: dict[str, Callable[[str], Any]] = typing.get_type_hints(ReplayRow)

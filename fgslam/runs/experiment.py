@@ -19,9 +19,6 @@ from fgslam.core.types import StereoFeatures
 from fgslam.export.atomic import ExistingFolder
 from fgslam.export.comparison_table import write_comparison_csv
 from fgslam.export.metrics import EstimatorMetrics
-from fgslam.factory import make_stream
-from fgslam.frontend.stream import FeatureFrame
-from fgslam.pipeline import FrameReport
 from fgslam.runs import checkpoint, map_entry, mapping
 from fgslam.runs.beginning import BegunRun, OpenedRun, Progress, begin, open_run
 from fgslam.runs.choosing import compared_with
@@ -30,6 +27,9 @@ from fgslam.runs.outputs import RunOutputs
 from fgslam.runs.pictures import draw_frame, draw_run, figures_of, frames_to_show
 from fgslam.runs.rendered_truth import TrueDepth
 from fgslam.runs.report import report_from_folder
+from fgslam.slam.factory import make_stream
+from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.pipeline import FrameReport
 
 _SAVING_SHARE = 10.0  # the loop runs at least this many times as long as it saves
 _PRECISION_EVERY = 10  # frames between checks of stereo matches against rendered depth

@@ -22,7 +22,7 @@ from fgslam.evaluation.trajectory import (
     to_estimate_world,
 )
 from fgslam.export.metrics import EstimatorMetrics, JsonValue, UpdateTime
-from fgslam.runs.replay import Replay
+from fgslam.slam.replay import Replay
 
 LEAST_SIGHTINGS = 3
 """Landmarks are judged that were seen so often: `valid` of Se et al. (6.1), for all estimators."""

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.arrival import Arrival
 from fgslam.config import ExperimentConfig, load_config
 from fgslam.core.errors import ConfigError, MapError
 from fgslam.core.map_types import LandmarkAppearances, Relocalisation
@@ -18,8 +17,9 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap, load_map, require_rig
 from fgslam.core.types import FloatArray, LandmarkMap, Prediction
 from fgslam.export.atomic import RUN_MARKER, is_run_folder
-from fgslam.factory import make_relocaliser, make_stereo_matcher, make_stream
-from fgslam.settings.maps import MapSettings, MapStartSettings
+from fgslam.slam.arrival import Arrival
+from fgslam.slam.factory import make_relocaliser, make_stereo_matcher, make_stream
+from fgslam.slam.map_settings import MapSettings, MapStartSettings
 
 FIRST_FOLDER = "first"
 MAP_FILE = "map.fgmap"

@@ -16,12 +16,12 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap, require_rig, save_map
 from fgslam.core.types import Estimate, StateArrays
-from fgslam.pipeline import SlamPipeline
 from fgslam.runs import checkpoint
 from fgslam.runs.map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, entry_of
 from fgslam.runs.outputs import RunOutputs
 from fgslam.runs.recorder import RunRecorder
-from fgslam.settings.maps import MapSettings
+from fgslam.slam.map_settings import MapSettings
+from fgslam.slam.pipeline import SlamPipeline
 
 _LOG = "log/"
 _TIMES = "recorder/stage_ms"

@@ -33,8 +33,8 @@ from fgslam.runs.comparison import (
 from fgslam.runs.estimator_files import FRAMES_FILE, read_frames
 from fgslam.runs.outputs import write_config
 from fgslam.runs.pictures import RunFigures, draw_run
-from fgslam.runs.replay import ReplayRow
 from fgslam.runs.summary import spread
+from fgslam.slam.replay import ReplayRow
 
 
 def holds_measurements(config: ExperimentConfig) -> bool:

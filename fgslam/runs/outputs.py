@@ -33,7 +33,6 @@ from fgslam.export.trajectories import write_tum
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.homing_config import HomingExperiment
 from fgslam.localisation_config import LocalisationConfig
-from fgslam.pipeline import SlamPipeline
 from fgslam.runs.checkpoint import save_log
 from fgslam.runs.comparison import GROUND_TRUTH_FILE, load_truth, remark_of
 from fgslam.runs.estimator_files import write_estimate
@@ -42,6 +41,7 @@ from fgslam.runs.places import closures_of, place_numbers, write_closures
 from fgslam.runs.recorder import STAGES, RunRecorder
 from fgslam.runs.rendered_truth import rendered_landmark_truth
 from fgslam.runs.summary import estimator_metrics, run_numbers
+from fgslam.slam.pipeline import SlamPipeline
 
 _VERSIONS_OF = ("numpy", "scipy", "opencv-python-headless", "gtsam", "open3d")
 

@@ -21,8 +21,8 @@ from fgslam.export.pictures import (
     draw_matches,
 )
 from fgslam.export.pictures.birds_eye import world_position_covariances
-from fgslam.pipeline import FrameReport
 from fgslam.runs.outputs import RunOutputs
+from fgslam.slam.pipeline import FrameReport
 
 FOLDER = "pictures"
 _SYNTHETIC = ", synthetic odometry"

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import FloatArray, StateArrays
-from fgslam.pipeline import FrameReport
+from fgslam.slam.pipeline import FrameReport
 
 STAGES = ("load", "sift", "wait", "predict", "stereo", "track", "places", "update")
 """Per frame: `load` and `sift` run in threads beside the loop, `wait` is what they held it up."""

@@ -18,7 +18,7 @@ from fgslam.core.types import (
 from fgslam.export.metrics import EstimatorMetrics, JsonValue, UpdateTime
 from fgslam.runs.judging import Answer, Truth, judge_answer
 from fgslam.runs.recorder import STAGES, RunRecorder
-from fgslam.runs.replay import peak_memory_mb
+from fgslam.slam.replay import peak_memory_mb
 
 _ESTIMATOR_STAGES = ("predict", "update")
 _LOOP_STAGES = ("predict", "stereo", "track", "places", "update")

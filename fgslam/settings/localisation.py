@@ -8,7 +8,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT
-from fgslam.settings.maps import FirstDriveSettings
+from fgslam.slam.map_settings import FirstDriveSettings
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -15,7 +15,7 @@ from fgslam.datasets.recording_settings import LightFieldSettings
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.features.settings import Appearance
 from fgslam.frontend.stereo.matching import StereoMatcher
-from fgslam.frontend.stream import FeatureFrame
+from fgslam.slam.feature_stream import FeatureFrame
 from scripts.results import epi
 from scripts.results.report import Cell, Table
 from scripts.results.runs import DATA, experiment, find_features, say

@@ -12,7 +12,7 @@ from fgslam.core.saved_map import SavedMap
 from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.frontend.tracking.permanence import reliable, seen_past
 from fgslam.frontend.tracking.settings import PermanenceSettings
-from fgslam.pipeline import FrameReport, SlamPipeline
+from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from scripts.results.person import position_errors
 from scripts.results.report import Cell, Table
 from scripts.results.runs import (

@@ -9,12 +9,12 @@ import numpy as np
 from fgslam.config import ExperimentConfig
 from fgslam.core.types import EgoMotion, FloatArray, Trajectory
 from fgslam.evaluation.trajectory import end_pose
-from fgslam.factory import make_pipeline
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.stereo.settings import StereoSettings
-from fgslam.frontend.stream import FeatureFrame
-from fgslam.pipeline import FrameReport
+from fgslam.slam.factory import make_pipeline
+from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.pipeline import FrameReport
 from scripts.results.report import Cell, Table
 from scripts.results.runs import experiment, say
 from scripts.results.views import LabViews, View, ViewPair, make_pair

@@ -11,7 +11,7 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.evaluation.trajectory import to_estimate_world
-from fgslam.pipeline import FrameReport, SlamPipeline
+from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.worlds.lab_settings import RenderedLabSettings
 from scripts.results.report import Cell, Table
 from scripts.results.runs import (

@@ -12,8 +12,8 @@ from fgslam.core.geometry import inverse
 from fgslam.core.map_types import LandmarkAppearances
 from fgslam.core.types import BoolArray, FloatArray, LandmarkMap, StereoFeatures
 from fgslam.evaluation.trajectory import rotation_angles
-from fgslam.factory import make_relocaliser, make_stereo_matcher
 from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
+from fgslam.slam.factory import make_relocaliser, make_stereo_matcher
 from scripts.results.report import Cell, Table
 from scripts.results.runs import DATA, experiment, find_features, say
 

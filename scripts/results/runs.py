@@ -13,10 +13,10 @@ from typing import Any
 from fgslam.config import ExperimentConfig, load_config
 from fgslam.core.recordings import Sequence
 from fgslam.evaluation.trajectory import Alignment, TrajectoryError, evaluate_trajectory
-from fgslam.factory import make_pipeline, make_stream, open_sequence
-from fgslam.frontend.stream import FeatureFrame
-from fgslam.pipeline import FrameReport, SlamPipeline
 from fgslam.runs.experiment import RunResult, run_experiment
+from fgslam.slam.factory import make_pipeline, make_stream, open_sequence
+from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.pipeline import FrameReport, SlamPipeline
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 DATA = Path(__file__).parents[3] / "shared" / "data"

@@ -34,10 +34,10 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import Sequence
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import CameraRig, FloatArray, Frame, Odometry, Trajectory
-from fgslam.factory import make_pipeline, make_stream, open_sequence
-from fgslam.frontend.stream import FeatureFrame
-from fgslam.pipeline import SlamPipeline
 from fgslam.runs.recorder import RunRecorder
+from fgslam.slam.factory import make_pipeline, make_stream, open_sequence
+from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.pipeline import SlamPipeline
 from tests.benchmark import estimators, homing, long_drive, maps, relocalising
 from tests.benchmark.drives import open_drive
 

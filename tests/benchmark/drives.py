@@ -26,11 +26,11 @@ from fgslam.core.types import (
 )
 from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.opening import open_measurements
-from fgslam.factory import make_estimator
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
-from fgslam.pipeline import replay_frame
-from fgslam.runs.replay import replay_motion
+from fgslam.slam.factory import make_estimator
+from fgslam.slam.pipeline import replay_frame
+from fgslam.slam.replay import replay_motion
 
 
 @dataclass(frozen=True)

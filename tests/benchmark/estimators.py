@@ -22,10 +22,10 @@ from fgslam.backend.smoothers.outliers import solver_parameters
 from fgslam.backend.smoothers.settings import BatchSettings, Isam2Settings
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import FloatArray, LandmarkMap
-from fgslam.factory import make_estimator
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.pipeline import replay_frame
-from fgslam.runs.replay import replay_motion
+from fgslam.slam.factory import make_estimator
+from fgslam.slam.pipeline import replay_frame
+from fgslam.slam.replay import replay_motion
 from tests.benchmark.drives import (
     MeasuredDrive,
     Played,

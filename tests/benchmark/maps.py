@@ -26,7 +26,6 @@ from fgslam.core.types import (
     StereoFeatures,
     Trajectory,
 )
-from fgslam.factory import make_tracker
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.settings import (
     DatabaseSettings,
@@ -34,7 +33,8 @@ from fgslam.frontend.tracking.settings import (
     ViewpointSettings,
 )
 from fgslam.frontend.tracking.tracker import LandmarkTracker
-from fgslam.settings.frontend import FrontendSettings
+from fgslam.slam.factory import make_tracker
+from fgslam.slam.frontend_settings import FrontendSettings
 
 SIZES = (1_000, 10_000, 100_000)
 FRAMES = 30

@@ -33,19 +33,19 @@ from fgslam.core.types import (
     StereoFeatures,
     Trajectory,
 )
-from fgslam.factory import (
+from fgslam.frontend.features.sift import SiftExtractor
+from fgslam.frontend.places.loops.recognition import PlaceRecognition
+from fgslam.frontend.places.settings import LostSettings
+from fgslam.frontend.tracking.tracker import LandmarkTracker
+from fgslam.slam.factory import (
     make_pipeline,
     make_places,
     make_stereo_matcher,
     make_tracker,
     open_sequence,
 )
-from fgslam.frontend.features.sift import SiftExtractor
-from fgslam.frontend.places.loops.recognition import PlaceRecognition
-from fgslam.frontend.places.settings import LostSettings
-from fgslam.frontend.stream import FeatureFrame
-from fgslam.frontend.tracking.tracker import LandmarkTracker
-from fgslam.settings.frontend import FrontendSettings
+from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.frontend_settings import FrontendSettings
 
 SIZES = (1_000, 3_000, 10_000, 30_000, 100_000)
 FRAMES, EVERY = 120, 8

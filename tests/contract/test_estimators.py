@@ -41,11 +41,11 @@ from fgslam.core.types import (
     UpdateStats,
 )
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
-from fgslam.factory import make_estimator
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
-from fgslam.motion import ConstantVelocityMotion
-from fgslam.pipeline import replay_step
+from fgslam.slam.factory import make_estimator
+from fgslam.slam.motion import ConstantVelocityMotion
+from fgslam.slam.pipeline import replay_step
 
 SETTINGS: dict[str, EstimatorSettings] = {
     "odometry": DeadReckoningSettings(),

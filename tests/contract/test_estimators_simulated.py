@@ -28,14 +28,14 @@ from fgslam.backend.smoothers.settings import FixedLagSettings, Isam2Settings
 from fgslam.core import geometry as g
 from fgslam.core.types import FloatArray, Frame, Odometry, Prediction
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
-from fgslam.factory import make_estimator, make_tracker
 from fgslam.frontend.stereo.matching import StereoMatcher
-from fgslam.frontend.stream import FeatureFrame
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
-from fgslam.motion import ConstantVelocityMotion, OdometryMotion
-from fgslam.pipeline import FrameReport, SlamPipeline, replay_step
-from fgslam.settings.frontend import FrontendSettings
+from fgslam.slam.factory import make_estimator, make_tracker
+from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.frontend_settings import FrontendSettings
+from fgslam.slam.motion import ConstantVelocityMotion, OdometryMotion
+from fgslam.slam.pipeline import FrameReport, SlamPipeline, replay_step
 
 DRIVE = Drive(frames=10)
 SIXDOF = EgoMotionSettings(dof=6)

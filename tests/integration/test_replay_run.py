@@ -10,13 +10,13 @@ import pytest
 from recordings import experiment
 from running import KIND, run_values
 
-from fgslam import factory
 from fgslam.config import ExperimentConfig, parse_config
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import Estimate
 from fgslam.export.trajectories import write_tum
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.pipeline import replay_step
+from fgslam.slam import factory
+from fgslam.slam.pipeline import replay_step
 
 
 def replay(config: ExperimentConfig, log: MeasurementLog) -> Estimate:

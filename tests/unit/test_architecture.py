@@ -91,7 +91,7 @@ LAYER_CASES = {
     "backend imports factors only": ("backend/a.py", "from fgslam.frontend import sift\n", 1),
     "the root imports nothing": ("__init__.py", "from fgslam.core.types import Frame\n", 1),
     "nothing imports cli": ("pipeline.py", "from fgslam.cli import main\n", 1),
-    "stages do not import the pipeline": ("backend/b.py", "import fgslam.pipeline\n", 1),
+    "stages do not import the pipeline": ("backend/b.py", "import fgslam.slam.pipeline\n", 1),
 }
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.arrival import Arrival, require_map_user, take_over
 from fgslam.backend.filters.ekf_update import FRONT, FloorMeasurement, Matches, correct
 from fgslam.backend.filters.growing_covariance import GrowingCovariance, rows_of
 from fgslam.backend.filters.settings import (
@@ -32,7 +31,8 @@ from fgslam.core.types import (
     Prediction,
     Trajectory,
 )
-from fgslam.factory import make_estimator
+from fgslam.slam.arrival import Arrival, require_map_user, take_over
+from fgslam.slam.factory import make_estimator
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 WTC = g.se3_exp(np.array([0.02, 0.3, -0.01, 0.4, 0.02, -0.2]))

@@ -13,7 +13,7 @@ from simulated import RIG, assert_same_bits
 from fgslam.core import geometry as g
 from fgslam.core.types import CameraRig, FloatArray, Odometry
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
-from fgslam.motion import ConstantVelocityMotion, OdometryMotion
+from fgslam.slam.motion import ConstantVelocityMotion, OdometryMotion
 
 SETTINGS = ConstantVelocitySettings()
 TWIST = np.array([0.05, -0.3, 0.1, 0.4, -0.1, 1.2])  # rad/s and m/s in the camera's frame

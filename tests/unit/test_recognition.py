@@ -26,13 +26,13 @@ from fgslam.core import geometry as g
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import EgoMotionStatus, FloatArray
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
-from fgslam.factory import make_estimator
 from fgslam.frontend.places.loops.confirmation import difference
 from fgslam.frontend.places.loops.recognition import PlaceRecognition
 from fgslam.frontend.places.settings import LostSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.motion import ConstantVelocityMotion
-from fgslam.pipeline import FrameReport, SlamPipeline, _observe, replay_step
+from fgslam.slam.factory import make_estimator
+from fgslam.slam.motion import ConstantVelocityMotion
+from fgslam.slam.pipeline import FrameReport, SlamPipeline, _observe, replay_step
 
 # -- the return ------------------------------------------------------------------------------
 

@@ -21,7 +21,6 @@ from rings import (
 )
 from simulated import RIG, assert_same_bits
 
-from fgslam.arrival import Arrival, take_over
 from fgslam.backend.filters.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
@@ -30,10 +29,11 @@ from fgslam.core import geometry as g
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.types import EgoMotionStatus, Prediction
-from fgslam.factory import make_estimator
 from fgslam.frontend.places.loops.confirmation import difference
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.pipeline import FrameReport, SlamPipeline, replay_step
+from fgslam.slam.arrival import Arrival, take_over
+from fgslam.slam.factory import make_estimator
+from fgslam.slam.pipeline import FrameReport, SlamPipeline, replay_step
 
 MAPPED = ROUND // 2  # frames of the drive that makes the map
 BEGIN = 22  # of it, where the second drive begins

@@ -24,12 +24,12 @@ from fgslam.core.types import (
     Trajectory,
     UpdateStats,
 )
-from fgslam.frontend.stream import FeatureFrame
-from fgslam.pipeline import FrameReport
 from fgslam.runs.checkpoint import write_arrays
 from fgslam.runs.judging import Truth
 from fgslam.runs.recorder import STAGES, FrameRow, RunRecorder
 from fgslam.runs.summary import estimator_metrics, frame_problems, run_numbers
+from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.pipeline import FrameReport
 
 RIG = CameraRig(32, 24, 30.0, 30.0, 15.5, 11.5, 0.1, None, np.eye(4))
 NO_IDS = np.empty(0, np.int64)

@@ -10,7 +10,6 @@ import pytest
 from loops import CLOSED, Rounds, drive_rounds
 from simulated import RIG, Drive, assert_same_bits, play, simulate
 
-from fgslam import factory
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.settings import DeadReckoningSettings, LandmarkKalmanSettings
 from fgslam.backend.smoothers.settings import BatchSettings
@@ -19,9 +18,10 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import Estimate, Trajectory, UpdateStats
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.frontend.tracking.settings import EgoMotionSettings
-from fgslam.runs import replay as module
 from fgslam.runs.judging import Truth, judge_replay
-from fgslam.runs.replay import Replay, memory_mb, peak_memory_mb, replay, replay_motion
+from fgslam.slam import factory
+from fgslam.slam import replay as module
+from fgslam.slam.replay import Replay, memory_mb, peak_memory_mb, replay, replay_motion
 
 SETTINGS = LandmarkKalmanSettings(label="named")
 CONSTANT_VELOCITY: dict[str, Any] = factory.ConstantVelocityMotion(

@@ -23,8 +23,8 @@ from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.localisation_config import load_experiment
-from fgslam.motion import ConstantVelocityMotion
-from fgslam.pipeline import replay_step
+from fgslam.slam.motion import ConstantVelocityMotion
+from fgslam.slam.pipeline import replay_step
 from fgslam.worlds.simulated.identities import IdentityBook
 from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 

@@ -11,7 +11,6 @@ from simulated import RIG, FeatureWorld, assert_same_bits, points_in_view
 
 from fgslam.core import geometry as g
 from fgslam.core.types import EgoMotionStatus, FloatArray, IntArray, LandmarkMap, Prediction
-from fgslam.factory import make_tracker
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.stereo.settings import StereoSettings
@@ -21,7 +20,8 @@ from fgslam.frontend.tracking.settings import (
     MapMatchingSettings,
 )
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
-from fgslam.settings.frontend import FrontendSettings
+from fgslam.slam.factory import make_tracker
+from fgslam.slam.frontend_settings import FrontendSettings
 
 COUNT = 60
 IMAGE = np.tile(np.arange(240, dtype=np.uint8)[:, None], (1, 320))  # grey value is the row

@@ -11,7 +11,6 @@ from test_tracker import CERTAIN, IMAGE, SETTINGS
 
 from fgslam.core import geometry as g
 from fgslam.core.types import BoolArray, FloatArray, IntArray, LandmarkMap, Prediction
-from fgslam.factory import make_tracker
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.settings import (
@@ -20,7 +19,8 @@ from fgslam.frontend.tracking.settings import (
     ViewpointSettings,
 )
 from fgslam.frontend.tracking.tracker import Association
-from fgslam.settings.frontend import FrontendSettings
+from fgslam.slam.factory import make_tracker
+from fgslam.slam.frontend_settings import FrontendSettings
 
 DISTANCE = 3.0  # metres, from the camera to the middle of the things
 HERE = 0.0

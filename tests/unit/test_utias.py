@@ -21,8 +21,8 @@ from fgslam.datasets.opening import open_measurements
 from fgslam.evaluation.trajectory import evaluate_trajectory
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
-from fgslam.motion import ConstantVelocityMotion
-from fgslam.pipeline import replay_step
+from fgslam.slam.motion import ConstantVelocityMotion
+from fgslam.slam.pipeline import replay_step
 
 N = 12
 STEREO_FILE = "utias_starry_night_dataset3.mat"

@@ -16,15 +16,15 @@ from fgslam.core.map_types import Relocalisation
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import require_rig
 from fgslam.core.types import FloatArray, LandmarkMap
-from fgslam.factory import make_relocaliser, make_stereo_matcher, make_stream
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 from fgslam.frontend.stereo.matching import StereoMatcher
-from fgslam.frontend.stream import FeatureFrame
 from fgslam.localisation_config import LocalisationConfig
 from fgslam.runs.localisation.sights import Sighted, TrueSights
 from fgslam.runs.localisation.submap import Window, submap_features
 from fgslam.runs.localisation.truth import TruthInMap, truth_in_map
 from fgslam.runs.map_entry import GivenMap, trusted
+from fgslam.slam.factory import make_relocaliser, make_stereo_matcher, make_stream
+from fgslam.slam.feature_stream import FeatureFrame
 
 Progress = Callable[[str, int, int], None]
 """Called with what is under way, how much is done, and of how much."""

@@ -11,7 +11,7 @@ from fgslam.core.saved_map import SavedMap
 from fgslam.core.types import FloatArray, LandmarkMap
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.runs.rendered_truth import TrueDepth
-from fgslam.settings.frontend import FrontendSettings
+from fgslam.slam.frontend_settings import FrontendSettings
 
 _BEHIND = 1.05  # times the rendered depth, plus the next: what is farther off is hidden
 _BEHIND_M = 0.05

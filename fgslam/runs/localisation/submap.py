@@ -20,10 +20,10 @@ from fgslam.core.map_types import LandmarkAppearances
 from fgslam.core.recordings import Sequence
 from fgslam.core.types import CameraRig, FloatArray, Frame, Odometry, StereoFeatures, Trajectory
 from fgslam.datasets.odometry_settings import OdometrySettings
-from fgslam.factory import make_pipeline
-from fgslam.frontend.stream import FeatureFrame
-from fgslam.pipeline import SlamPipeline
-from fgslam.settings.frontend import FrontendSettings
+from fgslam.slam.factory import make_pipeline
+from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.frontend_settings import FrontendSettings
+from fgslam.slam.pipeline import SlamPipeline
 
 _NEAREST_M = 0.1  # of the last camera's plane: nearer ones have no size in its image
 

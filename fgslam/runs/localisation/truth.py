@@ -16,7 +16,7 @@ from fgslam.core.saved_map import SavedMap
 from fgslam.core.types import FloatArray
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.evaluation.trajectory import align, associate
-from fgslam.factory import open_sequence
+from fgslam.slam.factory import open_sequence
 from fgslam.worlds.lab_settings import RenderedLabSettings
 from fgslam.worlds.places import PlaceChoice, plan_in_place
 from fgslam.worlds.world import make_rig

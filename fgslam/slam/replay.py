@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.arrival import Arrival, take_over
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.errors import ConfigError, FgslamError, MeasurementLogError
@@ -30,11 +29,12 @@ from fgslam.core.types import (
     Trajectory,
 )
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
-from fgslam.factory import make_estimator
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
-from fgslam.motion import ConstantVelocityMotion
-from fgslam.pipeline import ReplayedFrame, replay_frame
+from fgslam.slam.arrival import Arrival, take_over
+from fgslam.slam.factory import make_estimator
+from fgslam.slam.motion import ConstantVelocityMotion
+from fgslam.slam.pipeline import ReplayedFrame, replay_frame
 
 ESTIMATOR_FAULTS = (
     FgslamError,

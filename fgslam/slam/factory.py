@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fgslam.arrival import Arrival, take_over
 from fgslam.backend.common_settings import FloorSettings
 from fgslam.backend.filters.dead_reckoning import DeadReckoning
 from fgslam.backend.filters.ekf import FullEkf
@@ -44,15 +43,16 @@ from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.places.loops.recognition import PlaceRecognition, RecognitionParts
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 from fgslam.frontend.stereo.matching import StereoMatcher
-from fgslam.frontend.stream import FeatureStream
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.map_matching import MapMatcher
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.frontend.tracking.tracker import LandmarkTracker
-from fgslam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
-from fgslam.pipeline import SlamPipeline
-from fgslam.settings.frontend import FrontendSettings
+from fgslam.slam.arrival import Arrival, take_over
+from fgslam.slam.feature_stream import FeatureStream
+from fgslam.slam.frontend_settings import FrontendSettings
+from fgslam.slam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
+from fgslam.slam.pipeline import SlamPipeline
 from fgslam.worlds.lab_settings import RenderedLabSettings
 
 

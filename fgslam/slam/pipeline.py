@@ -29,11 +29,11 @@ from fgslam.core.types import (
 )
 from fgslam.frontend.places.loops.recognition import PlaceRecognition
 from fgslam.frontend.stereo.matching import StereoMatcher
-from fgslam.frontend.stream import FeatureFrame
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
 from fgslam.frontend.tracking.resection import Resection
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
-from fgslam.motion import MotionModel
+from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.motion import MotionModel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
