@@ -26,7 +26,7 @@ from fgslam.datasets.omni.settings import OmniDatasetSettings
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
-from fgslam.settings.homing_behaviour import (
+from fgslam.homing.settings import (
     HomingBehaviourSettings,
     LocalisationSettings,
     TopologicalMapSettings,

@@ -32,10 +32,10 @@ from fgslam.homing.closed_loop import Driver, follow
 from fgslam.homing.eyes import Sighting
 from fgslam.homing.path_following import PathFollower
 from fgslam.homing.record import DriveRecord
+from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.soundness import parallax
 from fgslam.homing.steering import Steering
 from fgslam.runs.homing.starting import start_from_matches
-from fgslam.settings.homing_behaviour import HomingBehaviourSettings
 
 DARK = np.zeros((1, 1, 3), dtype=np.uint8)
 

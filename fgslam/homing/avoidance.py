@@ -13,7 +13,7 @@ import numpy as np
 from fgslam.core.planar import wrap
 from fgslam.core.types import FloatArray
 from fgslam.homing.command import Drive
-from fgslam.settings.homing_behaviour import AvoidanceSettings
+from fgslam.homing.settings import AvoidanceSettings
 
 _AHEAD = np.deg2rad(45.0)  # farther off than this: turn on the spot
 _BRAKE = 0.5  # part of the speed at which the clear way is driven in a second

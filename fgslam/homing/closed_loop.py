@@ -15,9 +15,9 @@ from fgslam.homing.avoidance import ObstacleAvoider, RangeScan
 from fgslam.homing.command import Command, Drive
 from fgslam.homing.path_following import PathFollower
 from fgslam.homing.record import STAGES, DriveRecord, HomingLog
+from fgslam.homing.settings import ClosedLoopSettings
 from fgslam.homing.steering import Steering
 from fgslam.homing.underway import HomingUnderWay
-from fgslam.settings.homing_behaviour import ClosedLoopSettings
 
 
 class World(Protocol):

@@ -18,8 +18,8 @@ from fgslam.core.planar import wrap
 from fgslam.core.types import ByteArray
 from fgslam.homing.command import Command, HomingState
 from fgslam.homing.eyes import HomingEyes, Sighting
+from fgslam.homing.settings import HomingControlSettings
 from fgslam.homing.underway import EstimatorMaker, Fault, HomingUnderWay
-from fgslam.settings.homing_behaviour import HomingControlSettings
 
 _PROGRESS = 0.02  # parts of a leg; less is noise of the distance
 

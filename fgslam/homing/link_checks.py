@@ -16,7 +16,7 @@ import numpy as np
 from fgslam.core.planar import wrap
 from fgslam.core.types import FloatArray
 from fgslam.homing.linking import Link, Pair
-from fgslam.settings.homing_behaviour import TopologicalMapSettings
+from fgslam.homing.settings import TopologicalMapSettings
 
 _SIGMAS = 3.0
 _ROUNDS = 10  # of the rotation averaging's reweighting

@@ -11,7 +11,7 @@ import numpy as np
 from fgslam.core.homing_types import HomingVector, OmniFeatures, Refusal, RefusalReason
 from fgslam.core.planar import wrap
 from fgslam.core.types import FloatArray
-from fgslam.settings.homing_behaviour import TopologicalMapSettings
+from fgslam.homing.settings import TopologicalMapSettings
 
 Answer: TypeAlias = HomingVector | Refusal
 Linker: TypeAlias = Callable[[OmniFeatures, OmniFeatures], Answer]

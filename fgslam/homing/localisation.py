@@ -14,8 +14,8 @@ from fgslam.core.homing_types import OmniFeatures, Refusal, RefusalReason
 from fgslam.core.types import FloatArray, IntArray
 from fgslam.homing.linking import Linker
 from fgslam.homing.retrieval import VisualWords
+from fgslam.homing.settings import LocalisationSettings
 from fgslam.homing.topological_map import TopologicalMap
-from fgslam.settings.homing_behaviour import LocalisationSettings
 
 
 class Localiser:

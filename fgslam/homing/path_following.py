@@ -12,8 +12,8 @@ from fgslam.core.types import ByteArray
 from fgslam.homing.command import Command, HomingState
 from fgslam.homing.controller import HomingController
 from fgslam.homing.eyes import HomingEyes
+from fgslam.homing.settings import HomingControlSettings, PathFollowingSettings
 from fgslam.homing.underway import EstimatorMaker
-from fgslam.settings.homing_behaviour import HomingControlSettings, PathFollowingSettings
 
 LegResult: TypeAlias = Literal["arrived", "skipped", "refused", "unfinished"]
 

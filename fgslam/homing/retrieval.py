@@ -15,7 +15,7 @@ from scipy.cluster.vq import kmeans2
 
 from fgslam.core.homing_types import OmniFeatures
 from fgslam.core.types import FloatArray, IntArray
-from fgslam.settings.homing_behaviour import RetrievalSettings
+from fgslam.homing.settings import RetrievalSettings
 
 
 class VisualWords:

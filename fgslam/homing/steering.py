@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.homing.command import Command, Drive, HomingState
-from fgslam.settings.homing_behaviour import SteeringSettings
+from fgslam.homing.settings import SteeringSettings
 
 _BEHIND = np.deg2rad(150.0)  # from here on both ways round are as long; noise must not choose
 

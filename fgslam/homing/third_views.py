@@ -19,7 +19,7 @@ from fgslam.core.homing_types import OmniFeatures
 from fgslam.core.planar import wrap
 from fgslam.core.types import IntArray
 from fgslam.homing.linking import Link, Pair
-from fgslam.settings.homing_behaviour import TopologicalMapSettings
+from fgslam.homing.settings import TopologicalMapSettings
 
 InlierRows: TypeAlias = Mapping[Pair, IntArray]
 """Of pairs (from, to): (k, 2) rows of the SIFT features of both images that are inliers."""

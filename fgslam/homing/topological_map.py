@@ -25,8 +25,8 @@ from fgslam.homing.link_checks import LinkChecks
 from fgslam.homing.linking import Answer, Link, Linker, Pair, link_pairs
 from fgslam.homing.path_memory import PathMemory, read_names
 from fgslam.homing.retrieval import VisualWords, candidate_pairs
+from fgslam.homing.settings import TopologicalMapSettings
 from fgslam.homing.third_views import InlierRows, ThirdViews
-from fgslam.settings.homing_behaviour import TopologicalMapSettings
 
 FORMAT = "fgslam topological map"
 VERSION = 1

@@ -13,8 +13,8 @@ from fgslam.core.errors import EstimatorError
 from fgslam.core.homing_types import HomeVector, HomingStart, HomingVector, TrackedBearings
 from fgslam.core.planar import wrap
 from fgslam.core.types import BoolArray
+from fgslam.homing.settings import HomingControlSettings
 from fgslam.homing.soundness import common_turn, parallax, target_misfit, tracked_misfit
-from fgslam.settings.homing_behaviour import HomingControlSettings
 
 EstimatorMaker: TypeAlias = Callable[[HomingStart], HomingEstimator]
 

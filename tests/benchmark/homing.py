@@ -30,7 +30,7 @@ from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from fgslam.homing.controller import HomingController
 from fgslam.homing.eyes import HomingEyes
 from fgslam.homing.image_eyes import EyesSettings, ImageEyes
-from fgslam.settings.homing_behaviour import HomingControlSettings
+from fgslam.homing.settings import HomingControlSettings
 from fgslam.worlds.house.omni_world import OmniWorld
 from fgslam.worlds.house.settings import HousePathSettings, OmniHouseSettings
 from tests.benchmark.drives import cpu_seconds, interleaved

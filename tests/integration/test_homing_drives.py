@@ -20,6 +20,7 @@ from fgslam.homing.closed_loop import Driver, follow
 from fgslam.homing.drive_scores import cross_track, pass_distances, truly_arrived
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.record import DriveRecord
+from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import Steering
 from fgslam.homing_config import PathFollowingConfig, parse_homing
 from fgslam.runs.homing.drive_files import bearing_log, drive_of
@@ -30,7 +31,6 @@ from fgslam.runs.homing.driving import _displaced, with_one_leg
 from fgslam.runs.homing.logs import load_bearing_logs
 from fgslam.runs.homing.replay import replay_homing
 from fgslam.runs.homing.results import begin
-from fgslam.settings.homing_behaviour import HomingBehaviourSettings
 
 EKF = {"kind": "homing_ekf"}
 

@@ -8,7 +8,7 @@ from fgslam.core.planar import to_robot, wrap
 from fgslam.core.types import FloatArray
 from fgslam.homing.avoidance import CorridorAvoidance, RangeScan
 from fgslam.homing.command import Drive
-from fgslam.settings.homing_behaviour import AvoidanceSettings
+from fgslam.homing.settings import AvoidanceSettings
 
 BEAMS = np.linspace(-np.pi, np.pi, 72, endpoint=False)
 

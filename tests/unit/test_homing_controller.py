@@ -32,9 +32,9 @@ from fgslam.core.types import ByteArray, FloatArray
 from fgslam.homing.command import Command, HomingState
 from fgslam.homing.controller import HomingController
 from fgslam.homing.eyes import Sighting
+from fgslam.homing.settings import HomingControlSettings
 from fgslam.homing.soundness import parallax
 from fgslam.homing.underway import HomingUnderWay
-from fgslam.settings.homing_behaviour import HomingControlSettings
 from tests.homing import make_matches
 from tests.landmark_world import DARK, Setting, winding_path
 

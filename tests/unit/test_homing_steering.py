@@ -17,12 +17,8 @@ from fgslam.homing.avoidance import (
     make_avoider,
 )
 from fgslam.homing.command import Command, Drive, HomingState
+from fgslam.homing.settings import AvoidanceSettings, HomingBehaviourSettings, SteeringSettings
 from fgslam.homing.steering import Steering
-from fgslam.settings.homing_behaviour import (
-    AvoidanceSettings,
-    HomingBehaviourSettings,
-    SteeringSettings,
-)
 from tests.landmark_world import drive_path, ray_ranges, winding_path
 
 SETTINGS = SteeringSettings()

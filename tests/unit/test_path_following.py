@@ -16,7 +16,7 @@ from fgslam.homing.command import Drive, HomingState
 from fgslam.homing.drive_scores import corners, cross_track, pass_distances, slope_by_leg
 from fgslam.homing.path_following import PathFollower
 from fgslam.homing.record import STAGES, DriveRecord
-from fgslam.settings.homing_behaviour import (
+from fgslam.homing.settings import (
     ClosedLoopSettings,
     HomingBehaviourSettings,
     HomingControlSettings,

@@ -10,9 +10,9 @@ import pytest
 from fgslam.core.homing_types import HomingVector, OmniFeatures
 from fgslam.core.types import IntArray
 from fgslam.homing.linking import Answer, Link, Pair
+from fgslam.homing.settings import TopologicalMapSettings
 from fgslam.homing.third_views import ThirdViews
 from fgslam.homing.topological_map import TopologicalMap, map_of_answers
-from fgslam.settings.homing_behaviour import TopologicalMapSettings
 from tests.landmark_world import landmark_features
 
 SETTINGS = TopologicalMapSettings()

@@ -19,12 +19,8 @@ from fgslam.homing.link_checks import LinkChecks, between_misfit, heading_residu
 from fgslam.homing.linking import Answer, Link, link_pair
 from fgslam.homing.localisation import Localiser
 from fgslam.homing.retrieval import VisualWords, candidate_pairs
+from fgslam.homing.settings import LocalisationSettings, RetrievalSettings, TopologicalMapSettings
 from fgslam.homing.topological_map import TopologicalMap, build_map, map_of_answers
-from fgslam.settings.homing_behaviour import (
-    LocalisationSettings,
-    RetrievalSettings,
-    TopologicalMapSettings,
-)
 from tests.landmark_world import landmark_features, match_landmarks, numbers
 
 SETTINGS = TopologicalMapSettings()
