@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core.homing_types import HomingEstimate, HomingTruth
-from fgslam.export.homing_report import Column, HomingPage, TextTable
-from fgslam.export.homing_report.curves import Line, claimed_against_true, curve_figure
-from fgslam.export.homing_report.local_map import local_map_figure
-from fgslam.export.homing_report.plan import Drive, catchment_figure, drive_figure
+from fgslam.report.homing import Column, HomingPage, TextTable
+from fgslam.report.homing.curves import Line, claimed_against_true, curve_figure
+from fgslam.report.homing.local_map import local_map_figure
+from fgslam.report.homing.plan import Drive, catchment_figure, drive_figure
 
 FEATURES = np.array([[0.5, 0.8], [1.2, -0.6], [-0.3, 0.9], [0.7, -1.1]])
 LEG_M = 2.0

@@ -10,7 +10,7 @@ from PIL import Image
 
 from fgslam.core.geometry import pose, so3_exp
 from fgslam.core.types import FloatArray, LandmarkMap, Trajectory
-from fgslam.export.report import Column, Comparison, EstimatorReport, Picture, ReportData
+from fgslam.report.page import Column, Comparison, EstimatorReport, Picture, ReportData
 
 HOSTILE = "<script>alert('%{x}')</script> & \"quotes\" </style>"
 

@@ -9,8 +9,8 @@ from fgslam.backend.settings import EstimatorSettings
 from fgslam.config import ExperimentConfig
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.export.atomic import ExistingFolder, create_run_folder, is_run_folder
-from fgslam.export.comparison_table import write_comparison_csv
-from fgslam.export.metrics import EstimatorMetrics, JsonValue, read_metrics, write_metrics
+from fgslam.report.comparison_table import write_comparison_csv
+from fgslam.report.metrics import EstimatorMetrics, JsonValue, read_metrics, write_metrics
 from fgslam.runs.choosing import EVERY, Choice, choose
 from fgslam.runs.comparison import (
     COMPARISON_FILE,

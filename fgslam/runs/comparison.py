@@ -13,11 +13,11 @@ from fgslam.config import ExperimentConfig, load_config
 from fgslam.core.errors import DatasetError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.export.atomic import RUN_MARKER, is_run_folder
-from fgslam.export.landmark_truth import LANDMARK_TRUTH_FILE, read_landmark_truth
-from fgslam.export.metrics import EstimatorMetrics
-from fgslam.export.point_cloud import MapPoints, read_ply
-from fgslam.export.trajectories import read_tum
 from fgslam.frontend.tracking.settings import EgoMotionSettings
+from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, read_landmark_truth
+from fgslam.report.metrics import EstimatorMetrics
+from fgslam.report.point_cloud import MapPoints, read_ply
+from fgslam.report.trajectories import read_tum
 from fgslam.runs.checkpoint import LOG_FILE
 from fgslam.runs.estimator_files import write_replay
 from fgslam.runs.judging import Truth, judge_replay, seen_often

@@ -15,8 +15,8 @@ from fgslam.core.atomic_files import make_subfolder, write_text
 from fgslam.core.errors import DatasetError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import Estimate, IntArray, LandmarkMap, Trajectory
-from fgslam.export.point_cloud import MapPoints, write_ply
-from fgslam.export.trajectories import write_covariances, write_tum
+from fgslam.report.point_cloud import MapPoints, write_ply
+from fgslam.report.trajectories import write_covariances, write_tum
 from fgslam.slam.replay import Replay, ReplayRow
 
 FRAMES_FILE = "frames.csv"

@@ -17,8 +17,8 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import StereoFeatures
 from fgslam.export.atomic import ExistingFolder
-from fgslam.export.comparison_table import write_comparison_csv
-from fgslam.export.metrics import EstimatorMetrics
+from fgslam.report.comparison_table import write_comparison_csv
+from fgslam.report.metrics import EstimatorMetrics
 from fgslam.runs import checkpoint, map_entry, mapping
 from fgslam.runs.beginning import BegunRun, OpenedRun, Progress, begin, open_run
 from fgslam.runs.choosing import compared_with

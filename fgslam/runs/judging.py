@@ -21,7 +21,7 @@ from fgslam.evaluation.trajectory import (
     evaluate_trajectory,
     to_estimate_world,
 )
-from fgslam.export.metrics import EstimatorMetrics, JsonValue, UpdateTime
+from fgslam.report.metrics import EstimatorMetrics, JsonValue, UpdateTime
 from fgslam.slam.replay import Replay
 
 LEAST_SIGHTINGS = 3

@@ -15,10 +15,10 @@ from fgslam.core.types import Estimate, LandmarkMap
 from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.opening import open_measurements
 from fgslam.export.atomic import ExistingFolder, create_run_folder
-from fgslam.export.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
-from fgslam.export.metrics import JsonValue, StageTime, write_timing
-from fgslam.export.point_cloud import read_ply
-from fgslam.export.trajectories import read_covariances, read_tum, write_tum
+from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
+from fgslam.report.metrics import JsonValue, StageTime, write_timing
+from fgslam.report.point_cloud import read_ply
+from fgslam.report.trajectories import read_covariances, read_tum, write_tum
 from fgslam.runs.checkpoint import save_log
 from fgslam.runs.choosing import estimators_of
 from fgslam.runs.compare import write_comparison

@@ -20,19 +20,19 @@ from fgslam.core.atomic_files import make_subfolder, write_text
 from fgslam.core.recordings import Sequence
 from fgslam.core.types import Estimate, LandmarkMap, Trajectory
 from fgslam.export.atomic import RUN_MARKER
-from fgslam.export.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
-from fgslam.export.metrics import (
+from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.homing_config import HomingExperiment
+from fgslam.localisation_config import LocalisationConfig
+from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
+from fgslam.report.metrics import (
     EstimatorMetrics,
     JsonValue,
     StageTime,
     write_metrics,
     write_timing,
 )
-from fgslam.export.point_cloud import MapPoints
-from fgslam.export.trajectories import write_tum
-from fgslam.frontend.tracking.database import LandmarkDatabase
-from fgslam.homing_config import HomingExperiment
-from fgslam.localisation_config import LocalisationConfig
+from fgslam.report.point_cloud import MapPoints
+from fgslam.report.trajectories import write_tum
 from fgslam.runs.checkpoint import save_log
 from fgslam.runs.comparison import GROUND_TRUTH_FILE, load_truth, remark_of
 from fgslam.runs.estimator_files import write_estimate

@@ -10,7 +10,7 @@ import numpy as np
 from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.types import BoolArray, Estimate, FloatArray, Increment, IntArray, Trajectory
 from fgslam.evaluation.trajectory import to_estimate_world
-from fgslam.export.pictures import (
+from fgslam.report.pictures import (
     MapDrawing,
     draw_birds_eye,
     draw_disparities,
@@ -20,7 +20,7 @@ from fgslam.export.pictures import (
     draw_map_views,
     draw_matches,
 )
-from fgslam.export.pictures.birds_eye import world_position_covariances
+from fgslam.report.pictures.birds_eye import world_position_covariances
 from fgslam.runs.outputs import RunOutputs
 from fgslam.slam.pipeline import FrameReport
 

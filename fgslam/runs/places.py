@@ -13,9 +13,9 @@ import numpy as np
 from fgslam.core.errors import DatasetError
 from fgslam.core.types import Trajectory
 from fgslam.evaluation.closures import JudgedClosure, judge_closures
-from fgslam.export.metrics import JsonValue
-from fgslam.export.report import Column, Comparison
-from fgslam.export.tables import Cell, write_csv
+from fgslam.report.metrics import JsonValue
+from fgslam.report.page import Column, Comparison
+from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.recorder import RunRecorder
 
 LOOPS_FILE = "loops.csv"

@@ -21,10 +21,10 @@ from fgslam.evaluation.trajectory import (
     to_estimate_world,
 )
 from fgslam.export.atomic import RUN_MARKER
-from fgslam.export.metrics import read_metrics
-from fgslam.export.point_cloud import MapPoints, read_ply
-from fgslam.export.report import Comparison, EstimatorReport, ReportData, write_report
-from fgslam.export.trajectories import read_covariances, read_tum
+from fgslam.report.metrics import read_metrics
+from fgslam.report.page import Comparison, EstimatorReport, ReportData, write_report
+from fgslam.report.point_cloud import MapPoints, read_ply
+from fgslam.report.trajectories import read_covariances, read_tum
 from fgslam.runs.checkpoint import LOG_FILE
 from fgslam.runs.places import LOOPS_FILE, read_closures
 from fgslam.runs.report_parts import comparison_table, sample_pictures

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fgslam.core.errors import DatasetError
-from fgslam.export.report import Column, Comparison, Picture
+from fgslam.report.page import Column, Comparison, Picture
 
 UNKNOWN = "-"
 _FIGURES_OF_A_FRAME = {

@@ -15,7 +15,7 @@ from fgslam.core.types import (
     Trajectory,
     correlation,
 )
-from fgslam.export.metrics import EstimatorMetrics, JsonValue, UpdateTime
+from fgslam.report.metrics import EstimatorMetrics, JsonValue, UpdateTime
 from fgslam.runs.judging import Answer, Truth, judge_answer
 from fgslam.runs.recorder import STAGES, RunRecorder
 from fgslam.slam.replay import peak_memory_mb

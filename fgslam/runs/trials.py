@@ -14,7 +14,7 @@ from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.evaluation.consistency import Nees
 from fgslam.export.atomic import RUN_MARKER, ExistingFolder, create_run_folder, is_run_folder
-from fgslam.export.metrics import EstimatorMetrics
+from fgslam.report.metrics import EstimatorMetrics
 from fgslam.runs.checkpoint import LOG_FILE
 from fgslam.runs.choosing import EVERY, Choice, choose
 from fgslam.runs.comparison import Progress, load_truth

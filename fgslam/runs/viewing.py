@@ -16,11 +16,11 @@ from fgslam.core.atomic_files import replacing
 from fgslam.core.errors import MissingDependencyError, OutputError
 from fgslam.core.geometry import quaternion_from_rotation
 from fgslam.core.types import FloatArray
-from fgslam.export.pictures.birds_eye import world_position_covariances
-from fgslam.export.report import EstimatorReport, ReportData
-from fgslam.export.report.palette import COUNT, ON_DARK
-from fgslam.export.report.paths import level_axes
-from fgslam.export.report.traces import thinned
+from fgslam.report.page import EstimatorReport, ReportData
+from fgslam.report.page.palette import COUNT, ON_DARK
+from fgslam.report.page.paths import level_axes
+from fgslam.report.page.traces import thinned
+from fgslam.report.pictures.birds_eye import world_position_covariances
 from fgslam.runs.report import load_report
 
 SUFFIX = ".rrd"

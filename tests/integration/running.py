@@ -19,8 +19,8 @@ from fgslam import cli
 from fgslam.config import parse_config
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.export.atomic import ExistingFolder
-from fgslam.export.point_cloud import read_ply
-from fgslam.export.trajectories import read_covariances, read_tum
+from fgslam.report.point_cloud import read_ply
+from fgslam.report.trajectories import read_covariances, read_tum
 from fgslam.runs.experiment import RunResult, run_experiment
 from fgslam.runs.recorder import STAGES
 

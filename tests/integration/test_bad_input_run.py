@@ -24,7 +24,7 @@ from running import (
 )
 
 from fgslam.core.errors import OutputError
-from fgslam.export.trajectories import read_tum
+from fgslam.report.trajectories import read_tum
 
 Refusal = Callable[..., str]
 

@@ -22,8 +22,8 @@ from running import (
     write_config,
 )
 
-from fgslam.export.point_cloud import read_ply
-from fgslam.export.trajectories import read_kitti, read_tum
+from fgslam.report.point_cloud import read_ply
+from fgslam.report.trajectories import read_kitti, read_tum
 
 Capture = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch

@@ -16,9 +16,9 @@ from running import KIND, main, metrics_of, run_values, write_config
 
 from fgslam.config import parse_config
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.export.metrics import EstimatorMetrics
-from fgslam.export.point_cloud import read_ply
-from fgslam.export.trajectories import read_covariances, read_tum
+from fgslam.report.metrics import EstimatorMetrics
+from fgslam.report.point_cloud import read_ply
+from fgslam.report.trajectories import read_covariances, read_tum
 from fgslam.runs.measured import run_measured
 
 CONTRACT = set(EstimatorMetrics().as_json())

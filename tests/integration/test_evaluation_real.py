@@ -10,7 +10,7 @@ import pytest
 from fgslam.core.geometry import se3_exp
 from fgslam.core.types import Trajectory
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory, path_length
-from fgslam.export.trajectories import read_tum, write_tum
+from fgslam.report.trajectories import read_tum, write_tum
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 pytestmark = pytest.mark.data

@@ -11,7 +11,7 @@ from homing_pages import page
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
-from fgslam.export.homing_report import write_homing_report
+from fgslam.report.homing import write_homing_report
 
 FIGURES = ("local-map", "drive", "direction", "claimed", "catchment")
 DRAWN = "document.getElementById('plot-{}')._fullData"

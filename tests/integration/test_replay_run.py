@@ -13,8 +13,8 @@ from running import KIND, run_values
 from fgslam.config import ExperimentConfig, parse_config
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import Estimate
-from fgslam.export.trajectories import write_tum
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
+from fgslam.report.trajectories import write_tum
 from fgslam.slam import factory
 from fgslam.slam.pipeline import replay_step
 

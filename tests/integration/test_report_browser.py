@@ -14,7 +14,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
-from fgslam.export.report import EstimatorReport, Picture, ReportData, write_report
+from fgslam.report.page import EstimatorReport, Picture, ReportData, write_report
 
 FIGURES = ("above", "map", "error", "nees", "time")
 DRAWN = "document.getElementById('plot-{}')._fullData"

@@ -17,8 +17,8 @@ from fgslam.core.errors import DatasetError, FgslamError, MissingDependencyError
 from fgslam.core.geometry import rotation_from_quaternion
 from fgslam.core.types import Trajectory
 from fgslam.evaluation.trajectory import to_estimate_world
-from fgslam.export.report import EstimatorReport
-from fgslam.export.trajectories import read_covariances, read_tum, write_tum
+from fgslam.report.page import EstimatorReport
+from fgslam.report.trajectories import read_covariances, read_tum, write_tum
 from fgslam.runs.report import load_report, report_from_folder
 from fgslam.runs.viewing import ellipsoids, view_run
 

@@ -20,15 +20,15 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LandmarkTruth
 from fgslam.core.types import LandmarkMap
 from fgslam.evaluation.consistency import Nees
-from fgslam.export.comparison_table import (
+from fgslam.report.comparison_table import (
     RESULT_COLUMNS,
     TIME_COLUMNS,
     value_at,
     write_comparison_csv,
 )
-from fgslam.export.landmark_truth import read_landmark_truth, write_landmark_truth
-from fgslam.export.metrics import EstimatorMetrics, UpdateTime
-from fgslam.export.point_cloud import MapPoints
+from fgslam.report.landmark_truth import read_landmark_truth, write_landmark_truth
+from fgslam.report.metrics import EstimatorMetrics, UpdateTime
+from fgslam.report.point_cloud import MapPoints
 from fgslam.runs.baseline import check_baseline, read_baseline, write_baseline
 from fgslam.runs.choosing import Choice, all_kinds, choose, estimators_of
 from fgslam.runs.estimator_files import points_from_log

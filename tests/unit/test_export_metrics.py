@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import DatasetError
-from fgslam.export.metrics import (
+from fgslam.report.metrics import (
     EstimatorMetrics,
     StageTime,
     UpdateTime,

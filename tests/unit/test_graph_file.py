@@ -14,7 +14,7 @@ from fgslam.core.errors import OutputError
 from fgslam.core.geometry import inverse, pose, rotation_from_quaternion, se3_exp
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import FloatArray, IntArray, Trajectory
-from fgslam.export.graph_file import (
+from fgslam.report.graph_file import (
     EXACT_SIGMA,
     PoseLandmarkGraph,
     g2o_information,

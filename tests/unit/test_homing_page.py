@@ -13,19 +13,13 @@ from homing_pages import FEATURES, drive, estimates, page, truth
 from reports import HOSTILE
 
 from fgslam.core.types import FloatArray
-from fgslam.export.homing_report import Column, TextTable, write_homing_report
-from fgslam.export.homing_report.curves import claimed_against_true, sorted_errors
-from fgslam.export.homing_report.local_map import (
-    MAX_MOMENTS,
-    SIGMAS,
-    ellipse,
-    local_map_figure,
-    upwards,
-)
-from fgslam.export.homing_report.network import Links, network_figure, unfolded
-from fgslam.export.homing_report.page import render
-from fgslam.export.homing_report.plan import catchment_figure, drive_figure
-from fgslam.export.report.traces import Figure, Trace
+from fgslam.report.homing import Column, TextTable, write_homing_report
+from fgslam.report.homing.curves import claimed_against_true, sorted_errors
+from fgslam.report.homing.local_map import MAX_MOMENTS, SIGMAS, ellipse, local_map_figure, upwards
+from fgslam.report.homing.network import Links, network_figure, unfolded
+from fgslam.report.homing.page import render
+from fgslam.report.homing.plan import catchment_figure, drive_figure
+from fgslam.report.page.traces import Figure, Trace
 
 
 def numbers(packed: dict[str, str]) -> FloatArray:

@@ -15,7 +15,7 @@ from matplotlib.image import imread
 from fgslam.core.errors import OutputError
 from fgslam.core.geometry import pose, se3_exp, so3_exp
 from fgslam.core.types import Features, Image
-from fgslam.export.pictures import (
+from fgslam.report.pictures import (
     MapDrawing,
     draw_birds_eye,
     draw_disparities,
@@ -26,9 +26,9 @@ from fgslam.export.pictures import (
     draw_matches,
     style,
 )
-from fgslam.export.pictures.birds_eye import exaggeration, view_limits, world_position_covariances
-from fgslam.export.pictures.image_overlays import oriented_squares
-from fgslam.export.pictures.map_views import Viewer
+from fgslam.report.pictures.birds_eye import exaggeration, view_limits, world_position_covariances
+from fgslam.report.pictures.image_overlays import oriented_squares
+from fgslam.report.pictures.map_views import Viewer
 
 YELLOW = np.array([0xF0, 0xE4, 0x42]) / 255.0
 
@@ -119,7 +119,7 @@ def test_same_input_same_bytes_whatever_the_users_style(tmp_path: Path, name: st
 
 
 def test_pictures_need_no_display_and_no_pyplot() -> None:
-    code = "import sys, fgslam.export.pictures; print('matplotlib.pyplot' in sys.modules)"
+    code = "import sys, fgslam.report.pictures; print('matplotlib.pyplot' in sys.modules)"
     done = subprocess.run(  # noqa: S603
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import DatasetError, OutputError
-from fgslam.export.point_cloud import (
+from fgslam.report.point_cloud import (
     MapPoints,
     read_ply,
     write_map,

@@ -20,7 +20,7 @@ from reports import HOSTILE, estimator_report, full_report, loop, picture, witho
 from fgslam.core.errors import OutputError
 from fgslam.core.geometry import so3_exp
 from fgslam.core.types import FloatArray
-from fgslam.export.report import (
+from fgslam.report.page import (
     Column,
     Comparison,
     EstimatorReport,
@@ -29,13 +29,13 @@ from fgslam.export.report import (
     palette,
     write_report,
 )
-from fgslam.export.report import paths as drawn
-from fgslam.export.report.curves import error_over_time, nees_over_time, position_sigma
-from fgslam.export.report.page import render
-from fgslam.export.report.paths import drive_from_above, level_axes, map_to_turn
-from fgslam.export.report.pictures import BUDGET_BYTES, MAX_WIDTH, embed
-from fgslam.export.report.traces import Figure, Trace, peaks, thinned
-from fgslam.export.report.words import best, headline
+from fgslam.report.page import paths as drawn
+from fgslam.report.page.curves import error_over_time, nees_over_time, position_sigma
+from fgslam.report.page.page import render
+from fgslam.report.page.paths import drive_from_above, level_axes, map_to_turn
+from fgslam.report.page.pictures import BUDGET_BYTES, MAX_WIDTH, embed
+from fgslam.report.page.traces import Figure, Trace, peaks, thinned
+from fgslam.report.page.words import best, headline
 
 
 class Reader(HTMLParser):

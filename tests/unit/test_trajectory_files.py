@@ -10,7 +10,7 @@ import pytest
 from fgslam.core.errors import DatasetError, OutputError
 from fgslam.core.geometry import se3_exp
 from fgslam.core.types import Trajectory
-from fgslam.export.trajectories import (
+from fgslam.report.trajectories import (
     read_covariances,
     read_kitti,
     read_tum,

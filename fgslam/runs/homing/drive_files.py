@@ -11,11 +11,11 @@ from fgslam.core.bearing_log import BearingLog
 from fgslam.core.homing_types import HomingTruth
 from fgslam.core.planar import between, wrap
 from fgslam.core.types import FloatArray
-from fgslam.export.homing_report.plan import Drive
-from fgslam.export.tables import Cell, write_csv
 from fgslam.homing.command import HomingState
 from fgslam.homing.drive_scores import cross_track, pass_distances
 from fgslam.homing.record import DriveRecord, HomingLog
+from fgslam.report.homing.plan import Drive
+from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.homing.logs import save_bearing_logs
 
 LEGS_FILE = "legs.csv"

@@ -12,11 +12,11 @@ import numpy as np
 from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.homing_types import TrackedBearings
 from fgslam.core.types import ByteArray, FloatArray
-from fgslam.export.pictures.view_tracks import draw_view_tracks
-from fgslam.export.report.data import Picture
 from fgslam.homing.command import Command
 from fgslam.homing.path_following import PathFollower
 from fgslam.homing.underway import HomingUnderWay
+from fgslam.report.page.data import Picture
+from fgslam.report.pictures.view_tracks import draw_view_tracks
 
 FOLDER = "pictures"
 _TRAIL = 15  # images

@@ -10,12 +10,6 @@ import numpy as np
 
 from fgslam.core.planar import between
 from fgslam.core.types import FloatArray
-from fgslam.export.homing_report import Column, TextTable
-from fgslam.export.homing_report.curves import Line, curve_figure
-from fgslam.export.homing_report.local_map import local_map_figure
-from fgslam.export.homing_report.plan import PASS_RADIUS_M, catchment_figure, drive_figure
-from fgslam.export.metrics import JsonValue, UpdateTime
-from fgslam.export.report.traces import Figure
 from fgslam.homing.drive_scores import (
     ARRIVED_M,
     Slope,
@@ -28,6 +22,12 @@ from fgslam.homing.drive_scores import (
 )
 from fgslam.homing.record import STAGES, DriveRecord
 from fgslam.homing_config import DrivingConfig
+from fgslam.report.homing import Column, TextTable
+from fgslam.report.homing.curves import Line, curve_figure
+from fgslam.report.homing.local_map import local_map_figure
+from fgslam.report.homing.plan import PASS_RADIUS_M, catchment_figure, drive_figure
+from fgslam.report.metrics import JsonValue, UpdateTime
+from fgslam.report.page.traces import Figure
 from fgslam.runs.homing.drive_files import (
     bearing_log,
     drive_of,

@@ -9,8 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.homing_types import HomingVector, OmniFeatures, Refusal
-from fgslam.export.metrics import JsonValue
-from fgslam.export.tables import write_csv
 from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
 from fgslam.frontend.homing.matching import match_features
 from fgslam.homing.linking import Answer, Pair
@@ -19,6 +17,8 @@ from fgslam.homing.retrieval import VisualWords
 from fgslam.homing.third_views import InlierRows
 from fgslam.homing.topological_map import map_of_answers
 from fgslam.homing_config import TopologicalMapConfig
+from fgslam.report.metrics import JsonValue
+from fgslam.report.tables import write_csv
 from fgslam.runs.homing.results import Progress, Stopped
 
 LOCALISATION_FILE = "localisation.csv"

@@ -12,8 +12,8 @@ from scipy.stats import chi2
 from fgslam.core.homing_types import HomingVector, Refusal, RefusalReason
 from fgslam.core.planar import wrap
 from fgslam.core.types import BoolArray, FloatArray, IntArray
-from fgslam.export.metrics import JsonValue
-from fgslam.export.tables import Cell, write_csv
+from fgslam.report.metrics import JsonValue
+from fgslam.report.tables import Cell, write_csv
 
 PAIR_COLUMNS = (
     "from",

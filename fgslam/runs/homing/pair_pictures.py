@@ -11,8 +11,8 @@ from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.homing_types import BearingMatches, FeatureKind, HomingVector
 from fgslam.core.types import FloatArray
-from fgslam.export.pictures.view_matches import MatchedPixels, draw_view_matches
-from fgslam.export.report.data import Picture
+from fgslam.report.page.data import Picture
+from fgslam.report.pictures.view_matches import MatchedPixels, draw_view_matches
 from fgslam.runs.homing.pair_answers import PairAnswer, PairErrors
 from fgslam.runs.homing.pair_search import PairSearch, answer_pair
 from fgslam.runs.homing.views import Views

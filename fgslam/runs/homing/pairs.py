@@ -9,12 +9,12 @@ import numpy as np
 
 from fgslam.core.types import FloatArray
 from fgslam.export.atomic import ExistingFolder
-from fgslam.export.homing_report import Column, TextTable
-from fgslam.export.homing_report.curves import claimed_against_true, sorted_errors
-from fgslam.export.homing_report.network import Links, network_figure
-from fgslam.export.metrics import JsonValue
-from fgslam.export.report.traces import Figure
 from fgslam.homing_config import HomingPairsConfig
+from fgslam.report.homing import Column, TextTable
+from fgslam.report.homing.curves import claimed_against_true, sorted_errors
+from fgslam.report.homing.network import Links, network_figure
+from fgslam.report.metrics import JsonValue
+from fgslam.report.page.traces import Figure
 from fgslam.runs.homing.pair_answers import (
     WRONG_DEG,
     PairAnswer,

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from fgslam.export.atomic import ExistingFolder, create_run_folder
-from fgslam.export.homing_report import HomingPage, TextTable, write_homing_report
-from fgslam.export.metrics import JsonValue
-from fgslam.export.tables import write_json
 from fgslam.homing_config import HomingExperiment
+from fgslam.report.homing import HomingPage, TextTable, write_homing_report
+from fgslam.report.metrics import JsonValue
+from fgslam.report.tables import write_json
 from fgslam.runs.outputs import versions, write_config
 
 METRICS_FILE = "metrics.json"

@@ -23,8 +23,8 @@ from fgslam.evaluation.localisation import (
     localisation_errors,
     score,
 )
-from fgslam.export.homing_report import Column, TextTable
 from fgslam.localisation_config import LocalisationConfig
+from fgslam.report.homing import Column, TextTable
 from fgslam.runs.localisation.asking import Asked, Attempt
 
 _UNKNOWN = "-"

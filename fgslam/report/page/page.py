@@ -7,14 +7,14 @@ from html import escape
 from pathlib import Path
 
 from fgslam.core.atomic_files import write_text
-from fgslam.export.report import frame
-from fgslam.export.report.curves import error_over_time, nees_over_time, time_per_frame
-from fgslam.export.report.data import Column, Comparison, EstimatorReport, ReportData
-from fgslam.export.report.frame import NOT_KNOWN
-from fgslam.export.report.paths import drive_from_above, map_to_turn
-from fgslam.export.report.pictures import embed
-from fgslam.export.report.traces import Figure
-from fgslam.export.report.words import best, headline
+from fgslam.report.page import frame
+from fgslam.report.page.curves import error_over_time, nees_over_time, time_per_frame
+from fgslam.report.page.data import Column, Comparison, EstimatorReport, ReportData
+from fgslam.report.page.frame import NOT_KNOWN
+from fgslam.report.page.paths import drive_from_above, map_to_turn
+from fgslam.report.page.pictures import embed
+from fgslam.report.page.traces import Figure
+from fgslam.report.page.words import best, headline
 
 
 def write_report(path: Path, data: ReportData) -> None:

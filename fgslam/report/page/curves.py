@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from fgslam.core.types import FloatArray
-from fgslam.export.report.data import EstimatorReport, ReportData
-from fgslam.export.report.traces import Figure, Owner, Switch, Trace, peaks, trace
+from fgslam.report.page.data import EstimatorReport, ReportData
+from fgslam.report.page.traces import Figure, Owner, Switch, Trace, peaks, trace
 
 MAX_POINTS = 2500
 SIGMAS = 3.0

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fgslam.core.atomic_files import write_text
-from fgslam.export.metrics import EstimatorMetrics
+from fgslam.report.metrics import EstimatorMetrics
 
 RESULT_COLUMNS: tuple[tuple[str, str], ...] = (
     ("kind", "kind"),

@@ -7,9 +7,9 @@ from html import escape
 from pathlib import Path
 
 from fgslam.core.atomic_files import write_text
-from fgslam.export.homing_report.data import HomingPage, TextTable
-from fgslam.export.report import frame
-from fgslam.export.report.pictures import embed
+from fgslam.report.homing.data import HomingPage, TextTable
+from fgslam.report.page import frame
+from fgslam.report.page.pictures import embed
 
 
 def write_homing_report(path: Path, page: HomingPage) -> None:

@@ -4,10 +4,10 @@ Every function takes plain arrays and a path, returns nothing, and writes one fi
 same input gives the same bytes.
 """
 
-from fgslam.export.pictures.birds_eye import MapDrawing, draw_birds_eye
-from fgslam.export.pictures.curves import draw_errors, draw_matches
-from fgslam.export.pictures.image_overlays import draw_disparities, draw_features, draw_flow
-from fgslam.export.pictures.map_views import draw_map_views
+from fgslam.report.pictures.birds_eye import MapDrawing, draw_birds_eye
+from fgslam.report.pictures.curves import draw_errors, draw_matches
+from fgslam.report.pictures.image_overlays import draw_disparities, draw_features, draw_flow
+from fgslam.report.pictures.map_views import draw_map_views
 
 __all__ = [
     "MapDrawing",

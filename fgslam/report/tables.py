@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.core.atomic_files import write_text
-from fgslam.export.metrics import JsonValue, plain
+from fgslam.report.metrics import JsonValue, plain
 
 Cell: TypeAlias = "str | bool | int | float | np.generic | None"
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from fgslam.core.types import FloatArray, IntArray
-from fgslam.export.pictures.style import BLUE, GREEN, GREY, SKY, picture
+from fgslam.report.pictures.style import BLUE, GREEN, GREY, SKY, picture
 
 _AXIS_NAMES = ("X, right", "Y, down", "Z, ahead")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from fgslam.export.report.data import EstimatorReport, ReportData
+from fgslam.report.page.data import EstimatorReport, ReportData
 
 _ABOUT_EQUAL = 1.05
 _ROUND_FROM = 1000.0

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.types import FloatArray, Image
-from fgslam.export.pictures.style import SKY, VERMILLION, YELLOW, picture
+from fgslam.report.pictures.style import SKY, VERMILLION, YELLOW, picture
 
 _WIDTH_IN = 11.0
 _DIMMED = 0.7

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 
 from fgslam.core.geometry import congruence
 from fgslam.core.types import FloatArray
-from fgslam.export.pictures.style import (
+from fgslam.report.pictures.style import (
     BLUE,
     GREY,
     INK,

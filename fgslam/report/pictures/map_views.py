@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PathCollection
 
 from fgslam.core.types import BoolArray, FloatArray
-from fgslam.export.pictures.birds_eye import MapDrawing, dot_size, path_points
-from fgslam.export.pictures.style import (
+from fgslam.report.pictures.birds_eye import MapDrawing, dot_size, path_points
+from fgslam.report.pictures.style import (
     FAINT,
     INK,
     MAP_COLOURS,

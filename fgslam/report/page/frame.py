@@ -13,9 +13,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
 from importlib import resources
 
-from fgslam.export.report import palette
-from fgslam.export.report.pictures import Embedded
-from fgslam.export.report.traces import Figure, Switch
+from fgslam.report.page import palette
+from fgslam.report.page.pictures import Embedded
+from fgslam.report.page.traces import Figure, Switch
 
 NOT_KNOWN = "not known"
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import hsv_to_rgb
 
 from fgslam.core.types import BoolArray, FloatArray, Image
-from fgslam.export.pictures.style import picture
+from fgslam.report.pictures.style import picture
 
 _WIDTH_IN = 9.0
 _SHOWN_PX = 1100  # columns of a picture; more would not show

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from fgslam.core.types import BoolArray, FloatArray
-from fgslam.export.pictures.birds_eye import (
+from fgslam.report.pictures.birds_eye import (
     MapDrawing,
     add_ellipses,
     dot_size,
@@ -19,7 +19,7 @@ from fgslam.export.pictures.birds_eye import (
     view_limits,
     world_position_covariances,
 )
-from fgslam.export.pictures.style import BLUE, GREY, INK, ORANGE, VERMILLION, add_segments, picture
+from fgslam.report.pictures.style import BLUE, GREY, INK, ORANGE, VERMILLION, add_segments, picture
 
 _GROUND = [0, 2]  # X and Z of the world
 _HEADING = 0.025  # length of a heading, as a share of the picture

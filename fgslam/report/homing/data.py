@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from fgslam.export.report.data import Column, Picture
-from fgslam.export.report.traces import Figure
+from fgslam.report.page.data import Column, Picture
+from fgslam.report.page.traces import Figure
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from fgslam.core.homing_types import HomingEstimate, HomingTruth
 from fgslam.core.types import FloatArray
-from fgslam.export.report.traces import Figure, Owner, Switch, Trace, thinned, trace
+from fgslam.report.page.traces import Figure, Owner, Switch, Trace, thinned, trace
 
 MAX_MOMENTS = 60
 SIGMAS = 3.0

@@ -14,7 +14,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
 from fgslam.core.types import Features, FloatArray, Image
-from fgslam.export.pictures.style import (
+from fgslam.report.pictures.style import (
     INK,
     ORANGE,
     SKY,

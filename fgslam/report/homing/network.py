@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
 from fgslam.core.types import FloatArray
-from fgslam.export.report.traces import Figure, Owner, Switch, Trace, joined, plain_texts, trace
+from fgslam.report.page.traces import Figure, Owner, Switch, Trace, joined, plain_texts, trace
 
 _TOLD = "%{text}<extra></extra>"
 

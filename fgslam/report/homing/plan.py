@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fgslam.core.types import BoolArray, FloatArray, IntArray
-from fgslam.export.report.traces import (
+from fgslam.report.page.traces import (
     Figure,
     Owner,
     Switch,

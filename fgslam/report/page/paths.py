@@ -13,9 +13,8 @@ import numpy as np
 
 from fgslam.core.geometry import congruence
 from fgslam.core.types import FloatArray
-from fgslam.export.pictures.birds_eye import exaggeration, world_position_covariances
-from fgslam.export.report.data import EstimatorReport, ReportData
-from fgslam.export.report.traces import (
+from fgslam.report.page.data import EstimatorReport, ReportData
+from fgslam.report.page.traces import (
     Figure,
     Owner,
     Paint,
@@ -26,6 +25,7 @@ from fgslam.export.report.traces import (
     thinned,
     trace,
 )
+from fgslam.report.pictures.birds_eye import exaggeration, world_position_covariances
 
 MAX_POSES = 1_500
 MAX_DOTS_ABOVE = 3_000
