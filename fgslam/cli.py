@@ -14,13 +14,13 @@ from fgslam.core.errors import FgslamError
 from fgslam.interruption import stop_flag, stoppable
 
 if TYPE_CHECKING:
-    from fgslam.config import ExperimentConfig
-    from fgslam.export.atomic import ExistingFolder
-    from fgslam.homing_config import HomingExperiment
-    from fgslam.localisation_config import LocalisationConfig
     from fgslam.runs.baseline import Results
     from fgslam.runs.choosing import Choice
     from fgslam.runs.comparison import Compared
+    from fgslam.runs.config import ExperimentConfig
+    from fgslam.runs.folder import ExistingFolder
+    from fgslam.runs.homing.config import HomingExperiment
+    from fgslam.runs.localisation.config import LocalisationConfig
 
 EXIT_USER = 2
 EXIT_FAULT = 1
@@ -71,8 +71,8 @@ def run(
     Ctrl-C ends it early with all files valid; --resume goes on from there.
     """
     from fgslam.core.errors import ConfigError
-    from fgslam.homing_config import HomingExperiment
-    from fgslam.localisation_config import LocalisationConfig, load_experiment
+    from fgslam.runs.homing.config import HomingExperiment
+    from fgslam.runs.localisation.config import LocalisationConfig, load_experiment
     from fgslam.runs.measured import holds_measurements
 
     if overwrite and resume:
@@ -403,7 +403,7 @@ def inspect(
     Exits with 0 whatever the report says, with 2 where the recording cannot be opened at all.
     """
     from fgslam.console import progress_bar
-    from fgslam.inspection.recording import inspect_recording
+    from fgslam.runs.inspection.recording import inspect_recording
 
     with stop_flag() as stopped, progress_bar() as progress:
         report = inspect_recording(dataset, overrides or (), frames, stoppable(progress, stopped))

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from fgslam.config import ExperimentConfig
-from fgslam.homing_config import TASKS
-from fgslam.localisation_config import LocalisationConfig
+from fgslam.runs.config import ExperimentConfig
+from fgslam.runs.homing.config import TASKS
+from fgslam.runs.localisation.config import LocalisationConfig
 
 Node: TypeAlias = dict[str, Any]
 

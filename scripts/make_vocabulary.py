@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.config import load_config
 from fgslam.core.types import FloatArray
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.features.vocabulary import VOCABULARY_FILE
-from fgslam.slam.factory import open_sequence
+from fgslam.runs.config import load_config
+from fgslam.runs.opening import open_sequence
 
 _WORDS = 256
 _ROUNDS = 25

@@ -9,17 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fgslam.config import ExperimentConfig, load_config
 from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import Sequence
-from fgslam.export.atomic import RUN_MARKER, ExistingFolder, create_run_folder
 from fgslam.runs import checkpoint, map_entry, mapping
+from fgslam.runs.config import ExperimentConfig, load_config
+from fgslam.runs.folder import RUN_MARKER, ExistingFolder, create_run_folder
 from fgslam.runs.map_entry import Entry, GivenMap
+from fgslam.runs.opening import open_sequence
 from fgslam.runs.outputs import RunOutputs, versions, write_config
 from fgslam.runs.recorder import RunRecorder
 from fgslam.slam.arrival import require_map_user
-from fgslam.slam.factory import make_estimator, make_pipeline, open_sequence
+from fgslam.slam.factory import make_estimator, make_pipeline
 
 Progress = Callable[[str, int, int], None]
 """Called with what is under way, how much is done, and of how much."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from fgslam.backend.settings import EstimatorSettings
-from fgslam.config import ExperimentConfig, make_config
 from fgslam.core.errors import ConfigError
+from fgslam.runs.config import ExperimentConfig, make_config
 
 _PREFIX = "estimators."
 

@@ -6,9 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from fgslam.backend.settings import EstimatorSettings
-from fgslam.config import ExperimentConfig
 from fgslam.core.errors import ConfigError, OutputError
-from fgslam.export.atomic import ExistingFolder, create_run_folder, is_run_folder
 from fgslam.report.comparison_table import write_comparison_csv
 from fgslam.report.metrics import EstimatorMetrics, JsonValue, read_metrics, write_metrics
 from fgslam.runs.choosing import EVERY, Choice, choose
@@ -22,6 +20,8 @@ from fgslam.runs.comparison import (
     replay_apart,
     tasks_of,
 )
+from fgslam.runs.config import ExperimentConfig
+from fgslam.runs.folder import ExistingFolder, create_run_folder, is_run_folder
 from fgslam.runs.outputs import write_config
 from fgslam.runs.report import report_from_folder
 

@@ -11,18 +11,18 @@ from typing import Literal
 
 import numpy as np
 
-from fgslam.config import ExperimentConfig
 from fgslam.core.errors import DatasetError
 from fgslam.core.recordings import Sequence
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import StereoFeatures
-from fgslam.export.atomic import ExistingFolder
 from fgslam.report.comparison_table import write_comparison_csv
 from fgslam.report.metrics import EstimatorMetrics
 from fgslam.runs import checkpoint, map_entry, mapping
 from fgslam.runs.beginning import BegunRun, OpenedRun, Progress, begin, open_run
 from fgslam.runs.choosing import compared_with
 from fgslam.runs.comparison import COMPARISON_FILE, Compared, replay_apart, tasks_of
+from fgslam.runs.config import ExperimentConfig
+from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.outputs import RunOutputs
 from fgslam.runs.pictures import draw_frame, draw_run, figures_of, frames_to_show
 from fgslam.runs.rendered_truth import TrueDepth

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.config import ExperimentConfig, load_config
 from fgslam.core.errors import ConfigError, MapError
 from fgslam.core.map_types import LandmarkAppearances, Relocalisation
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap, load_map, require_rig
 from fgslam.core.types import FloatArray, LandmarkMap, Prediction
-from fgslam.export.atomic import RUN_MARKER, is_run_folder
+from fgslam.runs.config import ExperimentConfig, load_config
+from fgslam.runs.folder import RUN_MARKER, is_run_folder
 from fgslam.slam.arrival import Arrival
 from fgslam.slam.factory import make_relocaliser, make_stereo_matcher, make_stream
 from fgslam.slam.map_settings import MapSettings, MapStartSettings

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from fgslam import __version__
-from fgslam.config import ExperimentConfig, parse_config
 from fgslam.core.atomic_files import require_writable
 from fgslam.core.errors import ConfigError, MapError, MeasurementLogError
 from fgslam.core.measurement_log import MeasurementLog
@@ -17,6 +16,7 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap, require_rig, save_map
 from fgslam.core.types import Estimate, StateArrays
 from fgslam.runs import checkpoint
+from fgslam.runs.config import ExperimentConfig, parse_config
 from fgslam.runs.map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, entry_of
 from fgslam.runs.outputs import RunOutputs
 from fgslam.runs.recorder import RunRecorder

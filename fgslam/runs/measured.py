@@ -8,13 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.config import ExperimentConfig
 from fgslam.core.errors import ConfigError
 from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.types import Estimate, LandmarkMap
 from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.opening import open_measurements
-from fgslam.export.atomic import ExistingFolder, create_run_folder
 from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
 from fgslam.report.metrics import JsonValue, StageTime, write_timing
 from fgslam.report.point_cloud import read_ply
@@ -30,7 +28,9 @@ from fgslam.runs.comparison import (
     replay_apart,
     tasks_of,
 )
+from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.estimator_files import FRAMES_FILE, read_frames
+from fgslam.runs.folder import ExistingFolder, create_run_folder
 from fgslam.runs.outputs import write_config
 from fgslam.runs.pictures import RunFigures, draw_run
 from fgslam.runs.summary import spread

@@ -15,14 +15,10 @@ import numpy as np
 import yaml
 
 from fgslam import __version__
-from fgslam.config import ExperimentConfig
 from fgslam.core.atomic_files import make_subfolder, write_text
 from fgslam.core.recordings import Sequence
 from fgslam.core.types import Estimate, LandmarkMap, Trajectory
-from fgslam.export.atomic import RUN_MARKER
 from fgslam.frontend.tracking.database import LandmarkDatabase
-from fgslam.homing_config import HomingExperiment
-from fgslam.localisation_config import LocalisationConfig
 from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
 from fgslam.report.metrics import (
     EstimatorMetrics,
@@ -35,8 +31,12 @@ from fgslam.report.point_cloud import MapPoints
 from fgslam.report.trajectories import write_tum
 from fgslam.runs.checkpoint import save_log
 from fgslam.runs.comparison import GROUND_TRUTH_FILE, load_truth, remark_of
+from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.estimator_files import write_estimate
+from fgslam.runs.folder import RUN_MARKER
+from fgslam.runs.homing.config import HomingExperiment
 from fgslam.runs.judging import Truth, verdicts
+from fgslam.runs.localisation.config import LocalisationConfig
 from fgslam.runs.places import closures_of, place_numbers, write_closures
 from fgslam.runs.recorder import STAGES, RunRecorder
 from fgslam.runs.rendered_truth import rendered_landmark_truth

@@ -20,12 +20,12 @@ from fgslam.evaluation.trajectory import (
     position_errors,
     to_estimate_world,
 )
-from fgslam.export.atomic import RUN_MARKER
 from fgslam.report.metrics import read_metrics
 from fgslam.report.page import Comparison, EstimatorReport, ReportData, write_report
 from fgslam.report.point_cloud import MapPoints, read_ply
 from fgslam.report.trajectories import read_covariances, read_tum
 from fgslam.runs.checkpoint import LOG_FILE
+from fgslam.runs.folder import RUN_MARKER
 from fgslam.runs.places import LOOPS_FILE, read_closures
 from fgslam.runs.report_parts import comparison_table, sample_pictures
 

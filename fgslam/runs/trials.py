@@ -9,24 +9,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fgslam.backend.settings import EstimatorSettings
-from fgslam.config import ExperimentConfig, load_config
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.evaluation.consistency import Nees
-from fgslam.export.atomic import RUN_MARKER, ExistingFolder, create_run_folder, is_run_folder
 from fgslam.report.metrics import EstimatorMetrics
 from fgslam.runs.checkpoint import LOG_FILE
 from fgslam.runs.choosing import EVERY, Choice, choose
 from fgslam.runs.comparison import Progress, load_truth
+from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.experiment import run_experiment
+from fgslam.runs.folder import RUN_MARKER, ExistingFolder, create_run_folder, is_run_folder
 from fgslam.runs.judging import judge_replay
 from fgslam.runs.map_entry import arrival_of
 from fgslam.runs.measured import holds_measurements, open_measured, write_recording
+from fgslam.runs.opening import open_sequence
+from fgslam.runs.output_settings import OutputSettings
 from fgslam.runs.outputs import write_config
 from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.runs.trial_results import TrialSummary, summarise, write_trials
-from fgslam.settings.output import OutputSettings
-from fgslam.slam.factory import open_sequence
 from fgslam.slam.replay import replay
 from fgslam.worlds.lab_settings import RenderedLabSettings
 from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 
@@ -24,21 +23,15 @@ from fgslam.backend.smoothers.batch import BatchSmoother
 from fgslam.backend.smoothers.fixed_lag import FixedLagSmoother
 from fgslam.backend.smoothers.isam2 import Isam2Smoother
 from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
-from fgslam.config import ExperimentConfig
 from fgslam.core.errors import ConfigError
 from fgslam.core.floor import DegreesOfFreedom, Floor
 from fgslam.core.recordings import Sequence
 from fgslam.core.types import CameraRig, MeasurementType, Prediction, Sensor
-from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.odometry_settings import (
     ConstantVelocitySettings,
     OdometrySettings,
     RecordedOdometrySettings,
-    SyntheticOdometrySettings,
 )
-from fgslam.datasets.opening import open_recording
-from fgslam.datasets.rendered_lab import RenderedLabSequence
-from fgslam.datasets.synthetic_odometry import SyntheticOdometry
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.places.loops.recognition import PlaceRecognition, RecognitionParts
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
@@ -53,44 +46,6 @@ from fgslam.slam.feature_stream import FeatureStream
 from fgslam.slam.frontend_settings import FrontendSettings
 from fgslam.slam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
 from fgslam.slam.pipeline import SlamPipeline
-from fgslam.worlds.lab_settings import RenderedLabSettings
-
-
-def open_sequence(
-    config: ExperimentConfig, progress: Callable[[int, int], None] | None = None
-) -> Sequence:
-    """Opens the recording, rendered or read, with the odometry that the configuration wants.
-
-    ``progress`` is told how many frames of a rendered recording are done, and of how many.
-    """
-    dataset = config.dataset
-    if isinstance(dataset, RenderedLabSettings):
-        _require_own_noise(config.odometry)
-        sequence: Sequence = RenderedLabSequence(
-            dataset, config.seed, dataset.start, dataset.stop, dataset.stride, progress
-        )
-    elif isinstance(dataset, MeasurementDatasetSettings):
-        raise ConfigError(
-            f"dataset.kind {dataset.kind} holds measurements, no images; choose a recording of "
-            "images here"
-        )
-    else:
-        noise = config.odometry if isinstance(config.odometry, RecordedOdometrySettings) else None
-        sequence = open_recording(dataset, noise)
-    if isinstance(config.odometry, SyntheticOdometrySettings):
-        return SyntheticOdometry(sequence, config.odometry, config.seed)
-    return sequence
-
-
-def _require_own_noise(odometry: OdometrySettings) -> None:
-    """The rendered robot's odometry has its noise among the data set's keys: no key may be idle."""
-    if not isinstance(odometry, RecordedOdometrySettings):
-        return
-    if odometry != RecordedOdometrySettings(gap=odometry.gap):
-        raise ConfigError(
-            "keys of `odometry` other than kind and gap mean nothing to the rendered lab; set the "
-            "noise of its wheels under dataset.odometry"
-        )
 
 
 def make_stream(sequence: Sequence, settings: FrontendSettings) -> FeatureStream:

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.config import ExperimentConfig
 from fgslam.core.recordings import Sequence
 from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.datasets.recording_settings import LightFieldSettings
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.features.settings import Appearance
 from fgslam.frontend.stereo.matching import StereoMatcher
+from fgslam.runs.config import ExperimentConfig
 from fgslam.slam.feature_stream import FeatureFrame
 from scripts.results import epi
 from scripts.results.report import Cell, Table

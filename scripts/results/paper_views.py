@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgslam.config import ExperimentConfig
 from fgslam.core.types import EgoMotion, FloatArray, Trajectory
 from fgslam.evaluation.trajectory import end_pose
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.stereo.settings import StereoSettings
+from fgslam.runs.config import ExperimentConfig
 from fgslam.slam.factory import make_pipeline
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.pipeline import FrameReport

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fgslam.config import ExperimentConfig, load_config
 from fgslam.core.recordings import Sequence
 from fgslam.evaluation.trajectory import Alignment, TrajectoryError, evaluate_trajectory
+from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.experiment import RunResult, run_experiment
-from fgslam.slam.factory import make_pipeline, make_stream, open_sequence
+from fgslam.runs.opening import open_sequence
+from fgslam.slam.factory import make_pipeline, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 

@@ -15,12 +15,13 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.types import BoolArray, CameraRig, FloatArray, LandmarkMap, StereoFeatures
 from fgslam.evaluation.trajectory import rotation_angles
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
-from fgslam.localisation_config import LocalisationConfig, load_experiment
+from fgslam.runs.localisation.config import LocalisationConfig, load_experiment
 from fgslam.runs.localisation.experiment import run_localisation
 from fgslam.runs.localisation.submap import Window, submap_features
 from fgslam.runs.localisation.truth import truth_in_map
 from fgslam.runs.map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map, trusted
-from fgslam.slam.factory import make_relocaliser, make_stereo_matcher, make_stream, open_sequence
+from fgslam.runs.opening import open_sequence
+from fgslam.slam.factory import make_relocaliser, make_stereo_matcher, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from scripts.results.report import Cell, Table
 from scripts.results.runs import EXPERIMENTS, say

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.config import ExperimentConfig
 from fgslam.core.geometry import inverse, pose, so3_exp
 from fgslam.core.types import CameraRig, Features, FloatArray, Frame, Odometry, Trajectory
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.features.sift import SiftExtractor
+from fgslam.runs.config import ExperimentConfig
 from fgslam.worlds import wheel_odometry
 from fgslam.worlds.lab_settings import RenderedLabSettings
 from fgslam.worlds.rendering.image_effects import apply_effects

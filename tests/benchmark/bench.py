@@ -28,14 +28,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from fgslam.config import ExperimentConfig, load_config
 from fgslam.console import progress_bar
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import Sequence
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import CameraRig, FloatArray, Frame, Odometry, Trajectory
+from fgslam.runs.config import ExperimentConfig, load_config
+from fgslam.runs.opening import open_sequence
 from fgslam.runs.recorder import RunRecorder
-from fgslam.slam.factory import make_pipeline, make_stream, open_sequence
+from fgslam.slam.factory import make_pipeline, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.pipeline import SlamPipeline
 from tests.benchmark import estimators, homing, long_drive, maps, relocalising

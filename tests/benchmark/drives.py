@@ -12,7 +12,6 @@ import numpy as np
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
-from fgslam.config import load_config
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.types import (
     EgoMotion,
@@ -28,6 +27,7 @@ from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.opening import open_measurements
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
+from fgslam.runs.config import load_config
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.pipeline import replay_frame
 from fgslam.slam.replay import replay_motion

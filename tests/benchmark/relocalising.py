@@ -20,7 +20,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from fgslam.config import load_config
 from fgslam.core.geometry import pose
 from fgslam.core.map_types import LandmarkAppearances
 from fgslam.core.saved_map import SavedMap
@@ -37,13 +36,9 @@ from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.places.loops.recognition import PlaceRecognition
 from fgslam.frontend.places.settings import LostSettings
 from fgslam.frontend.tracking.tracker import LandmarkTracker
-from fgslam.slam.factory import (
-    make_pipeline,
-    make_places,
-    make_stereo_matcher,
-    make_tracker,
-    open_sequence,
-)
+from fgslam.runs.config import load_config
+from fgslam.runs.opening import open_sequence
+from fgslam.slam.factory import make_pipeline, make_places, make_stereo_matcher, make_tracker
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.frontend_settings import FrontendSettings
 

@@ -16,12 +16,12 @@ import pytest
 import yaml
 
 from fgslam import cli
-from fgslam.config import parse_config
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.export.atomic import ExistingFolder
 from fgslam.report.point_cloud import read_ply
 from fgslam.report.trajectories import read_covariances, read_tum
+from fgslam.runs.config import parse_config
 from fgslam.runs.experiment import RunResult, run_experiment
+from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.recorder import STAGES
 
 KIND = "landmark_kalman"

@@ -14,11 +14,11 @@ import yaml
 from recordings import experiment
 from running import KIND, main, metrics_of, run_values, write_config
 
-from fgslam.config import parse_config
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.report.metrics import EstimatorMetrics
 from fgslam.report.point_cloud import read_ply
 from fgslam.report.trajectories import read_covariances, read_tum
+from fgslam.runs.config import parse_config
 from fgslam.runs.measured import run_measured
 
 CONTRACT = set(EstimatorMetrics().as_json())

@@ -22,7 +22,7 @@ from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.record import DriveRecord
 from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import Steering
-from fgslam.homing_config import PathFollowingConfig, parse_homing
+from fgslam.runs.homing.config import PathFollowingConfig, parse_homing
 from fgslam.runs.homing.drive_files import bearing_log, drive_of
 from fgslam.runs.homing.drive_pictures import DriveWatcher, Unwrapping, draw_leg_views
 from fgslam.runs.homing.drive_results import drive_numbers, finish_drives

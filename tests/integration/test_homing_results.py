@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from fgslam.homing_config import load_homing
+from fgslam.runs.homing.config import load_homing
 from fgslam.runs.homing.run import run_homing
 
 pytestmark = pytest.mark.slow

@@ -16,7 +16,7 @@ import pytest
 from fgslam import cli
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
 from fgslam.core.types import Image
-from fgslam.inspection.recording import inspect_recording
+from fgslam.runs.inspection.recording import inspect_recording
 
 WIDTH, HEIGHT, FRAMES = 240, 180, 6
 FAR, NEAR = 6, 15  # disparities of the back wall and of the board before it, pixels

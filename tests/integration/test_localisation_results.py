@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fgslam.localisation_config import LocalisationConfig, load_experiment
+from fgslam.runs.localisation.config import LocalisationConfig, load_experiment
 from fgslam.runs.localisation.experiment import run_localisation
 from fgslam.runs.localisation.results import Scored, scored
 

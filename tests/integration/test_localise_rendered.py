@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgslam.localisation_config import parse_localisation
+from fgslam.runs.localisation.config import parse_localisation
 from fgslam.runs.localisation.experiment import run_localisation
 
 RIG = {"width": 160, "height": 120}

@@ -15,7 +15,7 @@ from recordings import experiment, write_calibration
 from running import main, run_values
 
 from fgslam.core.errors import ConfigError
-from fgslam.localisation_config import LocalisationConfig, load_experiment, parse_localisation
+from fgslam.runs.localisation.config import LocalisationConfig, load_experiment, parse_localisation
 from fgslam.runs.localisation.experiment import run_localisation
 
 

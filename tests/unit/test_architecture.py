@@ -67,7 +67,7 @@ def test_a_lawful_package_passes(tmp_path: Path) -> None:
 LAYER_CASES = {
     "geometry imports a stage": ("geometry.py", "from fgslam.frontend import sift\n", 1),
     "types imports geometry": ("types.py", "\nimport fgslam.core.geometry\n", 2),
-    "settings import config": ("settings/a.py", "from fgslam.config import load\n", 1),
+    "settings import config": ("settings/a.py", "from fgslam.runs.config import load\n", 1),
     "stage imports a stage": ("frontend/sift.py", "x = 1\nimport fgslam.export.ply\n", 2),
     "stage imports a stage from the root": ("frontend/b.py", "from fgslam import factors\n", 1),
     "relative imports count": ("evaluation/a.py", "from ..export import ply\n", 1),

@@ -14,7 +14,6 @@ from simulated import RIG, Drive, simulate
 
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.backend.smoothers.settings import Isam2Settings
-from fgslam.config import ExperimentConfig, parse_config
 from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LandmarkTruth
@@ -31,6 +30,7 @@ from fgslam.report.metrics import EstimatorMetrics, UpdateTime
 from fgslam.report.point_cloud import MapPoints
 from fgslam.runs.baseline import check_baseline, read_baseline, write_baseline
 from fgslam.runs.choosing import Choice, all_kinds, choose, estimators_of
+from fgslam.runs.config import ExperimentConfig, parse_config
 from fgslam.runs.estimator_files import points_from_log
 from fgslam.runs.judging import seen_often
 from fgslam.runs.rendered_truth import points_under

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 import yaml
 
-from fgslam.config import ExperimentConfig, load_config, parse_config
 from fgslam.core.errors import ConfigError
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.datasets.recording_settings import ImageFolderSettings
 from fgslam.frontend.places.settings import LoopSettings
-from fgslam.homing_config import is_homing
+from fgslam.runs.config import ExperimentConfig, load_config, parse_config
+from fgslam.runs.homing.config import is_homing
 from fgslam.worlds.lab_settings import RenderedLabSettings
 
 EXPERIMENTS = [

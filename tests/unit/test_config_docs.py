@@ -8,9 +8,9 @@ from types import ModuleType
 
 import pytest
 
-from fgslam.config import ExperimentConfig
-from fgslam.homing_config import TASKS
-from fgslam.localisation_config import LocalisationConfig
+from fgslam.runs.config import ExperimentConfig
+from fgslam.runs.homing.config import TASKS
+from fgslam.runs.localisation.config import LocalisationConfig
 
 ROOT = Path(__file__).parents[2]
 

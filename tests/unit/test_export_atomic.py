@@ -13,7 +13,7 @@ import pytest
 from fgslam.core import atomic_files as whole_files
 from fgslam.core.atomic_files import make_subfolder, replacing, write_bytes, write_text
 from fgslam.core.errors import OutputError
-from fgslam.export.atomic import create_run_folder, is_run_folder
+from fgslam.runs.folder import create_run_folder, is_run_folder
 
 
 def leftovers(folder: Path) -> list[Path]:

@@ -4,11 +4,12 @@ import pytest
 
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
-from fgslam.config import parse_config
 from fgslam.core.errors import ConfigError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
 from fgslam.core.types import CameraRig, MeasurementType
-from fgslam.slam.factory import make_estimator, open_sequence, require_support
+from fgslam.runs.config import parse_config
+from fgslam.runs.opening import open_sequence
+from fgslam.slam.factory import make_estimator, require_support
 
 RIG = CameraRig(320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, 0.1, BODY_FORWARD_LEFT_UP_FROM_CAMERA)
 

@@ -9,9 +9,9 @@ import pytest
 import yaml
 
 from fgslam.backend.homing.settings import HomingEkfSettings, HomingGraphSettings
-from fgslam.config import ExperimentConfig, load_config
 from fgslam.core.errors import ConfigError
-from fgslam.homing_config import (
+from fgslam.runs.config import ExperimentConfig, load_config
+from fgslam.runs.homing.config import (
     TASKS,
     HomingExperiment,
     HomingTrialsConfig,
@@ -20,7 +20,7 @@ from fgslam.homing_config import (
     load_homing,
     parse_homing,
 )
-from fgslam.localisation_config import load_experiment as load_any
+from fgslam.runs.localisation.config import load_experiment as load_any
 
 EXPERIMENTS = [
     path

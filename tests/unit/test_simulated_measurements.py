@@ -12,7 +12,6 @@ from simulated import assert_same_bits
 
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
-from fgslam.config import ExperimentConfig, make_config
 from fgslam.core import geometry as g
 from fgslam.core.errors import ConfigError
 from fgslam.core.recordings import MeasurementRecording
@@ -22,7 +21,8 @@ from fgslam.datasets.opening import open_measurements
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
-from fgslam.localisation_config import load_experiment
+from fgslam.runs.config import ExperimentConfig, make_config
+from fgslam.runs.localisation.config import load_experiment
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import replay_step
 from fgslam.worlds.simulated.identities import IdentityBook

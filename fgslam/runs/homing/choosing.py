@@ -15,10 +15,10 @@ from fgslam.backend.homing.settings import (
     HomingGraphSettings,
     SnapshotSettings,
 )
-from fgslam.config_reading import apply_overrides
 from fgslam.core.errors import ConfigError
-from fgslam.homing_config import HomingExperiment, parse_homing
 from fgslam.runs.choosing import Choice
+from fgslam.runs.config_reading import apply_overrides
+from fgslam.runs.homing.config import HomingExperiment, parse_homing
 
 _PREFIX = "estimators."
 VARIANTS: dict[str, HomingEstimatorSettings] = {

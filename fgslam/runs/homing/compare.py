@@ -13,8 +13,6 @@ from fgslam.backend.homing.settings import HomingEstimatorSettings
 from fgslam.core.bearing_log import BearingLog
 from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.evaluation.homing import HomingErrors, homing_errors, summarise_homings
-from fgslam.export.atomic import RUN_MARKER, ExistingFolder, is_run_folder
-from fgslam.homing_config import HomingExperiment, is_homing, load_homing
 from fgslam.report.homing import TextTable
 from fgslam.report.homing.curves import Line, curve_figure
 from fgslam.report.homing.local_map import local_map_figure
@@ -22,7 +20,9 @@ from fgslam.report.metrics import JsonValue, UpdateTime
 from fgslam.report.page.traces import Figure
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.choosing import EVERY, Choice
+from fgslam.runs.folder import RUN_MARKER, ExistingFolder, is_run_folder
 from fgslam.runs.homing.choosing import choose_homing
+from fgslam.runs.homing.config import HomingExperiment, is_homing, load_homing
 from fgslam.runs.homing.logs import load_bearing_logs
 from fgslam.runs.homing.replay import ReplayedHoming, replay_homing
 from fgslam.runs.homing.results import (

@@ -21,13 +21,13 @@ from fgslam.homing.drive_scores import (
     truly_arrived,
 )
 from fgslam.homing.record import STAGES, DriveRecord
-from fgslam.homing_config import DrivingConfig
 from fgslam.report.homing import Column, TextTable
 from fgslam.report.homing.curves import Line, curve_figure
 from fgslam.report.homing.local_map import local_map_figure
 from fgslam.report.homing.plan import PASS_RADIUS_M, catchment_figure, drive_figure
 from fgslam.report.metrics import JsonValue, UpdateTime
 from fgslam.report.page.traces import Figure
+from fgslam.runs.homing.config import DrivingConfig
 from fgslam.runs.homing.drive_files import (
     bearing_log,
     drive_of,

@@ -13,14 +13,14 @@ import numpy as np
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.core.errors import OutputError
 from fgslam.core.types import FloatArray, Image
-from fgslam.export.atomic import ExistingFolder
 from fgslam.homing.avoidance import make_avoider
 from fgslam.homing.closed_loop import Driver, World, follow
 from fgslam.homing.eyes import HomingEyes
 from fgslam.homing.path_following import PathFollower
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.steering import Steering
-from fgslam.homing_config import DrivingConfig
+from fgslam.runs.folder import ExistingFolder
+from fgslam.runs.homing.config import DrivingConfig
 from fgslam.runs.homing.drive_pictures import DriveWatcher, Unwrapping
 from fgslam.runs.homing.drive_results import finish_drives
 from fgslam.runs.homing.driven import DrivenSeed

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.homing.image_eyes import EyesSettings, ImageEyes
-from fgslam.homing_config import DrivingConfig
+from fgslam.runs.homing.config import DrivingConfig
 from fgslam.runs.homing.driving import Opened
 from fgslam.worlds.house.omni_world import OmniWorld
 

@@ -16,9 +16,9 @@ from fgslam.homing.localisation import Localiser
 from fgslam.homing.retrieval import VisualWords
 from fgslam.homing.third_views import InlierRows
 from fgslam.homing.topological_map import map_of_answers
-from fgslam.homing_config import TopologicalMapConfig
 from fgslam.report.metrics import JsonValue
 from fgslam.report.tables import write_csv
+from fgslam.runs.homing.config import TopologicalMapConfig
 from fgslam.runs.homing.results import Progress, Stopped
 
 LOCALISATION_FILE = "localisation.csv"

@@ -11,17 +11,17 @@ import numpy as np
 
 from fgslam.core.errors import ConfigError, StoredMapError
 from fgslam.core.homing_types import OmniFeatures
-from fgslam.export.atomic import ExistingFolder
 from fgslam.homing.linking import Answer, Link, Pair
 from fgslam.homing.third_views import InlierRows
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
-from fgslam.homing_config import TopologicalMapConfig
 from fgslam.report.homing import Column, TextTable
 from fgslam.report.homing.network import Links, network_figure, unfolded
 from fgslam.report.metrics import JsonValue
 from fgslam.report.page.data import Picture
 from fgslam.report.page.traces import Figure
 from fgslam.report.tables import Cell, write_csv
+from fgslam.runs.folder import ExistingFolder
+from fgslam.runs.homing.config import TopologicalMapConfig
 from fgslam.runs.homing.localising import Localised, localise, localised_numbers, write_localised
 from fgslam.runs.homing.pair_answers import PairAnswer
 from fgslam.runs.homing.pair_pictures import draw_pair

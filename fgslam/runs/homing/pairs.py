@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.types import FloatArray
-from fgslam.export.atomic import ExistingFolder
-from fgslam.homing_config import HomingPairsConfig
 from fgslam.report.homing import Column, TextTable
 from fgslam.report.homing.curves import claimed_against_true, sorted_errors
 from fgslam.report.homing.network import Links, network_figure
 from fgslam.report.metrics import JsonValue
 from fgslam.report.page.traces import Figure
+from fgslam.runs.folder import ExistingFolder
+from fgslam.runs.homing.config import HomingPairsConfig
 from fgslam.runs.homing.pair_answers import (
     WRONG_DEG,
     PairAnswer,

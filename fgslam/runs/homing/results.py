@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from fgslam.export.atomic import ExistingFolder, create_run_folder
-from fgslam.homing_config import HomingExperiment
 from fgslam.report.homing import HomingPage, TextTable, write_homing_report
 from fgslam.report.metrics import JsonValue
 from fgslam.report.tables import write_json
+from fgslam.runs.folder import ExistingFolder, create_run_folder
+from fgslam.runs.homing.config import HomingExperiment
 from fgslam.runs.outputs import versions, write_config
 
 METRICS_FILE = "metrics.json"

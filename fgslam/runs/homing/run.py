@@ -6,8 +6,8 @@ from pathlib import Path
 
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.threads import one_blas_thread
-from fgslam.export.atomic import ExistingFolder, is_run_folder
-from fgslam.homing_config import (
+from fgslam.runs.folder import ExistingFolder, is_run_folder
+from fgslam.runs.homing.config import (
     HomingConfig,
     HomingExperiment,
     HomingPairsConfig,

@@ -10,12 +10,12 @@ import numpy as np
 
 from fgslam.evaluation.consistency import Consistency, Nees
 from fgslam.evaluation.homing import HomingErrors, HomingSummary, summarise_homings
-from fgslam.homing_config import HomingTrialsConfig
 from fgslam.report.homing import Column, TextTable
 from fgslam.report.homing.curves import sorted_errors
 from fgslam.report.metrics import JsonValue, UpdateTime
 from fgslam.report.page.traces import Figure
 from fgslam.report.tables import Cell, write_csv
+from fgslam.runs.homing.config import HomingTrialsConfig
 from fgslam.runs.homing.results import HomingResult, Status, write_document, write_page
 from fgslam.runs.homing.trial_data import HomingTrial
 

@@ -12,8 +12,8 @@ import numpy as np
 from fgslam.core.bearing_log import BearingLog
 from fgslam.core.homing_types import Refusal
 from fgslam.evaluation.homing import homing_errors
-from fgslam.export.atomic import ExistingFolder
-from fgslam.homing_config import HomingTrialsConfig
+from fgslam.runs.folder import ExistingFolder
+from fgslam.runs.homing.config import HomingTrialsConfig
 from fgslam.runs.homing.logs import save_bearing_logs
 from fgslam.runs.homing.replay import replay_homing
 from fgslam.runs.homing.results import HomingResult, Progress, Stopped, begin, jobs_of

@@ -12,15 +12,15 @@ import numpy as np
 from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.types import FloatArray
 from fgslam.datasets.omni.recording import OmniRecording
-from fgslam.export.atomic import ExistingFolder
 from fgslam.frontend.homing.video_tracking import ReplenishedTracker, TrackedImage
-from fgslam.homing_config import OmniVideoConfig
 from fgslam.report.homing import Column, TextTable
 from fgslam.report.homing.curves import Line, curve_figure
 from fgslam.report.metrics import JsonValue, UpdateTime
 from fgslam.report.page.data import Picture
 from fgslam.report.pictures.view_tracks import draw_view_tracks
 from fgslam.report.tables import write_csv
+from fgslam.runs.folder import ExistingFolder
+from fgslam.runs.homing.config import OmniVideoConfig
 from fgslam.runs.homing.mirror_check import open_checked
 from fgslam.runs.homing.results import (
     HomingResult,

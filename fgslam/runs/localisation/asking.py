@@ -18,7 +18,7 @@ from fgslam.core.saved_map import require_rig
 from fgslam.core.types import FloatArray, LandmarkMap
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 from fgslam.frontend.stereo.matching import StereoMatcher
-from fgslam.localisation_config import LocalisationConfig
+from fgslam.runs.localisation.config import LocalisationConfig
 from fgslam.runs.localisation.sights import Sighted, TrueSights
 from fgslam.runs.localisation.submap import Window, submap_features
 from fgslam.runs.localisation.truth import TruthInMap, truth_in_map

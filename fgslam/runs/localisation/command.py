@@ -7,15 +7,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from fgslam.config import ExperimentConfig, load_config
 from fgslam.core.errors import ConfigError, FgslamError, OutputError
 from fgslam.core.recordings import Sequence as Recording
 from fgslam.core.saved_map import SavedMap, require_rig
 from fgslam.core.threads import one_blas_thread
 from fgslam.datasets.layouts import recognise_layout
-from fgslam.export.atomic import ExistingFolder, create_run_folder, is_run_folder
-from fgslam.localisation_config import LocalisationConfig, load_experiment, make_localisation
+from fgslam.runs.config import ExperimentConfig, load_config
+from fgslam.runs.folder import ExistingFolder, create_run_folder, is_run_folder
 from fgslam.runs.localisation.asking import Progress
+from fgslam.runs.localisation.config import LocalisationConfig, load_experiment, make_localisation
 from fgslam.runs.localisation.experiment import answer, open_queries, write_run_config
 from fgslam.runs.localisation.files import write_results
 from fgslam.runs.localisation.results import LocalisationResult

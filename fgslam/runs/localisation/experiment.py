@@ -10,16 +10,16 @@ from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import require_rig
 from fgslam.core.threads import one_blas_thread
-from fgslam.export.atomic import ExistingFolder, create_run_folder, is_run_folder
-from fgslam.localisation_config import LocalisationConfig
 from fgslam.runs.experiment import run_experiment
+from fgslam.runs.folder import ExistingFolder, create_run_folder, is_run_folder
 from fgslam.runs.localisation.asking import Progress, ask_all, nothing_asked
+from fgslam.runs.localisation.config import LocalisationConfig
 from fgslam.runs.localisation.files import write_results
 from fgslam.runs.localisation.results import LocalisationResult, result_of
 from fgslam.runs.map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map
 from fgslam.runs.mapping import first_config
+from fgslam.runs.opening import open_sequence
 from fgslam.runs.outputs import write_config
-from fgslam.slam.factory import open_sequence
 
 
 @one_blas_thread()

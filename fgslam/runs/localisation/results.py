@@ -23,9 +23,9 @@ from fgslam.evaluation.localisation import (
     localisation_errors,
     score,
 )
-from fgslam.localisation_config import LocalisationConfig
 from fgslam.report.homing import Column, TextTable
 from fgslam.runs.localisation.asking import Asked, Attempt
+from fgslam.runs.localisation.config import LocalisationConfig
 
 _UNKNOWN = "-"
 

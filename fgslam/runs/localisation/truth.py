@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.config import ExperimentConfig
-from fgslam.config_reading import Reader
 from fgslam.core.errors import FgslamError
 from fgslam.core.geometry import inverse, pose, transform_to_world
 from fgslam.core.recordings import Sequence
@@ -16,7 +14,9 @@ from fgslam.core.saved_map import SavedMap
 from fgslam.core.types import FloatArray
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.evaluation.trajectory import align, associate
-from fgslam.slam.factory import open_sequence
+from fgslam.runs.config import ExperimentConfig
+from fgslam.runs.config_reading import Reader
+from fgslam.runs.opening import open_sequence
 from fgslam.worlds.lab_settings import RenderedLabSettings
 from fgslam.worlds.places import PlaceChoice, plan_in_place
 from fgslam.worlds.world import make_rig

@@ -13,14 +13,6 @@ from typing import Annotated, Any, Literal, TypeAlias
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from fgslam.backend.homing.settings import HomingEstimatorSettings, HomingGraphSettings
-from fgslam.config import ExperimentConfig, make_config
-from fgslam.config_reading import (
-    Reader,
-    apply_overrides,
-    kind_as_settings,
-    read_mapping,
-    with_default_kind,
-)
 from fgslam.core.errors import ConfigError
 from fgslam.datasets.omni.settings import OmniDatasetSettings
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
@@ -31,7 +23,15 @@ from fgslam.homing.settings import (
     LocalisationSettings,
     TopologicalMapSettings,
 )
-from fgslam.settings.homing_output import HomingOutputSettings
+from fgslam.runs.config import ExperimentConfig, make_config
+from fgslam.runs.config_reading import (
+    Reader,
+    apply_overrides,
+    kind_as_settings,
+    read_mapping,
+    with_default_kind,
+)
+from fgslam.runs.homing.output_settings import HomingOutputSettings
 from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
 from fgslam.worlds.house.settings import OmniHouseSettings
 

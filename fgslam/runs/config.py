@@ -14,12 +14,12 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.backend.settings import EstimatorSettings
-from fgslam.config_reading import Reader, kind_as_settings, read_mapping, with_default_kind
 from fgslam.core.errors import ConfigError
 from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.datasets.settings import DatasetSettings
-from fgslam.settings.output import OutputSettings
+from fgslam.runs.config_reading import Reader, kind_as_settings, read_mapping, with_default_kind
+from fgslam.runs.output_settings import OutputSettings
 from fgslam.slam.frontend_settings import FrontendSettings
 from fgslam.slam.map_settings import MapSettings
 
@@ -73,7 +73,7 @@ def load_config(path: Path, overrides: Iterable[str] = ()) -> ExperimentConfig:
 
     Raises:
         ConfigError: the file is missing or no YAML mapping, a key or value is wrong, or it is
-            about homing (:func:`fgslam.homing_config.load_experiment` reads both).
+            about homing (:func:`fgslam.runs.homing.config.load_experiment` reads both).
     """
     return make_config(read_mapping(path), overrides, str(path))
 

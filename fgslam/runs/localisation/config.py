@@ -13,15 +13,15 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.backend.settings import EstimatorSettings
-from fgslam.config import ExperimentConfig
-from fgslam.config_reading import Reader, apply_overrides, read_mapping, with_default_kind
 from fgslam.core.errors import ConfigError
 from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.datasets.settings import DatasetSettings
-from fgslam.homing_config import HomingExperiment, make_experiment
-from fgslam.settings.localisation import KnownMapSettings, QuerySettings
-from fgslam.settings.output import OutputSettings
+from fgslam.runs.config import ExperimentConfig
+from fgslam.runs.config_reading import Reader, apply_overrides, read_mapping, with_default_kind
+from fgslam.runs.homing.config import HomingExperiment, make_experiment
+from fgslam.runs.localisation.settings import KnownMapSettings, QuerySettings
+from fgslam.runs.output_settings import OutputSettings
 from fgslam.slam.frontend_settings import FrontendSettings
 from fgslam.slam.map_settings import MapSettings
 

@@ -1,0 +1,56 @@
+"""TODO runs.opening."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fgslam.core.errors import ConfigError
+from fgslam.core.recordings import Sequence
+from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
+from fgslam.datasets.odometry_settings import (
+    OdometrySettings,
+    RecordedOdometrySettings,
+    SyntheticOdometrySettings,
+)
+from fgslam.datasets.opening import open_recording
+from fgslam.datasets.rendered_lab import RenderedLabSequence
+from fgslam.datasets.synthetic_odometry import SyntheticOdometry
+from fgslam.runs.config import ExperimentConfig
+from fgslam.worlds.lab_settings import RenderedLabSettings
+
+
+def open_sequence(
+    config: ExperimentConfig, progress: Callable[[int, int], None] | None = None
+) -> Sequence:
+    """Opens the recording, rendered or read, with the odometry that the configuration wants.
+
+    ``progress`` is told how many frames of a rendered recording are done, and of how many.
+    """
+    dataset = config.dataset
+    if isinstance(dataset, RenderedLabSettings):
+        _require_own_noise(config.odometry)
+        sequence: Sequence = RenderedLabSequence(
+            dataset, config.seed, dataset.start, dataset.stop, dataset.stride, progress
+        )
+    elif isinstance(dataset, MeasurementDatasetSettings):
+        raise ConfigError(
+            f"dataset.kind {dataset.kind} holds measurements, no images; choose a recording of "
+            "images here"
+        )
+    else:
+        noise = config.odometry if isinstance(config.odometry, RecordedOdometrySettings) else None
+        sequence = open_recording(dataset, noise)
+    if isinstance(config.odometry, SyntheticOdometrySettings):
+        return SyntheticOdometry(sequence, config.odometry, config.seed)
+    return sequence
+
+
+def _require_own_noise(odometry: OdometrySettings) -> None:
+    """The rendered robot's odometry has its noise among the data set's keys: no key may be idle."""
+    if not isinstance(odometry, RecordedOdometrySettings):
+        return
+    if odometry != RecordedOdometrySettings(gap=odometry.gap):
+        raise ConfigError(
+            "keys of `odometry` other than kind and gap mean nothing to the rendered lab; set the "
+            "noise of its wheels under dataset.odometry"
+        )
