@@ -28,7 +28,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from fgslam.console import progress_bar
+from fgslam.cli.console import progress_bar
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import Sequence
 from fgslam.core.threads import one_blas_thread

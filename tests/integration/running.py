@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import yaml
 
-from fgslam import cli
+from fgslam.cli import main as cli
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.report.point_cloud import read_ply
 from fgslam.report.trajectories import read_covariances, read_tum
@@ -122,7 +122,7 @@ def main(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
 
 
 def command(*arguments: object) -> list[str]:
-    return [sys.executable, "-c", "from fgslam.cli import main; main()", *map(str, arguments)]
+    return [sys.executable, "-c", "from fgslam.cli.main import main; main()", *map(str, arguments)]
 
 
 def start(*arguments: object, **environment: str) -> subprocess.Popen[str]:

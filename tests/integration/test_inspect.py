@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam import cli
+from fgslam.cli import main as cli
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
 from fgslam.core.types import Image
 from fgslam.runs.inspection.recording import inspect_recording

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from fgslam.homing_console import text_table
+from fgslam.cli.homing_console import text_table
 from fgslam.runs.localisation.files import LOCALISATION_FILE, METRICS_FILE, REPORT_FILE
 from fgslam.runs.localisation.results import LocalisationResult, details, told
 

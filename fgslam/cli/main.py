@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fgslam import compare_options as options
+from fgslam.cli import compare_options as options
+from fgslam.cli.interruption import stop_flag, stoppable
 from fgslam.core.errors import FgslamError
-from fgslam.interruption import stop_flag, stoppable
 
 if TYPE_CHECKING:
     from fgslam.runs.baseline import Results
@@ -91,8 +91,8 @@ def run(
 
 
 def _run_homing(settings: HomingExperiment, folder: Path, existing: ExistingFolder) -> None:
-    from fgslam.console import progress_bar
-    from fgslam.homing_console import show_homing
+    from fgslam.cli.console import progress_bar
+    from fgslam.cli.homing_console import show_homing
     from fgslam.runs.homing.run import run_homing
 
     with stop_flag() as stopped, progress_bar() as progress:
@@ -103,8 +103,8 @@ def _run_homing(settings: HomingExperiment, folder: Path, existing: ExistingFold
 
 
 def _run_localisation(settings: LocalisationConfig, folder: Path, existing: ExistingFolder) -> None:
-    from fgslam.console import progress_bar
-    from fgslam.localisation_console import show_localisation
+    from fgslam.cli.console import progress_bar
+    from fgslam.cli.localisation_console import show_localisation
     from fgslam.runs.localisation.experiment import run_localisation
 
     with stop_flag() as stopped, progress_bar() as progress:
@@ -116,8 +116,8 @@ def _run_localisation(settings: LocalisationConfig, folder: Path, existing: Exis
 
 
 def _run_images(settings: ExperimentConfig, folder: Path, existing: ExistingFolder) -> None:
-    from fgslam.comparison_console import show_comparisons
-    from fgslam.console import progress_bar, show_result
+    from fgslam.cli.comparison_console import show_comparisons
+    from fgslam.cli.console import progress_bar, show_result
     from fgslam.runs.beginning import resume_command
     from fgslam.runs.experiment import run_experiment
 
@@ -132,8 +132,8 @@ def _run_images(settings: ExperimentConfig, folder: Path, existing: ExistingFold
 
 
 def _run_measurements(settings: ExperimentConfig, folder: Path, existing: ExistingFolder) -> None:
-    from fgslam.comparison_console import show_comparisons
-    from fgslam.console import progress_bar
+    from fgslam.cli.comparison_console import show_comparisons
+    from fgslam.cli.console import progress_bar
     from fgslam.runs.measured import run_measured
 
     with stop_flag() as stopped, progress_bar() as progress:
@@ -204,8 +204,8 @@ def compare(  # noqa: PLR0913 - each option is a parameter
 def _compare_homing(
     runs: list[Path], choice: Choice, out: Path | None, existing: ExistingFolder, jobs: int
 ) -> None:
-    from fgslam.console import progress_bar
-    from fgslam.homing_console import show_homing
+    from fgslam.cli.console import progress_bar
+    from fgslam.cli.homing_console import show_homing
     from fgslam.runs.homing.compare import compare_homing_runs
 
     with stop_flag() as stopped, progress_bar() as progress:
@@ -224,8 +224,8 @@ def _compare_runs(
     runs: list[Path], choice: Choice, out: Path | None, existing: ExistingFolder, jobs: int
 ) -> tuple[Results, int]:
     """Metrics by run and estimator, and the exit status."""
-    from fgslam.comparison_console import show_comparisons
-    from fgslam.console import progress_bar
+    from fgslam.cli.comparison_console import show_comparisons
+    from fgslam.cli.console import progress_bar
     from fgslam.runs.compare import compare_runs
 
     with stop_flag() as stopped, progress_bar() as progress:
@@ -244,8 +244,8 @@ def _compare_trials(
     jobs: int,
 ) -> tuple[Results, int]:
     """Means over the trials by run and estimator, and the exit status."""
-    from fgslam.comparison_console import show_trials
-    from fgslam.console import progress_bar
+    from fgslam.cli.comparison_console import show_trials
+    from fgslam.cli.console import progress_bar
     from fgslam.runs.trial_results import together
     from fgslam.runs.trials import Seeds, run_trials
 
@@ -270,7 +270,7 @@ def _write_baseline(path: Path, results: Results) -> None:
 
 def _check_baseline(expected: dict[str, Any], results: Results) -> bool:
     """Shows what differs; whether something became worse."""
-    from fgslam.comparison_console import show_deviations
+    from fgslam.cli.comparison_console import show_deviations
     from fgslam.runs.baseline import check_baseline
 
     deviations = check_baseline(expected, results)
@@ -309,8 +309,8 @@ def localize(
     A pose is told only where it is beyond doubt, with the reasons. Exits with 0 whatever the
     answers are, with 2 where map or recording cannot be used.
     """
-    from fgslam.console import progress_bar
-    from fgslam.localisation_console import show_localisation
+    from fgslam.cli.console import progress_bar
+    from fgslam.cli.localisation_console import show_localisation
     from fgslam.runs.localisation.command import Wanted
     from fgslam.runs.localisation.command import localize as locate
 
@@ -402,7 +402,7 @@ def inspect(
 
     Exits with 0 whatever the report says, with 2 where the recording cannot be opened at all.
     """
-    from fgslam.console import progress_bar
+    from fgslam.cli.console import progress_bar
     from fgslam.runs.inspection.recording import inspect_recording
 
     with stop_flag() as stopped, progress_bar() as progress:
