@@ -47,7 +47,7 @@ RIG = CameraRig(
     vertical_baseline=0.1,
     bTc=g.BODY_FORWARD_LEFT_UP_FROM_CAMERA,
 )
-"""The paper's rig: 320x240, 60 degrees, 10 cm baselines (S1)."""
+"""The paper's rig: 320x240, 60 degrees, 10 cm baselines."""
 
 TURN_AND_GO = (0.0, 0.03, 0.0, 0.01, 0.0, 0.08)
 BORDER_PX = 5.0

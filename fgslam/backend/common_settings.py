@@ -1,4 +1,4 @@
-"""TODO backend.common_settings."""
+"""Settings that several estimators share: the floor, robust kernels, names."""
 
 from __future__ import annotations
 

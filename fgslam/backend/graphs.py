@@ -1,4 +1,4 @@
-"""TODO backend.graphs."""
+"""Helpers on GTSAM's graphs."""
 
 from __future__ import annotations
 

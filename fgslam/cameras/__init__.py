@@ -1,1 +1,1 @@
-"""TODO cameras."""
+"""Cameras: rigs of two and three cameras, omnidirectional models, calibration."""

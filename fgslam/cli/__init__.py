@@ -1,1 +1,1 @@
-"""TODO cli."""
+"""The command line: a user of the library."""

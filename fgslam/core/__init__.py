@@ -1,1 +1,1 @@
-"""TODO core."""
+"""What crosses the borders of rooms: types, geometry, errors, logs and files."""

@@ -1,4 +1,4 @@
-"""The floor that a wheeled robot keeps to: which camera motions it allows (Se et al. 5; S27).
+"""The floor that a wheeled robot keeps to: which camera motions it allows (Se et al. 5).
 
 Shared by the front-end's least squares, the filters and the graphs, so that all of them mean the
 same by "on the floor".

@@ -206,7 +206,7 @@ def compose_odometry(steps: Iterable[Odometry]) -> Odometry:
 
 
 def odometry_of_camera(body: Odometry, bTc: FloatArray) -> Odometry:
-    """Odometry of the robot's body as that of its camera, by the lever arm (Se et al. 5; S30)."""
+    """Odometry of the robot's body as that of its camera, by the lever arm (Se et al. 5)."""
     motion = body_to_camera_motion(body.motion, bTc)
     return Odometry(motion, change_tangent_frame(inverse(bTc), body.covariance))
 
@@ -218,7 +218,7 @@ def change_tangent_frame(aTb: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def body_to_camera_motion(bTb: FloatArray, bTc: FloatArray) -> FloatArray:
-    """Motion (4, 4) of the camera when the robot's body moves by ``bTb`` (Se et al. 5; S30).
+    """Motion (4, 4) of the camera when the robot's body moves by ``bTb`` (Se et al. 5).
 
     The lever arm turns a pure spin of the robot into an arc at the camera.
     """
@@ -345,7 +345,7 @@ def triangulation_covariance(
 ) -> FloatArray:
     """Full covariance (n, 3, 3) of triangulated points by first-order propagation.
 
-    Keeps the off-diagonals, so that the ellipsoids lie along the rays (design B4).
+    Keeps the off-diagonals, so that the ellipsoids lie along the rays.
 
     Args:
         sensor: the cameras, or the range-bearing sensor.
@@ -414,7 +414,7 @@ def inverse_spd3(matrices: FloatArray) -> FloatArray:
 
 
 def right_from_left_camera(wTl: FloatArray, baseline: float) -> FloatArray:
-    """Poses (..., 4, 4) of the right camera from those of the left one (design E-S6)."""
+    """Poses (..., 4, 4) of the right camera from those of the left one."""
     out = np.array(wTl, dtype=np.float64)
     out[..., :3, 3] += baseline * wTl[..., :3, 0]
     return out

@@ -49,7 +49,7 @@ class UprightFeatures:
         covariance: (n, 2, 2) of (bearing, elevation).
         scale: (n,) SIFT scale in radians of elevation (pixels over pixels a radian).
         descriptors: (n, 128) uint8.
-        colour: (n, 3) C_RB, C_RG, C_GB over the patch (eq. 1 as in E-G1).
+        colour: (n, 3) C_RB, C_RG, C_GB over the patch (eq. 1, with centred bands).
     """
 
     pixels: FloatArray
@@ -66,7 +66,7 @@ class UprightFeatures:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColumnSegments:
-    """Invariant column segments of one image (III-A2, design B1).
+    """Invariant column segments of one image (III-A2).
 
     Attributes:
         bearing: (n,) radians of the segment's column.
@@ -88,7 +88,7 @@ class ColumnSegments:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OmniFeatures:
-    """All that is kept of a path image: features, no pixels of it (G10)."""
+    """All that is kept of a path image: features, no pixels of it."""
 
     sift: UprightFeatures
     columns: ColumnSegments
@@ -181,7 +181,7 @@ class RefusalReason(str, Enum):
 class Refusal:
     """No homing vector, and why; ``details`` is one clear clause with the numbers.
 
-    ``AT_TARGET`` is an answer of its own: both views are from one place (D6), ``rotation`` holds
+    ``AT_TARGET`` is an answer of its own: both views are from one place, ``rotation`` holds
     the turn (radians); it is None for all other reasons.
     """
 
@@ -238,7 +238,7 @@ class HomingStart:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedBearings:
-    """What one image on the way says: eq. 6. A feature that is absent is lost for good (G28).
+    """What one image on the way says: eq. 6. A feature that is absent is lost for good.
 
     Attributes:
         time: seconds.
@@ -277,7 +277,7 @@ class TrackedBearings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HomeVector:
-    """The steering vector (E-G13): the target relative to the *present* pose.
+    """The steering vector: the target relative to the *present* pose.
 
     Attributes:
         distance: in legs; 1 at the start, so it is the fraction of the way that is left.

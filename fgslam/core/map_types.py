@@ -11,8 +11,7 @@ import numpy.typing as npt
 from fgslam.core.types import ByteArray, FloatArray, IntArray
 
 Words = npt.NDArray[np.int16]
-"""(v,) the cell of the vocabulary that each descriptor lies in (:mod:`fgslam.frontend.features.vocabulary`).
-"""
+"""(v,) the cell of the vocabulary (``frontend.features.vocabulary``) of each descriptor."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -55,7 +55,7 @@ def between(wTa: FloatArray, wTb: FloatArray) -> FloatArray:
 
 
 def to_robot(wTr: FloatArray, points: FloatArray) -> FloatArray:
-    """(n, 2) points of the world in the robot's axes: R(psi)^T (P - p), eq. 8 as in E-G2."""
+    """(n, 2) points of the world in the robot's axes: R(psi)^T (P - p), eq. 8 corrected."""
     return (np.asarray(points) - wTr[:2]) @ rotation(float(wTr[2]))
 
 

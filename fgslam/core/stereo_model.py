@@ -37,7 +37,7 @@ def measurement_map(kind: str, cameras: int, ratio: float) -> FloatArray:
 
     The covariance of the measurement follows as ``sigma^2 M M^T`` for equal independent noise on
     all coordinates. For `paper`, d is the mean of both disparities, which correlates with row and
-    column (design B4); `fused` is the least-squares solution of the rig's linear model, which
+    column; `fused` is the least-squares solution of the rig's linear model, which
     for three cameras has variances 5/12, 5/12 and 3/4 against the paper's 1, 1 and 1.
     """
     if kind == "fused":

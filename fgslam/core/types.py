@@ -248,7 +248,7 @@ class EgoMotion:
     def correlation(self) -> FloatArray:
         """(6, 6) correlations of the pose, [rotation, translation]; 0 where motion is excluded.
 
-        The known one is that of sideways motion and yaw (Se et al. 5; S28).
+        The known one is that of sideways motion and yaw (Se et al. 5).
         """
         return correlation(self.covariance)
 

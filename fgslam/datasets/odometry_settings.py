@@ -1,4 +1,4 @@
-"""TODO datasets.odometry_settings."""
+"""Settings of what serves as odometry, a tagged union over ``kind``."""
 
 from __future__ import annotations
 

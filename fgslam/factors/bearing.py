@@ -103,7 +103,7 @@ def start_prior(pose: int) -> Any:
 
 
 def leg_factor(start: int, target: int) -> Any:
-    """The distance from start to target is the unit of length (R = 1, III-B; E-G5)."""
+    """The distance from start to target is the unit of length (R = 1, III-B)."""
     return gtsam.RangeFactorPose2(start, target, 1.0, gtsam.noiseModel.Isotropic.Sigma(1, STIFF))
 
 
@@ -129,7 +129,7 @@ def velocity_prior(velocity: int, mean: FloatArray, sigmas: FloatArray) -> Any:
 def motion_factor(
     before: tuple[int, int, float], after: tuple[int, int, float], density: FloatArray
 ) -> Any:
-    """Constant velocity up to white noise on the acceleration (eqs 4 and 5 as in E-G4).
+    """Constant velocity up to white noise on the acceleration (eq 4 and 5, corrected).
 
     Args:
         before: keys of pose and of velocity, and time in seconds.

@@ -1,7 +1,7 @@
-"""Bearings and elevations in the plane, as pure functions with their derivatives (design D1, D9).
+"""Bearings and elevations in the plane, as pure functions with their derivatives.
 
 The specification of the factors of homing and the measurement model of its filter: eqs 7 to 9 as
-corrected in E-G2, E-G3 and E-G6. Residuals are *predicted minus measured*. Poses are (x, y, psi)
+corrected in sign and order. Residuals are *predicted minus measured*. Poses are (x, y, psi)
 arrays and derivatives are by these three numbers, not in a tangent space.
 """
 
@@ -21,7 +21,7 @@ def bearing(pose: FloatArray, points: FloatArray, measured: FloatArray) -> Float
 
 
 def bearing_jacobians(pose: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of bearings by the pose, (n, 3), and by their points, (n, 2) (D9)."""
+    """Derivatives of bearings by the pose, (n, 3), and by their points, (n, 2)."""
     offset = points - pose[:2]
     squared = np.einsum("ij,ij->i", offset, offset)[:, None]
     across = np.column_stack([-offset[:, 1], offset[:, 0]]) / squared
@@ -41,7 +41,7 @@ def polar_jacobians(polar: FloatArray) -> FloatArray:
 
 
 def target_pose(target: FloatArray) -> FloatArray:
-    """(3,) pose (x_t, y_t, psi_t) of (D_t, theta_t, psi_t): what eq. 9 leaves unsaid (E-G6)."""
+    """(3,) pose (x_t, y_t, psi_t) of (D_t, theta_t, psi_t): what eq. 9 leaves unsaid."""
     return np.append(target[0] * unit(target[1]), target[2])
 
 
@@ -74,7 +74,7 @@ def elevation_jacobians(
 def elevation_pair(
     target: FloatArray, point: FloatArray, elevations: FloatArray
 ) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-    """Elevation from the target of a landmark whose height the one from the start gives (G12).
+    """Elevation from the target of a landmark whose height the one from the start gives.
 
     The height d tan(alpha) is put in, d the distance from the start: the two elevations' factors
     with the height eliminated, to first order.
@@ -123,7 +123,7 @@ def direction_and_turn(
 def triangulated(
     vector: tuple[float, float], start: FloatArray, target: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Distances from the start, in legs, and their derivatives (D1).
+    """Distances from the start, in legs, and their derivatives.
 
     Args:
         vector: (theta, psi).

@@ -28,7 +28,7 @@ def odometry_factor(before: int, after: int, odometry: Odometry) -> Any:
 
 
 def floor_factors(pose: int, floor: Floor, wTc: FloatArray) -> list[Any]:
-    """Factors that keep a pose on the floor (Se et al. 5; S27): height, and for dof 3 its tilt.
+    """Factors that keep a pose on the floor (Se et al. 5): height, and for dof 3 its tilt.
 
     The height is exact anywhere. The tilt is measured about the rotation nearest to ``wTc``
     that the floor allows: it is zero for all upright poses, and its deviation keeps its meaning

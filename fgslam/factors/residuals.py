@@ -165,7 +165,7 @@ def odometry(wTp: FloatArray, wTn: FloatArray, pTn: FloatArray) -> FloatArray:
 
 
 def height(floor: Floor, wTc: FloatArray) -> float:
-    """How far the camera is below the floor's level (Se et al. 5; S27), metres."""
+    """How far the camera is below the floor's level (Se et al. 5), metres."""
     return float(floor.down @ wTc[:3, 3])
 
 

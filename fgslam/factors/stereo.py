@@ -1,6 +1,6 @@
 """Stereo factors: one landmark observation (column, row, disparity) by the rig.
 
-The paper's reference is the right camera, GTSAM's stereo camera the left one (design E-S6). The
+The paper's reference is the right camera, GTSAM's stereo camera the left one. The
 pose variable stays the right camera's; the left one sits ``baseline`` along its -x axis and is
 told to the factor as the sensor's place on the body. GTSAM measures (u_left, u_right, v), which
 is linear in ours: ``u_left = c + d, u_right = c, v = r``; its covariance follows exactly.

@@ -1,4 +1,4 @@
-"""The lower layer that may override the steering: obstacles in a range scan (IV; design G17).
+"""The lower layer that may override the steering: obstacles in a range scan (IV).
 
 It is kept apart from homing, as in the paper: homing says where home is, this says how to get past
 what stands in the way, and the next image corrects the rest.

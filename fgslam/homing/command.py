@@ -29,7 +29,7 @@ class HomingState(str, Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Command:
-    """The interface to what drives the robot (G17).
+    """The interface to what drives the robot.
 
     Attributes:
         time: of the image, seconds.

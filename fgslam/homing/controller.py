@@ -1,4 +1,4 @@
-"""One homing as a state machine: initialise, drive and update, stop (G3, G19; sections II to IV).
+"""One homing as a state machine: initialise, drive and update, stop (sections II to IV).
 
 The controller knows no metres. Lengths are parts of the leg, the distance to the target where the
 robot set out for it. When the target is matched anew on the way, the new homing's unit is what was

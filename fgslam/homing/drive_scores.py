@@ -1,4 +1,4 @@
-"""How well a drive kept to its path: distances to targets, and if errors build up (G2, G32)."""
+"""How well a drive kept to its path: distances to targets, and if errors build up."""
 
 from __future__ import annotations
 

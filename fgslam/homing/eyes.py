@@ -51,7 +51,7 @@ class HomingEyes(Protocol):
         ...
 
     def track(self, image: ByteArray, time: float) -> TrackedBearings:
-        """The features of the last ``begin`` in a new image; features once lost stay away (G28).
+        """The features of the last ``begin`` in a new image; features once lost stay away.
 
         An image without any of them gives no rows; that is not an error.
         """

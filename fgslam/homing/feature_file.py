@@ -1,4 +1,4 @@
-"""Features of many images as one compact ``.npz`` of plain arrays (G10): no pixels, no pickle.
+"""Features of many images as one compact ``.npz`` of plain arrays: no pixels, no pickle.
 
 Features of all images lie one after the other, with offsets: those of image ``k`` are rows
 ``start[k]:start[k + 1]``. SIFT descriptors are bytes; angles, sizes and column descriptors float32

@@ -91,7 +91,7 @@ def _one_way(
 ) -> Link | str:
     """One direction is answered, the other cannot decide: what holds there holds back.
 
-    Which of the two solutions (design D3) the few decisive features support, or which minimum of a
+    Which of the two solutions the few decisive features support, or which minimum of a
     valley, may hang on the draw; that is no contradiction. Any other refusal is, as both answers
     come from the same views.
     """

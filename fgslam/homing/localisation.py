@@ -1,4 +1,4 @@
-"""Where on the map is this? A Bayes filter over its nodes (I; design G34).
+"""Where on the map is this? A Bayes filter over its nodes (I).
 
 Images are compared as nodes are: by how many of their features agree on one homing. The belief is
 a distribution over nodes; between two images it stays, moves along an edge, or, rarely, leaps

@@ -1,4 +1,4 @@
-"""Following a path: a chain of homings, one target image after another (G1, G2)."""
+"""Following a path: a chain of homings, one target image after another."""
 
 from __future__ import annotations
 

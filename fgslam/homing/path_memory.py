@@ -1,4 +1,4 @@
-"""A path as it is remembered: the features of its images, in order, and nothing else (G10)."""
+"""A path as it is remembered: the features of its images, in order, and nothing else."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from fgslam.core.settings import STRICT
 
 @dataclass(frozen=True, config=STRICT)
 class HomingControlSettings:
-    """When a target is reached, when matching begins anew, and when to stop (G3, G19)."""
+    """When a target is reached, when matching begins anew, and when to stop."""
 
     switch_fraction: Annotated[
         float,
@@ -42,7 +42,7 @@ class HomingControlSettings:
         int,
         Field(
             ge=1,
-            description="with fewer than this the estimate is not believed any more (D8: a third "
+            description="with fewer than this the estimate is not believed any more (a third "
             "view needs three bearings)",
         ),
     ] = 4
@@ -185,7 +185,7 @@ class SteeringSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class AvoidanceSettings:
-    """A range scan overrides the steering (IV; design G17)."""
+    """A range scan overrides the steering (IV)."""
 
     method: Annotated[
         Literal["corridors", "none"],
@@ -234,7 +234,7 @@ class AvoidanceSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class PathFollowingSettings:
-    """A path is a chain of homings (G1)."""
+    """A path is a chain of homings."""
 
     skip_unmatched: Annotated[
         bool,
@@ -287,7 +287,7 @@ class RetrievalSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class TopologicalMapSettings:
-    """Edges where homing succeeds, and what makes an edge believed (G34)."""
+    """Edges where homing succeeds, and what makes an edge believed."""
 
     candidates: Annotated[
         int,
@@ -363,7 +363,7 @@ class TopologicalMapSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class LocalisationSettings:
-    """Bayesian localisation over a map's nodes (G34)."""
+    """Bayesian localisation over a map's nodes."""
 
     candidates: Annotated[
         int, Field(ge=0, description="nodes that an image is matched with; 0: all")

@@ -1,4 +1,4 @@
-"""Topological map: images as nodes, homings that succeed as edges (I; design G34)."""
+"""Topological map: images as nodes, homings that succeed as edges (I)."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""TODO report."""
+"""Results for people and for other tools: figures, pages, point clouds, trajectories, graphs."""

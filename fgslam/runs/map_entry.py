@@ -1,4 +1,4 @@
-"""The map that a run is given, and how the run enters it (S41)."""
+"""The map that a run is given, and how the run enters it."""
 
 from __future__ import annotations
 

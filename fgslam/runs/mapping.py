@@ -1,4 +1,4 @@
-"""Runs that go on where one stopped, or leave a map behind (S41)."""
+"""Runs that go on where one stopped, or leave a map behind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""TODO runs.opening."""
+"""Opens the recording of an experiment, with the odometry that its configuration wants."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def spread(counts: IntArray) -> JsonValue:
 
 
 def _sideways_yaw(recorder: RunRecorder) -> float | None:
-    """Median correlation of sideways motion and yaw (Se et al. 5; S28); None before frame 1."""
+    """Median correlation of sideways motion and yaw (Se et al. 5); None before frame 1."""
     if len(recorder) < 2:
         return None
     found = correlation(np.array(recorder.online_covariances[1:]))

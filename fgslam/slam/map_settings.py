@@ -1,4 +1,4 @@
-"""Settings of maps that outlive their run: where one comes from, what becomes of it (S41)."""
+"""Settings of maps that outlive their run: where one comes from, what becomes of it."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class MotionModel(Protocol):
 
 
 class OdometryMotion:
-    """The recording's odometry, moved from the robot's body to the camera (Se et al. 5; S30).
+    """The recording's odometry, moved from the robot's body to the camera (Se et al. 5).
 
     Over a gap in it, constant velocity stands in.
     """

@@ -23,7 +23,7 @@ class SimulatedBearingsSettings:
         Literal["isotropic", "anisotropic"],
         Field(
             description="`isotropic`: points lie all around, at all distances; `anisotropic`: four "
-            "in five on one side, where they are near, the others far, as beside a wall (G35)"
+            "in five on one side, where they are near, the others far, as beside a wall"
         ),
     ] = "isotropic"
     nearest_m: Annotated[
@@ -65,7 +65,7 @@ class SimulatedBearingsSettings:
         ),
     ] = 0.05
     bearing_sigma_deg: Annotated[
-        float, Field(gt=0.0, description="noise of all bearings (B7: 0.5 to 1)")
+        float, Field(gt=0.0, description="noise of all bearings (0.5 to 1)")
     ] = 1.0
     elevation_sigma_deg: Annotated[float, Field(gt=0.0, description="noise of all elevations")] = (
         1.0

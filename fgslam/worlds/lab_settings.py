@@ -18,7 +18,7 @@ FrameRange = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
 
 @dataclass(frozen=True, config=STRICT)
 class LabRigSettings:
-    """The cameras (S1): the right one is the reference, left beside it, top above it."""
+    """The cameras: the right one is the reference, left beside it, top above it."""
 
     width: Annotated[int, Field(ge=16, le=4096, description="image width, pixels")] = 320
     height: Annotated[int, Field(ge=16, le=4096, description="image height, pixels")] = 240
@@ -67,7 +67,7 @@ class RandomPosesSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class LabDriveSettings:
-    """The robot's path and speed (S31, S32)."""
+    """The robot's path and speed."""
 
     path: Annotated[
         PathName,

@@ -259,7 +259,7 @@ def _bend_cut(way: float, turn: float) -> float:
 
 
 def paper_loop() -> PlanarPath:
-    """Out along one side of the chair, around it and back to the start pose (S31), 17.6 m.
+    """Out along one side of the chair, around it and back to the start pose, 17.6 m.
 
     The robot gets 5.7 m ahead of its start, and turns through 360 degrees in all.
     """

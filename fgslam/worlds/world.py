@@ -19,7 +19,7 @@ from fgslam.worlds.rendering.raycaster import RayCaster
 
 
 def make_rig(settings: LabRigSettings) -> CameraRig:
-    """The calibrated cameras that the settings describe (S1)."""
+    """The calibrated cameras that the settings describe."""
     focal = settings.width / 2.0 / np.tan(np.deg2rad(settings.horizontal_fov_deg) / 2.0)
     tilt = np.deg2rad(settings.tilt_deg)
     bTc = geometry.BODY_FORWARD_LEFT_UP_FROM_CAMERA @ geometry.pose(

@@ -1,4 +1,4 @@
-"""SIFT's position noise against the rendered truth: what `stereo.pixel_sigma` stands for (S2)."""
+"""SIFT's position noise against the rendered truth: what `stereo.pixel_sigma` stands for."""
 
 from __future__ import annotations
 

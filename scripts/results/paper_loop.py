@@ -1,4 +1,4 @@
-"""The paper's drive: tables of Section 5 beside ours (design S31 to S33)."""
+"""The paper's drive: tables of Section 5 beside ours."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _end_poses(runs: list[tuple[str, Run]]) -> Table:
         ("paper (5)", -2.09, 0.0, -3.91, 4.43, 0.30, 2.10, -2.02, None, None)
     ]
     rows += [_end_row(name, run) for name, run in runs]
-    return Table("End pose against the start (S33)", columns, rows)
+    return Table("End pose against the start", columns, rows)
 
 
 def _end_row(name: str, run: Run) -> tuple[Cell, ...]:
@@ -54,7 +54,7 @@ def _maps(runs: list[tuple[str, Run]]) -> Table:
         ("paper (5)", 3590, None, 60, "40", None, "60", None, None, None)
     ]
     rows += [_map_row(name, run) for name, run in runs]
-    return Table("Landmarks and matches (S31, S32)", columns, rows)
+    return Table("Landmarks and matches", columns, rows)
 
 
 def _map_row(name: str, run: Run) -> tuple[Cell, ...]:
@@ -80,4 +80,4 @@ def _growth(runs: list[tuple[str, Run]]) -> Table:
     for name, run in runs:
         counts = run.result.outputs.recorder.column("landmarks")
         rows.append((name, *(int(counts[frame - 1]) for frame in _SHOWN)))
-    return Table("Landmarks in the map over the drive (S31)", columns, rows)
+    return Table("Landmarks in the map over the drive", columns, rows)

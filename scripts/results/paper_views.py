@@ -1,4 +1,4 @@
-"""Tables of Sections 2 and 3 of the paper beside ours (design S3, S9, S10, S14, S18)."""
+"""Tables of Sections 2 and 3 of the paper beside ours."""
 
 from __future__ import annotations
 
@@ -69,11 +69,11 @@ def tables() -> list[Table]:
 
 
 # ----------------------------------------------------------------------------------------------
-# S3, S9, S10: one view
+# One view
 
 
 def features_table(views: list[View]) -> Table:
-    """S3: how many features the three images have."""
+    """How many features the three images have."""
     counts = np.array([[len(f) for f in view.features] for view in views])
     spread = counts.max(axis=1) / counts.min(axis=1)
     columns = ("image", "paper", "start of the drive", "drive: median", "least", "most")
@@ -85,11 +85,11 @@ def features_table(views: list[View]) -> Table:
         f"most over least of the three counts: paper {193 / 166:.2f}, ours "
         f"{np.median(spread):.2f} (median of {len(views)} places), at worst {spread.max():.2f}"
     )
-    return Table("SIFT features of one frame (S3)", columns, rows, (note,))
+    return Table("SIFT features of one frame", columns, rows, (note,))
 
 
 def matches_table(lab: LabViews, triples: list[Triple]) -> Table:
-    """S9: matches right-left, then confirmed by the top image, in three neighbouring views."""
+    """Matches right-left, then confirmed by the top image, in three neighbouring views."""
     columns = ("", "paper", *_modes_twice())
     found = [_quantities(_stereo_counts(lab, triples, mode)) for mode in ("descriptor", "paper")]
     rows: list[tuple[Cell, ...]] = []
@@ -98,7 +98,7 @@ def matches_table(lab: LabViews, triples: list[Triple]) -> Table:
         for values in found:
             cells += [_number(values[name][0]), float(np.median(values[name]))]
         rows.append(tuple(cells))
-    return Table("Stereo matches, three views at small motions (S9)", columns, rows)
+    return Table("Stereo matches, three views at small motions", columns, rows)
 
 
 def _quantities(counts: FloatArray) -> dict[str, FloatArray]:
@@ -139,7 +139,7 @@ def _counts(matcher: StereoMatcher, view: View) -> tuple[int, int, int]:
 
 
 def sweep_table(lab: LabViews, views: list[View]) -> Table:
-    """S10: wider gates need not give more matches where ambiguity discards."""
+    """Wider gates need not give more matches where ambiguity discards."""
     stereo = experiment("lab_loop").frontend.stereo
     columns = (
         "all gates, times", "right-left", "right-left, start", "three images",
@@ -161,7 +161,7 @@ def sweep_table(lab: LabViews, views: list[View]) -> Table:
         f"`appearance: paper`, means of {len(views)} views; epipolar, disparity agreement, scale "
     )
     return Table(
-        "Width of the gates against the number of matches (S10)",
+        "Width of the gates against the number of matches",
         columns,
         rows,
         (note + "and orientation gates scaled together",),
@@ -181,7 +181,7 @@ def _widened(lab: LabViews, stereo: StereoSettings, mode: str, width: float) -> 
 
 
 # ----------------------------------------------------------------------------------------------
-# S14, S18: two views
+# Two views
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +208,7 @@ class Move:
 
     @property
     def share(self) -> float:
-        """Matches over the lesser of both views' stereo features (design E-S2)."""
+        """Matches over the lesser of both views' stereo features."""
         return self.matches / min(len(report.stereo) for report in self.reports)
 
     @property
@@ -246,7 +246,7 @@ def _move(config: ExperimentConfig, pair: ViewPair) -> Move:
 
 
 def frames_table(moves: dict[str, BothMoves]) -> Table:
-    """S14: how many features are found again after each motion."""
+    """How many features are found again after each motion."""
     columns = ("motion", "mode", "matches", "% of the lesser view", "median matches", "median %")
     rows: list[tuple[Cell, ...]] = [
         ("10 cm forward", "paper", 43, 73.0, None, None),
@@ -258,11 +258,11 @@ def frames_table(moves: dict[str, BothMoves]) -> Table:
             share = 100.0 * float(np.median([move.share for move in found]))
             first = found[0]
             rows.append((motion, name, first.matches, 100.0 * first.share, matches, share))
-    return Table("Matches between those views (S14)", columns, rows)
+    return Table("Matches between those views", columns, rows)
 
 
 def estimates_table(name: str, both: BothMoves) -> Table:
-    """S18: least-squares motion of both moves, its 1 sigma and its error."""
+    """Least-squares motion of both moves, its 1 sigma and its error."""
     columns = ("", *_COMPONENTS, "mean E px")
     paper_forward = (1.353, -0.534, 11.136, 0.059, -0.055, -0.029, 1.328)
     rows: list[tuple[Cell, ...]] = [("paper, 10 cm forward", *paper_forward)]
@@ -275,7 +275,7 @@ def estimates_table(name: str, both: BothMoves) -> Table:
         f"{lost} of {len(moves)} motions had too few matches in the search window around the "
         "odometry's prediction and are left out of the statistics",
     )
-    return Table(f"Ego-motion of the two small motions, {name} (S18)", columns, rows, notes)
+    return Table(f"Ego-motion of the two small motions, {name}", columns, rows, notes)
 
 
 def _motion_rows(motion: str, moves: list[Move]) -> list[tuple[Cell, ...]]:

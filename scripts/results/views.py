@@ -76,7 +76,7 @@ class LabViews:
 
 @dataclass(frozen=True, eq=False)
 class ViewPair:
-    """Two views as a recording of two frames; implements :class:`fgslam.core.recordings.Sequence`."""
+    """Two views as a recording of two frames; implements ``Sequence``."""
 
     rig: CameraRig
     views: tuple[View, View]

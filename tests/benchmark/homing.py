@@ -159,7 +159,7 @@ def front_end_ratios(leg: Leg) -> dict[str, float]:
     settings = OmniFeatureSettings()
     extractor = OmniFeatureExtractor(camera, settings)
     eyes = NotedEyes(leg.world)
-    memory = eyes.describe(other)  # a target's features are remembered, never found anew (E-G12)
+    memory = eyes.describe(other)  # a target's features are remembered, never found anew
     times = interleaved(
         {
             "raw": lambda: cpu_seconds(lambda: raw_sift_matching(image, other)),

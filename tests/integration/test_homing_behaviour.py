@@ -28,7 +28,7 @@ def drives(spacing: float, seeds: int, wrong: float = 0.1) -> list[DriveRecord]:
 @pytest.mark.parametrize("spacing", [2.0, 3.0, 4.0])
 def test_ten_legs_arrive_and_errors_do_not_build_up(spacing: float) -> None:
     """Every run arrives, passes each target within a tenth of a leg, and the last legs are as
-    good as the first ones (G1, G2, G32)."""
+    good as the first ones."""
     records = drives(spacing, SEEDS)
     assert sum(truly_arrived(r) for r in records) >= 0.98 * SEEDS
     passed = np.array([pass_distances(r) for r in records])
@@ -63,7 +63,7 @@ def from_offset(seed: int, offset: float) -> bool:
 
 @pytest.mark.slow
 def test_targets_are_reached_from_all_around_their_reach() -> None:
-    """Catchment (G36): sure within a leg beside the way, refused honestly where nothing is seen."""
+    """Catchment: sure within a leg beside the way, refused honestly where nothing is seen."""
     share = {
         offset: np.mean([from_offset(seed, offset) for seed in range(10)])
         for offset in (0.0, 1.0, 2.0, 4.0, 12.0)

@@ -47,7 +47,7 @@ def test_graph_beats_the_filters_at_twenty_percent_outliers() -> None:
 
 
 def test_counting_target_bearings_again_ruins_consistency() -> None:
-    """E-G7, without outliers."""
+    """Bearings to the target counted once, without outliers."""
     some = cases(8, 0.0)
     printed = replace(PAPER, gauge="unit_leg", exact_bearings=False, gate_sigmas=3.0)
     again = summarise_homings([homed(case, printed) for case in some])

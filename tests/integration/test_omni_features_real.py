@@ -35,7 +35,7 @@ def pose_and_image(root: Path, panorama: int) -> tuple[FloatArray, np.ndarray]: 
 
 
 def right(matches: BearingMatches, a: FloatArray, b: FloatArray) -> BoolArray:
-    """Within 1.5 degrees of the epipolar plane of the true poses (design D7), equal sigmas."""
+    """Within 1.5 degrees of the epipolar plane of the true poses, equal sigmas."""
     relative = between(a, b)
     direction = np.array([np.arctan2(relative[1], relative[0])])
     equal = BearingMatches(
@@ -62,9 +62,9 @@ def test_more_right_matches_and_no_more_wrong_ones(shared_data: Path) -> None:
     ours = match_features(a, b, OmniFeatureSettings().matching)
     plain_right, ours_right = right(plain, pose_a, pose_b), right(ours, pose_a, pose_b)
     sift = ours.kind == 0
-    # G6 asks for more right ones at no more wrong ones: from the most distinctive match on, as
+    # The aim is more right ones at no more wrong ones: from the most distinctive match on, as
     # many as it takes to reach the wrong ones of plain SIFT.
     ranked = ours_right[sift][np.argsort(-ours.quality[sift], kind="stable")]
     allowed = ranked[np.cumsum(~ranked) <= np.sum(~plain_right)]
-    assert allowed.sum() >= 1.4 * plain_right.sum(), "G6"
-    assert ours_right.sum() > max(ours_right[sift].sum(), ours_right[~sift].sum()), "G8"
+    assert allowed.sum() >= 1.4 * plain_right.sum()
+    assert ours_right.sum() > max(ours_right[sift].sum(), ours_right[~sift].sum())

@@ -82,7 +82,7 @@ def test_tracked_bearings_and_their_sigmas(leg: Leg) -> None:
 
 
 def test_mapped_bearings_of_true_matches(leg: Leg) -> None:
-    """G23: from a target half a metre off, under other light."""
+    """From a target half a metre off, under other light."""
     pose = leg.poses[STEPS // 2]
     matches, moved, pixels, points = leg.matched(leg.world.picture(pose, 7))
     truth = leg.angles(pose, points)

@@ -1,4 +1,4 @@
-"""Laws of candidate pairs and of the choice among them, against brute force (S6)."""
+"""Laws of candidate pairs and of the choice among them, against brute force."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The landmarks' state machine (S20, S24, S34) against a model in plain Python."""
+"""The landmarks' state machine against a model in plain Python."""
 
 from __future__ import annotations
 

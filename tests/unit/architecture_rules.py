@@ -1,4 +1,4 @@
-"""The house rules as a checker over a package's syntax trees; knows no module by heart but layers.
+"""The house rules as a checker over a package's syntax trees; knows no module by heart but rooms.
 
 Every finding is a :class:`Violation` with file and line. ``test_architecture.py`` runs it on fgslam
 and, to show that it can fail, on packages written to break each rule.
@@ -11,68 +11,51 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-BASE = frozenset(
-    {
-        "types",
-        "geometry",
-        "range_bearing",
-        "stereo_model",
-        "floor",
-        "errors",
-        "settings",
-        "measurement_log",
-        "recordings",
-        "system_check",
-        "planar",
-        "omni_cameras",
-        "homing_types",
-        "bearing_log",
-        "whole_files",
-        "columns",
-        "map_types",
-        "map_file",
-    }
-)
-STAGES = frozenset({"datasets", "simulation", "frontend", "factors", "evaluation", "export"})
-COMPOSITION = frozenset({"runs", "inspection", "homing"})
-PACKAGES = BASE | STAGES | COMPOSITION | {"config", "backend", "pipeline", "cli"}
-
-FOUNDATION_ALLOWS: dict[str, frozenset[str]] = {
-    "errors": frozenset(),
-    "system_check": frozenset(),
-    "types": frozenset({"errors"}),
-    "range_bearing": frozenset({"types"}),
-    "stereo_model": frozenset({"types"}),
-    "geometry": frozenset({"types", "errors", "range_bearing"}),
-    "floor": frozenset({"types", "geometry"}),
-    "settings": frozenset({"types", "errors"}),
-    "planar": frozenset({"types"}),
-    "omni_cameras": frozenset({"types", "errors", "planar"}),
-    "homing_types": frozenset({"types", "planar"}),
-    "bearing_log": frozenset({"types", "errors", "homing_types", "measurement_log"}),
-    "columns": frozenset({"types"}),
-    "map_types": frozenset({"types"}),
-    "whole_files": frozenset({"errors"}),
-    "map_file": frozenset(
-        {"types", "errors", "geometry", "map_types", "measurement_log", "whole_files"}
+ROOMS: dict[str, frozenset[str] | None] = {
+    "core": frozenset(),
+    "cameras": frozenset({"core"}),
+    "factors": frozenset({"core"}),
+    "evaluation": frozenset({"core"}),
+    "report": frozenset({"core"}),
+    "worlds": frozenset({"core", "cameras"}),
+    "frontend": frozenset({"core", "cameras"}),
+    "datasets": frozenset({"core", "cameras", "worlds"}),
+    "backend": frozenset({"core", "frontend", "factors"}),
+    "slam": frozenset({"core", "frontend", "backend", "datasets"}),
+    "homing": frozenset({"core", "cameras", "frontend", "backend"}),
+    "runs": frozenset(
+        {
+            "core",
+            "cameras",
+            "evaluation",
+            "report",
+            "frontend",
+            "datasets",
+            "backend",
+            "slam",
+            "homing",
+            "worlds",
+        }
     ),
-    "measurement_log": frozenset({"types", "errors", "geometry"}),
-    "recordings": frozenset({"types", "errors", "geometry", "measurement_log"}),
+    "cli": None,
 }
-"""The order within the lowest layer, so that it has no cycle to begin with."""
+"""Every room of the package and the rooms that it may import besides itself; None: all of them."""
 
-STAGE_EXTRAS: dict[str, frozenset[str]] = {
-    "datasets": frozenset({"simulation"}),
-    "backend": frozenset({"factors"}),
-    "config_reading": frozenset(),
-    "config": frozenset({"config_reading"}),
-    "homing_config": frozenset({"config_reading", "config"}),
-    "localisation_config": frozenset({"config_reading", "config", "homing_config"}),
-}
+TOP_MODULES = frozenset({"", "__main__"})
+"""What may stand at the top of the package beside its rooms."""
+
+SLAM_ROOMS = (
+    "slam",
+    "frontend.tracking",
+    "frontend.places",
+    "backend.filters",
+    "backend.smoothers",
+)
+"""Rooms of SLAM; those of homing are the ones with `homing` in their name."""
 
 THIRD_PARTY_HOMES: dict[str, frozenset[str]] = {
-    "cv2": frozenset({"frontend", "datasets"}),
-    "open3d": frozenset({"simulation", "export"}),
+    "cv2": frozenset({"frontend", "datasets", "cameras"}),
+    "open3d": frozenset({"worlds", "report"}),
     "gtsam": frozenset({"factors", "backend"}),
     "gtsam_unstable": frozenset({"factors", "backend"}),
 }
@@ -153,7 +136,8 @@ def check_package(root: Path) -> list[Violation]:
     found: list[Violation] = []
     imports = {module.name: list(imports_of(module, modules)) for module in modules}
     for module in modules:
-        found += layer_violations(module, imports[module.name])
+        found += room_violations(module, imports[module.name])
+        found += side_violations(module, imports[module.name])
         found += library_violations(module, imports[module.name])
         found += size_violations(module)
         found += statement_violations(module)
@@ -237,26 +221,18 @@ def _called_name(node: ast.Call) -> str:
 
 
 # --------------------------------------------------------------------------------------------
-# Layers, libraries, cycles
+# Rooms, libraries, cycles
 
 
-def allowed_layers(layer: str) -> frozenset[str] | None:
-    """Layers that ``layer`` may import besides itself; None for all but ``cli``."""
-    if layer in FOUNDATION_ALLOWS:
-        return FOUNDATION_ALLOWS[layer]
-    if layer in STAGES or layer in STAGE_EXTRAS:
-        return BASE | STAGE_EXTRAS.get(layer, frozenset())
-    return frozenset() if layer == "" else None
-
-
-def layer_violations(module: Module, imports: list[Import]) -> Iterator[Violation]:
-    """Imports that go against the layers, and packages that no layer knows."""
-    root = module.name.split(".")[0]
-    if module.name.count(".") == 1 and module.is_package and module.layer not in PACKAGES:
+def room_violations(module: Module, imports: list[Import]) -> Iterator[Violation]:
+    """Imports that go against the order of the rooms, and modules that stand in no room."""
+    if module.layer not in ROOMS and module.layer not in TOP_MODULES:
         yield Violation(
-            module.path, 1, f"package '{module.layer}' has no layer; give it one in {__name__}.py"
+            module.path, 1, f"'{module.layer}' is no room; give it one in architecture_rules.py"
         )
-    allowed = allowed_layers(module.layer)
+        return
+    root = module.name.split(".")[0]
+    allowed = ROOMS.get(module.layer)
     for item in imports:
         parts = item.target.split(".")
         if parts[0] != root or len(parts) == 1 or parts[1] == module.layer:
@@ -265,7 +241,27 @@ def layer_violations(module: Module, imports: list[Import]) -> Iterator[Violatio
             yield Violation(module.path, item.line, "nothing imports cli")
         elif allowed is not None and parts[1] not in allowed:
             yield Violation(
-                module.path, item.line, f"layer '{module.layer}' must not import '{item.target}'"
+                module.path, item.line, f"room '{module.layer}' must not import '{item.target}'"
+            )
+
+
+def side_of(name: str) -> str | None:
+    """`homing` or `slam`; None for what both may use."""
+    inner = name.partition(".")[2]
+    if any("homing" in part for part in inner.split(".")):
+        return "homing"
+    slam = any(inner == room or inner.startswith(f"{room}.") for room in SLAM_ROOMS)
+    return "slam" if slam else None
+
+
+def side_violations(module: Module, imports: list[Import]) -> Iterator[Violation]:
+    """Imports between SLAM and homing, in either direction."""
+    here = side_of(module.name)
+    for item in imports:
+        there = side_of(item.target) if item.target.startswith("fgslam.") else None
+        if here and there and here != there:
+            yield Violation(
+                module.path, item.line, f"{here} must not import {there}: '{item.target}'"
             )
 
 

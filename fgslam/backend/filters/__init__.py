@@ -1,1 +1,1 @@
-"""TODO filters."""
+"""Filters: dead reckoning, one Kalman filter per landmark, the full EKF."""

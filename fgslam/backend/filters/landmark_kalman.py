@@ -4,7 +4,7 @@ Se, Lowe and Little (2001), Sections 4.1 (averaging) and 6.4 (Kalman filters). T
 the least squares against the landmarks (3.3). Correlations between landmarks, and between
 landmarks and pose, are dropped: that is what makes the filter cheap, and overconfident.
 
-Past poses are revised by loop closures alone (backward correction by submaps, design B4): the
+Past poses are revised by loop closures alone (backward correction by submaps): the
 drive and the landmarks, each with the frame that it was made in, move to where a pose graph has
 them. The covariances of poses and landmarks stay what they are in this filter: how well a pose is
 known beside the map around it, and how well a landmark beside the poses that saw it.
@@ -260,7 +260,7 @@ class LandmarkKalman:
         return float(np.einsum("ki,kij,kj->", innovation, precision, innovation))
 
     def _average(self, rows: IntArray, observed: Observations) -> float:
-        """Averaging of 4.1: a running mean, or half old and half new (design E-S4)."""
+        """Averaging of 4.1: a running mean, or half old and half new."""
         positions, noise = self._observed_positions(observed)
         before = self._rows.positions[rows]
         innovation = positions - before

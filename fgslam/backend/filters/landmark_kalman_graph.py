@@ -1,7 +1,7 @@
 """The paper's estimator expressed as factor graphs, GTSAM doing the algebra.
 
-Equal to :class:`fgslam.backend.filters.landmark_kalman.LandmarkKalman` up to rounding: the pose is that of
-a graph on fixed landmarks (Se et al. 3.3), each landmark that of a graph of its own (6.4).
+Equal to :class:`~fgslam.backend.filters.landmark_kalman.LandmarkKalman` up to rounding: the pose
+is that of a graph on fixed landmarks (Se et al. 3.3), each landmark that of its own graph (6.4).
 Which edges of the full graph are missing, and what that costs, is derived in
 docs/derivations/landmark_filter_as_graph.md.
 """

@@ -1,4 +1,4 @@
-"""TODO backend.filters.settings."""
+"""Settings of the filters."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fgslam.core.settings import STRICT
 
 @dataclass(frozen=True, config=STRICT)
 class LoopCorrectionSettings:
-    """What closing a loop does to the drive so far (design B4; docs/derivations/submaps.md)."""
+    """What closing a loop does to the drive so far (docs/derivations/submaps.md)."""
 
     submap_frames: Annotated[
         int,

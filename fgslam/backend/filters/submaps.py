@@ -1,4 +1,4 @@
-"""Backward correction by submaps (Se, Lowe and Little's later work; design B4).
+"""Backward correction by submaps (Se, Lowe and Little's later work).
 
 A drive is a chain of steps, each as uncertain as it was tracked. Closing a loop asks for the least
 weighted changes to the chain under which it meets itself: the minimum of a pose graph. Its
@@ -226,7 +226,7 @@ def _inverses(poses: FloatArray) -> FloatArray:
 
 
 def _motions(twists: FloatArray) -> FloatArray:
-    """Rigid motions (n, 4, 4) of tangent vectors (n, 6): :func:`fgslam.core.geometry.se3_exp` of all."""
+    """Rigid motions (n, 4, 4) of tangent vectors (n, 6), as ``se3_exp`` of each."""
     angle = np.linalg.norm(twists[:, :3], axis=1)[:, None, None]
     cross = skew(twists[:, :3])
     square = cross @ cross

@@ -1,4 +1,4 @@
-"""Homing by averages of bearings: no map, no distance, no covariance (G35).
+"""Homing by averages of bearings: no map, no distance, no covariance.
 
 Both compare the bearings of now with those from the target, feature by feature, once the target's
 have been turned by the heading of the target relative to the present one. The methods take that
@@ -101,9 +101,9 @@ class AverageLandmarkVector(BearingAverage):
 class AverageDisplacement(BearingAverage):
     """Estimator of kind ``snapshot`` (after Cartwright and Collett 1983).
 
-    A step h moves the bearing phi of a feature at distance d by ``h . (sin phi, -cos phi) / d``
-    (D9). Of features all around at one distance the displacements' average along these
-    directions is h, up to its length.
+    A step h moves the bearing phi of a feature at distance d by ``h . (sin phi, -cos phi) / d``.
+    Of features all around at one distance the displacements' average along these directions is h,
+    up to its length.
     """
 
     kind: ClassVar[str] = "snapshot"

@@ -49,7 +49,7 @@ class FilterState:
     def keeping(self, which: BoolArray) -> FilterState:
         """The state without the features that are lost.
 
-        Rows and columns are deleted (G28), which *is* marginalisation: all that the lost features
+        Rows and columns are deleted, which *is* marginalisation: all that the lost features
         taught about the others stays.
         """
         if which.all():
@@ -155,7 +155,7 @@ def _with_one_distance(state: FilterState, settings: HomingEkfSettings) -> Filte
 def motion(
     robot: FloatArray, step: float, noise: FilterMotionSettings
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Next (x, y, psi, v), its derivative by the last and the noise's covariance (eqs 4, 5, E-G4).
+    """Next (x, y, psi, v), its derivative by the last and the noise's covariance (eqs 4, 5).
 
     Args:
         robot: (4,).
@@ -188,7 +188,7 @@ def predicted(state: FilterState, step: float, noise: FilterMotionSettings) -> F
 
 
 def seen_from_robot(state: FilterState, measured: FloatArray, sigma: FloatArray) -> Measured:
-    """Bearings (n,) of all features from the present pose (eqs 6 to 8 as in E-G2, E-G3)."""
+    """Bearings (n,) of all features from the present pose (eqs 6 to 8, corrected)."""
     by_pose, by_polar, innovation = _seen(state, state.mean[:3], measured)
     jacobian = np.zeros((len(measured), len(state.mean)))
     jacobian[:, :3] = by_pose
@@ -197,7 +197,7 @@ def seen_from_robot(state: FilterState, measured: FloatArray, sigma: FloatArray)
 
 
 def seen_from_target(state: FilterState, measured: FloatArray, sigma: FloatArray) -> Measured:
-    """Bearings (n,) of all features from the target (eq. 9 as in E-G6)."""
+    """Bearings (n,) of all features from the target (eq. 9, corrected)."""
     target = state.mean[TARGET]
     by_pose, by_polar, innovation = _seen(state, target_pose(target), measured)
     jacobian = np.zeros((len(measured), len(state.mean)))

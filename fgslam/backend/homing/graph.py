@@ -18,7 +18,7 @@ class HomingGraph:
     """Estimator of kind ``homing_graph``.
 
     On :class:`fgslam.backend.homing.protocol.HomingEstimator`. Lost features simply get no more
-    factors (G28); what they taught stays.
+    factors; what they taught stays.
     """
 
     kind: ClassVar[str] = "homing_graph"

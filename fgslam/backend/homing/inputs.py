@@ -10,7 +10,7 @@ from fgslam.core.types import BoolArray, IntArray
 
 
 class TrackedFeatures:
-    """Time and identities of a homing: which features were known, which are lost (G28)."""
+    """Time and identities of a homing: which features were known, which are lost."""
 
     def __init__(self, start: HomingStart) -> None:
         """All features of the start's local map are alive.

@@ -17,7 +17,7 @@ class HomingEstimator(Protocol):
     kind: ClassVar[str]
 
     def update(self, tracked: TrackedBearings) -> None:
-        """Takes in one image; features that are absent are deleted from the map (G28)."""
+        """Takes in one image; features that are absent are deleted from the map."""
         ...
 
     def estimate(self, landmarks: bool = True) -> HomingEstimate:

@@ -17,7 +17,7 @@ from fgslam.core.settings import STRICT
 
 @dataclass(frozen=True, config=STRICT)
 class FilterMotionSettings:
-    """Noise of the filter's motion (eqs 4 and 5, with what E-G4 adds); the paper states none."""
+    """Noise of the filter's motion (eqs 4 and 5), on the acceleration; the paper states none."""
 
     heading_deg: Annotated[
         float,
@@ -41,7 +41,7 @@ class FilterMotionSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class HomingEkfSettings(NamedSettings):
-    """The two filters of section IV with the corrected model (E-G2, E-G3, E-G4, E-G6).
+    """The two filters of section IV with the corrected model.
 
     The defaults are the honest variant; :data:`PAPER` holds what the paper says.
     """
@@ -51,13 +51,13 @@ class HomingEkfSettings(NamedSettings):
         Literal["one_distance", "unit_leg"],
         Field(
             description="what fixes the scale: `one_distance` that of one feature, the best known, "
-            "as printed; `unit_leg` the distance from start to target (E-G5)"
+            "as printed; `unit_leg` the distance from start to target"
         ),
     ] = "unit_leg"
     exact_bearings: Annotated[
         bool,
         Field(
-            description="the bearings from the start have no variance, as printed (E-G5); else "
+            description="the bearings from the start have no variance, as printed; else "
             "that of the image"
         ),
     ] = False
@@ -65,7 +65,7 @@ class HomingEkfSettings(NamedSettings):
         Literal["separate", "joint"],
         Field(
             description="`separate`: a filter of its own, told the target's bearings anew with "
-            "every image, as printed (E-G7); `joint`: the target is part of the state and its "
+            "every image, as printed; `joint`: the target is part of the state and its "
             "bearings count once, in the initial triangulation"
         ),
     ] = "joint"
@@ -216,14 +216,14 @@ class HomingGraphSettings(NamedSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class AverageLandmarkVectorSettings(NamedSettings):
-    """Average landmark vector (Lambrinos et al. 2000): direction alone, no distance (G35)."""
+    """Average landmark vector (Lambrinos et al. 2000): direction alone, no distance."""
 
     kind: Literal["alv"] = "alv"
 
 
 @dataclass(frozen=True, config=STRICT)
 class SnapshotSettings(NamedSettings):
-    """Average displacement of the bearings against the target's snapshot (G35): no distance."""
+    """Average displacement of the bearings against the target's snapshot: no distance."""
 
     kind: Literal["snapshot"] = "snapshot"
 

@@ -1,1 +1,1 @@
-"""TODO smoothers."""
+"""Smoothers: fixed lag, iSAM2 and batch on one graph builder."""

@@ -2,8 +2,8 @@
 
 The graph as solved before the loop and as it must be with it lie far apart. Linearised in between,
 landmarks would fly and kernels drop what is right: so poses and landmarks are first brought to
-where backward correction (:mod:`fgslam.backend.filters.submaps`) has them, each landmark along with the
-frame that saw it first. There every observation fits as before, and what is left is small.
+where backward correction (:mod:`fgslam.backend.filters.submaps`) has them, each landmark along
+with the frame that saw it first. There every observation fits as before, and what is left is small.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""TODO backend.smoothers.settings."""
+"""Settings of the smoothers."""
 
 from __future__ import annotations
 

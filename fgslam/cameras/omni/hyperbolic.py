@@ -1,4 +1,4 @@
-"""The hyperbolic mirror as a unified sphere, above and below the horizon (design B7).
+"""The hyperbolic mirror as a unified sphere, above and below the horizon.
 
 A ray is moved to the unit sphere around the mirror's focus and projected from a point ``xi`` above
 it: ``radius = focal cos(elevation) / (xi - sin(elevation))``. GTSAM's Cal3Unified divides by the

@@ -68,7 +68,7 @@ class Equirectangular:
 
 @dataclass(frozen=True, slots=True)
 class Cylinder:
-    """Rows proportional to the tangent of elevation (design B1).
+    """Rows proportional to the tangent of elevation.
 
     A vertical line then keeps its straightness, and a column segment scales about the horizon's row
     alone when its distance changes. Row v looks along tangent

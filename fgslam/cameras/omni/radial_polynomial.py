@@ -1,6 +1,6 @@
-"""The paper's own calibration: elevation as a polynomial of the image radius (G11, fig. 3).
+"""The paper's own calibration: elevation as a polynomial of the image radius (fig. 3).
 
-The paper names the degree, five, and a calibration image; the argument is ours (E-G14): the radius,
+The paper names the degree, five, and a calibration image; the argument is ours: the radius,
 scaled so that the ring's inner and outer rim lie at -1 and 1, which keeps the fit well conditioned.
 """
 

@@ -1,4 +1,4 @@
-"""Calibration from pictures: the mirror's circle, and elevations from known rings (G11).
+"""Calibration from pictures: the mirror's circle, and elevations from known rings.
 
 Both look along rays from the mirror's centre and find edges to a fraction of a pixel.
 """
@@ -292,7 +292,7 @@ def calibrate_from_rings(
     radii: tuple[float, float],
     degree: int = PAPER_DEGREE,
 ) -> RingCalibration:
-    """Fits the paper's polynomial to a picture of black and white rings around the camera (G11).
+    """Fits the paper's polynomial to a picture of black and white rings around the camera.
 
     The calibration object is an upright cylinder around the camera with black and white bands; each
     border of two bands is a ring at one elevation, and a circle in the picture.

@@ -1,1 +1,1 @@
-"""TODO checks."""
+"""Checks of recordings, as `fgslam inspect` reports them."""

@@ -1,1 +1,1 @@
-"""TODO measurements."""
+"""Recordings of measurements without images."""

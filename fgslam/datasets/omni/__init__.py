@@ -1,1 +1,1 @@
-"""TODO omni."""
+"""Recordings of omnidirectional cameras."""

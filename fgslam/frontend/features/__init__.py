@@ -1,1 +1,1 @@
-"""TODO features."""
+"""Features: SIFT (grey and colour), column segments, descriptors and their matching."""

@@ -1,10 +1,10 @@
-"""Colour moments of patches and segments: eq. 1 of Goedemé et al., as corrected in E-G1.
+"""Colour moments of patches and segments: eq. 1 of Goedemé et al., with centred bands.
 
 Printed, C_PQ = (int PQ)(int 1) / (int P)(int Q) with P and Q "centralised around their means"
 divides zero by zero, for a centralised band integrates to zero. Two readings make sense:
 
 * ``ratio``: without centralising, mean(PQ) / (mean P mean Q) = 1 + cov(P, Q) / (mean P mean Q).
-  Mindru's D02 (design B2): a gain of either band cancels, an offset does not;
+  Mindru's D02: a gain of either band cancels, an offset does not;
 * ``correlation``: centralised and divided by the deviations, Pearson's: both cancel.
 """
 

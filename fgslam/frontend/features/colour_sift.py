@@ -1,8 +1,8 @@
-"""Rotation-reduced colour SIFT of one omnidirectional image (Goedemé et al. III-A1; design B3).
+"""Rotation-reduced colour SIFT of one omnidirectional image (Goedemé et al. III-A1).
 
 A robot on a plane turns about the vertical alone, so features need no rotation of their own: every
 descriptor is taken along the direction in which the elevation grows at that pixel. In an unwrapped
-view that is up the image, in a raw mirror image it is along the radius (E-G9). Key points that
+view that is up the image, in a raw mirror image it is along the radius. Key points that
 differ only by the orientation OpenCV gave them are one.
 """
 

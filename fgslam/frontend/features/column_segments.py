@@ -1,4 +1,4 @@
-"""Invariant column segments of one cylindrical view (Goedemé et al. III-A2; design B1).
+"""Invariant column segments of one cylindrical view (Goedemé et al. III-A2).
 
 The view's rows are proportional to the tangent T of the elevation. A point at height z above the
 camera and range d lies at T = z / d, so between two places a column segment is only stretched about

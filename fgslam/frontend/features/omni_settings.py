@@ -16,7 +16,7 @@ from fgslam.core.settings import STRICT
 
 @dataclass(frozen=True, config=STRICT)
 class ColourMomentSettings:
-    """Colour of a patch or segment: eq. 1 as corrected in E-G1."""
+    """Colour of a patch or segment: eq. 1 with centred bands."""
 
     form: Annotated[
         Literal["ratio", "correlation"],
@@ -87,7 +87,7 @@ class UprightSiftSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class ColumnSegmentSettings:
-    """Invariant column segments (III-A2, design B1)."""
+    """Invariant column segments (III-A2)."""
 
     max_width: Annotated[
         int, Field(ge=64, le=16384, description="of the cylinder, pixels; less for coarser cameras")
@@ -148,7 +148,7 @@ class OmniMatchingSettings:
             gt=0.0,
             le=1.0,
             description="SIFT: nearest over second nearest distance below this; high, as the "
-            "colour filter and the planar gates take the wrong ones (G6)",
+            "colour filter and the planar gates take the wrong ones",
         ),
     ] = 0.8
     root: Annotated[
@@ -163,7 +163,7 @@ class OmniMatchingSettings:
         bool,
         Field(
             description="among candidates, leave out those no planar motion explains: elevations "
-            "of opposite sign (D1), apparent sizes against elevations"
+            "of opposite sign, apparent sizes against elevations"
         ),
     ] = True
     horizon_margin_deg: Annotated[

@@ -1,4 +1,4 @@
-"""TODO frontend.features.settings."""
+"""Settings of SIFT and of how descriptors are compared."""
 
 from __future__ import annotations
 

@@ -6,10 +6,10 @@ t = (cos theta, sin theta, 0) lie in one plane:
     r = a . (t x Rz(psi) b) = a_x b_z sin(theta) - a_y b_z cos(theta)
                               + a_z b_x sin(psi - theta) + a_z b_y cos(psi - theta) = 0.
 
-This is design D2 times the cosines of both elevations, so it stays finite towards the zenith; the
-paper's test of two ratios (III-B, second step) is the same constraint. It is linear in four numbers
-of the hypothesis, as are its derivatives by the measured angles: all hypotheses are tested by five
-matrix products.
+This is the coplanarity of both rays and the baseline times the cosines of both elevations, so it
+stays finite towards the zenith; the paper's test of two ratios (III-B, second step) is the same
+constraint. It is linear in four numbers of the hypothesis, as are its derivatives by the measured
+angles: all hypotheses are tested by five matrix products.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def in_front(
     rotation: FloatArray,
     least_parallax: float,
 ) -> BoolArray:
-    """(n, c) both distances positive (D1), or the rays too parallel to tell.
+    """(n, c) both distances positive, or the rays too parallel to tell.
 
     Args:
         bearings: (n,) from a and from b, radians.
@@ -96,7 +96,7 @@ class EpipolarTest:
         return cls(_products(a, b), derivatives, matches.bearing_a, matches.bearing_b)
 
     def normalised(self, direction: FloatArray, rotation: FloatArray) -> FloatArray:
-        """(n, c) residuals over their first-order standard deviations (D7), for c hypotheses."""
+        """(n, c) residuals over their first-order standard deviations, for c hypotheses."""
         between = rotation - direction
         hypothesis = np.stack(
             [np.sin(direction), -np.cos(direction), np.sin(between), np.cos(between)]

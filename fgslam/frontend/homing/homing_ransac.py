@@ -214,7 +214,7 @@ class _Search:
         return len(np.unique(self._cells[which]))
 
     def turn_at_target(self, best: Refined) -> Refusal | None:
-        """Both views from one place (D6): there is a turn, but no direction.
+        """Both views from one place: there is a turn, but no direction.
 
         That must be as well supported as any answer, and from enough sides: a single thing looks
         alike from anywhere, and like turned when it is another one of its kind.
@@ -334,10 +334,10 @@ def _angle_apart(one: FloatArray, other: FloatArray) -> FloatArray:
 def _log_ratios(
     matches: BearingMatches, tilt_sigma: float
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """(n,) ln rho and its standard deviation, and which matches may be sampled (D6).
+    """(n,) ln rho and its standard deviation, and which matches may be sampled.
 
     sigma(ln tan alpha) = 2 sigma / sin(2 alpha): it explodes towards the horizon and the zenith.
-    Where both elevations have different signs there is no ratio (D1).
+    Where both elevations have different signs there is no ratio.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.tan(matches.elevation_a) / np.tan(matches.elevation_b)

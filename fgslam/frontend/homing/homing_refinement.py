@@ -1,7 +1,7 @@
 """Least-squares refinement of a homing vector on its inliers, with covariance.
 
 The planar constraint supposes level cameras at one height. Real ones tilt by a fraction of a degree
-(D6: "estimate or inflate"), which bends elevations alike over whole sides of the view; so each
+("estimate or inflate"), which bends elevations alike over whole sides of the view; so each
 view's roll and pitch and the difference of heights are estimated along with theta and psi, held by
 a prior. The residual is the epipolar one with general rotations, a weighted first-order (Sampson)
 distance.
@@ -22,7 +22,7 @@ from fgslam.frontend.homing.match_odds import COMMON_CHANCE, gain, right_probabi
 
 _WIDENED = (4.0, 3.0, 2.0, 1.5)
 """Inliers' threshold in the first iterations: a hypothesis from two matches is a few degrees off,
-and the matches that would pull it right are its outliers (D7: 1 to 2 degrees)."""
+and the matches that would pull it right are its outliers (1 to 2 degrees)."""
 _ITERATIONS = 15
 _CONVERGED = 1e-7  # radians; a thousandth of the best covariance's square root
 _MAD_TO_SIGMA = 1.4826

@@ -1,4 +1,4 @@
-"""The local map: features triangulated from start and target (III-C, G16)."""
+"""The local map: features triangulated from start and target (III-C)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fgslam.core.types import BoolArray, FloatArray
 
 
 def triangulate(matches: BearingMatches, direction: float, rotation: float) -> FloatArray:
-    """(n,) distance d from the start, in legs (D1); not positive or infinite where rays diverge."""
+    """(n,) distance d from the start, in legs; not positive or infinite where rays diverge."""
     seen_b = matches.bearing_b + rotation
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.sin(seen_b - direction) / np.sin(seen_b - matches.bearing_a)

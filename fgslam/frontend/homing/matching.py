@@ -4,7 +4,7 @@ SIFT features: the nearest descriptor, clearly nearer than the second, mutually;
 filter of eq. 1. Column segments: the nearest of the whitened vectors, likewise.
 
 Both images are taken on one plane. What no motion on it explains is left out *before* the nearest
-are sought, so it does not count as a rival either: elevations of opposite sign (design D1), and
+are sought, so it does not count as a rival either: elevations of opposite sign, and
 apparent sizes that disagree with the elevations. A thing at height z and distance r has size ~ 1/r
 and sin(elevation) = z/r, so s_a / s_b = sin(e_a) / sin(e_b).
 """
@@ -219,7 +219,7 @@ def _column_matches(
 
 
 def consistent_tangents(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """One tangent of each view, their ratio the best estimate of e / d from both ends (D1, B1).
+    """One tangent of each view, their ratio the best estimate of e / d from both ends.
 
     The ends (low, high) of a segment are a vector that grows and shrinks with 1 / distance: a and b
     (n, 2) are parallel. With c the unit vector of their common direction, c.a / c.b is the ratio

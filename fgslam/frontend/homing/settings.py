@@ -12,7 +12,7 @@ from fgslam.core.settings import STRICT
 
 @dataclass(frozen=True, config=STRICT)
 class HomingVectorSettings:
-    """Two-point RANSAC, refinement by least squares, refusals (III-B; design D3, D6, D7)."""
+    """Two-point RANSAC, refinement by least squares, refusals (III-B)."""
 
     samples: Annotated[
         int, Field(ge=1, description="at most so many random pairs of matches (200 in the paper)")
@@ -27,13 +27,13 @@ class HomingVectorSettings:
     ] = 0.999
     inlier_sigmas: Annotated[
         float,
-        Field(gt=0.0, description="normalised epipolar residual of an inlier (D7: 2.5 to 3)"),
+        Field(gt=0.0, description="normalised epipolar residual of an inlier (2.5 to 3)"),
     ] = 3.0
     least_parallax_deg: Annotated[
         float,
         Field(
             ge=0.0,
-            description="of two rays; the distances' signs are tested above it only (D7: 3)",
+            description="of two rays; the distances' signs are tested above it only (3)",
         ),
     ] = 3.0
     tilt_sigma_deg: Annotated[
@@ -85,6 +85,6 @@ class HomingVectorSettings:
         float,
         Field(
             ge=0.0,
-            description="median parallax below which both views are from one place (D6)",
+            description="median parallax below which both views are from one place",
         ),
     ] = 0.5

@@ -1,7 +1,7 @@
-"""From wide-baseline features to points that can be tracked (Goedemé et al. IV-A, G23).
+"""From wide-baseline features to points that can be tracked (Goedemé et al. IV-A).
 
 Features that are recognised from afar are rarely the points that are tracked best. Near each one
-the point is chosen whose gradient matrix (eq. 2, summed over the window, E-G8) has the largest
+the point is chosen whose gradient matrix (eq. 2, summed over the window) has the largest
 smaller eigenvalue. In the target image that point was not looked for: it lies where the own
 frame of the feature puts it, as if its surroundings were a plane seen alike from both places.
 """

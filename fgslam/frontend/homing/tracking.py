@@ -1,6 +1,6 @@
-"""Tracking of features from image to image: KLT on a steady view (Goedemé et al. IV-A, G21-G23).
+"""Tracking of features from image to image: KLT on a steady view (Goedemé et al. IV-A).
 
-Eq. 2's matrix is summed over the window (E-G8). A point is lost for good when it cannot be tracked
+Eq. 2's matrix is summed over the window. A point is lost for good when it cannot be tracked
 back to where it came from, when it no longer looks as it did when its tracking began
 (:mod:`fgslam.frontend.homing.anchored_patches`), or when it leaves the view.
 """

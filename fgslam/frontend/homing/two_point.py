@@ -1,10 +1,10 @@
 """The planar two-point problem in closed form: two features in two views give the homing vector.
 
-Section III-B of Goedemé et al. (2005), fig. 3, as derived in design D1 and D3. One feature's height
+Section III-B of Goedemé et al. (2005), fig. 3. One feature's height
 is the same for both cameras, so the ratio of its elevations' tangents is that of its distances,
-``rho = e / d = tan(alpha_a) / tan(alpha_b)`` (G12). Two features and their bearings then make a
+``rho = e / d = tan(alpha_a) / tan(alpha_b)``. Two features and their bearings then make a
 quadrangle with one unknown, ``k = d_2 / d_1``, the root of a quadratic. The paper implies a unique
-answer; there are two wherever both features are nearer to the same camera (E-G11).
+answer; there are two wherever both features are nearer to the same camera.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from fgslam.core.planar import wrap
 from fgslam.core.types import BoolArray, FloatArray
 
 LEAST_SEPARATION = np.deg2rad(5.0)
-"""Bearing difference that two features need in one of the views (D6): less is one vertical line."""
+"""Bearing difference that two features need in one of the views: less is one vertical line."""
 
 _ALIKE = 1e-12
-"""|1 - rho^2| below which a feature counts as equally far from both cameras (D6)."""
+"""|1 - rho^2| below which a feature counts as equally far from both cameras."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,12 +67,12 @@ def solve_two_point(
     clamp_sigmas: float = 3.0,
     least_separation: float = LEAST_SEPARATION,
 ) -> TwoPointSolutions:
-    """All solutions with positive distances (D3); degenerate samples (D6) have none.
+    """All solutions with positive distances; degenerate samples have none.
 
     Args:
         samples: as described.
         clamp_sigmas: a negative discriminant within so many of its standard deviations counts as
-            a double root (D6); beyond, the sample is refused.
+            a double root; beyond, the sample is refused.
         least_separation: of the two bearings in one of the views, radians.
     """
     rho = np.exp(samples.log_ratio)
@@ -98,7 +98,7 @@ def solve_two_point(
 
 
 def _distance_ratios(samples: TwoPointSamples, rho: FloatArray, clamp_sigmas: float) -> FloatArray:
-    """(s, 2) roots k of D3's quadratic A k^2 - 2 B k + C = 0, NaN where there is none."""
+    """(s, 2) roots k of the quadratic A k^2 - 2 B k + C = 0, NaN where there is none."""
     between_a = samples.bearing_a[:, 1] - samples.bearing_a[:, 0]
     between_b = samples.bearing_b[:, 1] - samples.bearing_b[:, 0]
     # -expm1 keeps 1 - rho^2 exact where both distances are nearly equal.

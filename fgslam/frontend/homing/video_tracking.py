@@ -1,4 +1,4 @@
-"""Tracking through a whole recording: points that are lost are replaced by new ones (G21, G22)."""
+"""Tracking through a whole recording: points that are lost are replaced by new ones."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""TODO places."""
+"""Place recognition: relocalisation in a map, loop closures, joining of saved maps."""

@@ -1,4 +1,4 @@
-"""Lays one map onto another by what their landmarks look like and where they are (design B4).
+"""Lays one map onto another by what their landmarks look like and where they are.
 
 Tentative matches by appearance, RANSAC over triples, least squares weighted by both covariances,
 then every landmark that the alignment brings near one that looks like it. The verdict refuses

@@ -1,4 +1,4 @@
-"""Settings of place recognition: finding oneself again, closing loops (Se et al. 7; S41, S42)."""
+"""Settings of place recognition: finding oneself again, closing loops (Se et al. 7)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fgslam.core.settings import STRICT
 
 @dataclass(frozen=True, config=STRICT)
 class LostSettings:
-    """When a robot counts as lost, and what it then does (S36, S41)."""
+    """When a robot counts as lost, and what it then does."""
 
     after: Annotated[
         int,
@@ -34,7 +34,7 @@ class LostSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class LoopSettings:
-    """When a return is looked for, and what it takes to be believed (S42)."""
+    """When a return is looked for, and what it takes to be believed."""
 
     every: Annotated[
         int,
@@ -115,7 +115,7 @@ class LoopSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class MergeSettings:
-    """How two maps are laid onto each other, and when they are refused (design B4)."""
+    """How two maps are laid onto each other, and when they are refused."""
 
     max_distance: Annotated[
         float, Field(gt=0.0, description="largest distance of descriptors, of norm 512")

@@ -1,1 +1,1 @@
-"""TODO stereo."""
+"""Matching over two and three cameras."""

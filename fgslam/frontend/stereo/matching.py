@@ -104,7 +104,7 @@ class StereoMatcher:
 def _average(
     features: tuple[Features, ...], matches: tuple[IntArray, ...]
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean scale and circular mean orientation over the images (Se et al. 2.2; S7)."""
+    """Mean scale and circular mean orientation over the images (Se et al. 2.2)."""
     pairs = list(zip(features, matches, strict=True))
     scale = np.mean([f.scale[m] for f, m in pairs], axis=0)
     angles = np.array([f.orientation[m] for f, m in pairs])

@@ -1,4 +1,4 @@
-"""TODO frontend.stereo.settings."""
+"""Settings of stereo matching."""
 
 from __future__ import annotations
 

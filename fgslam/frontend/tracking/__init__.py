@@ -1,1 +1,1 @@
-"""TODO tracking."""
+"""Tracking against the map: landmark database, map matching, ego-motion."""

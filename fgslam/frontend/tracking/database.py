@@ -2,7 +2,7 @@
 
 Geometry (positions and covariances) belongs to the estimator; the two are joined by landmark ids.
 Each entry is [s, o, m, n, l] with a descriptor; the scale is kept as the physical size
-``s * Z``, because the image scale is inversely proportional to the depth (3.1; design E-S7). An
+``s * Z``, because the image scale is inversely proportional to the depth (3.1). An
 entry may be permanent (6.2), and have several views (6.3).
 """
 
@@ -126,7 +126,7 @@ class LandmarkDatabase(LandmarkTable):
         """What a located frame says against permanent landmarks: too often, and one is demoted.
 
         It contradicts those missing whose match was rejected as an outlier, and those whose place
-        it sees past (:func:`fgslam.frontend.tracking.permanence.seen_past`). What hides them says nothing.
+        it sees past (``permanence.seen_past``). What hides them says nothing.
 
         Args:
             expected: landmarks expected in view.

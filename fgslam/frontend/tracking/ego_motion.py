@@ -1,7 +1,7 @@
 """Pose of a frame by least squares on image residuals against the map (Se et al. 3.3 and 5).
 
 Newton's method in its Gauss-Newton form with analytic Jacobians, Lowe's stabilisation towards the
-odometry (Lowe 1991; design B6), Levenberg's damping where a step would raise the cost, repeated
+odometry (Lowe 1991), Levenberg's damping where a step would raise the cost, repeated
 after outliers are dropped, and capped.
 """
 
@@ -292,7 +292,7 @@ class EgoMotionSolver:
         )
 
     def _allowed_fraction(self, correction: FloatArray) -> float:
-        """Fraction of the correction that the cap lets through (section 5; S29)."""
+        """Fraction of the correction that the cap lets through (section 5)."""
         rotation = float(np.linalg.norm(correction[:3]))
         translation = float(np.linalg.norm(correction[3:]))
         return float(
@@ -363,7 +363,7 @@ def _add_prior(
     information: FloatArray,
     system: tuple[float, FloatArray, FloatArray],
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Adds ``|Log(predicted^-1 wTc)|^2`` in the prediction's metric (Lowe 1991, design B6)."""
+    """Adds ``|Log(predicted^-1 wTc)|^2`` in the prediction's metric (Lowe 1991)."""
     cost, hessian, gradient = system
     deviation = se3_log(inverse(predicted) @ wTc)
     jacobian = se3_log_jacobian(deviation)

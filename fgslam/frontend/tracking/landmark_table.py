@@ -24,7 +24,7 @@ class LandmarkTable:
     """
 
     def __init__(self, max_views: int, view_angle: float) -> None:
-        """Starts empty; see :class:`fgslam.frontend.tracking.views.ViewPool` for the views (radians)."""
+        """Starts empty; see ``views.ViewPool`` for the views (radians)."""
         self._pool = ViewPool(max_views, view_angle)
         self._next_id = 0
         self._frame = 0

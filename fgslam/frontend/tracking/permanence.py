@@ -1,4 +1,4 @@
-"""Which landmarks last, and what speaks against one that is said to (Se et al. 6.2; S36)."""
+"""Which landmarks last, and what speaks against one that is said to (Se et al. 6.2)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Pose of a frame from landmarks whose identity is known, without any prior.
 
 Three matches (two on a floor) place the camera: the triangulated points are laid onto the
-landmarks (design B4). The pose that most matches agree with starts the least squares.
+landmarks. The pose that most matches agree with starts the least squares.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""TODO frontend.tracking.settings."""
+"""Settings of map matching, the landmark database and the ego-motion."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""How landmarks look, from one or several directions (Se et al. 6.3; S37).
+"""How landmarks look, from one or several directions (Se et al. 6.3).
 
 A landmark has up to ``max_views`` views: SIFT scale (kept as the physical size, scale times depth),
 orientation, descriptor and view vector, the unit vector from the camera to the landmark. The views
 of all landmarks lie in one pool; a landmark names its own by their places in it, the first ones
 first, and -1 for none. So it costs only the views it has, and nothing moves when one leaves.
-A view's word (:mod:`fgslam.frontend.features.vocabulary`) is found when somebody asks for it, and kept.
+A view's word (``frontend.features.vocabulary``) is found when somebody asks for it, and kept.
 """
 
 from __future__ import annotations

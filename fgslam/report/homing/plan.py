@@ -71,7 +71,7 @@ def drive_figure(
 def catchment_figure(
     offsets: FloatArray, succeeded: BoolArray, told: Sequence[str], key: str = "catchment"
 ) -> Figure:
-    """From where homing arrives (G36).
+    """From where homing arrives.
 
     Args:
         offsets: (n, 2) starts relative to the target, metres, target's heading up the page.

@@ -183,7 +183,7 @@ class DrivingConfig(HomingExperiment):
         Field(
             ge=0.0,
             description="the robot starts up to so far from the path's start, turned at random: "
-            "from where homing succeeds (G36)",
+            "from where homing succeeds",
         ),
     ] = 0.0
     wrong_matches: Annotated[

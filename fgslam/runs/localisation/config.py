@@ -1,4 +1,4 @@
-"""Configuration of the task `localisation`: frames of a recording sought in a saved map (S41).
+"""Configuration of the task `localisation`: frames of a recording sought in a saved map.
 
 :func:`load_experiment` reads experiments of all kinds and tells them apart.
 """

@@ -23,7 +23,7 @@ class Sighted:
 
     Attributes:
         visible: in all images, not too near and not too small for the rig, and not hidden.
-        familiar: of these, seen from a direction from which they were seen before (S37).
+        familiar: of these, seen from a direction from which they were seen before.
     """
 
     visible: int = -1

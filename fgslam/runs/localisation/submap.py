@@ -30,7 +30,7 @@ _NEAREST_M = 0.1  # of the last camera's plane: nearer ones have no size in its 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Consecutive frames of a recording as one of its own; a :class:`fgslam.core.recordings.Sequence`.
+    """Consecutive frames of a recording as one of its own; a ``Sequence``.
 
     Attributes:
         whole: the recording.

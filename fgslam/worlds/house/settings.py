@@ -19,7 +19,7 @@ NonNegative = Annotated[float, Field(ge=0.0)]
 
 @dataclass(frozen=True, config=STRICT)
 class HouseMirrorSettings:
-    """A hyperbolic mirror above an upward-looking camera, as the unified sphere model (B7)."""
+    """A hyperbolic mirror above an upward-looking camera, as the unified sphere model."""
 
     kind: Literal["mirror"] = "mirror"
     width: Annotated[int, Field(ge=64, le=4096, description="image width, pixels")] = 320

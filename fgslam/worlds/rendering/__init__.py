@@ -1,1 +1,1 @@
-"""TODO rendering."""
+"""Rendering of textured patch scenes: pinhole and omnidirectional images, light, textures."""

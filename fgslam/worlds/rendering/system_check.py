@@ -1,8 +1,8 @@
 """What Open3D's wheel needs of the system, and what of it is absent here.
 
 Only the rendered lab and some point-cloud conversions need Open3D. ``make setup`` runs this module:
-``python -m fgslam.worlds.rendering.system_check`` says in one line what is missing and how to mend it, and
-``--packages`` prints the Debian package names alone. Standard library only.
+``python -m fgslam.worlds.rendering.system_check`` says in one line what is missing and how to
+provide it, and ``--packages`` prints the Debian package names alone. Standard library only.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""TODO simulated."""
+"""Simulated measurements without images: landmark drives and homings of bearings."""

@@ -35,7 +35,7 @@ from fgslam.worlds.world import make_rig
 # Streams of random numbers, apart so that one imperfection does not redraw another's.
 _DETECTION, _PIXELS, _ODOMETRY, _WRONG = 1, 2, 3, 4
 _MOVED = 5
-_BORDER_PX = 8.0  # nearer to the edge a landmark may be seen, but is not missed (S23)
+_BORDER_PX = 8.0  # nearer to the edge a landmark may be seen, but is not missed
 _STRENGTH_JITTER = 0.1
 _LEAST_DISPARITY_PX = 0.5  # a fainter one cannot be triangulated
 

@@ -1,4 +1,4 @@
-"""TODO worlds.simulated.settings."""
+"""Settings of simulated measurements: the world, the drive, the noise, the faults."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ _NO_PAIRS: IntArray = np.empty((0, 2), np.int64)
 
 
 class Locator(Protocol):
-    """Finds a frame in a map without a prior; :mod:`fgslam.frontend.places.relocalisation` is one."""
+    """Finds a frame in a map without a prior, as ``frontend.places.relocalisation`` does."""
 
     def learn(self, landmarks: LandmarkMap, appearances: LandmarkAppearances) -> None:
         """Makes these landmarks the ones to be found."""

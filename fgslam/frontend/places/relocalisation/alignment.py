@@ -23,7 +23,7 @@ def rigid(here: FloatArray, there: FloatArray, covariances: FloatArray, floor: F
         here: (h, m, 3) sampled features in the camera's frame.
         there: (h, m, 3) their landmarks in the world.
         covariances: (h, m, 3, 3) of feature and landmark together, isotropic enough for a test.
-        floor: on a level one lengths are horizontal (design B4: A^2 + B^2 = C^2 + D^2).
+        floor: on a level one lengths are horizontal (A^2 + B^2 = C^2 + D^2).
     """
     keep = np.ones(len(here), np.bool_)
     sizes = []
@@ -70,7 +70,7 @@ def floor_axes(floor: Floor) -> FloatArray:
 
 
 def align_planar(here: FloatArray, there: FloatArray, floor: Floor) -> FloatArray:
-    """The two-match alignment of design B4, for any number of points: turn, then shift.
+    """The two-match alignment on a level floor, for any number of points: turn, then shift.
 
     With the differences (A, B) of the camera's and (C, D) of the map's horizontal coordinates the
     turn about the vertical is ``atan2(sum A D - B C, sum A C + B D)``.

@@ -49,7 +49,7 @@ class AppearanceIndex:
     def __init__(self, descriptors: ByteArray, words: Words | None = None) -> None:
         """Holds ``descriptors`` (m, 128), which are not copied and must not change.
 
-        ``words`` (m,) are those of :func:`fgslam.frontend.features.vocabulary.words_of`, where known.
+        ``words`` (m,) are those of ``vocabulary.words_of``, where known.
         """
         self._descriptors = descriptors
         self._small = len(descriptors) <= _EXACT

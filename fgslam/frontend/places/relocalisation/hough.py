@@ -1,4 +1,4 @@
-"""Poses on a level floor by votes (design B4): the Hough transform over X, Z and heading.
+"""Poses on a level floor by votes: the Hough transform over X, Z and heading.
 
 A match fixes two of the three numbers: for each heading there is one position from which the
 feature would be the landmark. So it votes along a one-parameter family of poses; where many

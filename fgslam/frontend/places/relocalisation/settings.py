@@ -12,7 +12,7 @@ from fgslam.core.settings import STRICT
 
 @dataclass(frozen=True, config=STRICT)
 class RelocalisationSettings:
-    """Global localisation from one frame, or from a short submap of frames (design B4)."""
+    """Global localisation from one frame, or from a short submap of frames."""
 
     method: Annotated[
         Literal["ransac", "hough"],

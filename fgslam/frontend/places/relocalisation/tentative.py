@@ -75,7 +75,7 @@ def _heights_agree(
     floor: Floor,
     settings: RelocalisationSettings,
 ) -> BoolArray:
-    """Motion on a level floor leaves heights as they are (design B4)."""
+    """Motion on a level floor leaves heights as they are."""
     down = floor.down
     difference = np.abs(features.position[i] @ down - landmarks.positions[rows] @ down)
     variance = np.einsum("i,kij,j->k", down, features.position_covariance[i], down)

@@ -1,1 +1,0 @@
-"""The run folder, trajectories, point clouds and pictures."""

@@ -1,0 +1,75 @@
+"""One BLAS thread: within it, whatever was set before, and given back afterwards."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from fgslam.core.threads import one_blas_thread
+
+ROOT = Path(__file__).parents[3]
+
+# A full EKF whose covariance outgrows the size from which OpenBLAS shares products among threads:
+# without the limit its bytes differ between one thread and two.
+EKF_DIGEST = """
+import hashlib
+from pathlib import Path
+from threadpoolctl import threadpool_info
+from fgslam.config import load_config
+from fgslam.datasets.opening import open_measurements
+from fgslam.measurement_log import MeasurementLog
+from fgslam.runs.replay import replay
+from fgslam.settings.backend import EkfSettings
+
+config = load_config(Path("experiments/lab_trials.yaml"))
+whole = open_measurements(config.dataset, 0).log
+log = MeasurementLog(whole.rig, whole.motion_model)
+for increment in whole.increments[:24]:
+    log.append(increment)
+estimate = replay(log, EkfSettings(), config.frontend.ego_motion).estimate
+assert len(estimate.landmarks) > 150
+digest = hashlib.sha256()
+for array in (estimate.trajectory.poses, estimate.covariances, estimate.landmarks.covariances):
+    digest.update(array.tobytes())
+print(max(x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas"))
+print(digest.hexdigest())
+"""
+
+
+def blas_threads() -> list[int]:
+    """Threads of every BLAS that this process has loaded."""
+    return [x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas"]
+
+
+def digest_with(threads: int) -> tuple[int, str]:
+    """What a process of its own says that was told to use so many threads."""
+    found = subprocess.run(  # noqa: S603  our own program, above
+        [sys.executable, "-c", EKF_DIGEST],
+        cwd=ROOT,
+        env=os.environ | {"OPENBLAS_NUM_THREADS": str(threads)},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    allowed, digest = found.stdout.split()
+    return int(allowed), digest
+
+
+def test_one_thread_inside_and_as_before_outside() -> None:
+    with threadpool_limits(limits=2, user_api="blas"):
+        before = blas_threads()
+        assert max(before) == 2
+        with one_blas_thread():
+            assert set(blas_threads()) == {1}
+        assert blas_threads() == before
+
+
+def test_the_same_bytes_whatever_the_environment_says() -> None:
+    (one, first), (two, second) = digest_with(1), digest_with(2)
+    assert (one, two) == (1, 2)
+    assert first == second

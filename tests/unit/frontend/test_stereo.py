@@ -1,0 +1,346 @@
+"""Matching over the rig (Se et al. 2.2)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from simulated import RIG
+
+from fgslam.core import geometry as g
+from fgslam.core.types import CameraRig, Features, FloatArray, StereoFeatures
+from fgslam.frontend.features.settings import AppearanceSettings
+from fgslam.frontend.stereo.matching import StereoMatcher, measurement_map
+from fgslam.frontend.stereo.settings import StereoSettings
+
+PAPER = AppearanceSettings(mode="paper")
+DESCRIPTOR = AppearanceSettings(mode="descriptor")
+GATES = StereoSettings(
+    epipolar_px=1.0,
+    min_disparity_px=1.0,
+    max_disparity_px=40.0,
+    scale_ratio=1.5,
+    orientation_deg=20.0,
+    disparity_agreement_px=1.0,
+)
+TWO_CAMERAS = dataclasses.replace(RIG, vertical_baseline=None)
+RIGHT = (100.0, 80.0)
+
+
+def features(
+    xy: object,
+    scale: object = 2.0,
+    orientation_deg: object = 30.0,
+    descriptors: FloatArray | None = None,
+) -> Features:
+    at = np.asarray(xy, np.float64).reshape(-1, 2)
+    count = len(at)
+    if descriptors is None:
+        descriptors = np.full((count, 128), 45, np.uint8)
+    return Features(
+        at,
+        np.broadcast_to(np.asarray(scale, np.float64), count).copy(),
+        np.broadcast_to(np.deg2rad(np.asarray(orientation_deg, np.float64)), count).copy(),
+        descriptors,
+    )
+
+
+def match(
+    *images: Features,
+    rig: CameraRig = RIG,
+    appearance: AppearanceSettings = PAPER,
+    **changes: object,
+) -> StereoFeatures:
+    settings = dataclasses.replace(GATES, **changes)
+    return StereoMatcher(rig, settings, appearance).match(images)
+
+
+# --------------------------------------------------------------------------------------------
+# Gates: each alone, just inside and just outside
+
+INSIDE_AND_OUTSIDE = {
+    "epipolar, below": (((110.0, 80.99), 2.0, 30.0), ((110.0, 81.01), 2.0, 30.0)),
+    "epipolar, above": (((110.0, 79.01), 2.0, 30.0), ((110.0, 78.99), 2.0, 30.0)),
+    "disparity, least": (((101.01, 80.0), 2.0, 30.0), ((100.99, 80.0), 2.0, 30.0)),
+    "disparity, negative": (((101.01, 80.0), 2.0, 30.0), ((90.0, 80.0), 2.0, 30.0)),
+    "disparity, largest": (((139.99, 80.0), 2.0, 30.0), ((140.01, 80.0), 2.0, 30.0)),
+    "scale, larger": (((110.0, 80.0), 2.99, 30.0), ((110.0, 80.0), 3.01, 30.0)),
+    "scale, smaller": (((110.0, 80.0), 1.34, 30.0), ((110.0, 80.0), 1.33, 30.0)),
+    "orientation, clockwise": (((110.0, 80.0), 2.0, 49.9), ((110.0, 80.0), 2.0, 50.1)),
+    "orientation, through 0": (((110.0, 80.0), 2.0, 10.1), ((110.0, 80.0), 2.0, 9.9)),
+    "orientation, opposite": (((110.0, 80.0), 2.0, 390.0), ((110.0, 80.0), 2.0, 210.0)),
+}
+
+
+@pytest.mark.parametrize("appearance", [PAPER, DESCRIPTOR], ids=["paper", "descriptor"])
+@pytest.mark.parametrize("gate", INSIDE_AND_OUTSIDE)
+def test_each_gate_of_the_left_image(gate: str, appearance: AppearanceSettings) -> None:
+    right = features(RIGHT)
+    for left, count in zip(INSIDE_AND_OUTSIDE[gate], (1, 0), strict=True):
+        found = match(right, features(*left), rig=TWO_CAMERAS, appearance=appearance)
+        assert len(found) == count
+
+
+def test_orientations_are_compared_around_the_circle() -> None:
+    left = features((110.0, 80.0), orientation_deg=355.0)
+    assert len(match(features(RIGHT, orientation_deg=5.0), left, rig=TWO_CAMERAS)) == 1
+    assert len(match(features(RIGHT, orientation_deg=16.0), left, rig=TWO_CAMERAS)) == 0
+
+
+TOP = {
+    "epipolar, right": (((100.99, 90.0), 2.0, 30.0), ((101.01, 90.0), 2.0, 30.0)),
+    "epipolar, left": (((99.01, 90.0), 2.0, 30.0), ((98.99, 90.0), 2.0, 30.0)),
+    "agreement, more": (((100.0, 90.99), 2.0, 30.0), ((100.0, 91.01), 2.0, 30.0)),
+    "agreement, less": (((100.0, 89.01), 2.0, 30.0), ((100.0, 88.99), 2.0, 30.0)),
+    "agreement, sign": (((100.0, 90.0), 2.0, 30.0), ((100.0, 70.0), 2.0, 30.0)),
+    "scale": (((100.0, 90.0), 2.99, 30.0), ((100.0, 90.0), 3.01, 30.0)),
+    "orientation": (((100.0, 90.0), 2.0, 49.9), ((100.0, 90.0), 2.0, 50.1)),
+}
+
+
+@pytest.mark.parametrize("appearance", [PAPER, DESCRIPTOR], ids=["paper", "descriptor"])
+@pytest.mark.parametrize("gate", TOP)
+def test_each_gate_of_the_top_image(gate: str, appearance: AppearanceSettings) -> None:
+    right, left = features(RIGHT), features((110.0, 80.0))
+    for top, count in zip(TOP[gate], (1, 0), strict=True):
+        found = match(right, left, features(*top), appearance=appearance)
+        assert len(found) == count
+
+
+def test_unequal_baselines_scale_the_agreement() -> None:
+    rig = dataclasses.replace(RIG, vertical_baseline=0.2)
+    right, left = features(RIGHT), features((110.0, 80.0))
+    assert len(match(right, left, features((100.0, 100.0)), rig=rig)) == 1
+    assert len(match(right, left, features((100.0, 90.0)), rig=rig)) == 0
+    # One pixel of horizontal disparity is two vertical ones here.
+    assert len(match(right, left, features((100.0, 101.9)), rig=rig)) == 1
+    assert len(match(right, left, features((100.0, 102.1)), rig=rig)) == 0
+
+
+def test_descriptors_gate_by_distance_and_ratio() -> None:
+    near, far = np.zeros((1, 128), np.uint8), np.zeros((1, 128), np.uint8)
+    far[0, 0] = 251
+    right = features(RIGHT, descriptors=near)
+    appearance = AppearanceSettings(mode="descriptor", max_distance=250.0, ratio=0.8)
+    two = dataclasses.replace(TWO_CAMERAS)
+    assert (
+        len(match(right, features((110, 80), descriptors=far), rig=two, appearance=appearance)) == 0
+    )
+    far[0, 0] = 250
+    assert (
+        len(match(right, features((110, 80), descriptors=far), rig=two, appearance=appearance)) == 1
+    )
+    # Two candidates at distances 79 and 100 are told apart, 81 and 100 are not.
+    for distance, count in ((79, 1), (81, 0)):
+        candidates = np.zeros((2, 128), np.uint8)
+        candidates[0, 0], candidates[1, 0] = distance, 100
+        left = features([(110, 80), (115, 80)], descriptors=candidates)
+        found = match(right, left, rig=two, appearance=appearance)
+        assert len(found) == count
+        if count:
+            assert found.measurement[0, 2] == pytest.approx(10.0)
+
+
+# --------------------------------------------------------------------------------------------
+# Ambiguity
+
+
+def test_duplicate_texture_matches_nothing() -> None:
+    """A row of equal features, as of a grating, has more than one admissible partner each."""
+    columns = np.arange(20.0, 300.0, 10.0)
+    right = features(np.column_stack([columns, np.full(len(columns), 50.0)]))
+    left = features(np.column_stack([columns + 5.0, np.full(len(columns), 50.0)]))
+    # The rightmost ones have a single candidate, but that one is wanted by others.
+    assert len(match(right, left, rig=TWO_CAMERAS, max_disparity_px=35.0)) == 0
+    # The same far enough apart for a single candidate each.
+    assert len(match(right, left, rig=TWO_CAMERAS, max_disparity_px=9.0)) == len(columns)
+
+
+def test_an_ambiguous_top_feature_discards() -> None:
+    right, left = features(RIGHT), features((110.0, 80.0))
+    assert len(match(right, left, features([(100.0, 90.0), (100.4, 90.3)]))) == 0
+    # Two pairs that want the same top feature lose it both.
+    right = features([RIGHT, (100.5, 80.0)], scale=[2.0, 3.5])
+    left = features([(110.0, 80.0), (110.5, 80.0)], scale=[2.0, 3.5])
+    assert len(match(right, left, rig=TWO_CAMERAS)) == 2
+    assert len(match(right, left, features((100.0, 90.0), scale=2.6))) == 0
+
+
+def crowd(rng: np.random.Generator, count: int = 150, noise: float = 0.5):
+    """Features that look alike, each with its true partner, all over the image."""
+    xy = np.column_stack([rng.uniform(0, 280, count), rng.uniform(0, 240, count)])
+    disparity = rng.uniform(3, 30, count)
+    left = xy + np.outer(disparity, [1, 0]) + noise * rng.standard_normal(xy.shape)
+    top = xy + np.outer(disparity, [0, 1]) + noise * rng.standard_normal(xy.shape)
+    return features(xy), features(left), features(top)
+
+
+def test_wider_gates_need_not_give_more_matches() -> None:
+    """The count has its maximum inside the range of widths."""
+    widths = [0.05, 0.2, 0.5, 1.0, 2.0, 5.0, 15.0]
+    counts = np.zeros(len(widths))
+    for seed in range(10):
+        images = crowd(np.random.default_rng(seed))[:2]
+        counts += [len(match(*images, rig=TWO_CAMERAS, epipolar_px=w)) for w in widths]
+    best = int(np.argmax(counts))
+    assert 0 < best < len(widths) - 1
+    assert counts[0] < 0.7 * counts[best]
+    assert counts[-1] < 0.3 * counts[best]
+
+
+def test_the_top_image_removes_wrong_matches() -> None:
+    """Features whose left partner was not found meet a stranger in the left image."""
+    rng = np.random.default_rng(4)
+    right, left, top = crowd(rng, 250, noise=0.2)
+    true_left = left.xy.copy()
+    lost = rng.uniform(size=250) < 0.6
+    # In place of the lost ones: features at random places, as many.
+    elsewhere = np.column_stack([rng.uniform(0, 320, lost.sum()), rng.uniform(0, 240, lost.sum())])
+    moved = left.xy.copy()
+    moved[lost] = elsewhere
+    left = dataclasses.replace(left, xy=moved)
+    matcher = StereoMatcher(RIG, GATES, PAPER)
+    i, j = matcher.match_left(right, left)
+    kept, k = matcher.match_top(right, left, top, (i, j))
+
+    def right_ones(i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        return (i == j) & (left.xy[j] == true_left[j]).all(axis=1)
+
+    before, after = right_ones(i, j), right_ones(i[kept], j[kept]) & (i[kept] == k)
+    assert before.mean() < 0.9
+    assert after.mean() > before.mean() + 0.08
+    assert after.mean() >= 0.97
+    assert after.sum() > 0.6 * before.sum()
+
+
+# --------------------------------------------------------------------------------------------
+# The measurement and its covariance
+
+
+@pytest.mark.parametrize(
+    ("angles", "mean"),
+    [
+        ((350.0, 5.0, 8.0), 1.0),
+        ((1.0, 359.0, 0.0), 0.0),
+        ((90.0, 100.0, 95.0), 95.0),
+        ((181.0, 179.0, 180.0), 180.0),
+    ],
+)
+def test_orientation_is_averaged_around_the_circle(angles: tuple, mean: float) -> None:
+    images = [
+        features(at, scale=s, orientation_deg=a)
+        for at, s, a in zip(
+            [RIGHT, (110.0, 80.0), (100.0, 90.0)], (2.0, 2.2, 2.7), angles, strict=True
+        )
+    ]
+    found = match(*images)
+    assert found.scale[0] == pytest.approx(2.3)
+    difference = np.rad2deg(g.wrap_angle(found.orientation - np.deg2rad(mean)))
+    np.testing.assert_allclose(difference, 0.0, atol=0.05)
+    assert 0.0 <= found.orientation[0] < 2 * np.pi
+
+
+def test_the_papers_measurement() -> None:
+    """Reference row and column, mean disparity, (X, Y, Z) from them."""
+    images = (features(RIGHT), features((110.2, 80.3)), features((100.4, 89.6)))
+    found = match(*images, measurement="paper")
+    np.testing.assert_allclose(found.measurement[0], [100.0, 80.0, (10.2 + 9.6) / 2], atol=1e-12)
+    np.testing.assert_array_equal(found.pixels[0], [RIGHT, (110.2, 80.3), (100.4, 89.6)])
+    depth = 277.0 * 0.1 / 9.9
+    expected = [(100.0 - 159.5) * depth / 277.0, (80.0 - 119.5) * depth / 277.0, depth]
+    np.testing.assert_allclose(found.position[0], expected, atol=1e-12)
+
+
+def test_two_cameras_leave_the_top_pixels_unknown() -> None:
+    found = match(features(RIGHT), features((110.0, 80.0)), rig=TWO_CAMERAS)
+    assert np.isnan(found.pixels[0, 2]).all()
+    assert np.isfinite(found.pixels[0, :2]).all()
+
+
+def test_the_papers_covariance_is_that_of_b4() -> None:
+    m = measurement_map("paper", 3, 1.0)
+    expected = [[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [-0.5, -0.5, 1.0]]
+    np.testing.assert_allclose(m @ m.T, expected, atol=1e-15)
+
+
+def test_fusing_all_coordinates_halves_the_variances() -> None:
+    m = measurement_map("fused", 3, 1.0)
+    np.testing.assert_allclose(np.diag(m @ m.T), [5 / 12, 5 / 12, 3 / 4], atol=1e-14)
+
+
+@pytest.mark.parametrize("kind", ["paper", "fused"])
+@pytest.mark.parametrize("ratio", [1.0, 0.5, 2.5])
+@pytest.mark.parametrize("cameras", [2, 3])
+def test_exact_pixels_give_the_exact_measurement(kind: str, ratio: float, cameras: int) -> None:
+    m = measurement_map(kind, cameras, ratio)
+    column, row, disparity = 123.4, 56.7, 8.9
+    pixels = [column, row, column + disparity, row, column, row + disparity / ratio]
+    found = m @ np.array(pixels[: 2 * cameras])
+    np.testing.assert_allclose(found, [column, row, disparity], atol=1e-12)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 0.5, 2.5])
+def test_fused_is_never_worse_and_more_cameras_never_hurt(ratio: float) -> None:
+    paper, fused = (measurement_map(kind, 3, ratio) for kind in ("paper", "fused"))
+    two = measurement_map("fused", 2, ratio)
+    better = paper @ paper.T - fused @ fused.T
+    assert np.linalg.eigvalsh(better).min() > -1e-12
+    assert np.linalg.eigvalsh(two @ two.T - fused @ fused.T).min() > -1e-12
+
+
+@pytest.mark.parametrize("kind", ["paper", "fused"])
+@pytest.mark.parametrize("vertical", [0.1, 0.25, None])
+def test_covariances_match_monte_carlo(kind: str, vertical: float | None) -> None:
+    """Within 3 % of a hundred thousand noisy triples, in the image and in space."""
+    rng = np.random.default_rng(10)
+    rig = dataclasses.replace(RIG, vertical_baseline=vertical)
+    at = [RIGHT, (118.0, 80.0), (100.0, 80.0 + 18.0 * (vertical or 0.0) / 0.1)][: rig.cameras]
+    found = match(*[features(xy) for xy in at], rig=rig, measurement=kind, pixel_sigma=0.3)
+    assert len(found) == 1
+    matcher = StereoMatcher(rig, dataclasses.replace(GATES, measurement=kind), PAPER)
+    drawn = np.array(at) + 0.3 * rng.standard_normal((100_000, rig.cameras, 2))
+    everyone = np.arange(len(drawn))
+    images = [features(drawn[:, camera]) for camera in range(rig.cameras)]
+    noisy = matcher._measure(tuple(images), (everyone,) * rig.cameras)
+    for sample, stated in (
+        (noisy.measurement, found.measurement_covariance[0]),
+        (noisy.position, found.position_covariance[0]),
+    ):
+        measured = np.cov(sample.T)
+        scale = np.sqrt(np.outer(np.diag(stated), np.diag(stated)))
+        np.testing.assert_allclose(measured / scale, stated / scale, rtol=0, atol=0.03)
+        np.testing.assert_allclose(np.diag(measured), np.diag(stated), rtol=0.03)
+
+
+def test_empty_images_match_nothing() -> None:
+    none = features(np.empty((0, 2)))
+    some = features(RIGHT)
+    for images in ((none, none, none), (some, none, none), (none, some, some)):
+        for appearance in (PAPER, DESCRIPTOR):
+            found = match(*images, appearance=appearance)
+            assert len(found) == 0
+            assert found.measurement.shape == found.position.shape == (0, 3)
+            assert found.pixels.shape == (0, 3, 2)
+            assert found.descriptors.shape == (0, 128)
+
+
+def test_shuffled_features_match_the_same() -> None:
+    rng = np.random.default_rng(11)
+    images = crowd(rng, 60, noise=0.2)
+    before = match(*images)
+    shuffled = []
+    for image in images:
+        order = rng.permutation(len(image))
+        shuffled.append(
+            Features(
+                *(getattr(image, n)[order] for n in ("xy", "scale", "orientation", "descriptors"))
+            )
+        )
+    after = match(*shuffled)
+    assert len(before) > 20
+
+    def ordered(found: StereoFeatures) -> FloatArray:
+        return found.measurement[np.lexsort(found.measurement.T)]
+
+    np.testing.assert_array_equal(ordered(before), ordered(after))

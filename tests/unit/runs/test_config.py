@@ -1,0 +1,387 @@
+"""The configuration: strict at every depth, messages that name the mend, overrides, round trip."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from fgslam.core.errors import ConfigError
+from fgslam.datasets.odometry_settings import ConstantVelocitySettings
+from fgslam.datasets.recording_settings import ImageFolderSettings
+from fgslam.frontend.places.settings import LoopSettings
+from fgslam.runs.config import ExperimentConfig, load_config, parse_config
+from fgslam.runs.homing.config import is_homing
+from fgslam.worlds.lab_settings import RenderedLabSettings
+
+EXPERIMENTS = [
+    path
+    for path in sorted((Path(__file__).parents[3] / "experiments").glob("*.yaml"))
+    if not is_homing(path)
+]
+MINIMAL: dict[str, Any] = {"name": "x", "dataset": {"kind": "image_folder", "path": "there"}}
+LAB: dict[str, Any] = {"name": "x", "dataset": {"kind": "rendered_lab"}}
+
+
+def nested(base: dict[str, Any], dotted: str, value: object) -> dict[str, Any]:
+    """A copy of ``base`` with one dotted key set."""
+    first, _, rest = dotted.partition(".")
+    inner = base.get(first, {})
+    return base | {first: nested(inner, rest, value) if rest else value}
+
+
+def message_of(values: object, tmp_path: Path, *overrides: str) -> str:
+    path = tmp_path / "c.yaml"
+    path.write_text(yaml.safe_dump(values), encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load_config(path, overrides)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith((str(path), "--set"))
+    return message
+
+
+# --------------------------------------------------------------------------------------------
+# Unknown, missing and wrong keys
+
+
+@pytest.mark.parametrize(
+    ("base", "typo", "meant"),
+    [
+        (MINIMAL, "seeed", "seed"),
+        (MINIMAL, "front_end", "frontend"),
+        (MINIMAL, "dataset.pth", "path"),
+        (MINIMAL, "dataset.use_tops", "use_top"),
+        (MINIMAL, "frontend.shift", "sift"),
+        (MINIMAL, "frontend.sift.octave_layer", "octave_layers"),
+        (MINIMAL, "frontend.ego_motion.min_match", "min_matches"),
+        (MINIMAL, "odometry.max_speed", "max_speed_mps"),
+        (MINIMAL, "estimator.updates", "update"),
+        (MINIMAL, "output.picture", "pictures"),
+        (LAB, "dataset.rig.baseline", "baseline_m"),
+        (LAB, "dataset.drive.lap", "laps"),
+        (LAB, "dataset.effects.noise_gray", "noise_grey"),
+        (LAB, "dataset.effects.person.first_frames", "first_frame"),
+    ],
+)
+def test_an_unknown_key_brings_the_nearest_one(
+    base: dict[str, Any], typo: str, meant: str, tmp_path: Path
+) -> None:
+    if typo.startswith("odometry"):
+        base = nested(base, "odometry.kind", "recorded")
+    message = message_of(nested(base, typo, 1), tmp_path)
+    assert f"unknown key {typo}; did you mean {meant}?" in message
+
+
+def test_an_unknown_key_like_nothing_lists_the_known_ones(tmp_path: Path) -> None:
+    message = message_of(nested(MINIMAL, "output.zzz", 1), tmp_path)
+    assert "unknown key output.zzz; known here: checkpoint_seconds, pictures" in message
+
+
+def test_a_misspelt_required_key_is_told_as_such(tmp_path: Path) -> None:
+    values = {"name": "x", "dataset": {"kind": "image_folder", "paht": "there"}}
+    message = message_of(values, tmp_path)
+    assert "unknown key dataset.paht; did you mean path? (and 1 more)" in message
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"name": "x"}, "key dataset is missing; add it"),
+        ({"dataset": LAB["dataset"]}, "key name is missing; add it"),
+        ({"name": "x", "dataset": {"kind": "image_folder"}}, "key dataset.path is missing; add it"),
+        ({"name": "x", "dataset": {"path": "there"}}, "dataset.kind is missing; add one of"),
+        (nested(MINIMAL, "dataset.kind", "kiti"), "dataset.kind is 'kiti'; use one of"),
+        (nested(MINIMAL, "odometry.kind", "wheel"), "odometry.kind is 'wheel'; use one of"),
+        (nested(MINIMAL, "estimator.kind", "magic"), "estimator.kind is 'magic'; use one of"),
+    ],
+)
+def test_missing_keys_and_bad_kinds(values: dict[str, Any], expected: str, tmp_path: Path) -> None:
+    assert expected in message_of(values, tmp_path)
+
+
+def test_kinds_are_listed(tmp_path: Path) -> None:
+    message = message_of(nested(MINIMAL, "dataset.kind", "bag"), tmp_path)
+    for kind in ("rendered_lab", "image_folder", "kitti", "euroc", "light_field"):
+        assert kind in message
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("name", "a/b"),
+        ("name", ""),
+        ("name", 7),
+        ("seed", -1),
+        ("seed", 1.5),
+        ("seed", "many"),
+        ("dataset", "there"),
+        ("dataset.path", ""),
+        ("dataset.start", -1),
+        ("dataset.stop", 0),
+        ("dataset.stride", 0),
+        ("dataset.lever_arm_m", 1.0),
+        ("frontend", None),
+        ("frontend.sift.octave_layers", 0),
+        ("frontend.sift.contrast_threshold", float("nan")),
+        ("frontend.sift.contrast_threshold", float("inf")),
+        ("frontend.appearance.ratio", 1.01),
+        ("frontend.appearance.mode", "colour"),
+        ("frontend.ego_motion.dof", 4),
+        ("frontend.matching.refine", "perhaps"),
+        ("output.checkpoint_seconds", -0.1),
+        ("output.checkpoint_seconds", float("nan")),
+    ],
+)
+def test_a_wrong_value_is_named_with_its_key(key: str, value: object, tmp_path: Path) -> None:
+    message = message_of(nested(MINIMAL, key, value), tmp_path)
+    assert f"{key} = {value!r} is not usable: " in message
+
+
+def test_a_wrong_item_of_a_vector_is_named_by_its_place(tmp_path: Path) -> None:
+    values = nested(MINIMAL, "dataset.lever_arm_m", [1.0, 2.0, float("inf")])
+    assert "dataset.lever_arm_m[2] = inf is not usable" in message_of(values, tmp_path)
+    values = nested(MINIMAL, "dataset.lever_arm_m", [1.0, 2.0])
+    assert "dataset.lever_arm_m[2] is missing" in message_of(values, tmp_path)
+
+
+# --------------------------------------------------------------------------------------------
+# Files
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"", "holds no `key: value` pairs"),
+        (b"# only a remark\n", "holds no `key: value` pairs"),
+        (b"- 1\n- 2\n", "holds no `key: value` pairs"),
+        (b"just words\n", "holds no `key: value` pairs"),
+        (b"name: [1, 2\n", "not valid YAML"),
+        (b"name: x\n  seed: 1\n", "not valid YAML"),
+        (b"name: !!python/object/apply:os.system ['true']\n", "not valid YAML"),
+        (b"\x89PNG\r\n\x1a\n\x00\xff\xfe", "cannot be read"),
+        (b"name: a\x00b\n", "not valid YAML"),
+        (b"[" * 5000, "not valid YAML"),
+    ],
+)
+def test_files_that_are_no_configuration(content: bytes, expected: str, tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_bytes(content)
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    assert str(caught.value).startswith(f"{path}: {expected}")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_folder_and_nothing_at_all(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"cannot be read .*; give a YAML text file"):
+        load_config(tmp_path)
+    with pytest.raises(ConfigError, match="no such file; give a YAML file"):
+        load_config(tmp_path / "absent.yaml")
+
+
+def test_a_key_given_twice_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text("name: x\nseed: 1\ndataset: {kind: rendered_lab}\nseed: 2\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"line 4.*seed.*twice"):
+        load_config(path)
+
+
+# --------------------------------------------------------------------------------------------
+# Overrides
+
+
+def load(tmp_path: Path, *overrides: str, base: dict[str, Any] = MINIMAL) -> ExperimentConfig:
+    path = tmp_path / "c.yaml"
+    path.write_text(yaml.safe_dump(base), encoding="utf-8")
+    return load_config(path, overrides)
+
+
+def test_overrides_reach_any_depth_and_are_yaml(tmp_path: Path) -> None:
+    config = load(
+        tmp_path,
+        "seed=3",
+        "frontend.sift.octave_layers=4",
+        "dataset.lever_arm_m=[1, -2.5, 1e-1]",
+        "dataset.stop=null",
+        "dataset.use_top=false",
+        "output.checkpoint_seconds=0",
+        "dataset.path=a folder/with=sign",
+        "frontend.matching={refine: true}",
+    )
+    assert config.seed == 3
+    assert config.frontend.sift.octave_layers == 4
+    assert isinstance(config.dataset, ImageFolderSettings)
+    assert config.dataset.lever_arm_m == (1.0, -2.5, 0.1)
+    assert config.dataset.stop is None
+    assert config.dataset.use_top is False
+    assert config.dataset.path == "a folder/with=sign"
+    assert config.output.checkpoint_seconds == 0.0
+    assert config.frontend.matching.refine is True
+
+
+def test_the_last_override_wins(tmp_path: Path) -> None:
+    assert load(tmp_path, "seed=3", "seed=4").seed == 4
+
+
+def test_overrides_do_not_outlive_their_run(tmp_path: Path) -> None:
+    values = {"name": "x", "dataset": {"kind": "image_folder", "path": "there"}}
+    load(tmp_path, "dataset.path=elsewhere", base=values)
+    assert values["dataset"] == {"kind": "image_folder", "path": "there"}
+
+
+@pytest.mark.parametrize("override", ["seed", "=3", "a..b=1", ".seed=1", "seed.=1", ""])
+def test_malformed_overrides(override: str, tmp_path: Path) -> None:
+    assert "not of the form a.b=value" in message_of(MINIMAL, tmp_path, override)
+
+
+def test_overrides_that_cannot_be_applied(tmp_path: Path) -> None:
+    assert "not valid YAML; quote it" in message_of(MINIMAL, tmp_path, "name=[1")
+    message = message_of(MINIMAL, tmp_path, "name.first=1")
+    assert "--set name.first=1: name holds a value, not a group" in message
+    message = message_of(MINIMAL, tmp_path, "frontend.sift.octave_layrs=3")
+    assert "unknown key frontend.sift.octave_layrs; did you mean octave_layers?" in message
+
+
+def test_another_kind_drops_the_keys_of_the_old_one_but_no_misspelling(tmp_path: Path) -> None:
+    base = nested(nested(MINIMAL, "odometry.kind", "recorded"), "odometry.speed_sigma_mps", 0.3)
+    config = load(tmp_path, "odometry.kind=constant_velocity", base=base)
+    assert isinstance(config.odometry, ConstantVelocitySettings)
+    message = message_of(
+        base, tmp_path, "odometry.kind=constant_velocity", "odometry.start_sped_sigma_mps=1"
+    )
+    assert "unknown key odometry.start_sped_sigma_mps; did you mean start_speed_sigma_mps?" in (
+        message
+    )
+
+
+# --------------------------------------------------------------------------------------------
+# Round trip
+
+
+def test_there_are_experiments() -> None:
+    assert {"lab_loop.yaml", "kitti06.yaml"} <= {path.name for path in EXPERIMENTS}
+
+
+@pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
+def test_every_experiment_is_valid_and_survives_a_round_trip(path: Path, tmp_path: Path) -> None:
+    config = load_config(path)
+    assert config.name == path.stem
+    resolved = tmp_path / "config.yaml"
+    values = config.as_values() | {"provenance": {"fgslam": "0", "dataset": {"identity": "ab"}}}
+    resolved.write_text(yaml.safe_dump(values), encoding="utf-8")
+    again = load_config(resolved)
+    assert again.as_values() == config.as_values()
+    assert again.model_copy(update={"provenance": None}) == config
+
+
+def test_defaults_are_filled_in() -> None:
+    values = parse_config(LAB, "x").as_values()
+    assert values["seed"] == 0
+    assert values["dataset"]["rig"]["width"] == 320
+    assert values["estimator"]["kind"] == "landmark_kalman"
+    assert isinstance(parse_config(values, "x").dataset, RenderedLabSettings)
+
+
+def test_a_configuration_cannot_be_changed() -> None:
+    config = parse_config(LAB, "x")
+    with pytest.raises(ValueError, match="frozen"):
+        config.seed = 3  # type: ignore[misc]
+
+
+def descriptions(node: dict[str, Any], schema: dict[str, Any], at: str) -> list[str]:
+    """Dotted names of all fields below a schema node that say nothing about themselves."""
+    if "$ref" in node:
+        node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
+    silent = []
+    for name, inner in node.get("properties", {}).items():
+        kinds = [inner, *inner.get("oneOf", []), *inner.get("anyOf", []), *inner.get("allOf", [])]
+        groups = [kind for kind in kinds if "$ref" in kind]
+        if not groups and name != "kind" and "description" not in inner:
+            silent.append(f"{at}{name}")
+        for kind in groups:
+            silent += descriptions(kind, schema, f"{at}{name}.")
+    return silent
+
+
+def test_every_key_says_what_it_means() -> None:
+    schema = ExperimentConfig.model_json_schema()
+    assert descriptions(schema, schema, "") == []
+
+
+# --------------------------------------------------------------------------------------------
+# Estimators to compare
+
+
+@pytest.mark.parametrize(
+    ("compare", "words"),
+    [
+        (["isam3"], "compare[0].kind is 'isam3'; use one of odometry, landmark_kalman"),
+        (["batch", {"update_every": 3}], "compare[1].kind is missing; add one of odometry"),
+        ([{"kind": "isam2", "updat_every": 3}], "compare[0].updat_every; did you mean update_ev"),
+        ([{"kind": "isam2", "kernel": {"nam": "x"}}], "compare[0].kernel.nam; did you mean name?"),
+        (["batch", {"kind": "isam2", "update_every": 0}], "compare[1].update_every = 0 is not"),
+        ([3], "compare[0] = 3 is not usable: give a group of keys, or the name of a kind"),
+        ("isam2", "compare = 'isam2' is not usable: give a list, e.g. [a, b]"),
+    ],
+)
+def test_items_of_compare_are_named_by_their_place(
+    compare: object, words: str, tmp_path: Path
+) -> None:
+    assert words in message_of(LAB | {"compare": compare}, tmp_path)
+
+
+def test_every_estimator_has_a_folder_of_its_own(tmp_path: Path) -> None:
+    other = {"kind": "landmark_kalman", "update": "world"}
+    message = message_of(LAB | {"compare": [other]}, tmp_path)
+    assert "two different estimators are called landmark_kalman; give one of them a" in message
+    assert len(parse_config(LAB | {"compare": [other | {"label": "w"}]}, "x").compare) == 1
+    assert len(parse_config(LAB | {"compare": ["landmark_kalman"]}, "x").compare) == 1
+    taken = LAB | {"estimator": {"label": "pictures"}}
+    assert "cannot be called pictures, a folder of the run" in message_of(taken, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("dataset.stride", "two", "give a whole number"),
+        ("dataset.stride", 1.5, "give a whole number"),
+        ("output.pictures", "perhaps", "give true or false"),
+        ("estimator.miss_growth_m", "much", "give a number"),
+    ],
+)
+def test_wrong_types_are_told_in_plain_words(
+    key: str, value: object, words: str, tmp_path: Path
+) -> None:
+    message = message_of(nested(MINIMAL, key, value), tmp_path)
+    assert f"{key} = {value!r} is not usable: {words}" in message
+
+
+# --------------------------------------------------------------------------------------------
+# Maps
+
+
+@pytest.mark.parametrize(
+    ("maps", "expected"),
+    [
+        ({"start": "last"}, "mean nothing without a map"),
+        ({"extend": False}, "mean nothing without a map"),
+        ({"load": "a", "made_from": {"dataset": MINIMAL["dataset"]}}, "exclude each other"),
+        ({"load": "a", "save": "b", "extend": False}, "no new map to save"),
+        ({"load": "a", "save": "a"}, "are one file"),
+        ({"load": "maps/../a", "save": "./a"}, "are one file"),
+        ({"load": "a", "start": "continue", "extend": False}, "takes map.load alone"),
+    ],
+)
+def test_maps_that_contradict_themselves(maps: dict[str, Any], expected: str) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        parse_config({**MINIMAL, "map": maps}, "test")
+
+
+def test_a_map_that_stays_as_it_is_may_be_returned_to() -> None:
+    values = {**MINIMAL, "map": {"load": "a", "extend": False}, "frontend": {"loops": {}}}
+    config = parse_config(values, "test")
+    assert not config.map.extend
+    assert config.frontend.loops == LoopSettings()

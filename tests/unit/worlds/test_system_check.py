@@ -1,0 +1,240 @@
+"""What setting up says and does on machines that lack something."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from fgslam.worlds.rendering import system_check
+
+ROOT = Path(__file__).parents[3]
+# What a surrounding `make test FGSLAM_PYTHON=...` hands down must not steer the runs in here.
+FROM_MAKE = ("MAKEFLAGS", "MFLAGS", "MAKELEVEL", "MAKEOVERRIDES", "FGSLAM_PYTHON")
+PROVIDED_EVERYWHERE = ("libc.so", "libm.so", "libgcc_s.so", "ld-linux", "libtbb.so", "libpthread")
+
+
+def needed_libraries(path: Path) -> list[str]:
+    """NEEDED entries of a 64-bit little-endian ELF file, from its dynamic section."""
+    with path.open("rb") as file:
+        header = file.read(64)
+        assert header[:6] == b"\x7fELF\x02\x01"
+        sections_at = struct.unpack_from("<Q", header, 40)[0]
+        size, count = struct.unpack_from("<HH", header, 58)
+        file.seek(sections_at)
+        table = file.read(size * count)
+        # Of each section: type, offset, size, link.
+        sections = [(*struct.unpack_from("<4xI16xQQI", table, i * size),) for i in range(count)]
+        _, offset, length, link = next(s for s in sections if s[0] == 6)
+        file.seek(offset)
+        dynamic = struct.iter_unpack("<qQ", file.read(length))
+        names_at = [value for tag, value in dynamic if tag == 1]
+        file.seek(sections[link][1])
+        names = file.read(sections[link][2])
+    return [names[at : names.index(b"\0", at)].decode() for at in names_at]
+
+
+def test_the_table_is_what_the_wheel_needs() -> None:
+    spec = importlib.util.find_spec("open3d")
+    if spec is None or not spec.submodule_search_locations:
+        pytest.skip("open3d is not installed")
+    folder = Path(spec.submodule_search_locations[0])
+    libraries = sorted(folder.glob("libOpen3D.so*"))
+    if not libraries:
+        pytest.skip(f"this build of open3d has no libOpen3D.so in {folder}")
+    needed = {n for n in needed_libraries(libraries[0]) if not n.startswith(PROVIDED_EVERYWHERE)}
+    assert needed == set(system_check.DEBIAN_PACKAGES)
+
+
+def test_nothing_is_missing_where_all_loads() -> None:
+    assert system_check.missing_libraries(can_load=lambda _: True) == []
+
+
+def test_missing_libraries_are_named_in_order() -> None:
+    absent = {"libX11.so.6", "libGL.so.1"}
+    missing = system_check.missing_libraries(can_load=lambda name: name not in absent)
+    assert missing == ["libGL.so.1", "libX11.so.6"]
+
+
+@pytest.mark.parametrize(("carried", "expected"), [(True, []), (False, ["libusb-1.0.so.0"])])
+def test_libusb_may_come_from_its_python_package(carried: bool, expected: list[str]) -> None:
+    missing = system_check.missing_libraries(
+        can_load=lambda name: name != "libusb-1.0.so.0",
+        has_package=lambda name: carried and name == "libusb_package",
+    )
+    assert missing == expected
+
+
+def test_the_loader_is_asked() -> None:
+    assert system_check.can_load("libc.so.6")
+    assert not system_check.can_load("libno-such-library-anywhere.so.1")
+    assert system_check.has_package("numpy")
+    assert not system_check.has_package("no_such_package_anywhere")
+
+
+def test_the_message_says_what_where_and_the_mend(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(system_check, "missing_libraries", lambda: ["libEGL.so.1", "libGL.so.1"])
+    assert system_check.main([]) == 1
+    line = capsys.readouterr().out
+    assert line.count("\n") == 1
+    assert "missing libEGL.so.1, libGL.so.1" in line
+    assert "apt-get install libegl1 libgl1" in line
+    assert system_check.main(["--packages"]) == 1
+    assert capsys.readouterr().out == "libegl1 libgl1\n"
+
+
+def test_a_complete_machine_gets_no_message(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(system_check, "missing_libraries", list)
+    assert system_check.main(["--packages"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+# --------------------------------------------------------------------------------------------
+# scripts/setup.sh and the Makefile, on machines made up here
+
+
+def executable(path: Path, script: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("#!/bin/sh\n" + script)
+    path.chmod(0o755)
+    return path
+
+
+def own_environment() -> dict[str, str]:
+    return {name: value for name, value in os.environ.items() if name not in FROM_MAKE}
+
+
+def run_setup(
+    checkout: Path, *arguments: str, **variables: str
+) -> subprocess.CompletedProcess[str]:
+    """Runs a copy of the script, so that it cannot touch this checkout's environment."""
+    bash = shutil.which("bash")
+    if bash is None:
+        pytest.skip("bash is not installed")
+    (checkout / "scripts").mkdir(parents=True)
+    shutil.copy(ROOT / "scripts" / "setup.sh", checkout / "scripts")
+    # Not root, so that nothing is ever installed here.
+    executable(checkout / "bin" / "id", "echo 1000\n")
+    path = f"{checkout / 'bin'}:/usr/bin:/bin"
+    return subprocess.run(  # noqa: S603 - our own script
+        [bash, str(checkout / "scripts" / "setup.sh"), *arguments],
+        capture_output=True,
+        text=True,
+        env={**own_environment(), "PATH": path, **variables},
+        check=False,
+    )
+
+
+def test_setup_says_which_python_is_needed(tmp_path: Path) -> None:
+    done = run_setup(tmp_path, "runtime", FGSLAM_PYTHON="/nowhere/python")
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "Python 3.11, 3.12 or 3.13 is needed" in done.stderr
+    assert "make setup FGSLAM_PYTHON=" in done.stderr
+
+
+def test_setup_says_which_package_makes_environments(tmp_path: Path) -> None:
+    python = executable(
+        tmp_path / "python",
+        'case "$2" in *ensurepip*) exit 1 ;; *print*) echo 3.12 ;; esac\n',
+    )
+    done = run_setup(tmp_path, "runtime", FGSLAM_PYTHON=str(python))
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "no ensurepip" in done.stderr
+    assert "python3.12-venv" in done.stderr
+    assert not (tmp_path / ".venv").exists()
+
+
+def test_setup_passes_over_pythons_that_do_not_run(tmp_path: Path) -> None:
+    # As the names that version managers leave on the PATH.
+    for name in ("python3.11", "python3.12", "python3.13"):
+        executable(tmp_path / "bin" / name, "echo not for this folder >&2; exit 127\n")
+    executable(
+        tmp_path / "bin" / "python3",
+        'case "$2" in *ensurepip*) exit 1 ;; *print*) echo 3.13 ;; esac\n',
+    )
+    done = run_setup(tmp_path, "runtime")
+    assert "python3 cannot make virtual environments" in done.stderr
+    assert "python3.13-venv" in done.stderr
+
+
+def test_setup_that_fails_leaves_no_stamp(tmp_path: Path) -> None:
+    executable(
+        tmp_path / ".venv" / "bin" / "python",
+        'case "$*" in *"pip install"*) echo "no index" >&2; exit 1 ;; esac\n',
+    )
+    done = run_setup(tmp_path, "dev")
+    assert done.returncode == 1
+    assert "pip could not install" in done.stderr
+    assert not (tmp_path / ".venv" / ".dev-stamp").exists()
+
+
+def test_setup_lives_with_missing_system_libraries(tmp_path: Path) -> None:
+    executable(
+        tmp_path / ".venv" / "bin" / "python",
+        'case "$*" in\n'
+        '  *"system_check --packages") echo libgl1; exit 1 ;;\n'
+        "  *system_check) echo Open3D cannot load here; exit 1 ;;\n"
+        "esac\n",
+    )
+    done = run_setup(tmp_path, "runtime")
+    assert done.returncode == 0, done.stderr
+    assert "Open3D cannot load here" in done.stderr
+    assert (tmp_path / ".venv" / ".runtime-stamp").exists()
+
+
+def test_setup_refuses_unknown_kinds(tmp_path: Path) -> None:
+    done = run_setup(tmp_path, "everything")
+    assert done.returncode == 1
+    assert "use runtime or dev" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("target", "stamps"),
+    [
+        ("demo", ["runtime"]),
+        ("setup", ["runtime", "dev"]),
+        ("test", ["runtime", "dev"]),
+        ("test-all", ["runtime", "dev"]),
+        ("check", ["runtime", "dev"]),
+        ("bench", ["runtime", "dev"]),
+        ("bench-long", ["runtime", "dev"]),
+    ],
+)
+def test_every_target_sets_up_first_and_once(
+    tmp_path: Path, target: str, stamps: list[str]
+) -> None:
+    make = shutil.which("make")
+    if make is None:
+        pytest.skip("make is not installed")
+    for name in ("Makefile", "pyproject.toml", "scripts/setup.sh"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+
+    def dry_run() -> list[str]:
+        command = [make, "--dry-run", "--no-print-directory", target]
+        done = subprocess.run(  # noqa: S603 - our own Makefile
+            command,
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            env=own_environment(),
+            check=True,
+        )
+        return [line for line in done.stdout.splitlines() if "scripts/setup.sh" in line]
+
+    assert dry_run() == [f"bash scripts/setup.sh {kind}" for kind in stamps]
+    (tmp_path / ".venv").mkdir()
+    for kind in stamps:
+        (tmp_path / ".venv" / f".{kind}-stamp").touch()
+    assert dry_run() == []
