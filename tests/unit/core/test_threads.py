@@ -19,11 +19,11 @@ EKF_DIGEST = """
 import hashlib
 from pathlib import Path
 from threadpoolctl import threadpool_info
-from fgslam.config import load_config
+from fgslam.runs.config import load_config
 from fgslam.datasets.opening import open_measurements
-from fgslam.measurement_log import MeasurementLog
-from fgslam.runs.replay import replay
-from fgslam.settings.backend import EkfSettings
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.slam.replay import replay
+from fgslam.backend.filters.settings import EkfSettings
 
 config = load_config(Path("experiments/lab_trials.yaml"))
 whole = open_measurements(config.dataset, 0).log
