@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.features.vocabulary import VOCABULARY_FILE
 from fgslam.runs.config import load_config

@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from fgslam.core.types import FloatArray, Image
+from fgslam.core.arrays import FloatArray, Image
 
 WIDTH, HEIGHT = 32, 24
 CALIBRATION = {

@@ -9,7 +9,8 @@ import gtsam
 import numpy as np
 
 from fgslam.core import geometry as g
-from fgslam.core.types import CameraRig, FloatArray
+from fgslam.core.arrays import FloatArray
+from fgslam.core.sensors import CameraRig
 
 UNEVEN_RIG = CameraRig(
     width=640,

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.homing_types import BearingMatches, FeatureKind
+from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.homing import BearingMatches, FeatureKind
 from fgslam.core.planar import bearings, unit
-from fgslam.core.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)

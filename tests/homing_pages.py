@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.homing_types import HomingEstimate, HomingTruth
+from fgslam.core.homing import HomingEstimate, HomingTruth
 from fgslam.report.homing import Column, HomingPage, TextTable
 from fgslam.report.homing.curves import Line, claimed_against_true, curve_figure
 from fgslam.report.homing.local_map import local_map_figure

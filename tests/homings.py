@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.homing_types import HomingStart, HomingTruth, HomingVector, TrackedBearings
-from fgslam.core.types import BoolArray
+from fgslam.core.arrays import BoolArray
+from fgslam.core.homing import HomingStart, HomingTruth, HomingVector, TrackedBearings
 from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
 from fgslam.frontend.homing.local_map import make_local_map
 from fgslam.frontend.homing.settings import HomingVectorSettings

@@ -14,7 +14,8 @@ import numpy as np
 
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.backend.homing.settings import HomingEkfSettings, HomingEstimatorSettings
-from fgslam.core.homing_types import (
+from fgslam.core.arrays import ByteArray, FloatArray, IntArray
+from fgslam.core.homing import (
     BearingMatches,
     ColumnSegments,
     HomingStart,
@@ -25,7 +26,6 @@ from fgslam.core.homing_types import (
     UprightFeatures,
 )
 from fgslam.core.planar import bearings, compose, wrap
-from fgslam.core.types import ByteArray, FloatArray, IntArray
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.homing.avoidance import NoAvoidance, ObstacleAvoider
 from fgslam.homing.closed_loop import Driver, follow

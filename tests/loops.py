@@ -21,7 +21,8 @@ from simulated import (
 )
 
 from fgslam.core import geometry as g
-from fgslam.core.types import BoolArray, FloatArray, Increment, LoopClosure
+from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.measurements import Increment, LoopClosure
 
 CIRCLE = (0.0, 0.1, 0.0, 0.0, 0.0, 0.25)
 """63 frames a round of 5 m across."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.cameras.omni.panoramas import Equirectangular
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.worlds.rendering.colour_bank import ColourBank
 from fgslam.worlds.rendering.lighting import flat_light
 from fgslam.worlds.rendering.patches import Surface, Thing, rectangle, stack

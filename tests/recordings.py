@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, se3_exp
-from fgslam.core.types import FloatArray, Image
 
 WIDTH, HEIGHT = 160, 120
 FOCAL = 130.0

@@ -8,8 +8,9 @@ import io
 import numpy as np
 from PIL import Image
 
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import LandmarkMap, Trajectory
 from fgslam.core.geometry import pose, so3_exp
-from fgslam.core.types import FloatArray, LandmarkMap, Trajectory
 from fgslam.report.page import Column, Comparison, EstimatorReport, Picture, ReportData
 
 HOSTILE = "<script>alert('%{x}')</script> & \"quotes\" </style>"

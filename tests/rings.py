@@ -11,7 +11,10 @@ from simulated import RIG, FeatureWorld, assert_same_bits
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core import geometry as g
-from fgslam.core.types import Features, FloatArray, Frame, Increment, Odometry
+from fgslam.core.arrays import FloatArray
+from fgslam.core.features import Features
+from fgslam.core.measurements import Increment, Odometry
+from fgslam.core.recordings import Frame
 from fgslam.frontend.places.loops.confirmation import difference
 from fgslam.frontend.places.settings import LoopSettings, LostSettings
 from fgslam.frontend.stereo.matching import StereoMatcher

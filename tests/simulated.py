@@ -14,21 +14,11 @@ import numpy as np
 
 from fgslam.backend.protocol import Estimator
 from fgslam.core import geometry as g
-from fgslam.core.types import (
-    BoolArray,
-    CameraRig,
-    EgoMotion,
-    EgoMotionStatus,
-    Features,
-    FloatArray,
-    Increment,
-    IntArray,
-    Observations,
-    Odometry,
-    Prediction,
-    Sensor,
-    UpdateStats,
-)
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction, UpdateStats
+from fgslam.core.features import Features
+from fgslam.core.measurements import Increment, Observations, Odometry
+from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.settings import EgoMotionSettings

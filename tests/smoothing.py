@@ -12,7 +12,9 @@ from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.core import geometry as g
-from fgslam.core.types import BoolArray, Estimate, FloatArray, Increment, Prediction, UpdateStats
+from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.estimates import Estimate, Prediction, UpdateStats
+from fgslam.core.measurements import Increment
 from fgslam.evaluation.consistency import Nees, landmark_nees, pose_nees
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.slam.factory import make_estimator

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from fgslam.cameras.omni.panoramas import Equirectangular
-from fgslam.core.types import FloatArray, Image
+from fgslam.core.arrays import FloatArray, Image
 
 CAMERA = Equirectangular(601, 181, np.deg2rad(54.0), np.deg2rad(-54.0))
 HALF = 3.0

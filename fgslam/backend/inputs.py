@@ -11,17 +11,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.errors import EstimatorError
+from fgslam.core.estimates import EgoMotion, EgoMotionStatus
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import (
-    EgoMotion,
-    EgoMotionStatus,
-    FloatArray,
-    Increment,
-    Odometry,
-    Sensor,
-    StateArrays,
-)
+from fgslam.core.measurements import Increment, Odometry
+from fgslam.core.sensors import Sensor
 
 
 def require_finite(increment: Increment, tracking: EgoMotion, motion: Odometry | None) -> None:

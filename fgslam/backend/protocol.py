@@ -9,19 +9,9 @@ from __future__ import annotations
 
 from typing import ClassVar, Protocol, runtime_checkable
 
-from fgslam.core.types import (
-    EgoMotion,
-    Estimate,
-    FloatArray,
-    Increment,
-    IntArray,
-    LandmarkMap,
-    MeasurementType,
-    Odometry,
-    Prediction,
-    StateArrays,
-    UpdateStats,
-)
+from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
+from fgslam.core.measurements import Increment, MeasurementType, Odometry
 
 
 class Estimator(Protocol):

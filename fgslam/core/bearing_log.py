@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import MeasurementLogError
-from fgslam.core.homing_types import (
+from fgslam.core.homing import (
     BearingMatches,
     HomingStart,
     HomingTruth,
@@ -25,7 +26,6 @@ from fgslam.core.homing_types import (
     TrackedBearings,
 )
 from fgslam.core.measurement_log import load_arrays
-from fgslam.core.types import StateArrays
 
 FORMAT = "fgslam bearing log"
 VERSION = 1

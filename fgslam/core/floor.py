@@ -12,8 +12,9 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import congruence, pose, so3_exp
-from fgslam.core.types import FloatArray, Sensor
+from fgslam.core.sensors import Sensor
 
 DegreesOfFreedom: TypeAlias = Literal[3, 5, 6]
 

@@ -1,6 +1,6 @@
 """Pure geometry: rigid motions, the sensors and their Jacobians, triangulation, frame changes.
 
-Conventions as in :mod:`fgslam.core.types`: ``wTc`` poses as 4x4 matrices, tangent vectors
+Conventions as in :mod:`fgslam.core`: ``wTc`` poses as 4x4 matrices, tangent vectors
 [rotation, translation] on the right (``T * Exp(xi)``), which is GTSAM's ``Pose3`` convention.
 Functions over many items are vectorised over the leading axis.
 """
@@ -13,7 +13,9 @@ from collections.abc import Iterable
 import numpy as np
 
 from fgslam.core import range_bearing
-from fgslam.core.types import BoolArray, CameraRig, FloatArray, Odometry, Sensor
+from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.measurements import Odometry
+from fgslam.core.sensors import CameraRig, Sensor
 
 # Below this rotation angle the series of sin and cos are exact to double precision.
 _SMALL_ANGLE = 1e-4

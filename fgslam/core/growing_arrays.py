@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.types import BoolArray, IntArray, StateArrays
+from fgslam.core.arrays import BoolArray, IntArray, StateArrays
 
 _GROWTH = 1.5
 _LEAST = 64

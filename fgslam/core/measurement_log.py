@@ -20,20 +20,10 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MeasurementLogError
-from fgslam.core.types import (
-    BoolArray,
-    CameraRig,
-    FloatArray,
-    Increment,
-    IntArray,
-    LoopClosure,
-    Observations,
-    Odometry,
-    RangeBearingSensor,
-    Sensor,
-    StateArrays,
-)
+from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
+from fgslam.core.sensors import CameraRig, RangeBearingSensor, Sensor
 
 FORMAT = "fgslam measurement log"
 VERSION = 3

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 
 
 def wrap(angle: FloatArray) -> FloatArray:

@@ -5,8 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.estimates import Trajectory
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import CameraRig, FloatArray, Frame, IntArray, Odometry, Trajectory
+from fgslam.core.measurements import Odometry
+from fgslam.core.sensors import CameraRig
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """The images of one instant, in the order right, left[, top]; grey, uint8, (height, width).
+
+    ``index`` counts the recording's own frames (before ``start``/``stop``/``stride``).
+    """
+
+    index: int
+    timestamp: float
+    images: tuple[Image, ...]
 
 
 @runtime_checkable

@@ -16,20 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, StateArrays
 from fgslam.core.atomic_files import replacing
 from fgslam.core.errors import MapError, MeasurementLogError
-from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.estimates import LandmarkMap, Trajectory
+from fgslam.core.features import LandmarkAppearances
 from fgslam.core.measurement_log import load_arrays
-from fgslam.core.types import (
-    BoolArray,
-    ByteArray,
-    CameraRig,
-    FloatArray,
-    IntArray,
-    LandmarkMap,
-    StateArrays,
-    Trajectory,
-)
+from fgslam.core.sensors import CameraRig
 
 FORMAT = "fgslam map"
 VERSION = 1

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.types import CameraRig, FloatArray
+from fgslam.core.arrays import FloatArray
+from fgslam.core.sensors import CameraRig
 
 
 def vertical_to_horizontal(rig: CameraRig) -> float:

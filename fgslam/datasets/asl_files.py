@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import yaml
 
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import inverse
-from fgslam.core.types import FloatArray, IntArray, Trajectory
 from fgslam.datasets.calibration import is_rigid
 from fgslam.datasets.tables import Table, read_lines, read_table, require_increasing
 from fgslam.datasets.trajectories import (

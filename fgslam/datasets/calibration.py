@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose, so3_exp
-from fgslam.core.types import CameraRig, FloatArray
+from fgslam.core.sensors import CameraRig
 
 _RIGID_TOLERANCE = 1e-4
 

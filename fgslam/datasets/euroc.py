@@ -10,9 +10,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import inverse
-from fgslam.core.types import CameraRig, FloatArray, Image, Trajectory
+from fgslam.core.sensors import CameraRig
 from fgslam.datasets.asl_files import (
     NANOSECONDS,
     AslCamera,

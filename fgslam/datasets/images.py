@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from fgslam.core.arrays import Image
 from fgslam.core.errors import DatasetError, FrameError
-from fgslam.core.types import Image
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, right_from_left_camera
-from fgslam.core.types import CameraRig, FloatArray, Trajectory
+from fgslam.core.sensors import CameraRig
 from fgslam.datasets.images import list_numbered_images
 from fgslam.datasets.recording import Recording, recording_identity
 from fgslam.datasets.recording_settings import KittiSettings

@@ -18,9 +18,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import DatasetError, FrameError
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
-from fgslam.core.types import CameraRig, FloatArray, Image, Trajectory
+from fgslam.core.sensors import CameraRig
 from fgslam.datasets.calibration import pixels, read_json_object
 from fgslam.datasets.images import read_grey_image
 from fgslam.datasets.recording import Recording, recording_identity

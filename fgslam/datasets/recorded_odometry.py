@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import OdometryError
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import inverse, rotation_angle
-from fgslam.core.types import BoolArray, FloatArray, Odometry, Trajectory
+from fgslam.core.measurements import Odometry
 from fgslam.datasets.odometry_settings import RecordedOdometrySettings
 from fgslam.datasets.tables import Table, read_table, require_increasing
 from fgslam.datasets.trajectories import interpolate_poses, read_tum_table

@@ -9,7 +9,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import TypeAlias
 
-from fgslam.core.types import CameraRig, FloatArray, Frame, Image, IntArray, Odometry, Trajectory
+from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.estimates import Trajectory
+from fgslam.core.measurements import Odometry
+from fgslam.core.recordings import Frame
+from fgslam.core.sensors import CameraRig
 
 ImageLoader: TypeAlias = Callable[[int], tuple[Image, ...]]
 """Images (right, left[, top]) of one of the recording's own frames; raises FrameError."""

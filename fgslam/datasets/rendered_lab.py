@@ -15,8 +15,12 @@ from typing import Any
 import numpy as np
 
 from fgslam.core import geometry
+from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, FrameError
-from fgslam.core.types import CameraRig, FloatArray, Frame, Image, IntArray, Odometry, Trajectory
+from fgslam.core.estimates import Trajectory
+from fgslam.core.measurements import Odometry
+from fgslam.core.recordings import Frame
+from fgslam.core.sensors import CameraRig
 from fgslam.worlds import wheel_odometry
 from fgslam.worlds.lab_settings import LabSettings
 from fgslam.worlds.paths import PosesInTime

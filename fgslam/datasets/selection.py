@@ -6,8 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
+from fgslam.core.arrays import IntArray
 from fgslam.core.errors import DatasetError
-from fgslam.core.types import IntArray
 from fgslam.datasets.recording_settings import RecordingSettings
 
 

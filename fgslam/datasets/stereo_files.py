@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
-from fgslam.core.types import FloatArray, Image
 from fgslam.datasets.images import read_grey_image
 
 CAMERA_NAMES = ("right", "left", "top")

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import inverse, se3_exp
-from fgslam.core.recordings import Sequence
-from fgslam.core.types import CameraRig, FloatArray, Frame, Odometry, Trajectory
+from fgslam.core.measurements import Odometry
+from fgslam.core.recordings import Frame, Sequence
+from fgslam.core.sensors import CameraRig
 from fgslam.datasets.odometry_settings import SyntheticOdometrySettings
 from fgslam.datasets.trajectories import rows_at
 

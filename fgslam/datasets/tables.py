@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
-from fgslam.core.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

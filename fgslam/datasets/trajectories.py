@@ -8,8 +8,9 @@ from typing import TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import DatasetError
-from fgslam.core.types import BoolArray, FloatArray, IntArray, Trajectory
+from fgslam.core.estimates import Trajectory
 from fgslam.datasets.tables import Table, read_table, require_increasing
 
 TUM_COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import inverse
-from fgslam.core.types import FloatArray, LoopClosure, Trajectory
+from fgslam.core.measurements import LoopClosure
 from fgslam.evaluation.trajectory import position_errors, rotation_angles, to_estimate_world
 
 FALSE_M = 0.5

@@ -18,8 +18,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy.stats import chi2
 
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.geometry import inverse, se3_log
-from fgslam.core.types import FloatArray, IntArray
 
 Verdict: TypeAlias = Literal["consistent", "overconfident", "conservative"]
 

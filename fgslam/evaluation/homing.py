@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.homing_types import HomingEstimate, HomingTruth, home_vector_jacobian
+from fgslam.core.arrays import FloatArray
+from fgslam.core.homing import HomingEstimate, HomingTruth, home_vector_jacobian
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray
 from fgslam.evaluation.consistency import Consistency, Nees, judge, nees
 
 DIVERGED_RAD = float(np.deg2rad(30.0))

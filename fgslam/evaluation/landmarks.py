@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import LandmarkMap
 from fgslam.core.geometry import transform_to_world
 from fgslam.core.recordings import LandmarkTruth
-from fgslam.core.types import FloatArray, IntArray, LandmarkMap
 from fgslam.evaluation.consistency import Nees, landmark_nees
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.geometry import inverse
-from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.evaluation.consistency import pose_nees
 from fgslam.evaluation.trajectory import rotation_angles
 

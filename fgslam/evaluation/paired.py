@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

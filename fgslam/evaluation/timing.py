@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 
 _LEAST_FRAMES = 25  # five a fifth: fewer make no median worth the name
 

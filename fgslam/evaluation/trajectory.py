@@ -15,8 +15,9 @@ from enum import Enum
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import inverse, pose, yaw_pitch_roll
-from fgslam.core.types import FloatArray, IntArray, Trajectory
 
 # Three points are the fewest that fix a rigid motion in space.
 _MIN_POSES_TO_ALIGN = 3

@@ -14,8 +14,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import rotation
-from fgslam.core.types import FloatArray
 from fgslam.factors.bearing_residuals import (
     direction_and_turn,
     elevation,

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import bearings, between, rotation, unit, wrap
-from fgslam.core.types import FloatArray
 
 _SMALL = 1e-5  # radians: below it the series of the logarithm is exact to rounding
 

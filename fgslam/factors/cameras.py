@@ -13,7 +13,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.core.types import CameraRig, FloatArray
+from fgslam.core.arrays import FloatArray
+from fgslam.core.sensors import CameraRig
 from fgslam.factors.noise import Whitening
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.factors.noise import KernelName
 
 

@@ -7,8 +7,10 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Prediction
 from fgslam.core.floor import Floor
-from fgslam.core.types import FloatArray, Odometry, Prediction
+from fgslam.core.measurements import Odometry
 from fgslam.factors.noise import STIFF_M, STIFF_RAD, positive_definite
 
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import between
-from fgslam.core.types import FloatArray
 
 _SMALL = 1e-2  # radians: below it the series of the cotangent is exact to rounding
 

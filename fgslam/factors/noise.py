@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeAlias
 import gtsam
 import numpy as np
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 
 KernelName: TypeAlias = Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"]
 

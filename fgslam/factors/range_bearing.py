@@ -7,7 +7,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.factors.noise import Whitening
 
 _REACH_SIGMAS = 10.0  # how far from the measured direction the predicted one is expected

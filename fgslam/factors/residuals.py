@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     inverse,
@@ -23,8 +24,8 @@ from fgslam.core.geometry import (
     transform_to_camera,
 )
 from fgslam.core.range_bearing import triangulate, triangulation_jacobian
+from fgslam.core.sensors import CameraRig, RangeBearingSensor
 from fgslam.core.stereo_model import vertical_to_horizontal
-from fgslam.core.types import CameraRig, FloatArray, RangeBearingSensor
 
 # --------------------------------------------------------------------------------------------
 # Cameras

@@ -14,7 +14,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.core.types import CameraRig, FloatArray
+from fgslam.core.arrays import FloatArray
+from fgslam.core.sensors import CameraRig
 from fgslam.factors.noise import Whitening
 
 FROM_MEASUREMENT: FloatArray = np.array([[1.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

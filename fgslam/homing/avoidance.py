@@ -10,8 +10,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray
 from fgslam.homing.command import Drive
 from fgslam.homing.settings import AvoidanceSettings
 

@@ -9,8 +9,8 @@ from typing import Protocol
 
 import numpy as np
 
-from fgslam.core.homing_types import HomingEstimate
-from fgslam.core.types import ByteArray, FloatArray
+from fgslam.core.arrays import ByteArray, FloatArray
+from fgslam.core.homing import HomingEstimate
 from fgslam.homing.avoidance import ObstacleAvoider, RangeScan
 from fgslam.homing.command import Command, Drive
 from fgslam.homing.path_following import PathFollower

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from fgslam.core.homing_types import Refusal
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
+from fgslam.core.homing import Refusal
 
 
 class HomingState(str, Enum):

@@ -12,10 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from fgslam.core.arrays import ByteArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing_types import HomingVector, OmniFeatures, Refusal, RefusalReason
+from fgslam.core.homing import HomingVector, OmniFeatures, Refusal, RefusalReason
 from fgslam.core.planar import wrap
-from fgslam.core.types import ByteArray
 from fgslam.homing.command import Command, HomingState
 from fgslam.homing.eyes import HomingEyes, Sighting
 from fgslam.homing.settings import HomingControlSettings

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student_t
 
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray, IntArray
 from fgslam.homing.record import DriveRecord
 
 ARRIVED_M = 0.5

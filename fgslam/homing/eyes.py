@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from fgslam.core.homing_types import (
+from fgslam.core.arrays import ByteArray
+from fgslam.core.homing import (
     HomingStart,
     HomingVector,
     OmniFeatures,
     Refusal,
     TrackedBearings,
 )
-from fgslam.core.types import ByteArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.atomic_files import replacing
 from fgslam.core.errors import MeasurementLogError, StoredMapError
-from fgslam.core.homing_types import ColumnSegments, OmniFeatures, UprightFeatures
+from fgslam.core.homing import ColumnSegments, OmniFeatures, UprightFeatures
 from fgslam.core.measurement_log import load_arrays
-from fgslam.core.types import FloatArray, IntArray, StateArrays
 
 # Arrays by what their first axis counts, with type and the shape of an item.
 _SIFT: dict[str, tuple[type, tuple[int, ...]]] = {

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgslam.cameras.omni.protocol import OmniCamera
-from fgslam.core.homing_types import (
+from fgslam.core.arrays import ByteArray, FloatArray, IntArray
+from fgslam.core.homing import (
     BearingMatches,
     HomingStart,
     HomingVector,
@@ -16,7 +17,6 @@ from fgslam.core.homing_types import (
     RefusalReason,
     TrackedBearings,
 )
-from fgslam.core.types import ByteArray, FloatArray, IntArray
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.frontend.homing.homing_ransac import estimate_homing_vector, paired_anew

@@ -13,8 +13,8 @@ from collections.abc import Collection, Iterable
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray
 from fgslam.homing.linking import Link, Pair
 from fgslam.homing.settings import TopologicalMapSettings
 

@@ -8,9 +8,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.core.homing_types import HomingVector, OmniFeatures, Refusal, RefusalReason
+from fgslam.core.arrays import FloatArray
+from fgslam.core.homing import HomingVector, OmniFeatures, Refusal, RefusalReason
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray
 from fgslam.homing.settings import TopologicalMapSettings
 
 Answer: TypeAlias = HomingVector | Refusal

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import diags
 
-from fgslam.core.homing_types import OmniFeatures, Refusal, RefusalReason
-from fgslam.core.types import FloatArray, IntArray
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason
 from fgslam.homing.linking import Linker
 from fgslam.homing.retrieval import VisualWords
 from fgslam.homing.settings import LocalisationSettings

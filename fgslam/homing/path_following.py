@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
+from fgslam.core.arrays import ByteArray
 from fgslam.core.errors import ConfigError
-from fgslam.core.homing_types import OmniFeatures
-from fgslam.core.types import ByteArray
+from fgslam.core.homing import OmniFeatures
 from fgslam.homing.command import Command, HomingState
 from fgslam.homing.controller import HomingController
 from fgslam.homing.eyes import HomingEyes

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fgslam.core.errors import StoredMapError
-from fgslam.core.homing_types import OmniFeatures
+from fgslam.core.homing import OmniFeatures
 from fgslam.homing.feature_file import load_archive, pack_features, save_archive, unpack_features
 
 FORMAT = "fgslam path memory"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fgslam.core.homing_types import HomingEstimate, HomingStart, TrackedBearings
-from fgslam.core.types import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings
 from fgslam.homing.path_following import LegOutcome
 
 STAGES = ("image", "homing", "steering", "drive")

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
-from fgslam.core.homing_types import OmniFeatures
-from fgslam.core.types import FloatArray, IntArray
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.homing import OmniFeatures
 from fgslam.homing.settings import RetrievalSettings
 
 

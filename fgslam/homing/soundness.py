@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.homing_types import (
+from fgslam.core.arrays import FloatArray
+from fgslam.core.homing import (
     BearingMatches,
     HomingEstimate,
     HomingStart,
@@ -16,7 +17,6 @@ from fgslam.core.homing_types import (
     among,
 )
 from fgslam.core.planar import bearings, wrap
-from fgslam.core.types import FloatArray
 
 _FEWEST = 3  # fewer bearings say nothing about a pose with three unknowns
 

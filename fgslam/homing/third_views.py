@@ -15,9 +15,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.core.homing_types import OmniFeatures
+from fgslam.core.arrays import IntArray
+from fgslam.core.homing import OmniFeatures
 from fgslam.core.planar import wrap
-from fgslam.core.types import IntArray
 from fgslam.homing.linking import Link, Pair
 from fgslam.homing.settings import TopologicalMapSettings
 

@@ -11,9 +11,9 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import StoredMapError
-from fgslam.core.homing_types import OmniFeatures
-from fgslam.core.types import FloatArray, IntArray, StateArrays
+from fgslam.core.homing import OmniFeatures
 from fgslam.homing.feature_file import (
     load_archive,
     pack_features,

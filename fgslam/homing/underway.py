@@ -9,10 +9,10 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.backend.homing.protocol import HomingEstimator
+from fgslam.core.arrays import BoolArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing_types import HomeVector, HomingStart, HomingVector, TrackedBearings
+from fgslam.core.homing import HomeVector, HomingStart, HomingVector, TrackedBearings
 from fgslam.core.planar import wrap
-from fgslam.core.types import BoolArray
 from fgslam.homing.settings import HomingControlSettings
 from fgslam.homing.soundness import common_turn, parallax, target_misfit, tracked_misfit
 

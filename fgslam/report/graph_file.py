@@ -21,10 +21,10 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.atomic_files import write_text
 from fgslam.core.errors import OutputError
 from fgslam.core.geometry import congruence, quaternion_from_rotation
-from fgslam.core.types import FloatArray, IntArray
 
 SUFFIX = ".g2o"
 EXACT_SIGMA = 1e-6

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.atomic_files import write_text
 from fgslam.core.errors import DatasetError
 from fgslam.core.recordings import LandmarkTruth
-from fgslam.core.types import FloatArray
 
 LANDMARK_TRUTH_FILE = "ground_truth_landmarks.csv"
 _HEADER = "id,x,y,z,sigma_m"

@@ -11,9 +11,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.atomic_files import write_text
 from fgslam.core.errors import DatasetError
-from fgslam.core.types import FloatArray
 
 JsonValue: TypeAlias = (
     bool | int | float | str | Sequence["JsonValue"] | Mapping[str, "JsonValue"] | None

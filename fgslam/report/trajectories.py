@@ -11,10 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.atomic_files import write_text
 from fgslam.core.errors import DatasetError, OutputError
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import pose, quaternion_from_rotation, rotation_from_quaternion
-from fgslam.core.types import BoolArray, FloatArray, IntArray, Trajectory
 
 _TUM_FORMAT = "%.9f" + 7 * " %.12f"
 _KITTI_FORMAT = " ".join(12 * ["%.12e"])

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.arrays import StateArrays
 from fgslam.core.atomic_files import write_bytes
 from fgslam.core.errors import OutputError
 from fgslam.core.measurement_log import MeasurementLog, load_arrays
-from fgslam.core.types import StateArrays
 from fgslam.runs.recorder import RunRecorder
 from fgslam.slam.pipeline import SlamPipeline
 

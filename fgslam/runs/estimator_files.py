@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.core.arrays import IntArray
 from fgslam.core.atomic_files import make_subfolder, write_text
 from fgslam.core.errors import DatasetError
+from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import Estimate, IntArray, LandmarkMap, Trajectory
 from fgslam.report.point_cloud import MapPoints, write_ply
 from fgslam.report.trajectories import write_covariances, write_tum
 from fgslam.slam.replay import Replay, ReplayRow

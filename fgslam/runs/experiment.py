@@ -12,9 +12,9 @@ from typing import Literal
 import numpy as np
 
 from fgslam.core.errors import DatasetError
+from fgslam.core.features import StereoFeatures
 from fgslam.core.recordings import Sequence
 from fgslam.core.threads import one_blas_thread
-from fgslam.core.types import StereoFeatures
 from fgslam.report.comparison_table import write_comparison_csv
 from fgslam.report.metrics import EstimatorMetrics
 from fgslam.runs import checkpoint, map_entry, mapping

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import BoolArray, FloatArray, Increment, IntArray, Trajectory
+from fgslam.core.measurements import Increment
 from fgslam.report.graph_file import PoseLandmarkGraph, require_graph_suffix, write_g2o
 from fgslam.report.point_cloud import read_ply
 from fgslam.report.trajectories import read_tum

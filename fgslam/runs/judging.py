@@ -7,9 +7,10 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import Estimate, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LandmarkTruth
-from fgslam.core.types import Estimate, FloatArray, IntArray, Trajectory
 from fgslam.evaluation.consistency import Consistency, Nees, judge, pose_nees
 from fgslam.evaluation.landmarks import LandmarkErrors, landmark_errors
 from fgslam.evaluation.timing import time_growth

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, MapError
-from fgslam.core.map_types import LandmarkAppearances, Relocalisation
+from fgslam.core.estimates import LandmarkMap, Prediction, Relocalisation
+from fgslam.core.features import LandmarkAppearances
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap, load_map, require_rig
-from fgslam.core.types import FloatArray, LandmarkMap, Prediction
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
 from fgslam.slam.arrival import Arrival

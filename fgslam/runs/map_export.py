@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.saved_map import SavedMap, load_map
-from fgslam.core.types import BoolArray
 from fgslam.report.point_cloud import MapPoints, write_map
 from fgslam.report.trajectories import write_trajectory
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.errors import ConfigError
+from fgslam.core.estimates import Estimate, LandmarkMap
 from fgslam.core.recordings import MeasurementRecording
-from fgslam.core.types import Estimate, LandmarkMap
 from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.opening import open_measurements
 from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth

@@ -16,8 +16,8 @@ import yaml
 
 from fgslam import __version__
 from fgslam.core.atomic_files import make_subfolder, write_text
+from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.recordings import Sequence
-from fgslam.core.types import Estimate, LandmarkMap, Trajectory
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
 from fgslam.report.metrics import (

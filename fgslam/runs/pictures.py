@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.atomic_files import make_subfolder
-from fgslam.core.types import BoolArray, Estimate, FloatArray, Increment, IntArray, Trajectory
+from fgslam.core.estimates import Estimate, Trajectory
+from fgslam.core.measurements import Increment
 from fgslam.evaluation.trajectory import to_estimate_world
 from fgslam.report.pictures import (
     MapDrawing,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.errors import DatasetError
-from fgslam.core.types import Trajectory
+from fgslam.core.estimates import Trajectory
 from fgslam.evaluation.closures import JudgedClosure, judge_closures
 from fgslam.report.metrics import JsonValue
 from fgslam.report.page import Column, Comparison

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import FloatArray, StateArrays
 from fgslam.slam.pipeline import FrameReport
 
 STAGES = ("load", "sift", "wait", "predict", "stereo", "track", "places", "update")

@@ -6,10 +6,11 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.geometry import transform_to_world
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LandmarkTruth, Sequence
-from fgslam.core.types import BoolArray, CameraRig, FloatArray, IntArray
+from fgslam.core.sensors import CameraRig
 
 _LEAST_SIGHTINGS = 3
 _SAME_SURFACE = 0.03

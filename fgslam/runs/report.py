@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import yaml
 
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError, FgslamError
+from fgslam.core.estimates import LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import FloatArray, IntArray, LandmarkMap, Trajectory
 from fgslam.evaluation.consistency import chi_square_band, judge, pose_nees
 from fgslam.evaluation.trajectory import (
     Alignment,

@@ -7,14 +7,8 @@ from dataclasses import asdict
 
 import numpy as np
 
-from fgslam.core.types import (
-    EgoMotionStatus,
-    Estimate,
-    FloatArray,
-    IntArray,
-    Trajectory,
-    correlation,
-)
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import EgoMotionStatus, Estimate, Trajectory, correlation
 from fgslam.report.metrics import EstimatorMetrics, JsonValue, UpdateTime
 from fgslam.runs.judging import Answer, Truth, judge_answer
 from fgslam.runs.recorder import STAGES, RunRecorder

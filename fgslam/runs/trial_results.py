@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.evaluation.consistency import Consistency, Nees, judge
 from fgslam.evaluation.paired import MeanInterval, PairedTest, mean_interval, paired_test
 from fgslam.report.comparison_table import (

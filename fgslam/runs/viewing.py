@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.atomic_files import replacing
 from fgslam.core.errors import MissingDependencyError, OutputError
 from fgslam.core.geometry import quaternion_from_rotation
-from fgslam.core.types import FloatArray
 from fgslam.report.page import EstimatorReport, ReportData
 from fgslam.report.page.palette import COUNT, ON_DARK
 from fgslam.report.page.paths import level_axes

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from fgslam.backend.protocol import Estimator, MapUser
 from fgslam.core.errors import ConfigError
+from fgslam.core.estimates import Prediction
 from fgslam.core.saved_map import SavedMap
-from fgslam.core.types import Prediction
 
 
 @dataclass(frozen=True, slots=True, eq=False)

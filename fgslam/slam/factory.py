@@ -24,9 +24,11 @@ from fgslam.backend.smoothers.fixed_lag import FixedLagSmoother
 from fgslam.backend.smoothers.isam2 import Isam2Smoother
 from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.core.errors import ConfigError
+from fgslam.core.estimates import Prediction
 from fgslam.core.floor import DegreesOfFreedom, Floor
+from fgslam.core.measurements import MeasurementType
 from fgslam.core.recordings import Sequence
-from fgslam.core.types import CameraRig, MeasurementType, Prediction, Sensor
+from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.datasets.odometry_settings import (
     ConstantVelocitySettings,
     OdometrySettings,

@@ -9,9 +9,10 @@ from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
+from fgslam.core.arrays import Image
 from fgslam.core.errors import FrameError
-from fgslam.core.recordings import Sequence
-from fgslam.core.types import Features, Frame, Image
+from fgslam.core.features import Features
+from fgslam.core.recordings import Frame, Sequence
 
 # Frames in work at once. Three images on two cores leave one idle at the end of each frame;
 # the next frame's images fill the gap.

@@ -7,9 +7,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.geometry import inverse, odometry_of_camera, se3_exp, se3_log
+from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
-from fgslam.core.types import FloatArray, Odometry, StateArrays
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 
 

@@ -14,19 +14,10 @@ from functools import partial
 import numpy as np
 
 from fgslam.backend.protocol import Estimator
-from fgslam.core.types import (
-    EgoMotion,
-    EgoMotionStatus,
-    Increment,
-    IntArray,
-    LandmarkMap,
-    LoopClosure,
-    Observations,
-    Odometry,
-    Prediction,
-    StereoFeatures,
-    UpdateStats,
-)
+from fgslam.core.arrays import IntArray
+from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
+from fgslam.core.features import StereoFeatures
+from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
 from fgslam.frontend.places.loops.recognition import PlaceRecognition
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, unmeasured

@@ -16,18 +16,13 @@ import numpy.typing as npt
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, FgslamError, MeasurementLogError
+from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.measurements import Increment, MeasurementType
+from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
-from fgslam.core.types import (
-    CameraRig,
-    Estimate,
-    FloatArray,
-    Increment,
-    LandmarkMap,
-    MeasurementType,
-    Trajectory,
-)
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings

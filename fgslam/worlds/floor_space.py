@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from fgslam.core.types import BoolArray, FloatArray
+from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.worlds.rendering.patches import PatchArrays
 
 # What is lower is driven over (rugs), what is higher driven under (lintels, lamps); metres.

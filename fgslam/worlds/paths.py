@@ -13,8 +13,8 @@ from typing import Protocol
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
+from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.core.types import BoolArray, FloatArray
 from fgslam.worlds.lab_settings import LabDriveSettings
 
 _STEP_M = 0.004

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.core.types import CameraRig, FloatArray
+from fgslam.core.sensors import CameraRig
 from fgslam.worlds.lab_settings import LabPersonSettings, LabSettings
 from fgslam.worlds.paths import PosesInTime
 from fgslam.worlds.rendering.patches import Patch, Surface, Thing, box, placed, prism

@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.core.types import CameraRig, FloatArray
+from fgslam.core.sensors import CameraRig
 from fgslam.worlds import lab
 from fgslam.worlds.buildings import alike, office
 from fgslam.worlds.buildings.wall_textures import building_library, corridor_library

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.core.types import BoolArray, FloatArray
 from fgslam.worlds.floor_space import FloorSpace
 from fgslam.worlds.lab_settings import LabDriveSettings
 from fgslam.worlds.paths import planar_poses

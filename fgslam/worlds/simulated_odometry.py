@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core import geometry as g
-from fgslam.core.types import FloatArray, Odometry
+from fgslam.core.arrays import FloatArray
+from fgslam.core.measurements import Odometry
 from fgslam.worlds import wheel_odometry
 from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 

@@ -15,7 +15,8 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core import geometry
-from fgslam.core.types import FloatArray, Odometry
+from fgslam.core.arrays import FloatArray
+from fgslam.core.measurements import Odometry
 from fgslam.worlds.lab_settings import WheelOdometrySettings
 
 _YAW, _ALONG = 2, 3

@@ -7,7 +7,8 @@ from functools import lru_cache
 import numpy as np
 
 from fgslam.core import geometry
-from fgslam.core.types import CameraRig, FloatArray
+from fgslam.core.arrays import FloatArray
+from fgslam.core.sensors import CameraRig
 from fgslam.worlds.lab_settings import LabRigSettings
 from fgslam.worlds.person import Stance, person
 from fgslam.worlds.places import PlaceChoice, build_place, build_textures

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.recordings import Sequence
-from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.datasets.recording_settings import LightFieldSettings
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.features.settings import Appearance

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgslam.core.types import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording_settings import LightFieldSettings
 

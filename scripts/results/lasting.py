@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap
-from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.frontend.tracking.permanence import reliable, seen_past
 from fgslam.frontend.tracking.settings import PermanenceSettings
 from fgslam.slam.pipeline import FrameReport, SlamPipeline

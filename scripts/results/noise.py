@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.geometry import inverse, transform_to_camera
+from fgslam.core.measurements import Observations
 from fgslam.core.recordings import Sequence
-from fgslam.core.types import BoolArray, CameraRig, FloatArray, IntArray, Observations
+from fgslam.core.sensors import CameraRig
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.stereo.matching import StereoMatcher
 from scripts.results.report import Cell, Table

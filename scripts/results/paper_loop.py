@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.types import IntArray
+from fgslam.core.arrays import IntArray
 from scripts.results.report import Cell, Table
 from scripts.results.runs import Run, experiment, run_whole
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgslam.core.types import EgoMotion, FloatArray, Trajectory
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import EgoMotion, Trajectory
 from fgslam.evaluation.trajectory import end_pose
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.stereo.matching import StereoMatcher

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.recordings import Sequence
-from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.evaluation.trajectory import to_estimate_world
 from fgslam.slam.pipeline import FrameReport, SlamPipeline

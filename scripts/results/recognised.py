@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.estimates import LandmarkMap
+from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.geometry import inverse
-from fgslam.core.map_types import LandmarkAppearances
-from fgslam.core.types import BoolArray, FloatArray, LandmarkMap, StereoFeatures
 from fgslam.evaluation.trajectory import rotation_angles
 from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
 from fgslam.slam.factory import make_relocaliser, make_stereo_matcher

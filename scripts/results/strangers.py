@@ -9,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.estimates import LandmarkMap
+from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.geometry import inverse, project, transform_to_camera
-from fgslam.core.map_types import LandmarkAppearances
 from fgslam.core.recordings import Sequence
-from fgslam.core.types import BoolArray, CameraRig, FloatArray, LandmarkMap, StereoFeatures
+from fgslam.core.sensors import CameraRig
 from fgslam.evaluation.trajectory import rotation_angles
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 from fgslam.runs.localisation.config import LocalisationConfig, load_experiment

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.core.arrays import BoolArray
 from fgslam.core.saved_map import SavedMap, load_map
-from fgslam.core.types import BoolArray
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.runs.experiment import RunResult, run_experiment
 from fgslam.runs.map_entry import MAP_FILE

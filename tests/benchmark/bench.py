@@ -29,10 +29,13 @@ from rich.console import Console
 from rich.table import Table
 
 from fgslam.cli.console import progress_bar
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Trajectory
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.recordings import Sequence
+from fgslam.core.measurements import Odometry
+from fgslam.core.recordings import Frame, Sequence
+from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
-from fgslam.core.types import CameraRig, FloatArray, Frame, Odometry, Trajectory
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.recorder import RunRecorder

@@ -12,17 +12,10 @@ import numpy as np
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import EgoMotion, LandmarkMap, Prediction, Trajectory, UpdateStats
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import (
-    EgoMotion,
-    FloatArray,
-    Increment,
-    LandmarkMap,
-    Odometry,
-    Prediction,
-    Trajectory,
-    UpdateStats,
-)
+from fgslam.core.measurements import Increment, Odometry
 from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.opening import open_measurements
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver

@@ -20,8 +20,9 @@ from fgslam.backend.smoothers.batch import BatchSmoother
 from fgslam.backend.smoothers.marginals import marginals_of
 from fgslam.backend.smoothers.outliers import solver_parameters
 from fgslam.backend.smoothers.settings import BatchSettings, Isam2Settings
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import LandmarkMap
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import FloatArray, LandmarkMap
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.pipeline import replay_frame

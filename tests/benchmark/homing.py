@@ -20,9 +20,9 @@ from fgslam.backend.homing.settings import (
     HomingEstimatorSettings,
     HomingGraphSettings,
 )
-from fgslam.core.homing_types import OmniFeatures, TrackedBearings
+from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.homing import OmniFeatures, TrackedBearings
 from fgslam.core.threads import one_blas_thread
-from fgslam.core.types import FloatArray, Image
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings

@@ -16,8 +16,8 @@ from fgslam.backend.common_settings import KernelSettings
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
+from fgslam.core.estimates import Estimate
 from fgslam.core.threads import one_blas_thread
-from fgslam.core.types import Estimate
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
 from tests.benchmark.drives import MeasuredDrive, Player, cpu_seconds, open_drive, play
 

@@ -14,18 +14,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fgslam.core import geometry as g
-from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import LandmarkMap, Prediction, Trajectory
+from fgslam.core.features import LandmarkAppearances, StereoFeatures
+from fgslam.core.measurements import Observations
 from fgslam.core.saved_map import SavedMap
+from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
-from fgslam.core.types import (
-    CameraRig,
-    FloatArray,
-    LandmarkMap,
-    Observations,
-    Prediction,
-    StereoFeatures,
-    Trajectory,
-)
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.settings import (
     DatabaseSettings,

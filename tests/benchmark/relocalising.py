@@ -20,18 +20,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import LandmarkMap, Prediction, Trajectory
+from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.geometry import pose
-from fgslam.core.map_types import LandmarkAppearances
 from fgslam.core.saved_map import SavedMap
+from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
-from fgslam.core.types import (
-    CameraRig,
-    FloatArray,
-    LandmarkMap,
-    Prediction,
-    StereoFeatures,
-    Trajectory,
-)
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.places.loops.recognition import PlaceRecognition
 from fgslam.frontend.places.settings import LostSettings

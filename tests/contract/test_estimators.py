@@ -25,21 +25,10 @@ from fgslam.backend.settings import EstimatorSettings
 from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core import geometry as g
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.types import (
-    BoolArray,
-    EgoMotion,
-    EgoMotionStatus,
-    FloatArray,
-    Increment,
-    IntArray,
-    LoopClosure,
-    MeasurementType,
-    Observations,
-    Odometry,
-    Prediction,
-    UpdateStats,
-)
+from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction, UpdateStats
+from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings

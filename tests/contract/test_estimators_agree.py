@@ -25,7 +25,9 @@ from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.core import geometry as g
-from fgslam.core.types import Estimate, FloatArray, Increment, Odometry, Prediction
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Estimate, Prediction
+from fgslam.core.measurements import Increment, Odometry
 
 PRIOR = Prediction(np.eye(4), np.diag([1e-3, 2e-3, 1e-3, 3e-3, 2e-3, 4e-3]) ** 2)
 LEAST_SQUARES = {

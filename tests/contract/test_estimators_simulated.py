@@ -26,7 +26,10 @@ from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.backend.smoothers.settings import FixedLagSettings, Isam2Settings
 from fgslam.core import geometry as g
-from fgslam.core.types import FloatArray, Frame, Odometry, Prediction
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Prediction
+from fgslam.core.measurements import Odometry
+from fgslam.core.recordings import Frame
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver

@@ -21,7 +21,7 @@ from fgslam.backend.homing.settings import (
     SnapshotSettings,
 )
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing_types import HomingEstimate, TrackedBearings
+from fgslam.core.homing import HomingEstimate, TrackedBearings
 from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
 
 EVERY: list[HomingEstimatorSettings] = [

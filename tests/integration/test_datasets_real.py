@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
-from fgslam.core.types import FloatArray
 from fgslam.datasets.checks.findings import Level
 from fgslam.datasets.checks.matches import check_epipolar
 from fgslam.datasets.checks.recording import inspect_sequence

@@ -13,7 +13,7 @@ import pytest
 from landmark_world import drive_path, make_follower, winding_path
 
 from fgslam.backend.homing.settings import HomingGraphSettings
-from fgslam.core.homing_types import TrackedBearings
+from fgslam.core.homing import TrackedBearings
 from fgslam.evaluation.homing import homing_errors
 from fgslam.homing.avoidance import NoAvoidance
 from fgslam.homing.closed_loop import Driver, follow

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from fgslam.cli import main as cli
+from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
-from fgslam.core.types import Image
 from fgslam.runs.inspection.recording import inspect_recording
 
 WIDTH, HEIGHT, FRAMES = 240, 180, 6

@@ -21,9 +21,9 @@ from running import (
     write_config,
 )
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, EstimatorError, FgslamError, MapError, OutputError
 from fgslam.core.saved_map import load_map, save_map
-from fgslam.core.types import FloatArray
 from fgslam.report.point_cloud import read_ply
 from fgslam.report.trajectories import read_tum
 from fgslam.runs.map_entry import arrival_of

@@ -15,7 +15,7 @@ from fgslam.cameras.omni.ring_calibration import find_mirror_circle, mirror_offs
 from fgslam.cameras.omni.settings import OCamCalibSettings
 from fgslam.cameras.omni.straightness import upright_edges
 from fgslam.cameras.omni.unwrapping import unwrap_maps
-from fgslam.core.types import FloatArray, Image
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.datasets.images import read_colour_image
 from fgslam.datasets.omni.opening import open_omni
 from fgslam.datasets.omni.recording import OmniRecording

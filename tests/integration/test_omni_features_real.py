@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from fgslam.cameras.omni.panoramas import Equirectangular
-from fgslam.core.homing_types import BearingMatches
+from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.homing import BearingMatches
 from fgslam.core.planar import between
-from fgslam.core.types import BoolArray, FloatArray
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
 from fgslam.frontend.homing.epipolar import EpipolarTest

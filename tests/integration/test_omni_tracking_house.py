@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.core.homing_types import BearingMatches
+from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.homing import BearingMatches
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray, Image
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.frontend.homing.matching import match_features

@@ -9,7 +9,7 @@ import pytest
 
 from fgslam.cameras.omni.ring_calibration import find_mirror_circle
 from fgslam.cameras.omni.settings import HyperbolicMirrorSettings
-from fgslam.core.homing_types import FeatureKind, HomingVector
+from fgslam.core.homing import FeatureKind, HomingVector
 from fgslam.datasets.images import read_colour_image
 from fgslam.datasets.omni.camera_files import make_camera
 from fgslam.datasets.omni.opening import open_omni

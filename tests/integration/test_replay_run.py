@@ -10,8 +10,8 @@ import pytest
 from recordings import experiment
 from running import KIND, run_values
 
+from fgslam.core.estimates import Estimate
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import Estimate
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.report.trajectories import write_tum
 from fgslam.runs.config import ExperimentConfig, parse_config

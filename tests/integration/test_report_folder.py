@@ -14,8 +14,8 @@ import pytest
 from running import KIND, Finished, main
 
 from fgslam.core.errors import DatasetError, FgslamError, MissingDependencyError, OutputError
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import rotation_from_quaternion
-from fgslam.core.types import Trajectory
 from fgslam.evaluation.trajectory import to_estimate_world
 from fgslam.report.page import EstimatorReport
 from fgslam.report.trajectories import read_covariances, read_tum, write_tum

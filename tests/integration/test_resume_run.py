@@ -33,7 +33,7 @@ from fgslam.core.errors import (
     OutputError,
 )
 from fgslam.core.measurement_log import load_arrays
-from fgslam.core.types import Odometry
+from fgslam.core.measurements import Odometry
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.recording_settings import ImageFolderSettings

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as nps
 
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import pose, so3_exp
-from fgslam.core.types import FloatArray, Trajectory
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory, umeyama
 from fgslam.report.trajectories import read_tum, write_tum
 

@@ -13,8 +13,10 @@ from hypothesis.extra.numpy import arrays
 from simulated import RIG
 
 from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray
 from fgslam.core.floor import Floor
-from fgslam.core.types import FloatArray, Odometry, RangeBearingSensor
+from fgslam.core.measurements import Odometry
+from fgslam.core.sensors import RangeBearingSensor
 from fgslam.factors import residuals
 from fgslam.factors.motion import floor_factors, odometry_factor
 from fgslam.factors.noise import Whitening, positive_definite

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from fgslam.core import geometry as g
-from fgslam.core.types import CameraRig, FloatArray
+from fgslam.core.arrays import FloatArray
+from fgslam.core.sensors import CameraRig
 
 SINGULAR_ANGLES = [0.0, 1e-12, 1e-9, 1e-5, 0.99e-4, 1.01e-4, np.pi - 1e-6, np.pi - 1e-9, np.pi]
 

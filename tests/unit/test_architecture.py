@@ -38,7 +38,7 @@ def test_the_checker_sees_the_whole_package() -> None:
     names = {module.name for module in load_package(PACKAGE)}
     assert {
         "fgslam",
-        "fgslam.core.types",
+        "fgslam.core.arrays",
         "fgslam.core.geometry",
         "fgslam.backend.protocol",
     } <= names
@@ -47,11 +47,11 @@ def test_the_checker_sees_the_whole_package() -> None:
 
 def test_a_lawful_package_passes(tmp_path: Path) -> None:
     files = {
-        "core/types.py": "import numpy as np\n",
-        "core/geometry.py": "from fgslam.core.types import x\n",
+        "core/arrays.py": "import numpy as np\n",
+        "core/geometry.py": "from fgslam.core.arrays import x\n",
         "worlds/open3d_library.py": "def load():\n    import open3d\n    return open3d\n",
         "datasets/lab.py": "import cv2\nfrom fgslam.worlds import open3d_library\n",
-        "factors/stereo.py": "import gtsam\nfrom fgslam.core import types\n",
+        "factors/stereo.py": "import gtsam\nfrom fgslam.core import arrays\n",
         "backend/isam2.py": "import gtsam\nfrom fgslam.factors.stereo import f\n",
         "slam/pipeline.py": "from fgslam.backend import isam2\nfrom fgslam.datasets import lab\n",
         "cli/main.py": "def main():\n    from fgslam.slam import pipeline\n    return pipeline\n",
@@ -63,7 +63,7 @@ def test_a_lawful_package_passes(tmp_path: Path) -> None:
 
 ROOM_CASES = {
     "core imports a room": ("core/a.py", "from fgslam.frontend import sift\n", 1),
-    "absolute imports count": ("core/types.py", "\nimport fgslam.slam.pipeline\n", 2),
+    "absolute imports count": ("core/arrays.py", "\nimport fgslam.slam.pipeline\n", 2),
     "a stage imports a stage": ("frontend/sift.py", "x = 1\nimport fgslam.report.ply\n", 2),
     "a stage imports a stage from the root": ("frontend/b.py", "from fgslam import factors\n", 1),
     "relative imports count": ("evaluation/a.py", "from ..report import ply\n", 1),
@@ -217,7 +217,7 @@ def test_every_room_of_the_order_exists() -> None:
 
 @pytest.mark.parametrize(
     "module",
-    ["core.types", "core.geometry", "core.measurement_log", "runs.config", "cli.main"],
+    ["core.arrays", "core.geometry", "core.measurement_log", "runs.config", "cli.main"],
 )
 def test_light_modules_load_no_heavy_library(module: str) -> None:
     # `fgslam --help` must answer at once, and work where a library cannot be loaded.

@@ -11,6 +11,8 @@ from typing import ClassVar
 import numpy as np
 
 from fgslam.backend.filters.filtered import FilteredTrajectory, FirstSights, moved
+from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.geometry import (
     adjoint,
     congruence,
@@ -20,21 +22,8 @@ from fgslam.core.geometry import (
     transform_to_camera,
     transform_to_world,
 )
-from fgslam.core.types import (
-    EgoMotion,
-    Estimate,
-    FloatArray,
-    Increment,
-    IntArray,
-    LandmarkMap,
-    MeasurementType,
-    Observations,
-    Odometry,
-    Prediction,
-    Sensor,
-    StateArrays,
-    UpdateStats,
-)
+from fgslam.core.measurements import Increment, MeasurementType, Observations, Odometry
+from fgslam.core.sensors import Sensor
 
 
 class DeadReckoning:

@@ -24,7 +24,9 @@ from fgslam.backend.filters.ekf_update import (
 from fgslam.backend.filters.filtered import FilteredTrajectory, FirstSights
 from fgslam.backend.filters.growing_covariance import BLOCK, FRONT, GrowingCovariance, rows_of
 from fgslam.backend.filters.settings import EkfSettings
+from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError
+from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     adjoint,
@@ -37,22 +39,8 @@ from fgslam.core.geometry import (
     so3_exp,
     transform_to_world,
 )
-from fgslam.core.types import (
-    EgoMotion,
-    Estimate,
-    FloatArray,
-    Increment,
-    IntArray,
-    LandmarkMap,
-    LoopClosure,
-    MeasurementType,
-    Observations,
-    Odometry,
-    Prediction,
-    Sensor,
-    StateArrays,
-    UpdateStats,
-)
+from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
+from fgslam.core.sensors import Sensor
 
 _UNKNOWN = 100.0  # by which a pose found without a prior is less certain before its landmarks count
 _ADMITTED = 0.999  # quantile of an innovation squared beyond which the covariance is contradicted

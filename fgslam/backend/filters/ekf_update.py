@@ -13,6 +13,7 @@ import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
 from fgslam.backend.filters.growing_covariance import FRONT, GrowingCovariance, rows_of
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     in_front,
@@ -24,7 +25,8 @@ from fgslam.core.geometry import (
     so3_log,
     transform_to_camera,
 )
-from fgslam.core.types import BoolArray, FloatArray, IntArray, Observations, Sensor
+from fgslam.core.measurements import Observations
+from fgslam.core.sensors import Sensor
 
 _ITERATIONS = 30
 _SETTLED = 1e-5  # radians and metres: far below what any measurement tells

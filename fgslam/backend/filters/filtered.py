@@ -6,20 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray, StateArrays
 from fgslam.core.errors import EstimatorError
+from fgslam.core.estimates import Prediction, Trajectory
 from fgslam.core.geometry import compose_covariance, in_front, triangulate, triangulation_covariance
-from fgslam.core.types import (
-    BoolArray,
-    CameraRig,
-    FloatArray,
-    Increment,
-    Observations,
-    Odometry,
-    Prediction,
-    Sensor,
-    StateArrays,
-    Trajectory,
-)
+from fgslam.core.measurements import Increment, Observations, Odometry
+from fgslam.core.sensors import CameraRig, Sensor
 
 
 @dataclass(slots=True, eq=False)

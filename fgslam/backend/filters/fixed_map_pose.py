@@ -13,6 +13,8 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.filters.landmark_elimination import whitening
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     congruence,
@@ -22,7 +24,8 @@ from fgslam.core.geometry import (
     so3_exp,
     transform_to_camera,
 )
-from fgslam.core.types import CameraRig, FloatArray, LandmarkMap, Observations, Prediction
+from fgslam.core.measurements import Observations
+from fgslam.core.sensors import CameraRig
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.stereo import FROM_MEASUREMENT
 from fgslam.frontend.tracking.settings import EgoMotionSettings

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.types import FloatArray, IntArray
+from fgslam.core.arrays import FloatArray, IntArray
 
 FRONT = 6
 """The pose's rows and columns come first."""

@@ -14,7 +14,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.factors.keys import landmark_key, pose_key
 
 _POSE, _LANDMARK = pose_key(0), landmark_key(0)

@@ -21,6 +21,8 @@ from fgslam.backend.filters.landmark_rows import LandmarkRows
 from fgslam.backend.filters.loop_correction import DriveBook
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.backend.filters.submaps import Chain, changes, home_changes, rotated, transported
+from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.geometry import (
     block_diagonal,
     congruence,
@@ -35,22 +37,8 @@ from fgslam.core.geometry import (
     triangulate,
     triangulation_covariance,
 )
-from fgslam.core.types import (
-    EgoMotion,
-    Estimate,
-    FloatArray,
-    Increment,
-    IntArray,
-    LandmarkMap,
-    LoopClosure,
-    MeasurementType,
-    Observations,
-    Odometry,
-    Prediction,
-    Sensor,
-    StateArrays,
-    UpdateStats,
-)
+from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
+from fgslam.core.sensors import Sensor
 
 
 class LandmarkKalman:

@@ -18,23 +18,12 @@ from fgslam.backend.filters.fixed_map_pose import FixedMapPose
 from fgslam.backend.filters.landmark_elimination import Eliminated, LandmarkElimination, fused
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
+from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction, UpdateStats
 from fgslam.core.geometry import transform_to_world, triangulate
-from fgslam.core.types import (
-    BoolArray,
-    CameraRig,
-    EgoMotion,
-    EgoMotionStatus,
-    FloatArray,
-    Increment,
-    IntArray,
-    MeasurementType,
-    Observations,
-    Odometry,
-    Prediction,
-    Sensor,
-    UpdateStats,
-)
+from fgslam.core.measurements import Increment, MeasurementType, Observations, Odometry
+from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.noise import Whitening
 from fgslam.factors.stereo import StereoFactors

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import LandmarkMap
 from fgslam.core.growing_arrays import GrowingColumns
-from fgslam.core.types import FloatArray, IntArray, LandmarkMap
 
 
 class LandmarkRows:

@@ -14,9 +14,11 @@ import numpy as np
 
 from fgslam.backend.filters.settings import LoopCorrectionSettings
 from fgslam.backend.filters.submaps import FREE, Chain, Constraint
+from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError
+from fgslam.core.estimates import EgoMotion
 from fgslam.core.geometry import inverse
-from fgslam.core.types import EgoMotion, FloatArray, IntArray, LoopClosure, Odometry, StateArrays
+from fgslam.core.measurements import LoopClosure, Odometry
 
 _TIED_BY = 10  # landmarks of an old place that hold a frame there
 _OLD = 5  # submaps

@@ -18,8 +18,10 @@ import numpy as np
 
 from fgslam.backend.smoothers.graph_solution import poses_of_frame
 from fgslam.backend.smoothers.outliers import solver_parameters
+from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.estimates import Prediction
 from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise, se3_log, skew
-from fgslam.core.types import FloatArray, IntArray, Odometry, Prediction, StateArrays
+from fgslam.core.measurements import Odometry
 from fgslam.factors.keys import pose_key
 from fgslam.factors.motion import odometry_factor, pose_prior
 

@@ -14,10 +14,10 @@ from typing import ClassVar
 import numpy as np
 
 from fgslam.backend.homing.inputs import TrackedFeatures
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing_types import HomingEstimate, HomingStart, TrackedBearings
+from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings
 from fgslam.core.planar import unit, wrap
-from fgslam.core.types import FloatArray
 
 
 class BearingAverage:

@@ -17,10 +17,10 @@ from fgslam.backend.homing.ekf_model import (
 )
 from fgslam.backend.homing.inputs import TrackedFeatures
 from fgslam.backend.homing.settings import HomingEkfSettings
+from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing_types import HomingEstimate, HomingStart, TrackedBearings, among
+from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings, among
 from fgslam.core.planar import wrap
-from fgslam.core.types import BoolArray, FloatArray
 from fgslam.factors.bearing_residuals import (
     polar_jacobians,
     polar_points,

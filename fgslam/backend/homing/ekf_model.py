@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.backend.homing.settings import FilterMotionSettings, HomingEkfSettings
-from fgslam.core.homing_types import HomingStart
-from fgslam.core.types import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.homing import HomingStart
 from fgslam.factors.bearing_residuals import (
     bearing,
     bearing_jacobians,

@@ -13,7 +13,7 @@ from fgslam.backend.homing.settings import (
     HomingGraphSettings,
     SnapshotSettings,
 )
-from fgslam.core.homing_types import HomingStart
+from fgslam.core.homing import HomingStart
 
 
 def make_homing_estimator(start: HomingStart, settings: HomingEstimatorSettings) -> HomingEstimator:

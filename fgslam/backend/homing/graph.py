@@ -10,8 +10,8 @@ from fgslam.backend.homing.graph_problem import HomingProblem, Motion
 from fgslam.backend.homing.graph_solvers import make_solver
 from fgslam.backend.homing.inputs import TrackedFeatures
 from fgslam.backend.homing.settings import HomingGraphSettings
-from fgslam.core.homing_types import HomingEstimate, HomingStart, TrackedBearings
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
+from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings
 
 
 class HomingGraph:

@@ -13,8 +13,8 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.homing.settings import GraphMotionSettings
-from fgslam.core.homing_types import HomingVector
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
+from fgslam.core.homing import HomingVector
 from fgslam.factors.bearing import (
     BearingFactors,
     leg_factor,

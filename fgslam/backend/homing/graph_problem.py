@@ -15,9 +15,9 @@ import numpy as np
 from fgslam.backend.homing.graph_parts import TARGET, Beginning, NewPart, Pair, Sight
 from fgslam.backend.homing.resection import resected
 from fgslam.backend.homing.settings import GraphMotionSettings, HomingGraphSettings
-from fgslam.core.homing_types import HomingStart, TrackedBearings
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.homing import HomingStart, TrackedBearings
 from fgslam.core.planar import compose, unit, wrap
-from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.factors.bearing_residuals import bearing, bearing_jacobians, polar_points, triangulated
 
 _COLLAPSED = 0.1  # of the first distance from the start: gates let no error of ninety percent in

@@ -16,8 +16,8 @@ from fgslam.backend.graphs import without_gaps
 from fgslam.backend.homing.graph_parts import GtsamParts, NewPart
 from fgslam.backend.homing.schur_solver import SchurSolver
 from fgslam.backend.homing.settings import HomingGraphSettings
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.types import FloatArray
 from fgslam.factors.bearing import BearingFactors, tangent_to_pose
 from fgslam.factors.keys import is_pose, landmark_key, pose_key, target_key, velocity_key
 

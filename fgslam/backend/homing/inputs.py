@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, IntArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing_types import HomingStart, TrackedBearings, among
-from fgslam.core.types import BoolArray, IntArray
+from fgslam.core.homing import HomingStart, TrackedBearings, among
 
 
 class TrackedFeatures:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar, Protocol
 
-from fgslam.core.homing_types import HomingEstimate, TrackedBearings
+from fgslam.core.homing import HomingEstimate, TrackedBearings
 
 
 class HomingEstimator(Protocol):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.factors.bearing_residuals import bearing, bearing_jacobians
 
 _ITERATIONS = 8

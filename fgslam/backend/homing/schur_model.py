@@ -12,8 +12,8 @@ import numpy as np
 from fgslam.backend.homing.graph_parts import NewPart, Pair, Sight, first_speeds, motion_densities
 from fgslam.backend.homing.schur_system import STATE, NormalEquations
 from fgslam.backend.homing.settings import HomingGraphSettings
+from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray
 from fgslam.factors.bearing import STIFF
 from fgslam.factors.bearing_residuals import direction_and_turn, elevation_pair
 from fgslam.factors.kernels import kernel_losses, kernel_weights

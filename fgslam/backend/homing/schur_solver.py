@@ -13,9 +13,9 @@ from fgslam.backend.homing.graph_parts import NewPart
 from fgslam.backend.homing.schur_model import Look, SchurModel, State
 from fgslam.backend.homing.schur_system import Factored
 from fgslam.backend.homing.settings import HomingGraphSettings
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray, IntArray
 
 _STILL = 0.3  # deviations, of all variables together: a shorter step ends the iteration
 _FIRST_DAMPING, _MORE, _MOST = 1e-3, 10.0, 1e6

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.linalg import LinAlgError
 from scipy.linalg import cho_factor, cho_solve, lapack
 
-from fgslam.core.types import FloatArray, IntArray
+from fgslam.core.arrays import FloatArray, IntArray
 
 STATE = 6  # numbers of an image: pose and velocity
 _ROWS, _COLUMNS = np.indices((STATE, STATE))

@@ -22,9 +22,10 @@ from fgslam.backend.smoothers.refinement import Refined, refine
 from fgslam.backend.smoothers.segments import TrackedFrame
 from fgslam.backend.smoothers.settings import BatchSettings
 from fgslam.backend.smoothers.whole_graph import WholeGraphSmoother
+from fgslam.core.estimates import Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import reorthonormalise
-from fgslam.core.types import Prediction, Sensor
+from fgslam.core.sensors import Sensor
 from fgslam.factors.keys import pose_key
 
 _RELATIVE_TOLERANCE = 1e-9  # of the cost; the estimate then moves by less than a micrometre

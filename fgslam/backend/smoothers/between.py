@@ -14,6 +14,8 @@ import numpy as np
 
 from fgslam.backend.smoothers.graph_solution import Solution, allowed_parts
 from fgslam.backend.smoothers.segments import TrackedFrame
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.estimates import Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     adjoint,
@@ -28,7 +30,8 @@ from fgslam.core.geometry import (
     reorthonormalise,
     se3_exp,
 )
-from fgslam.core.types import BoolArray, FloatArray, IntArray, Odometry, Prediction, Sensor
+from fgslam.core.measurements import Odometry
+from fgslam.core.sensors import Sensor
 from fgslam.factors.keys import pose_key
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior
 

@@ -29,7 +29,9 @@ from fgslam.backend.smoothers.marginals import DenseMarginals, UndeterminedError
 from fgslam.backend.smoothers.segments import TrackedFrame
 from fgslam.backend.smoothers.settings import FixedLagSettings
 from fgslam.backend.smoothers.smoother import Smoother
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
+from fgslam.core.estimates import Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     adjoint,
@@ -42,7 +44,8 @@ from fgslam.core.geometry import (
     transform_to_camera,
     transform_to_world,
 )
-from fgslam.core.types import FloatArray, LoopClosure, Prediction, Sensor
+from fgslam.core.measurements import LoopClosure
+from fgslam.core.sensors import Sensor
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 from fgslam.factors.motion import pose_prior
 

@@ -17,6 +17,8 @@ import numpy as np
 from fgslam.backend.graphs import without_gaps
 from fgslam.backend.smoothers.segments import TrackedFrame
 from fgslam.backend.smoothers.settings import GraphSettings
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     congruence,
@@ -24,15 +26,8 @@ from fgslam.core.geometry import (
     triangulate,
     triangulation_covariance,
 )
-from fgslam.core.types import (
-    CameraRig,
-    FloatArray,
-    IntArray,
-    LandmarkMap,
-    Observations,
-    Prediction,
-    Sensor,
-)
+from fgslam.core.measurements import Observations
+from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.motion import (
     floor_factors,

@@ -8,10 +8,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from fgslam.backend.smoothers.marginals import marginals_of
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import congruence
-from fgslam.core.types import FloatArray, IntArray
 from fgslam.factors.keys import landmark_key, pose_key
 
 

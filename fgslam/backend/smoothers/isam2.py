@@ -21,9 +21,12 @@ from fgslam.backend.smoothers.refinement import Refined, refine
 from fgslam.backend.smoothers.segments import Segments, TrackedFrame
 from fgslam.backend.smoothers.settings import Isam2Settings
 from fgslam.backend.smoothers.whole_graph import WholeGraphSmoother
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise
-from fgslam.core.types import FloatArray, Observations, Prediction, Sensor
+from fgslam.core.measurements import Observations
+from fgslam.core.sensors import Sensor
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 
 _RELATIVE_TOLERANCE = 1e-9  # of the cost

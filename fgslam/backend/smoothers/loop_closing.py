@@ -18,8 +18,10 @@ from fgslam.backend.filters.submaps import Chain, Constraint, changes, corrected
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.graph_solution import poses_of_frame
 from fgslam.backend.smoothers.outliers import solver_parameters
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import EgoMotion
 from fgslam.core.geometry import adjoint, congruence, inverse, transform_to_world
-from fgslam.core.types import EgoMotion, FloatArray, IntArray, LoopClosure
+from fgslam.core.measurements import LoopClosure
 from fgslam.factors.keys import landmark_key, pose_key
 
 _ITERATIONS = 20

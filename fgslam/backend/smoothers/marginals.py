@@ -15,9 +15,9 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded, lapack, solve_triangular
 from scipy.sparse import csc_matrix, csr_matrix
 
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import inverse_spd3
-from fgslam.core.types import FloatArray, IntArray
 from fgslam.factors.keys import is_pose
 
 _UNDETERMINED = "the measurements do not determine all variables; no covariances"

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import LandmarkMap
 from fgslam.core.geometry import (
     compose_odometry,
     in_front,
@@ -26,15 +28,8 @@ from fgslam.core.geometry import (
     transform_to_camera,
     triangulate,
 )
-from fgslam.core.types import (
-    CameraRig,
-    FloatArray,
-    IntArray,
-    LandmarkMap,
-    Observations,
-    Odometry,
-    Sensor,
-)
+from fgslam.core.measurements import Observations, Odometry
+from fgslam.core.sensors import CameraRig, Sensor
 
 _ITERATIONS = 2  # of Gauss-Newton; the map is a fraction of a pixel away
 _LEAST_OBSERVATIONS = 6  # of a frame whose place in its block is known: fewer, and it is odometry's

@@ -24,7 +24,16 @@ from fgslam.backend.smoothers.loop_closing import carried_to
 from fgslam.backend.smoothers.refinement import Refined
 from fgslam.backend.smoothers.segments import TrackedFrame
 from fgslam.backend.smoothers.settings import GraphSettings
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError
+from fgslam.core.estimates import (
+    EgoMotion,
+    Estimate,
+    LandmarkMap,
+    Prediction,
+    Trajectory,
+    UpdateStats,
+)
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     adjoint,
@@ -35,25 +44,8 @@ from fgslam.core.geometry import (
     triangulate,
     triangulation_covariance,
 )
-from fgslam.core.types import (
-    BoolArray,
-    CameraRig,
-    EgoMotion,
-    Estimate,
-    FloatArray,
-    Increment,
-    IntArray,
-    LandmarkMap,
-    LoopClosure,
-    MeasurementType,
-    Observations,
-    Odometry,
-    Prediction,
-    Sensor,
-    StateArrays,
-    Trajectory,
-    UpdateStats,
-)
+from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
+from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.factors.keys import landmark_key, pose_key
 
 _ASTRAY_PX = 12.0  # where nothing is left out: farther off, a match speaks against its landmark

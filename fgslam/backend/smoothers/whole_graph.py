@@ -14,8 +14,11 @@ from fgslam.backend.smoothers.graph_solution import poses_of_frame
 from fgslam.backend.smoothers.loop_closing import first_guess, misfit, solved
 from fgslam.backend.smoothers.settings import GraphSettings
 from fgslam.backend.smoothers.smoother import Smoother
+from fgslam.core.arrays import IntArray, StateArrays
+from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
-from fgslam.core.types import IntArray, LandmarkMap, LoopClosure, Prediction, Sensor, StateArrays
+from fgslam.core.measurements import LoopClosure
+from fgslam.core.sensors import Sensor
 
 _AGREES = float(chi2.ppf(0.99, 6))  # 16.8: a loop that the graph meets as it is
 

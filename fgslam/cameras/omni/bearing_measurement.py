@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray
 
 _STEP_PX = 0.05  # of the central difference: its error is a millionth of the derivative
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.cameras.omni.radial import AHEAD_IS_UP, MirrorFrame, RadialCamera
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.types import FloatArray
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.types import FloatArray
 
 
 def require_size(what: str, width: int, height: int) -> None:

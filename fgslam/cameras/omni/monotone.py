@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 
 ValueAndSlope: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 

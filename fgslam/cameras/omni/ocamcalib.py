@@ -16,8 +16,8 @@ from numpy.polynomial import polynomial
 
 from fgslam.cameras.omni.monotone import MonotoneInverse
 from fgslam.cameras.omni.radial import AHEAD_IS_UP, MirrorFrame, RadialCamera
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.types import FloatArray
 
 _MAX_TERMS = 32
 # The file's two polynomials are fits of one another: further apart, one of them is damaged.

@@ -12,8 +12,8 @@ import numpy as np
 
 from fgslam.cameras.omni.bearing_measurement import unit_rays
 from fgslam.cameras.omni.image_bounds import inside, require_size
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.types import FloatArray
 
 _HALF_TURN = np.pi
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 
 
 class OmniCamera(Protocol):

@@ -13,8 +13,8 @@ import numpy as np
 
 from fgslam.cameras.omni.bearing_measurement import unit_rays
 from fgslam.cameras.omni.image_bounds import inside, require_size
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.types import FloatArray
 
 # Relative: what a round trip may lose at the very rim.
 _RIM = 1e-9

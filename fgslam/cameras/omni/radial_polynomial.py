@@ -13,8 +13,8 @@ from numpy.polynomial import polynomial
 
 from fgslam.cameras.omni.monotone import MonotoneInverse
 from fgslam.cameras.omni.radial import MirrorFrame, RadialCamera
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.types import FloatArray
 
 PAPER_DEGREE = 5
 

@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from fgslam.cameras.omni.radial import MirrorFrame, RadialCamera
 from fgslam.cameras.omni.radial_polynomial import PAPER_DEGREE, RadialFit, fit_radial_polynomial
+from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.types import FloatArray, Image, IntArray
 
 Float32 = npt.NDArray[np.float32]
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.types import FloatArray, Image
+from fgslam.core.arrays import FloatArray, Image
 
 Float32 = npt.NDArray[np.float32]
 

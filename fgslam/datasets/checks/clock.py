@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.geometry import inverse, so3_log
 from fgslam.core.recordings import Sequence
-from fgslam.core.types import FloatArray
 from fgslam.datasets.checks.findings import Finding, Level
 from fgslam.datasets.recording import OdometrySource, Recording
 from fgslam.datasets.trajectories import rows_at

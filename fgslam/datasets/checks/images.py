@@ -8,9 +8,9 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fgslam.core.arrays import Image, IntArray
 from fgslam.core.errors import FrameError
-from fgslam.core.recordings import Sequence
-from fgslam.core.types import Frame, Image, IntArray
+from fgslam.core.recordings import Frame, Sequence
 from fgslam.datasets.checks.findings import Finding, Level, listed, share
 
 Told: TypeAlias = Callable[[int, int], None]

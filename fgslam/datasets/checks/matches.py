@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.types import FloatArray, IntArray
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.datasets.checks.findings import Finding, Level, listed
 from fgslam.datasets.checks.images import CAMERA_NAMES
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import inverse, se3_log
+from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
-from fgslam.core.types import FloatArray, Odometry, Trajectory
 from fgslam.datasets.checks.findings import Finding, Level, listed, share
 from fgslam.datasets.trajectories import rows_at
 

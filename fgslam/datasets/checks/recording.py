@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.recordings import Sequence
-from fgslam.core.types import CameraRig, FloatArray
+from fgslam.core.sensors import CameraRig
 from fgslam.datasets.checks.clock import check_clock
 from fgslam.datasets.checks.findings import Finding, Level, by_severity
 from fgslam.datasets.checks.images import Told, check_images

@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import FloatArray, Increment, IntArray, Observations, Odometry, Sensor
+from fgslam.core.measurements import Increment, Observations, Odometry
+from fgslam.core.sensors import Sensor
 from fgslam.datasets.odometry_settings import (
     ConstantVelocitySettings,
     OdometrySettings,

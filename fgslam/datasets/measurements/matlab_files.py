@@ -11,8 +11,8 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
-from fgslam.core.types import FloatArray
 
 _UNREADABLE = (
     OSError,

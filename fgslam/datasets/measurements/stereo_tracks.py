@@ -12,15 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import (
     BODY_FORWARD_LEFT_UP_FROM_CAMERA,
     reorthonormalise,
     right_from_left_camera,
 )
 from fgslam.core.recordings import MeasurementRecording
+from fgslam.core.sensors import CameraRig
 from fgslam.core.stereo_model import measurement_map
-from fgslam.core.types import CameraRig, FloatArray, IntArray, Trajectory
 from fgslam.datasets.measurements.files import (
     MeasuredFrame,
     files_identity,

@@ -18,15 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core import geometry as g
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.estimates import Trajectory
+from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import LandmarkTruth, MeasurementRecording
-from fgslam.core.types import (
-    BoolArray,
-    FloatArray,
-    IntArray,
-    Odometry,
-    RangeBearingSensor,
-    Trajectory,
-)
+from fgslam.core.sensors import RangeBearingSensor
 from fgslam.datasets.measurements.files import (
     MeasuredFrame,
     files_identity,

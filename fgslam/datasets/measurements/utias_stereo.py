@@ -15,9 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core import geometry as g
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import DatasetError
+from fgslam.core.estimates import Trajectory
+from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import LandmarkTruth, MeasurementRecording
-from fgslam.core.types import BoolArray, CameraRig, FloatArray, IntArray, Odometry, Trajectory
+from fgslam.core.sensors import CameraRig
 from fgslam.datasets.measurements.files import (
     MeasuredFrame,
     files_identity,

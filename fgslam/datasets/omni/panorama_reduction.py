@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from fgslam.core.types import FloatArray, Image
+from fgslam.core.arrays import FloatArray, Image
 
 Float32 = npt.NDArray[np.float32]
 

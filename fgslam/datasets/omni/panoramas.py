@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray, Image, IntArray
 from fgslam.datasets.images import IMAGE_SUFFIXES, read_colour_image
 from fgslam.datasets.omni.camera_files import make_camera
 from fgslam.datasets.omni.panorama_reduction import PanoramaReduction

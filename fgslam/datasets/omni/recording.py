@@ -13,8 +13,8 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
-from fgslam.core.types import FloatArray, Image, IntArray
 from fgslam.datasets.images import IMAGE_SUFFIXES
 
 ColourLoader: TypeAlias = Callable[[int], Image]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
 from fgslam.core.geometry import wrap_angle
-from fgslam.core.types import BoolArray, ByteArray, FloatArray, IntArray
 from fgslam.frontend.features.settings import AppearanceSettings
 
 

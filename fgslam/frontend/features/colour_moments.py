@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.types import FloatArray, Image, IntArray
+from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.frontend.features.omni_settings import ColourMomentSettings
 
 Float32Image: TypeAlias = npt.NDArray[np.float32]

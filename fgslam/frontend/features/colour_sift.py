@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 
 from fgslam.cameras.omni.bearing_measurement import measure
 from fgslam.cameras.omni.protocol import OmniCamera
-from fgslam.core.homing_types import UprightFeatures
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray
+from fgslam.core.homing import UprightFeatures
 from fgslam.core.planar import wrap
-from fgslam.core.types import BoolArray, ByteArray, FloatArray, Image, IntArray
 from fgslam.frontend.features.colour_moments import PatchColours
 from fgslam.frontend.features.omni_settings import ColourMomentSettings, UprightSiftSettings
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 
 # fmt: off
 _DEVIATIONS = np.array(

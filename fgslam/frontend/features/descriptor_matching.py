@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.types import ByteArray, IntArray
+from fgslam.core.arrays import ByteArray, IntArray
 
 
 def mutual_nearest(a: ByteArray, b: ByteArray, ratio: float = 0.8) -> tuple[IntArray, IntArray]:

@@ -9,9 +9,9 @@ from fgslam.cameras.omni.bearing_measurement import unit_rays
 from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
 from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.cameras.omni.unwrapping import unwrap_maps
+from fgslam.core.arrays import Image
 from fgslam.core.errors import FrameError
-from fgslam.core.homing_types import ColumnSegments, OmniFeatures, UprightFeatures
-from fgslam.core.types import Image
+from fgslam.core.homing import ColumnSegments, OmniFeatures, UprightFeatures
 from fgslam.frontend.features.colour_sift import (
     UprightSift,
     empty_features,

@@ -8,7 +8,8 @@ from concurrent.futures import Executor
 import cv2
 import numpy as np
 
-from fgslam.core.types import ByteArray, Features, Image, IntArray
+from fgslam.core.arrays import ByteArray, Image, IntArray
+from fgslam.core.features import Features
 from fgslam.frontend.features.settings import Appearance, SiftSettings
 
 

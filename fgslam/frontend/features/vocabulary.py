@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.map_types import Words
-from fgslam.core.types import ByteArray, IntArray
+from fgslam.core.arrays import ByteArray, IntArray
+from fgslam.core.features import Words
 
 VOCABULARY_FILE = Path(__file__).with_name("vocabulary.npz")
 

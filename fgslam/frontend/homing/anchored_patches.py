@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.types import BoolArray, FloatArray, Image
+from fgslam.core.arrays import BoolArray, FloatArray, Image
 
 Float32 = npt.NDArray[np.float32]
 

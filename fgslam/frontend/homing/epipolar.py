@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.cameras.omni.bearing_measurement import unit_rays
-from fgslam.core.homing_types import BearingMatches
+from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.homing import BearingMatches
 from fgslam.core.planar import wrap
-from fgslam.core.types import BoolArray, FloatArray
 
 
 def ray_derivatives(bearing: FloatArray, elevation: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.homing_types import BearingMatches, HomingVector, Refusal, RefusalReason
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.homing import BearingMatches, HomingVector, Refusal, RefusalReason
 from fgslam.core.planar import unit, wrap
-from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.frontend.homing.epipolar import EpipolarTest
 from fgslam.frontend.homing.homing_refinement import HomingRefinement, Refined, RefinementPrior
 from fgslam.frontend.homing.match_odds import (

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.homing_types import BearingMatches, HomingVector, LocalMap
-from fgslam.core.types import BoolArray, FloatArray
+from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.homing import BearingMatches, HomingVector, LocalMap
 
 
 def triangulate(matches: BearingMatches, direction: float, rotation: float) -> FloatArray:

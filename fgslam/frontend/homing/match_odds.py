@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.homing_types import BearingMatches, FeatureKind
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
+from fgslam.core.homing import BearingMatches, FeatureKind
 
 _LOGIT = {FeatureKind.SIFT: (-3.0, 10.5), FeatureKind.COLUMN: (-2.3, 3.5)}
 """Logit of p as a line over quality: offset and slope, by kind.

@@ -14,14 +14,14 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.homing_types import (
+from fgslam.core.arrays import ByteArray, FloatArray, IntArray
+from fgslam.core.homing import (
     BearingMatches,
     ColumnSegments,
     FeatureKind,
     OmniFeatures,
     UprightFeatures,
 )
-from fgslam.core.types import ByteArray, FloatArray, IntArray
 from fgslam.frontend.features.column_whitening import whitened
 from fgslam.frontend.features.omni_settings import OmniMatchingSettings
 

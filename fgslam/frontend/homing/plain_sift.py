@@ -7,8 +7,8 @@ import numpy as np
 
 from fgslam.cameras.omni.bearing_measurement import measure
 from fgslam.cameras.omni.protocol import OmniCamera
-from fgslam.core.homing_types import BearingMatches, UprightFeatures
-from fgslam.core.types import Image
+from fgslam.core.arrays import Image
+from fgslam.core.homing import BearingMatches, UprightFeatures
 from fgslam.frontend.features.colour_sift import up_in_image
 from fgslam.frontend.features.omni_settings import OmniMatchingSettings
 from fgslam.frontend.homing.matching import match_sift

@@ -18,8 +18,8 @@ from scipy.fft import next_fast_len
 from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.cameras.omni.unwrapping import Float32, unwrap_maps
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import FrameError
-from fgslam.core.types import FloatArray, Image
 from fgslam.frontend.features.colour_sift import wrapping_period
 from fgslam.frontend.features.omni_features import pixels_a_radian
 

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from fgslam.cameras.omni.panoramas import Equirectangular
-from fgslam.core.homing_types import BearingMatches, FeatureKind, OmniFeatures
+from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
+from fgslam.core.homing import BearingMatches, FeatureKind, OmniFeatures
 from fgslam.core.planar import wrap
-from fgslam.core.types import BoolArray, FloatArray, Image, IntArray
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 
 

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing_types import TrackedBearings
-from fgslam.core.types import BoolArray, FloatArray, Image, IntArray
+from fgslam.core.homing import TrackedBearings
 from fgslam.frontend.homing.anchored_patches import AnchoredPatches, align, anchor
 from fgslam.frontend.homing.steady_view import SteadyImage, SteadyView
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.planar import wrap
-from fgslam.core.types import BoolArray, FloatArray
 
 LEAST_SEPARATION = np.deg2rad(5.0)
 """Bearing difference that two features need in one of the views: less is one vertical line."""

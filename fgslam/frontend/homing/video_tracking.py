@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from fgslam.cameras.omni.protocol import OmniCamera
-from fgslam.core.homing_types import TrackedBearings
-from fgslam.core.types import FloatArray, Image, IntArray
+from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.homing import TrackedBearings
 from fgslam.frontend.homing.tracking import BearingTracker
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import LandmarkMap, Trajectory
+from fgslam.core.features import LandmarkAppearances
 from fgslam.core.geometry import congruence, inverse_spd3, point_pose_jacobian, transform_to_world
-from fgslam.core.map_types import LandmarkAppearances
 from fgslam.core.saved_map import SavedMap
-from fgslam.core.types import FloatArray, IntArray, LandmarkMap, Trajectory
 from fgslam.frontend.places.map_alignment import Alignment
 
 

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.geometry import triangulate, triangulation_covariance
+from fgslam.core.sensors import CameraRig
 from fgslam.core.stereo_model import measurement_map, vertical_to_horizontal
-from fgslam.core.types import CameraRig, Features, FloatArray, IntArray, StereoFeatures
 from fgslam.frontend.features.candidates import alike, choose, pairs_within
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.stereo.settings import StereoSettings

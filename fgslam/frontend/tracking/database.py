@@ -10,15 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.types import (
-    BoolArray,
-    ByteArray,
-    CameraRig,
-    FloatArray,
-    IntArray,
-    LandmarkMap,
-    StereoFeatures,
-)
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from fgslam.core.estimates import LandmarkMap
+from fgslam.core.features import StereoFeatures
+from fgslam.core.sensors import CameraRig
 from fgslam.frontend.tracking.landmark_table import LandmarkTable
 from fgslam.frontend.tracking.permanence import is_blind, reliable, seen_past
 from fgslam.frontend.tracking.settings import DatabaseSettings, PermanenceSettings

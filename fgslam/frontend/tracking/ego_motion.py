@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     congruence,
@@ -31,17 +33,8 @@ from fgslam.core.geometry import (
     so3_exp,
     transform_to_camera,
 )
-from fgslam.core.types import (
-    BoolArray,
-    CameraRig,
-    EgoMotion,
-    EgoMotionStatus,
-    FloatArray,
-    LandmarkMap,
-    Observations,
-    Prediction,
-    Sensor,
-)
+from fgslam.core.measurements import Observations
+from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 
 _STEP_TOLERANCE = 1e-9  # radians and metres; far below anything measurable

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.types import BoolArray, FloatArray, IntArray, StereoFeatures
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.features import StereoFeatures
 from fgslam.frontend.features.candidates import alike, pairs_within, pick, resembling
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.tracking.settings import MapMatchingSettings

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.types import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.frontend.features.candidates import pairs_within
 from fgslam.frontend.tracking.settings import PermanenceSettings
 from fgslam.frontend.tracking.visibility import ExpectedLandmarks

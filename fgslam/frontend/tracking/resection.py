@@ -10,8 +10,9 @@ import dataclasses
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction
 from fgslam.core.geometry import triangulate
-from fgslam.core.types import EgoMotion, EgoMotionStatus, FloatArray, Prediction
 from fgslam.frontend.places.relocalisation.alignment import align, sample_size
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
 

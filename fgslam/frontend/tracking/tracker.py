@@ -6,20 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgslam.core.types import (
-    BoolArray,
-    ByteArray,
-    CameraRig,
-    EgoMotion,
-    EgoMotionStatus,
-    FloatArray,
-    Image,
-    IntArray,
-    LandmarkMap,
-    Observations,
-    Prediction,
-    StereoFeatures,
-)
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray
+from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
+from fgslam.core.features import StereoFeatures
+from fgslam.core.measurements import Observations
+from fgslam.core.sensors import CameraRig
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.map_matching import MapMatcher, MapMatches

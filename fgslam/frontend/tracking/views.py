@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.map_types import Words
-from fgslam.core.types import BoolArray, ByteArray, FloatArray, IntArray, StereoFeatures
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from fgslam.core.features import StereoFeatures, Words
 from fgslam.frontend.features.vocabulary import words_of
 
 Places = npt.NDArray[np.int32]

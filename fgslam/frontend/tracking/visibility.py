@@ -8,6 +8,8 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from fgslam.core.estimates import Prediction
 from fgslam.core.geometry import (
     congruence,
     point_pose_jacobian,
@@ -16,7 +18,7 @@ from fgslam.core.geometry import (
     rotate_covariances,
     transform_to_camera,
 )
-from fgslam.core.types import BoolArray, ByteArray, CameraRig, FloatArray, IntArray, Prediction
+from fgslam.core.sensors import CameraRig
 from fgslam.frontend.tracking.settings import DatabaseSettings
 
 Wanted: TypeAlias = Callable[[IntArray, FloatArray], BoolArray]

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.core.homing_types import HomingEstimate, HomingTruth
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
+from fgslam.core.homing import HomingEstimate, HomingTruth
 from fgslam.report.page.traces import Figure, Owner, Switch, Trace, thinned, trace
 
 MAX_MOMENTS = 60

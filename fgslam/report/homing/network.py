@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.report.page.traces import Figure, Owner, Switch, Trace, joined, plain_texts, trace
 
 _TOLD = "%{text}<extra></extra>"

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.core.types import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.report.page.traces import (
     Figure,
     Owner,

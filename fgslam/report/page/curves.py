@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.report.page.data import EstimatorReport, ReportData
 from fgslam.report.page.traces import Figure, Owner, Switch, Trace, peaks, trace
 

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgslam.core.types import FloatArray, LandmarkMap, Trajectory
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import LandmarkMap, Trajectory
 
 
 def _no_landmarks() -> LandmarkMap:

@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.ticker import MaxNLocator
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import congruence
-from fgslam.core.types import FloatArray
 from fgslam.report.pictures.style import (
     BLUE,
     GREY,

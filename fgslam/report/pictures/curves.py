@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from fgslam.core.types import FloatArray, IntArray
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.report.pictures.style import BLUE, GREEN, GREY, SKY, picture
 
 _AXIS_NAMES = ("X, right", "Y, down", "Z, ahead")

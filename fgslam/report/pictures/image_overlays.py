@@ -13,7 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
-from fgslam.core.types import Features, FloatArray, Image
+from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.features import Features
 from fgslam.report.pictures.style import (
     INK,
     ORANGE,

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from fgslam.core.types import BoolArray, FloatArray
+from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.report.pictures.birds_eye import (
     MapDrawing,
     add_ellipses,

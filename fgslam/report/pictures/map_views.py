@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PathCollection
 
-from fgslam.core.types import BoolArray, FloatArray
+from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.report.pictures.birds_eye import MapDrawing, dot_size, path_points
 from fgslam.report.pictures.style import (
     FAINT,

@@ -16,8 +16,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.atomic_files import replacing
-from fgslam.core.types import FloatArray, Image
 
 # Okabe and Ito's colours, which the colour-blind can tell apart.
 ORANGE = "#E69F00"

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import hsv_to_rgb
 
-from fgslam.core.types import BoolArray, FloatArray, Image
+from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.report.pictures.style import picture
 
 _WIDTH_IN = 9.0

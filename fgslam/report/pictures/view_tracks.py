@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.core.types import FloatArray, Image
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.report.pictures.style import SKY, VERMILLION, YELLOW, picture
 
 _WIDTH_IN = 11.0

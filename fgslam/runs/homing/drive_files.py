@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.bearing_log import BearingLog
-from fgslam.core.homing_types import HomingTruth
+from fgslam.core.homing import HomingTruth
 from fgslam.core.planar import between, wrap
-from fgslam.core.types import FloatArray
 from fgslam.homing.command import HomingState
 from fgslam.homing.drive_scores import cross_track, pass_distances
 from fgslam.homing.record import DriveRecord, HomingLog

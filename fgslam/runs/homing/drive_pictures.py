@@ -9,9 +9,9 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from fgslam.core.arrays import ByteArray, FloatArray
 from fgslam.core.atomic_files import make_subfolder
-from fgslam.core.homing_types import TrackedBearings
-from fgslam.core.types import ByteArray, FloatArray
+from fgslam.core.homing import TrackedBearings
 from fgslam.homing.command import Command
 from fgslam.homing.path_following import PathFollower
 from fgslam.homing.underway import HomingUnderWay

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import between
-from fgslam.core.types import FloatArray
 from fgslam.homing.drive_scores import (
     ARRIVED_M,
     Slope,

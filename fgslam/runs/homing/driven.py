@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.record import DriveRecord
 from fgslam.runs.homing.drive_pictures import LegView

@@ -11,8 +11,8 @@ from typing import Protocol, TypeAlias
 import numpy as np
 
 from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import OutputError
-from fgslam.core.types import FloatArray, Image
 from fgslam.homing.avoidance import make_avoider
 from fgslam.homing.closed_loop import Driver, World, follow
 from fgslam.homing.eyes import HomingEyes

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.core.homing_types import HomingVector, OmniFeatures, Refusal
+from fgslam.core.homing import HomingVector, OmniFeatures, Refusal
 from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
 from fgslam.frontend.homing.matching import match_features
 from fgslam.homing.linking import Answer, Pair

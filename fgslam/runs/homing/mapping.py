@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.errors import ConfigError, StoredMapError
-from fgslam.core.homing_types import OmniFeatures
+from fgslam.core.homing import OmniFeatures
 from fgslam.homing.linking import Answer, Link, Pair
 from fgslam.homing.third_views import InlierRows
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers

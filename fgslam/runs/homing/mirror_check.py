@@ -8,8 +8,8 @@ import numpy as np
 
 from fgslam.cameras.omni.radial import RadialCamera
 from fgslam.cameras.omni.ring_calibration import MirrorCircle, find_mirror_circle
+from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError
-from fgslam.core.types import Image
 from fgslam.datasets.omni.opening import open_omni
 from fgslam.datasets.omni.recording import OmniRecording
 from fgslam.datasets.omni.settings import OmniDatasetSettings

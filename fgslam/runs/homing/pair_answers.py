@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from fgslam.core.homing_types import HomingVector, Refusal, RefusalReason
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.homing import HomingVector, Refusal, RefusalReason
 from fgslam.core.planar import wrap
-from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.report.metrics import JsonValue
 from fgslam.report.tables import Cell, write_csv
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.core.arrays import FloatArray
 from fgslam.core.atomic_files import make_subfolder
-from fgslam.core.homing_types import BearingMatches, FeatureKind, HomingVector
-from fgslam.core.types import FloatArray
+from fgslam.core.homing import BearingMatches, FeatureKind, HomingVector
 from fgslam.report.page.data import Picture
 from fgslam.report.pictures.view_matches import MatchedPixels, draw_view_matches
 from fgslam.runs.homing.pair_answers import PairAnswer, PairErrors

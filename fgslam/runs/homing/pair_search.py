@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.homing_types import (
+from fgslam.core.arrays import IntArray
+from fgslam.core.homing import (
     BearingMatches,
     FeatureKind,
     HomingVector,
     OmniFeatures,
     Refusal,
 )
-from fgslam.core.types import IntArray
 from fgslam.frontend.features.omni_settings import OmniMatchingSettings
 from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
 from fgslam.frontend.homing.matching import match_features

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.report.homing import Column, TextTable
 from fgslam.report.homing.curves import claimed_against_true, sorted_errors
 from fgslam.report.homing.network import Links, network_figure

@@ -10,9 +10,9 @@ import numpy as np
 
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.backend.homing.settings import HomingEstimatorSettings
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing_types import HomingEstimate, HomingStart, TrackedBearings
-from fgslam.core.types import FloatArray
+from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings
 
 
 @dataclass(frozen=True, slots=True, eq=False)

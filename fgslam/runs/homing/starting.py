@@ -6,8 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from fgslam.core.homing_types import BearingMatches, HomingStart, Refusal
-from fgslam.core.types import IntArray
+from fgslam.core.arrays import IntArray
+from fgslam.core.homing import BearingMatches, HomingStart, Refusal
 from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
 from fgslam.frontend.homing.local_map import make_local_map
 from fgslam.frontend.homing.settings import HomingVectorSettings

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.bearing_log import BearingLog
-from fgslam.core.types import FloatArray
 from fgslam.evaluation.homing import HomingErrors
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.bearing_log import BearingLog
-from fgslam.core.homing_types import Refusal
+from fgslam.core.homing import Refusal
 from fgslam.evaluation.homing import homing_errors
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.homing.config import HomingTrialsConfig

@@ -9,8 +9,8 @@ from time import perf_counter
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.atomic_files import make_subfolder
-from fgslam.core.types import FloatArray
 from fgslam.datasets.omni.recording import OmniRecording
 from fgslam.frontend.homing.video_tracking import ReplenishedTracker, TrackedImage
 from fgslam.report.homing import Column, TextTable

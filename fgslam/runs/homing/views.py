@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import OutputError
-from fgslam.core.homing_types import OmniFeatures
-from fgslam.core.types import FloatArray
+from fgslam.core.homing import OmniFeatures
 from fgslam.datasets.omni.opening import open_omni
 from fgslam.datasets.omni.recording import OmniRecording
 from fgslam.datasets.omni.settings import OmniDatasetSettings

@@ -10,9 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import FrameError
+from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.recordings import Sequence
-from fgslam.core.types import CameraRig, Features, FloatArray, IntArray, StereoFeatures
+from fgslam.core.sensors import CameraRig
 from fgslam.datasets.checks.findings import Finding, Level
 from fgslam.datasets.checks.images import spread_over
 from fgslam.datasets.checks.matches import (

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, MapError
+from fgslam.core.estimates import LandmarkMap, Relocalisation
 from fgslam.core.floor import Floor
-from fgslam.core.map_types import Relocalisation
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import require_rig
-from fgslam.core.types import FloatArray, LandmarkMap
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.runs.localisation.config import LocalisationConfig

@@ -10,9 +10,9 @@ from typing import Literal
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Relocalisation
 from fgslam.core.geometry import yaw_pitch_roll
-from fgslam.core.map_types import Relocalisation
-from fgslam.core.types import FloatArray
 from fgslam.evaluation.localisation import (
     Answers,
     Bounds,

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import LandmarkMap
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap
-from fgslam.core.types import FloatArray, LandmarkMap
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.runs.rendered_truth import TrueDepth
 from fgslam.slam.frontend_settings import FrontendSettings

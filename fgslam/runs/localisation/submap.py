@@ -9,6 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Trajectory
+from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.geometry import (
     congruence,
     project,
@@ -16,9 +19,9 @@ from fgslam.core.geometry import (
     rotate_covariances,
     transform_to_camera,
 )
-from fgslam.core.map_types import LandmarkAppearances
-from fgslam.core.recordings import Sequence
-from fgslam.core.types import CameraRig, FloatArray, Frame, Odometry, StereoFeatures, Trajectory
+from fgslam.core.measurements import Odometry
+from fgslam.core.recordings import Frame, Sequence
+from fgslam.core.sensors import CameraRig
 from fgslam.datasets.odometry_settings import OdometrySettings
 from fgslam.slam.factory import make_pipeline
 from fgslam.slam.feature_stream import FeatureFrame

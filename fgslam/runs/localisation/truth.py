@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import FgslamError
 from fgslam.core.geometry import inverse, pose, transform_to_world
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap
-from fgslam.core.types import FloatArray
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.evaluation.trajectory import align, associate
 from fgslam.runs.config import ExperimentConfig

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.worlds import furniture
 from fgslam.worlds.buildings.floor_plan import DOOR_HEIGHT, HEIGHT
 from fgslam.worlds.rendering.patches import Patch, Surface, Thing, box, placed, rectangle

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.worlds.rendering.patches import Patch, Surface, Thing, box, rectangle
 
 HEIGHT = 2.7

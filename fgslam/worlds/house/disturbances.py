@@ -7,7 +7,7 @@ import copy
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.worlds.house.settings import (
     HouseExposureSettings,
     HouseLightSettings,

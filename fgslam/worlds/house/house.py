@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.worlds import furniture
 from fgslam.worlds.buildings.fitting import FittingStyle, RoomFitter
 from fgslam.worlds.buildings.floor_plan import (

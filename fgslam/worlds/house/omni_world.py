@@ -12,7 +12,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from fgslam.cameras.omni.protocol import OmniCamera
-from fgslam.core.types import BoolArray, FloatArray, Image
+from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.worlds.floor_space import FloorSpace
 from fgslam.worlds.house import disturbances
 from fgslam.worlds.house.floor_plan import DEPTH, WIDTH

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.types import BoolArray, FloatArray, Image
+from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.worlds.house.floor_plan import room_at
 from fgslam.worlds.house.omni_world import OmniWorld
 

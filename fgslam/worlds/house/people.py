@@ -7,8 +7,8 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.planar import unit
-from fgslam.core.types import BoolArray, FloatArray
 from fgslam.worlds.person import Stance, person
 from fgslam.worlds.rendering.colour_bank import ColourBank
 from fgslam.worlds.rendering.colour_textures import SHIRTS

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import unit, wrap
-from fgslam.core.types import FloatArray
 from fgslam.worlds.house.settings import RangeSensorSettings
 from fgslam.worlds.rendering.raycaster import RayCaster
 

@@ -14,9 +14,9 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.planar import unit, wrap
-from fgslam.core.types import FloatArray, IntArray
 from fgslam.worlds.buildings.floor_plan import Room
 from fgslam.worlds.floor_space import FloorSpace
 from fgslam.worlds.house.floor_plan import ROOMS

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray
 from fgslam.worlds.house.settings import WheelchairSettings
 
 _STEP_S = 0.01

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.core.arrays import Image
 from fgslam.core.errors import DatasetError
-from fgslam.core.types import Image
 
 _MAGIC = b"FGSLAB1\n"
 _HEADER = struct.Struct("<8sIIII")

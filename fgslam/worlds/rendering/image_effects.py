@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.types import Image
+from fgslam.core.arrays import Image
 from fgslam.worlds.lab_settings import LabEffectsSettings, LabExposureSettings
 
 _COVER_SEED = 7

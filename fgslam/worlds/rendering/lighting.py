@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.types import FloatArray, IntArray
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.worlds.rendering.patches import PatchArrays
 from fgslam.worlds.rendering.raycaster import RayCaster
 

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.types import FloatArray, IntArray
+from fgslam.core.arrays import FloatArray, IntArray
 
 Float32 = npt.NDArray[np.float32]
 Int32 = npt.NDArray[np.int32]

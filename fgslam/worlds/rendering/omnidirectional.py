@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.cameras.omni.protocol import OmniCamera
-from fgslam.core.types import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.worlds.rendering.colour_bank import ColourBank
 from fgslam.worlds.rendering.pinhole import LEAST_INVERSE_DEPTH, Layer, light_at
 

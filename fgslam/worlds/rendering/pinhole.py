@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.types import FloatArray, IntArray
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.worlds.rendering.lighting import LightMaps
 from fgslam.worlds.rendering.mipmap import TextureBank, TextureSizes, texture_indices
 from fgslam.worlds.rendering.patches import PatchArrays

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.types import BoolArray, FloatArray
+from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.worlds.rendering.open3d_library import load_open3d
 from fgslam.worlds.rendering.patches import PatchArrays
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import ConfigError
-from fgslam.core.homing_types import BearingMatches, FeatureKind, HomingTruth, TrackedBearings
+from fgslam.core.homing import BearingMatches, FeatureKind, HomingTruth, TrackedBearings
 from fgslam.core.planar import bearings, rotation, wrap
-from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
 
 _CORRELATION_S = 0.5  # of the disturbances of the drive

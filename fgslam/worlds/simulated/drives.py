@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.core.types import FloatArray
 from fgslam.worlds.lab_settings import LabDriveSettings
 from fgslam.worlds.paths import (
     PlanarPath,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.types import BoolArray, IntArray
+from fgslam.core.arrays import BoolArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.types import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.worlds.lab import build_lab
 from fgslam.worlds.rendering.patches import stack
 from fgslam.worlds.simulated.drives import CORRIDOR_WIDTH_M

@@ -13,18 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core import geometry as g
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import ConfigError
+from fgslam.core.estimates import Trajectory
+from fgslam.core.measurements import Increment, Observations, Odometry
+from fgslam.core.sensors import CameraRig
 from fgslam.core.stereo_model import measurement_map, pixel_model, vertical_to_horizontal
-from fgslam.core.types import (
-    BoolArray,
-    CameraRig,
-    FloatArray,
-    Increment,
-    IntArray,
-    Observations,
-    Odometry,
-    Trajectory,
-)
 from fgslam.worlds.simulated.drives import plan_measured_drive
 from fgslam.worlds.simulated.identities import IdentityBook, Sightings
 from fgslam.worlds.simulated.landmarks import LandmarkWorld, build_world

@@ -13,8 +13,9 @@ from fgslam.backend.smoothers.between import fill_between
 from fgslam.backend.smoothers.graph_solution import Solution
 from fgslam.backend.smoothers.segments import TrackedFrame
 from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray
 from fgslam.core.floor import Floor
-from fgslam.core.types import FloatArray, Odometry
+from fgslam.core.measurements import Odometry
 
 FREE = Floor.under(RIG, 6)
 KNOWN = [0, 4, 8]

@@ -15,9 +15,11 @@ from fgslam.backend.filters.ekf_update import DivergedError, FloorMeasurement, M
 from fgslam.backend.filters.growing_covariance import GrowingCovariance
 from fgslam.backend.filters.settings import EkfSettings
 from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
+from fgslam.core.estimates import Prediction, UpdateStats
 from fgslam.core.floor import Floor
-from fgslam.core.types import FloatArray, Increment, Odometry, Prediction, UpdateStats
+from fgslam.core.measurements import Increment, Odometry
 from fgslam.evaluation.consistency import judge, landmark_nees, pose_nees
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior

@@ -26,7 +26,7 @@ from smoothing import (
 from fgslam.backend.smoothers.fixed_lag import FixedLagSmoother
 from fgslam.backend.smoothers.settings import FixedLagSettings
 from fgslam.core.errors import EstimatorError
-from fgslam.core.types import Prediction
+from fgslam.core.estimates import Prediction
 from fgslam.evaluation.consistency import judge
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 

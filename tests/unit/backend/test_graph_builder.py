@@ -28,8 +28,9 @@ from fgslam.backend.smoothers.segments import TrackedFrame
 from fgslam.backend.smoothers.settings import BatchSettings, GraphSettings
 from fgslam.core import geometry as g
 from fgslam.core.errors import EstimatorError
+from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
-from fgslam.core.types import Increment, LandmarkMap, Odometry, Prediction
+from fgslam.core.measurements import Increment, Odometry
 from fgslam.evaluation.consistency import judge, landmark_nees
 from fgslam.factors.keys import is_pose, landmark_key, pose_key
 

@@ -14,7 +14,7 @@ from fgslam.backend.homing.ekf import HomingEkf
 from fgslam.backend.homing.ekf_model import FilterState, initial_state, motion
 from fgslam.backend.homing.settings import PAPER, FilterMotionSettings, HomingEkfSettings
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing_types import HomingStart, HomingVector, LocalMap, TrackedBearings
+from fgslam.core.homing import HomingStart, HomingVector, LocalMap, TrackedBearings
 from fgslam.core.planar import bearings, wrap
 from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
 

@@ -23,7 +23,7 @@ from fgslam.backend.homing.ekf_model import (
     seen_from_target,
 )
 from fgslam.backend.homing.settings import PAPER, HomingEkfSettings
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.factors.bearing_residuals import (
     bearing_jacobians,
     polar_jacobians,

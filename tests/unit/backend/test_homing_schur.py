@@ -15,10 +15,10 @@ from fgslam.backend.homing.schur_model import SchurModel, State
 from fgslam.backend.homing.schur_solver import SchurSolver
 from fgslam.backend.homing.schur_system import Factored
 from fgslam.backend.homing.settings import HomingGraphSettings
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing_types import HomingEstimate
+from fgslam.core.homing import HomingEstimate
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray
 from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
 
 NONE, CAUCHY, HUBER = (

@@ -25,8 +25,10 @@ from simulated import (
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.types import FloatArray, Increment, IntArray, Prediction
+from fgslam.core.estimates import Prediction
+from fgslam.core.measurements import Increment
 
 SIGMA = np.array([0.3, 0.4, 0.2])
 NO_IDS = np.empty(0, np.int64)

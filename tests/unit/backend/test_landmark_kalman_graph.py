@@ -24,16 +24,11 @@ from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
 from fgslam.backend.filters.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
 from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.types import (
-    EgoMotionStatus,
-    FloatArray,
-    Increment,
-    LandmarkMap,
-    Prediction,
-    RangeBearingSensor,
-    UpdateStats,
-)
+from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
+from fgslam.core.measurements import Increment
+from fgslam.core.sensors import RangeBearingSensor
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.motion import pose_prior
 from fgslam.factors.noise import Whitening

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from fgslam.backend.filters.landmark_rows import LandmarkRows
-from fgslam.core.types import IntArray, LandmarkMap
+from fgslam.core.arrays import IntArray
+from fgslam.core.estimates import LandmarkMap
 
 
 def fill(rows: LandmarkRows, ids: IntArray, rng: np.random.Generator, home: int) -> None:

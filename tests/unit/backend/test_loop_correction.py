@@ -9,15 +9,10 @@ import pytest
 
 from fgslam.backend.filters.loop_correction import DriveBook
 from fgslam.backend.filters.settings import LoopCorrectionSettings
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import EgoMotion, EgoMotionStatus
 from fgslam.core.geometry import pose
-from fgslam.core.types import (
-    EgoMotion,
-    EgoMotionStatus,
-    FloatArray,
-    LoopClosure,
-    Observations,
-    Odometry,
-)
+from fgslam.core.measurements import LoopClosure, Observations, Odometry
 
 _TRACKED = np.diag([1e-6] * 6)
 _WHEELS = np.diag([1e-4] * 6)

@@ -22,8 +22,10 @@ from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.types import Estimate, FloatArray, Increment, Odometry
+from fgslam.core.estimates import Estimate
+from fgslam.core.measurements import Increment, Odometry
 from fgslam.evaluation.consistency import pose_nees
 
 CLOSING: dict[str, EstimatorSettings] = {

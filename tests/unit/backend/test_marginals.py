@@ -19,9 +19,11 @@ from fgslam.backend.smoothers.marginals import (
     marginals_of,
 )
 from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
+from fgslam.core.estimates import Prediction
 from fgslam.core.floor import Floor
-from fgslam.core.types import FloatArray, Odometry, Prediction
+from fgslam.core.measurements import Odometry
 from fgslam.factors.cameras import RawPixelFactors
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior

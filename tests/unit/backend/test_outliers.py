@@ -18,7 +18,7 @@ from fgslam.backend.smoothers.outliers import (
     trimmed,
 )
 from fgslam.backend.smoothers.settings import BatchSettings
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 
 CAUCHY = KernelSettings("cauchy", 3.0)
 ROBUST: dict[str, EstimatorSettings] = SMOOTHERS | {

@@ -26,9 +26,9 @@ from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.backend.smoothers.settings import BatchSettings, Isam2Settings
 from fgslam.core import geometry as g
+from fgslam.core.estimates import EgoMotionStatus, Prediction
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.saved_map import SavedMap
-from fgslam.core.types import EgoMotionStatus, Prediction
 from fgslam.frontend.places.loops.confirmation import difference
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.arrival import Arrival, take_over

@@ -12,7 +12,9 @@ from smoothing import FREE, answer, assert_finite, ate, blackout, build, drawn, 
 from fgslam.backend.smoothers.segments import Segments, TrackedFrame, summarise
 from fgslam.backend.smoothers.settings import Isam2Settings
 from fgslam.core import geometry as g
-from fgslam.core.types import FloatArray, LandmarkMap, Observations
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import LandmarkMap
+from fgslam.core.measurements import Observations
 from fgslam.evaluation.consistency import judge
 
 KEYFRAMES = Isam2Settings(keyframe_every=5)

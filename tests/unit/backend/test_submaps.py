@@ -21,7 +21,7 @@ from fgslam.backend.filters.submaps import (
     transported,
 )
 from fgslam.core import geometry as g
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 
 COUNT = 41
 STEP = g.se3_exp(np.array([0.0, 2.0 * np.pi / 40, 0.0, 0.0, 0.0, 0.3]))

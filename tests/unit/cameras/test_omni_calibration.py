@@ -17,8 +17,8 @@ from fgslam.cameras.omni.ring_calibration import (
 )
 from fgslam.cameras.omni.straightness import upright_edges
 from fgslam.cameras.omni.unwrapping import unwrap_maps
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError
-from fgslam.core.types import FloatArray, Image
 
 FRAME = MirrorFrame(640, 480, (322.4, 236.7))
 MIRROR = HyperbolicMirror(FRAME, 32.0, 232.0, xi=0.92, focal_px=127.0)

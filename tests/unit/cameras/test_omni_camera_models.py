@@ -11,9 +11,9 @@ from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
 from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
 from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.cameras.omni.radial import MirrorFrame
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray
 
 
 def mirror(**changes: float) -> HyperbolicMirror:

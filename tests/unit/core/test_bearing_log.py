@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from homings import trial
 
+from fgslam.core.arrays import StateArrays
 from fgslam.core.bearing_log import BearingLog
 from fgslam.core.errors import MeasurementLogError
-from fgslam.core.types import StateArrays
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from fgslam.core import geometry as g
-from fgslam.core.types import CameraRig, FloatArray
+from fgslam.core.arrays import FloatArray
+from fgslam.core.sensors import CameraRig
 
 RIG = CameraRig(
     width=320,

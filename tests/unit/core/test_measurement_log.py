@@ -14,14 +14,8 @@ import pytest
 from fgslam.core import geometry as g
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.measurement_log import MeasurementLog, load_arrays
-from fgslam.core.types import (
-    CameraRig,
-    Increment,
-    LoopClosure,
-    Observations,
-    Odometry,
-    RangeBearingSensor,
-)
+from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
+from fgslam.core.sensors import CameraRig, RangeBearingSensor
 from fgslam.runs.checkpoint import save_log, write_arrays
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))

@@ -9,15 +9,10 @@ from simulated import RIG, noisy_odometry_of, play
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
-from fgslam.core.types import (
-    EgoMotionStatus,
-    FloatArray,
-    Increment,
-    LandmarkMap,
-    Observations,
-    Prediction,
-    RangeBearingSensor,
-)
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Prediction
+from fgslam.core.measurements import Increment, Observations
+from fgslam.core.sensors import RangeBearingSensor
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 

@@ -14,11 +14,13 @@ import pytest
 from fgslam.core import atomic_files as whole_files
 from fgslam.core import geometry as g
 from fgslam.core import saved_map as map_file
+from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import MapError, OutputError
-from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.estimates import LandmarkMap, Trajectory
+from fgslam.core.features import LandmarkAppearances
 from fgslam.core.measurement_log import MeasurementLog, load_arrays
 from fgslam.core.saved_map import SavedMap, load_map, require_rig, save_map
-from fgslam.core.types import CameraRig, LandmarkMap, StateArrays, Trajectory
+from fgslam.core.sensors import CameraRig
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 

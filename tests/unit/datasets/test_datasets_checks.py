@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from dataset_builders import curve, image_folder, picture, save, write_tum
 
-from fgslam.core.types import CameraRig
+from fgslam.core.sensors import CameraRig
 from fgslam.datasets.checks.findings import Finding, Level
 from fgslam.datasets.checks.images import check_images
 from fgslam.datasets.checks.matches import check_epipolar

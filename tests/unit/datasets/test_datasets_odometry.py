@@ -9,9 +9,10 @@ from dataset_builders import curve, image_folder, write_tum
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError, OdometryError
 from fgslam.core.geometry import inverse
-from fgslam.core.types import FloatArray, Odometry
+from fgslam.core.measurements import Odometry
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.odometry_settings import RecordedOdometrySettings
 from fgslam.datasets.recorded_odometry import (

@@ -18,10 +18,10 @@ from dataset_builders import (
     write_euroc_truth,
 )
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
 from fgslam.core.geometry import inverse, pose, project, se3_exp, so3_exp, transform_to_camera
 from fgslam.core.recordings import Sequence
-from fgslam.core.types import FloatArray
 from fgslam.datasets.asl_files import AslCamera, read_camera
 from fgslam.datasets.euroc import open_euroc, rectifier
 from fgslam.datasets.recording import Recording

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from dataset_builders import save
 
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
 from fgslam.core.geometry import project, transform_to_camera
 from fgslam.core.recordings import Sequence
-from fgslam.core.types import FloatArray, Image
 from fgslam.datasets.light_field import open_light_field, shift_image
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.recording_settings import LightFieldSettings

@@ -21,8 +21,8 @@ from fgslam.cameras.omni.settings import (
     OCamCalibSettings,
     RadialPolynomialSettings,
 )
+from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
-from fgslam.core.types import Image
 from fgslam.datasets.omni.camera_files import make_camera
 from fgslam.datasets.omni.opening import open_omni
 from fgslam.datasets.omni.panorama_reduction import PanoramaReduction

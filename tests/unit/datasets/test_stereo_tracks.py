@@ -14,9 +14,11 @@ from simulated import assert_same_bits
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.estimates import Prediction
 from fgslam.core.recordings import MeasurementRecording
-from fgslam.core.types import CameraRig, FloatArray, Prediction
+from fgslam.core.sensors import CameraRig
 from fgslam.datasets.measurements.settings import StereoTracksSettings
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.datasets.opening import open_measurements

@@ -7,10 +7,11 @@ import pytest
 from dataset_builders import curve, image_folder, write_tum
 from scipy import stats
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
+from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
-from fgslam.core.types import FloatArray, Odometry
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.odometry_settings import SyntheticOdometrySettings
 from fgslam.datasets.recording import Recording

@@ -12,9 +12,11 @@ from scipy.io import savemat
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
+from fgslam.core.estimates import Prediction, Trajectory
 from fgslam.core.recordings import MeasurementRecording
-from fgslam.core.types import CameraRig, FloatArray, Prediction, RangeBearingSensor, Trajectory
+from fgslam.core.sensors import CameraRig, RangeBearingSensor
 from fgslam.datasets.measurements.settings import UtiasRangeBearingSettings, UtiasStereoSettings
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.datasets.opening import open_measurements

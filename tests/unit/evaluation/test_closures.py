@@ -11,9 +11,11 @@ import pytest
 from simulated import RIG
 
 from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
+from fgslam.core.estimates import Trajectory
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import FloatArray, Increment, LoopClosure, Observations, Trajectory
+from fgslam.core.measurements import Increment, LoopClosure, Observations
 from fgslam.evaluation.closures import judge_closures
 from fgslam.runs.places import LOOPS_FILE, closures_of, place_numbers, read_closures, write_closures
 from fgslam.runs.recorder import RunRecorder

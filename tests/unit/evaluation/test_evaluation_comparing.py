@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from fgslam.core.estimates import LandmarkMap, Trajectory
 from fgslam.core.geometry import inverse, se3_exp, transform_to_world
 from fgslam.core.recordings import LandmarkTruth
-from fgslam.core.types import LandmarkMap, Trajectory
 from fgslam.evaluation.landmarks import landmark_errors
 from fgslam.evaluation.paired import mean_interval, paired_test
 from fgslam.evaluation.timing import time_growth

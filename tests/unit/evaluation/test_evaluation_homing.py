@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.core.homing_types import HomingEstimate, HomingTruth
+from fgslam.core.arrays import FloatArray
+from fgslam.core.homing import HomingEstimate, HomingTruth
 from fgslam.core.planar import between
-from fgslam.core.types import FloatArray
 from fgslam.evaluation.homing import homing_errors, summarise_homings
 
 TRUTH = HomingTruth(

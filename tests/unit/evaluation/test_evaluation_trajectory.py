@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import pose, quaternion_from_rotation, se3_exp, so3_exp
-from fgslam.core.types import FloatArray, Trajectory
 from fgslam.evaluation.trajectory import (
     Alignment,
     align,

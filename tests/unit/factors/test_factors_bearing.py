@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 import pytest
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import bearings
-from fgslam.core.types import FloatArray
 from fgslam.factors import bearing as f
 from fgslam.factors import bearing_residuals as r
 from fgslam.factors.keys import height_key, landmark_key, pose_key, target_key, velocity_key

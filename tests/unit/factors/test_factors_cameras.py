@@ -23,8 +23,9 @@ from factor_checks import (
 from simulated import RIG
 
 from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray
+from fgslam.core.sensors import CameraRig
 from fgslam.core.stereo_model import measurement_map, pixel_model, vertical_to_horizontal
-from fgslam.core.types import CameraRig, FloatArray
 from fgslam.factors import residuals
 from fgslam.factors.cameras import RawPixelFactors
 from fgslam.factors.noise import Whitening

@@ -18,8 +18,10 @@ from factor_checks import (
 )
 
 from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Prediction
 from fgslam.core.floor import DegreesOfFreedom, Floor
-from fgslam.core.types import FloatArray, Odometry, Prediction
+from fgslam.core.measurements import Odometry
 from fgslam.factors import residuals
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior, weak_point_prior
 from fgslam.factors.noise import STIFF_M, STIFF_RAD, positive_definite

@@ -11,7 +11,7 @@ from factor_checks import assert_near, random_covariance, root_information, valu
 from simulated import RIG
 
 from fgslam.core import geometry as g
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 from fgslam.factors.noise import KernelName, Whitening
 from fgslam.factors.stereo import FROM_MEASUREMENT, StereoFactors

@@ -23,7 +23,8 @@ from factor_checks import (
 )
 
 from fgslam.core import geometry as g
-from fgslam.core.types import FloatArray, RangeBearingSensor
+from fgslam.core.arrays import FloatArray
+from fgslam.core.sensors import RangeBearingSensor
 from fgslam.factors import residuals
 from fgslam.factors.noise import Whitening
 from fgslam.factors.range_bearing import RangeBearingFactors, bearing_axes

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.core.types import FloatArray, Image
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.frontend.homing.anchored_patches import align, anchor
 from tests.textured_room import TEXTURE
 

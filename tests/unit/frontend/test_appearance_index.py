@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.core.types import ByteArray
+from fgslam.core.arrays import ByteArray
 from fgslam.frontend.features import vocabulary
 from fgslam.frontend.places.relocalisation import appearance_index
 from fgslam.frontend.places.relocalisation.appearance_index import AppearanceIndex, Neighbours

@@ -10,14 +10,10 @@ import pytest
 from simulated import RIG, assert_same_bits
 
 from fgslam.core import geometry as g
-from fgslam.core.types import (
-    CameraRig,
-    FloatArray,
-    IntArray,
-    LandmarkMap,
-    Prediction,
-    StereoFeatures,
-)
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import LandmarkMap, Prediction
+from fgslam.core.features import StereoFeatures
+from fgslam.core.sensors import CameraRig
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.settings import DatabaseSettings
 from fgslam.frontend.tracking.visibility import predicted_covariance

@@ -12,15 +12,10 @@ from scipy import optimize, stats
 from simulated import RIG, assert_same_bits, points_in_view
 
 from fgslam.core import geometry as g
-from fgslam.core.types import (
-    CameraRig,
-    EgoMotion,
-    EgoMotionStatus,
-    FloatArray,
-    LandmarkMap,
-    Observations,
-    Prediction,
-)
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
+from fgslam.core.measurements import Observations
+from fgslam.core.sensors import CameraRig
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from fgslam.core.homing_types import BearingMatches, HomingVector, LocalMap, Refusal, RefusalReason
+from fgslam.core.arrays import FloatArray
+from fgslam.core.homing import BearingMatches, HomingVector, LocalMap, Refusal, RefusalReason
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray
 from fgslam.frontend.homing.epipolar import EpipolarTest
 from fgslam.frontend.homing.homing_ransac import _cells, estimate_homing_vector
 from fgslam.frontend.homing.homing_refinement import HomingRefinement, RefinementPrior

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import LandmarkMap
+from fgslam.core.features import LandmarkAppearances
 from fgslam.core.geometry import project, transform_to_camera
-from fgslam.core.map_types import LandmarkAppearances
-from fgslam.core.types import FloatArray, IntArray, LandmarkMap
 from fgslam.frontend.places.relocalisation.known_map import KnownMap
 from tests.known_places import RIG, looks, planar
 

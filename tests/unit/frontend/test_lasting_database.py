@@ -9,10 +9,11 @@ import pytest
 from simulated import RIG, assert_same_bits
 from test_database import at_pixels, database_of, landmark_map, stereo_features
 
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import MapError
-from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.estimates import Trajectory
+from fgslam.core.features import LandmarkAppearances
 from fgslam.core.saved_map import SavedMap
-from fgslam.core.types import FloatArray, IntArray, Trajectory
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.settings import (
     DatabaseSettings,

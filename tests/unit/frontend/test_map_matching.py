@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from fgslam.core.types import FloatArray, StereoFeatures
+from fgslam.core.arrays import FloatArray
+from fgslam.core.features import StereoFeatures
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.tracking.map_matching import MapMatcher, MapMatches
 from fgslam.frontend.tracking.settings import MapMatchingSettings

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from fgslam.core import geometry as g
+from fgslam.core.arrays import ByteArray, FloatArray, IntArray
 from fgslam.core.errors import MapError
-from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.estimates import LandmarkMap, Trajectory
+from fgslam.core.features import LandmarkAppearances
 from fgslam.core.saved_map import SavedMap, load_map, save_map
-from fgslam.core.types import ByteArray, CameraRig, FloatArray, IntArray, LandmarkMap, Trajectory
+from fgslam.core.sensors import CameraRig
 from fgslam.frontend.places import map_alignment
 from fgslam.frontend.places.map_alignment import Alignment, align_maps, tentative_pairs
 from fgslam.frontend.places.map_fusion import merge_maps

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.core.types import FloatArray, Image
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.frontend.features.colour_moments import PAIRS, PatchColours, colour_from_means
 from fgslam.frontend.features.omni_settings import ColourMomentSettings
 

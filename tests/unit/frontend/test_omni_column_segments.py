@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from fgslam.cameras.omni.panoramas import Cylinder
-from fgslam.core.homing_types import ColumnSegments
+from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.homing import ColumnSegments
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray, Image
 from fgslam.frontend.features.column_segments import ColumnSegmentFinder, dct_rows
 from fgslam.frontend.features.column_whitening import COVARIANCE, whitened
 from fgslam.frontend.features.omni_settings import (

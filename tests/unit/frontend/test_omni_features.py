@@ -11,10 +11,10 @@ import pytest
 from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
 from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
 from fgslam.cameras.omni.unwrapping import unwrap_maps
+from fgslam.core.arrays import Image
 from fgslam.core.errors import FrameError
-from fgslam.core.homing_types import FeatureKind, OmniFeatures, UprightFeatures
+from fgslam.core.homing import FeatureKind, OmniFeatures, UprightFeatures
 from fgslam.core.planar import wrap
-from fgslam.core.types import Image
 from fgslam.frontend.features.colour_sift import up_in_image, wrapping_period
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor, _View
 from fgslam.frontend.features.omni_settings import (

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import EstimatorError, FrameError
-from fgslam.core.homing_types import TrackedBearings
+from fgslam.core.homing import TrackedBearings
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray, Image
 from fgslam.frontend.homing.tracking import BearingTracker
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from tests.textured_room import CAMERA, angles, hits, picture

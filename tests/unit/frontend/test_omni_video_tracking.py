@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from fgslam.cameras.omni.panoramas import Equirectangular
-from fgslam.core.types import Image
+from fgslam.core.arrays import Image
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from fgslam.frontend.homing.video_tracking import ReplenishedTracker
 

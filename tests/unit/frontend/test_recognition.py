@@ -23,8 +23,9 @@ from simulated import RIG, assert_same_bits
 
 from fgslam.backend.filters.settings import LandmarkKalmanSettings, LoopCorrectionSettings
 from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import EgoMotionStatus
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import EgoMotionStatus, FloatArray
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.frontend.places.loops.confirmation import difference
 from fgslam.frontend.places.loops.recognition import PlaceRecognition

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from fgslam.core import geometry
-from fgslam.core.types import LandmarkMap, StereoFeatures
+from fgslam.core.estimates import LandmarkMap
+from fgslam.core.features import StereoFeatures
 from fgslam.frontend.places.relocalisation.alignment import align, align_in_space, rigid
 from fgslam.frontend.places.relocalisation.appearance_index import Neighbours
 from fgslam.frontend.places.relocalisation.known_map import KnownMap

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
+from fgslam.core.estimates import Relocalisation, Verdict
+from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import pose, so3_exp
-from fgslam.core.map_types import Relocalisation, Verdict
-from fgslam.core.types import FloatArray, StereoFeatures
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
 from tests.known_places import RIG, Place, error, floor, planar, room, seen, things

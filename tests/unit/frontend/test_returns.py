@@ -9,18 +9,11 @@ import pytest
 from simulated import RIG, assert_same_bits
 
 from fgslam.core import geometry as g
-from fgslam.core.map_types import LandmarkAppearances, Relocalisation, Verdict
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Relocalisation, Verdict
+from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import (
-    EgoMotionStatus,
-    FloatArray,
-    Increment,
-    IntArray,
-    LandmarkMap,
-    LoopClosure,
-    Observations,
-    StereoFeatures,
-)
+from fgslam.core.measurements import Increment, LoopClosure, Observations
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.places.loops.closure import close_loop
 from fgslam.frontend.places.loops.confirmation import Confirmation, difference, drift_allows

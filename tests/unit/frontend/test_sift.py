@@ -11,8 +11,9 @@ import pytest
 from scipy import ndimage
 from simulated import assert_same_bits
 
+from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.features import Features
 from fgslam.core.geometry import wrap_angle
-from fgslam.core.types import Features, FloatArray, Image
 from fgslam.frontend.features.settings import SiftSettings
 from fgslam.frontend.features.sift import SiftExtractor
 

@@ -9,7 +9,9 @@ import pytest
 from simulated import RIG
 
 from fgslam.core import geometry as g
-from fgslam.core.types import CameraRig, Features, FloatArray, StereoFeatures
+from fgslam.core.arrays import FloatArray
+from fgslam.core.features import Features, StereoFeatures
+from fgslam.core.sensors import CameraRig
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.stereo.matching import StereoMatcher, measurement_map
 from fgslam.frontend.stereo.settings import StereoSettings

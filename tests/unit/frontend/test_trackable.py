@@ -5,7 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from fgslam.core.homing_types import (
+from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.homing import (
     BearingMatches,
     ColumnSegments,
     FeatureKind,
@@ -13,7 +14,6 @@ from fgslam.core.homing_types import (
     UprightFeatures,
 )
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray, Image
 from fgslam.frontend.features.colour_sift import empty_features
 from fgslam.frontend.features.column_segments import empty_segments
 from fgslam.frontend.homing.trackable import move_to_trackable

@@ -10,7 +10,8 @@ import pytest
 from simulated import RIG, FeatureWorld, assert_same_bits, points_in_view
 
 from fgslam.core import geometry as g
-from fgslam.core.types import EgoMotionStatus, FloatArray, IntArray, LandmarkMap, Prediction
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.stereo.settings import StereoSettings

@@ -10,7 +10,8 @@ from simulated import RIG, FeatureWorld
 from test_tracker import CERTAIN, IMAGE, SETTINGS
 
 from fgslam.core import geometry as g
-from fgslam.core.types import BoolArray, FloatArray, IntArray, LandmarkMap, Prediction
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.settings import (

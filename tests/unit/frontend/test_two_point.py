@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import unit, wrap
-from fgslam.core.types import FloatArray
 from fgslam.frontend.homing.two_point import TwoPointSamples, TwoPointSolutions, solve_two_point
 
 poselib = pytest.importorskip("poselib", reason="the test oracle PoseLib is not installed")

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgslam.core.map_types import Verdict
-from fgslam.core.types import IntArray, LandmarkMap
+from fgslam.core.arrays import IntArray
+from fgslam.core.estimates import LandmarkMap, Verdict
 from fgslam.frontend.places.relocalisation.refinement import Refined
 from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
 from fgslam.frontend.places.relocalisation.tentative import Tentative

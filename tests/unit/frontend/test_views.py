@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.core.types import IntArray
+from fgslam.core.arrays import IntArray
 from fgslam.frontend.tracking.views import Places, ViewPool, Views
 
 ANGLE = np.deg2rad(20.0)

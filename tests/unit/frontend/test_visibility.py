@@ -10,7 +10,8 @@ from simulated import RIG
 from test_database import database_of, landmark_map
 
 from fgslam.core import geometry as g
-from fgslam.core.types import BoolArray, CameraRig, FloatArray
+from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.sensors import CameraRig
 from fgslam.frontend.tracking.settings import DatabaseSettings
 from fgslam.frontend.tracking.visibility import FieldOfView, directions_to
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.core.types import ByteArray
+from fgslam.core.arrays import ByteArray
 from fgslam.frontend.features import vocabulary
 from fgslam.frontend.tracking import views as views_module
 from fgslam.frontend.tracking.views import ViewPool, Views

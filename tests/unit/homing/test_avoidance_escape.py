@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import to_robot, wrap
-from fgslam.core.types import FloatArray
 from fgslam.homing.avoidance import CorridorAvoidance, RangeScan
 from fgslam.homing.command import Drive
 from fgslam.homing.settings import AvoidanceSettings

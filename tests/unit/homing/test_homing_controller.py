@@ -16,8 +16,9 @@ from fgslam.backend.homing.settings import (
     HomingGraphSettings,
     SnapshotSettings,
 )
+from fgslam.core.arrays import ByteArray, FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing_types import (
+from fgslam.core.homing import (
     HomingEstimate,
     HomingStart,
     HomingVector,
@@ -28,7 +29,6 @@ from fgslam.core.homing_types import (
     TrackedBearings,
 )
 from fgslam.core.planar import bearings, between, unit, wrap
-from fgslam.core.types import ByteArray, FloatArray
 from fgslam.homing.command import Command, HomingState
 from fgslam.homing.controller import HomingController
 from fgslam.homing.eyes import Sighting

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import wrap
-from fgslam.core.types import FloatArray
 from fgslam.homing.avoidance import (
     CorridorAvoidance,
     NoAvoidance,

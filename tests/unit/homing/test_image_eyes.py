@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fgslam.cameras.omni.panoramas import Equirectangular
-from fgslam.core.homing_types import FeatureKind, Refusal, RefusalReason
+from fgslam.core.homing import FeatureKind, Refusal, RefusalReason
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings

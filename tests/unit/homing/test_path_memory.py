@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import StoredMapError
-from fgslam.core.homing_types import ColumnSegments, OmniFeatures, UprightFeatures
+from fgslam.core.homing import ColumnSegments, OmniFeatures, UprightFeatures
 from fgslam.homing.feature_file import pack_features
 from fgslam.homing.path_memory import FORMAT, PathMemory
 from tests.landmark_world import no_columns

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from fgslam.core.homing_types import HomingVector, OmniFeatures
-from fgslam.core.types import IntArray
+from fgslam.core.arrays import IntArray
+from fgslam.core.homing import HomingVector, OmniFeatures
 from fgslam.homing.linking import Answer, Link, Pair
 from fgslam.homing.settings import TopologicalMapSettings
 from fgslam.homing.third_views import ThirdViews

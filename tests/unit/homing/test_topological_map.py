@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import StoredMapError
-from fgslam.core.homing_types import HomingVector, OmniFeatures, Refusal, RefusalReason
+from fgslam.core.homing import HomingVector, OmniFeatures, Refusal, RefusalReason
 from fgslam.core.planar import between, wrap
-from fgslam.core.types import FloatArray
 from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.homing.link_checks import LinkChecks, between_misfit, heading_residuals

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from simulated import Drive, simulate
 
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import OutputError
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import inverse, pose, rotation_from_quaternion, se3_exp
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import FloatArray, IntArray, Trajectory
 from fgslam.report.graph_file import (
     EXACT_SIGMA,
     PoseLandmarkGraph,

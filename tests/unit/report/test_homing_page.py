@@ -12,7 +12,7 @@ import pytest
 from homing_pages import FEATURES, drive, estimates, page, truth
 from reports import HOSTILE
 
-from fgslam.core.types import FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.report.homing import Column, TextTable, write_homing_report
 from fgslam.report.homing.curves import claimed_against_true, sorted_errors
 from fgslam.report.homing.local_map import MAX_MOMENTS, SIGMAS, ellipse, local_map_figure, upwards

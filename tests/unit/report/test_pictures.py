@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from fgslam.core.arrays import Image
 from fgslam.core.errors import OutputError
+from fgslam.core.features import Features
 from fgslam.core.geometry import pose, se3_exp, so3_exp
-from fgslam.core.types import Features, Image
 from fgslam.report.pictures import (
     MapDrawing,
     draw_birds_eye,

@@ -17,9 +17,9 @@ import pytest
 from PIL import Image
 from reports import HOSTILE, estimator_report, full_report, loop, picture, without_truth
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import OutputError
 from fgslam.core.geometry import so3_exp
-from fgslam.core.types import FloatArray
 from fgslam.report.page import (
     Column,
     Comparison,

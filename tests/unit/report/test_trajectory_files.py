@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import DatasetError, OutputError
+from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import se3_exp
-from fgslam.core.types import Trajectory
 from fgslam.report.trajectories import (
     read_covariances,
     read_kitti,

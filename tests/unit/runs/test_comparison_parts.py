@@ -15,9 +15,9 @@ from simulated import RIG, Drive, simulate
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.backend.smoothers.settings import Isam2Settings
 from fgslam.core.errors import ConfigError, DatasetError
+from fgslam.core.estimates import LandmarkMap
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LandmarkTruth
-from fgslam.core.types import LandmarkMap
 from fgslam.evaluation.consistency import Nees
 from fgslam.report.comparison_table import (
     RESULT_COLUMNS,

@@ -12,7 +12,7 @@ import pytest
 from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
 from fgslam.cameras.omni.radial import MirrorFrame
 from fgslam.cameras.omni.settings import EquirectangularSettings, HyperbolicMirrorSettings
-from fgslam.core.types import Image
+from fgslam.core.arrays import Image
 from fgslam.datasets.omni.settings import OmniPathSettings
 from fgslam.runs.homing.mirror_check import open_checked
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.core.homing_types import HomingVector, Refusal, RefusalReason
+from fgslam.core.arrays import FloatArray
+from fgslam.core.homing import HomingVector, Refusal, RefusalReason
 from fgslam.core.planar import compose, wrap
-from fgslam.core.types import FloatArray
 from fgslam.runs.homing.pair_answers import (
     PairAnswer,
     answer_numbers,

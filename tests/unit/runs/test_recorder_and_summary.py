@@ -8,22 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgslam.core.geometry import se3_exp
-from fgslam.core.measurement_log import MeasurementLog, load_arrays
-from fgslam.core.types import (
-    CameraRig,
+from fgslam.core.estimates import (
     EgoMotion,
     EgoMotionStatus,
     Estimate,
-    Features,
-    Frame,
-    Increment,
     LandmarkMap,
-    Observations,
-    StereoFeatures,
     Trajectory,
     UpdateStats,
 )
+from fgslam.core.features import Features, StereoFeatures
+from fgslam.core.geometry import se3_exp
+from fgslam.core.measurement_log import MeasurementLog, load_arrays
+from fgslam.core.measurements import Increment, Observations
+from fgslam.core.recordings import Frame
+from fgslam.core.sensors import CameraRig
 from fgslam.runs.checkpoint import write_arrays
 from fgslam.runs.judging import Truth
 from fgslam.runs.recorder import STAGES, FrameRow, RunRecorder

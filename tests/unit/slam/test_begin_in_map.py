@@ -17,20 +17,13 @@ from fgslam.backend.protocol import Estimator, MapUser
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.core.map_types import LandmarkAppearances
+from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction, Trajectory
+from fgslam.core.features import LandmarkAppearances
+from fgslam.core.measurements import Increment, Observations
 from fgslam.core.saved_map import SavedMap
-from fgslam.core.types import (
-    CameraRig,
-    EgoMotion,
-    EgoMotionStatus,
-    FloatArray,
-    Increment,
-    LandmarkMap,
-    Observations,
-    Prediction,
-    Trajectory,
-)
+from fgslam.core.sensors import CameraRig
 from fgslam.slam.arrival import Arrival, require_map_user, take_over
 from fgslam.slam.factory import make_estimator
 

@@ -6,7 +6,8 @@ from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.core.errors import ConfigError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
-from fgslam.core.types import CameraRig, MeasurementType
+from fgslam.core.measurements import MeasurementType
+from fgslam.core.sensors import CameraRig
 from fgslam.runs.config import parse_config
 from fgslam.runs.opening import open_sequence
 from fgslam.slam.factory import make_estimator, require_support

@@ -11,7 +11,9 @@ import pytest
 from simulated import RIG, assert_same_bits
 
 from fgslam.core import geometry as g
-from fgslam.core.types import CameraRig, FloatArray, Odometry
+from fgslam.core.arrays import FloatArray
+from fgslam.core.measurements import Odometry
+from fgslam.core.sensors import CameraRig
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.slam.motion import ConstantVelocityMotion, OdometryMotion
 

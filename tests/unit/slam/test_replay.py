@@ -14,8 +14,8 @@ from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.settings import DeadReckoningSettings, LandmarkKalmanSettings
 from fgslam.backend.smoothers.settings import BatchSettings
 from fgslam.core.errors import EstimatorError, MeasurementLogError
+from fgslam.core.estimates import Estimate, Trajectory, UpdateStats
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import Estimate, Trajectory, UpdateStats
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.runs.judging import Truth, judge_replay

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.planar import between, wrap
-from fgslam.core.types import FloatArray
 from fgslam.worlds.floor_space import FloorSpace
 from fgslam.worlds.house.disturbances import CameraTilt, camera_pose, exposed, noisy
 from fgslam.worlds.house.floor_plan import DEPTH, WIDTH, room_at

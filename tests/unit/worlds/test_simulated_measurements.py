@@ -13,9 +13,11 @@ from simulated import assert_same_bits
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import ConfigError
+from fgslam.core.estimates import Prediction, Trajectory
 from fgslam.core.recordings import MeasurementRecording
-from fgslam.core.types import CameraRig, FloatArray, IntArray, Prediction, Trajectory
+from fgslam.core.sensors import CameraRig
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings, SyntheticOdometrySettings
 from fgslam.datasets.opening import open_measurements
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory

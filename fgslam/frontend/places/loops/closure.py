@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import EgoMotion, LandmarkMap, Relocalisation
+from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import adjoint, congruence, inverse
-from fgslam.core.map_types import Relocalisation
-from fgslam.core.types import (
-    EgoMotion,
-    FloatArray,
-    IntArray,
-    LandmarkMap,
-    LoopClosure,
-    StereoFeatures,
-)
+from fgslam.core.measurements import LoopClosure
 from fgslam.frontend.places.loops.memory import SightingMemory
 from fgslam.frontend.places.settings import LoopSettings
 from fgslam.frontend.tracking.ego_motion import PoseProblem

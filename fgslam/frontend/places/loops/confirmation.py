@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import inverse, se3_log
-from fgslam.core.types import FloatArray
 from fgslam.frontend.places.settings import LoopSettings
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from fgslam.core.map_types import LandmarkAppearances
-from fgslam.core.types import FloatArray, IntArray, LandmarkMap
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import LandmarkMap
+from fgslam.core.features import LandmarkAppearances
 from fgslam.frontend.features.candidates import choose
 from fgslam.frontend.features.settings import AppearanceSettings
 

@@ -9,16 +9,10 @@ import numpy as np
 from scipy.sparse import lil_array
 from scipy.sparse.csgraph import dijkstra
 
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
+from fgslam.core.estimates import LandmarkMap
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import (
-    BoolArray,
-    FloatArray,
-    Increment,
-    IntArray,
-    LandmarkMap,
-    Observations,
-    StateArrays,
-)
+from fgslam.core.measurements import Increment, Observations
 
 _RETURN_FRAMES = 30  # unseen for so long: tracking them again ties the frame to an older one
 _RETURN_MATCHES = 10  # of them, as for the ties of the filter's backward correction; so many of a

@@ -7,20 +7,12 @@ from typing import Protocol
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.estimates import LandmarkMap, Prediction, Relocalisation, UpdateStats
+from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.geometry import inverse
-from fgslam.core.map_types import LandmarkAppearances, Relocalisation
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.types import (
-    FloatArray,
-    Increment,
-    IntArray,
-    LandmarkMap,
-    LoopClosure,
-    Prediction,
-    StateArrays,
-    StereoFeatures,
-    UpdateStats,
-)
+from fgslam.core.measurements import Increment, LoopClosure
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.places.loops.closure import close_loop, is_sharp
 from fgslam.frontend.places.loops.confirmation import Confirmation, difference, drift_allows

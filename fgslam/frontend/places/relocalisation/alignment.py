@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.floor import Floor
-from fgslam.core.types import BoolArray, FloatArray
 
 _RIGID_SIGMAS = 3.0
 _LEAST_SPREAD_M = 0.15  # shorter samples turn the pose by more than any measurement mends

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.map_types import Words
-from fgslam.core.types import ByteArray, FloatArray, IntArray
+from fgslam.core.arrays import ByteArray, FloatArray, IntArray
+from fgslam.core.features import Words
 from fgslam.frontend.features.vocabulary import nearest_words, vocabulary, words_of
 
 _CHUNK = 4096  # descriptors compared at a time; their distances stay in the cache

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.floor import Floor
-from fgslam.core.types import FloatArray, IntArray
 from fgslam.frontend.places.relocalisation.alignment import align_planar, floor_axes
 from fgslam.frontend.places.relocalisation.least_squares import refine
 from fgslam.frontend.places.relocalisation.proposals import Evidence, Proposals

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import LandmarkMap
+from fgslam.core.features import LandmarkAppearances
 from fgslam.core.geometry import project, transform_to_camera
-from fgslam.core.map_types import LandmarkAppearances
-from fgslam.core.types import CameraRig, FloatArray, IntArray, LandmarkMap
+from fgslam.core.sensors import CameraRig
 from fgslam.frontend.places.relocalisation.appearance_index import AppearanceIndex
 
 _NEAREST_DEPTH_M = 0.3

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import inverse_spd3, so3_exp
-from fgslam.core.types import CameraRig, FloatArray, IntArray
+from fgslam.core.sensors import CameraRig
 from fgslam.frontend.places.relocalisation.residuals import Pairs, residuals
 
 _HOPELESS = 1e-12  # of the reduced Hessian's reciprocal condition

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.types import BoolArray, CameraRig, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.sensors import CameraRig
 from fgslam.frontend.places.relocalisation.residuals import Pairs, log_likelihoods, residuals
 from fgslam.frontend.places.relocalisation.tentative import Tentative
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.floor import Floor
-from fgslam.core.types import BoolArray, FloatArray, IntArray
 from fgslam.frontend.places.relocalisation.alignment import align, rigid, sample_size
 from fgslam.frontend.places.relocalisation.least_squares import refine
 from fgslam.frontend.places.relocalisation.proposals import Evidence, Proposals

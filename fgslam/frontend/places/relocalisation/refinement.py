@@ -6,8 +6,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from fgslam.core.features import StereoFeatures
 from fgslam.core.floor import Floor
-from fgslam.core.types import BoolArray, ByteArray, CameraRig, FloatArray, IntArray, StereoFeatures
+from fgslam.core.sensors import CameraRig
 from fgslam.frontend.places.relocalisation.known_map import KnownMap
 from fgslam.frontend.places.relocalisation.least_squares import refine
 from fgslam.frontend.places.relocalisation.proposals import Evidence, Proposals

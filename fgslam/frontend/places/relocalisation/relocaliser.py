@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core.errors import ConfigError
+from fgslam.core.estimates import LandmarkMap, Relocalisation
+from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.floor import Floor
-from fgslam.core.map_types import LandmarkAppearances, Relocalisation
-from fgslam.core.types import CameraRig, LandmarkMap, StereoFeatures
+from fgslam.core.sensors import CameraRig
 from fgslam.frontend.places.relocalisation import hough, ransac
 from fgslam.frontend.places.relocalisation.known_map import KnownMap
 from fgslam.frontend.places.relocalisation.proposals import Evidence, Proposals, apart, distinct

@@ -12,15 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.estimates import LandmarkMap
+from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import inverse_spd3, point_pose_jacobian, project, projection_jacobian
-from fgslam.core.types import (
-    BoolArray,
-    CameraRig,
-    FloatArray,
-    IntArray,
-    LandmarkMap,
-    StereoFeatures,
-)
+from fgslam.core.sensors import CameraRig
 
 _NEAREST_DEPTH_M = 0.1
 _LOG_TWO_PI = float(np.log(2.0 * np.pi))

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.estimates import LandmarkMap
+from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import wrap_angle
-from fgslam.core.map_types import LandmarkAppearances
-from fgslam.core.types import BoolArray, FloatArray, IntArray, LandmarkMap, StereoFeatures
 from fgslam.frontend.features.candidates import pairs_within
 from fgslam.frontend.places.relocalisation.appearance_index import Neighbours
 from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.map_types import Relocalisation, Verdict
-from fgslam.core.types import LandmarkMap
+from fgslam.core.estimates import LandmarkMap, Relocalisation, Verdict
 from fgslam.frontend.places.relocalisation.refinement import Refined
 from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
 from fgslam.frontend.places.relocalisation.tentative import Tentative

@@ -14,8 +14,8 @@ from enum import Enum
 
 import numpy as np
 
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
 from fgslam.core.planar import between, rotation, wrap
-from fgslam.core.types import BoolArray, ByteArray, FloatArray, IntArray
 
 
 def among(ids: IntArray, others: IntArray) -> BoolArray:

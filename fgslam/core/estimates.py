@@ -1,0 +1,210 @@
+"""Estimates: poses, trajectories, maps, and how each was found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Stamped poses of the reference camera: timestamps (n,) increasing, ``wTc`` (n, 4, 4)."""
+
+    timestamps: FloatArray
+    poses: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkMap:
+    """Landmark positions of an estimator, ids ascending.
+
+    Attributes:
+        ids: (n,) ascending.
+        positions: (n, 3) world, metres.
+        covariances: (n, 3, 3), metres squared.
+    """
+
+    ids: IntArray
+    positions: FloatArray
+    covariances: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def select(self, keep: BoolArray | IntArray) -> LandmarkMap:
+        """The chosen rows, ascending, as a new value."""
+        return LandmarkMap(self.ids[keep], self.positions[keep], self.covariances[keep])
+
+    def without(self, ids: IntArray) -> LandmarkMap:
+        """The map but for these landmarks, as a new value."""
+        return self.select(~np.isin(self.ids, ids))
+
+    def rows(self, ids: IntArray) -> IntArray:
+        """Row of each id. Raises KeyError when one is absent."""
+        rows = np.searchsorted(self.ids, ids)
+        if len(ids) and (rows.max() >= len(self.ids) or not np.array_equal(self.ids[rows], ids)):
+            raise KeyError(f"landmarks not in the map: {np.setdiff1d(ids, self.ids)[:5].tolist()}")
+        return rows
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """Pose expected before the frame's observations: ``wTc`` (4, 4) and its covariance (6, 6)."""
+
+    wTc: FloatArray
+    covariance: FloatArray
+
+
+class EgoMotionStatus(str, Enum):
+    """How the pose of a frame was found."""
+
+    FIRST = "first"
+    OK = "ok"
+    CAPPED = "capped"
+    RELOCALISED = "relocalised"
+    TOO_FEW_MATCHES = "too_few_matches"
+    DIVERGED = "diverged"
+    NO_IMAGE = "no_image"
+
+    @property
+    def measured(self) -> bool:
+        """Whether the landmarks had a say in the pose (otherwise it is the odometry's)."""
+        return self in (
+            EgoMotionStatus.OK,
+            EgoMotionStatus.CAPPED,
+            EgoMotionStatus.RELOCALISED,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EgoMotion:
+    """Result of the least-squares pose (Se et al. 3.3).
+
+    Attributes:
+        wTc: (4, 4) estimated pose.
+        covariance: (6, 6) in the tangent space at ``wTc``.
+        inliers: (k,) which of the given matches were used in the last iteration.
+        residuals: (k,) image residual E of every match at ``wTc``, pixels (range sensor: radians).
+        status: how it ended.
+        iterations: Newton steps taken.
+        weighted_at: (4, 4) pose at which the last minimisation's weights were evaluated; None
+            where nothing was minimised.
+    """
+
+    wTc: FloatArray
+    covariance: FloatArray
+    inliers: BoolArray
+    residuals: FloatArray
+    status: EgoMotionStatus
+    iterations: int
+    weighted_at: FloatArray | None = None
+
+    @property
+    def coherent(self) -> bool:
+        """Whether most of what was matched was used; a pose that was not measured uses nothing."""
+        return not self.status.measured or 2 * int(self.inliers.sum()) >= len(self.inliers)
+
+    @property
+    def correlation(self) -> FloatArray:
+        """(6, 6) correlations of the pose, [rotation, translation]; 0 where motion is excluded.
+
+        The known one is that of sideways motion and yaw (Se et al. 5).
+        """
+        return correlation(self.covariance)
+
+
+def correlation(covariance: FloatArray) -> FloatArray:
+    """Correlations (..., n, n) of covariances (..., n, n); 0 for what has no variance."""
+    sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
+    scale = np.divide(1.0, sigma, out=np.zeros_like(sigma), where=sigma > 0.0)
+    return np.asarray(covariance * scale[..., :, None] * scale[..., None, :])
+
+
+class Verdict(str, Enum):
+    """How a search for a pose without a prior ended."""
+
+    FOUND = "found"
+    TOO_FEW_MATCHES = "too_few_matches"
+    TOO_FEW_INLIERS = "too_few_inliers"
+    AMBIGUOUS = "ambiguous"
+    CONTRADICTED = "contradicted"
+    INACCURATE = "inaccurate"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Relocalisation:
+    """The pose of a frame in a map, found without a prior, and why it is believed or refused.
+
+    Attributes:
+        verdict: FOUND, or why the best pose is refused.
+        wTc: (4, 4) best pose; the identity where there is none.
+        covariance: (6, 6) of it, in the tangent space at ``wTc``; NaN where there is none.
+        features: (k,) indices of the frame's features that agree with the pose.
+        ids: (k,) the landmarks that they match, unique.
+        candidates: tentative matches by appearance.
+        expected: landmarks that the pose should see.
+        residual_px: root mean square image residual of the inliers; NaN where there are none.
+        second: inliers of the second-best pose elsewhere in the map, 0 where there is none.
+        why: the verdict in words with its numbers.
+    """
+
+    verdict: Verdict
+    wTc: FloatArray
+    covariance: FloatArray
+    features: IntArray
+    ids: IntArray
+    candidates: int
+    expected: int
+    residual_px: float
+    second: int
+    why: str
+
+    @property
+    def found(self) -> bool:
+        """Whether the pose is to be believed."""
+        return self.verdict is Verdict.FOUND
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UpdateStats:
+    """What an update did: pose afterwards and the numbers that tests of consistency need.
+
+    Attributes:
+        wTc: (4, 4) pose of the frame just processed.
+        covariance: (6, 6) its marginal.
+        landmarks: number of landmarks in the estimator.
+        nis: normalised innovation squared of the matched observations, or NaN.
+        nis_dof: degrees of freedom of ``nis``.
+        closed: for each of the increment's loops whether the estimator took it (or met it already).
+    """
+
+    wTc: FloatArray
+    covariance: FloatArray
+    landmarks: int
+    nis: float
+    nis_dof: int
+    closed: tuple[bool, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """An estimator's whole answer.
+
+    Attributes:
+        trajectory: all poses as known now.
+        covariances: (n, 6, 6) their marginals; NaN where one cannot be had.
+        landmarks: the map, with marginal covariances.
+        remarks: what the estimator had to mend or leave out, in words.
+    """
+
+    trajectory: Trajectory
+    covariances: FloatArray
+    landmarks: LandmarkMap
+    remarks: tuple[str, ...] = ()

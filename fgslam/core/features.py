@@ -1,0 +1,124 @@
+"""Features of images, matched over the rig, and how the landmarks made of them look."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from fgslam.core.arrays import ByteArray, FloatArray, IntArray
+from fgslam.core.measurements import Observations
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """SIFT features of one image.
+
+    Attributes:
+        xy: (n, 2) sub-pixel (column, row).
+        scale: (n,) standard deviation of the Gaussian at which the feature was found, in pixels.
+        orientation: (n,) radians, clockwise from the image's x axis, in [0, 2 pi).
+        descriptors: (n, 128) uint8.
+    """
+
+    xy: FloatArray
+    scale: FloatArray
+    orientation: FloatArray
+    descriptors: ByteArray
+
+    def __len__(self) -> int:
+        return len(self.scale)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoFeatures:
+    """Features matched over the rig: the paper's [r, c, s, o, d, X, Y, Z] (Se et al. 3).
+
+    Attributes:
+        measurement: (n, 3) (column, row, disparity) in the reference image, pixels.
+        measurement_covariance: (n, 3, 3) of the above, pixels squared.
+        scale: (n,) mean over the images, pixels.
+        orientation: (n,) circular mean over the images, radians.
+        descriptors: (n, 128) uint8, of the reference image.
+        position: (n, 3) in the reference camera's frame, metres.
+        position_covariance: (n, 3, 3), metres squared.
+        pixels: (n, 3, 2) raw (column, row) in right, left and top image; NaN without a top camera.
+    """
+
+    measurement: FloatArray
+    measurement_covariance: FloatArray
+    scale: FloatArray
+    orientation: FloatArray
+    descriptors: ByteArray
+    position: FloatArray
+    position_covariance: FloatArray
+    pixels: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.scale)
+
+    def observations(self, which: IntArray, ids: IntArray, is_new: bool) -> Observations:
+        """Some of the features as observations of the landmarks ``ids``."""
+        return Observations(
+            ids,
+            self.measurement[which],
+            self.measurement_covariance[which],
+            self.pixels[which],
+            np.full(len(which), is_new),
+        )
+
+    @staticmethod
+    def empty() -> StereoFeatures:
+        """No feature at all."""
+        return StereoFeatures(
+            measurement=np.empty((0, 3)),
+            measurement_covariance=np.empty((0, 3, 3)),
+            scale=np.empty(0),
+            orientation=np.empty(0),
+            descriptors=np.empty((0, 128), np.uint8),
+            position=np.empty((0, 3)),
+            position_covariance=np.empty((0, 3, 3)),
+            pixels=np.empty((0, 3, 2)),
+        )
+
+
+Words = npt.NDArray[np.int16]
+"""(v,) the cell of the vocabulary (``frontend.features.vocabulary``) of each descriptor."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkAppearances:
+    """How landmarks look, one row a stored view; a landmark may have several (Se et al. 6.3).
+
+    Attributes:
+        ids: (v,) identity of the landmark that each view belongs to, ascending.
+        descriptors: (v, 128) uint8.
+        size: (v,) physical size, scale times depth: pixels times metres.
+        orientation: (v,) radians, as in the image.
+        direction: (v, 3) unit vector from the camera to the landmark, world; NaN where unknown.
+        words: (v,) of the descriptors, where they are at hand; None where they must be found. No
+            part of what is known: they follow from the descriptors.
+    """
+
+    ids: IntArray
+    descriptors: ByteArray
+    size: FloatArray
+    orientation: FloatArray
+    direction: FloatArray
+    words: Words | None = None
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def of(self, ids: IntArray) -> LandmarkAppearances:
+        """Only the views of the named landmarks (any order; unknown ones give none)."""
+        keep = np.isin(self.ids, ids)
+        return LandmarkAppearances(
+            self.ids[keep],
+            self.descriptors[keep],
+            self.size[keep],
+            self.orientation[keep],
+            self.direction[keep],
+            None if self.words is None else self.words[keep],
+        )

@@ -1,0 +1,126 @@
+"""Measurements, as every estimator consumes them and as the log keeps them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+
+
+class MeasurementType(str, Enum):
+    """Kinds of measurement that an estimator may support; checked before a run starts."""
+
+    ODOMETRY = "odometry"
+    STEREO = "stereo"
+    RANGE_BEARING = "range_bearing"
+    LOOP = "loop"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """Motion between two consecutive frames, with its uncertainty.
+
+    Attributes:
+        motion: (4, 4) ``pTn``: the pose at the new frame, in the frame of the previous one.
+        covariance: (6, 6) of the tangent vector at the new pose, [rotation, translation].
+    """
+
+    motion: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Landmark observations of one frame, with their identity.
+
+    Attributes:
+        ids: (k,) landmark identities, unique within the frame.
+        measurement: (k, 3) (column, row, disparity), pixels; of a range-bearing sensor
+            (azimuth, elevation, range), radians and metres.
+        covariance: (k, 3, 3) of the measurement.
+        pixels: (k, 3, 2) raw pixels in right, left, top; NaN where there is no such camera.
+        is_new: (k,) True where this observation initiates the landmark (Type IV).
+    """
+
+    ids: IntArray
+    measurement: FloatArray
+    covariance: FloatArray
+    pixels: FloatArray
+    is_new: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def select(self, keep: BoolArray | IntArray) -> Observations:
+        """The chosen rows, as a new value."""
+        return Observations(
+            self.ids[keep],
+            self.measurement[keep],
+            self.covariance[keep],
+            self.pixels[keep],
+            self.is_new[keep],
+        )
+
+    def join(self, other: Observations) -> Observations:
+        """Both, one after the other."""
+        return Observations(
+            np.concatenate([self.ids, other.ids]),
+            np.concatenate([self.measurement, other.measurement]),
+            np.concatenate([self.covariance, other.covariance]),
+            np.concatenate([self.pixels, other.pixels]),
+            np.concatenate([self.is_new, other.is_new]),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopClosure:
+    """A place seen again: the frame sees landmarks of an earlier frame, under new identities.
+
+    Attributes:
+        frame: position in the log of the earlier frame (0 is the log's first). Of a part of a saved
+            map that the run has yet to see: that in which it entered the map, held still between.
+        oTc: (4, 4) pose of the present camera in the earlier frame's camera.
+        covariance: (6, 6) of ``oTc``, [rotation, translation], in the tangent space at it.
+        observations: the earlier landmarks as the present frame measures them, under their old
+            identities.
+        merged: (m, 2) pairs (identity that ends, identity that stays) of landmarks that are one if
+            this is the same place; the frame observes the first. Where the live estimator took the
+            closure, it is pruned in the next frame (older logs: in this one).
+    """
+
+    frame: int
+    oTc: FloatArray
+    covariance: FloatArray
+    observations: Observations
+    merged: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Increment:
+    """Everything that one frame adds to the problem: what the log stores, what estimators consume.
+
+    Attributes:
+        index: the recording's frame number.
+        timestamp: seconds.
+        odometry: camera motion since the previous increment; None for the first one.
+        observations: matched (Type III) and new (Type IV) landmarks.
+        rejected: (k,) matched observations that the live run's pose rejected as outliers.
+        missed_ids: landmarks expected in view and not matched (Type II).
+        pruned_ids: landmarks that the database dropped after this frame; those merged into others
+            because of the last frame's loop closure among them.
+        loops: places recognised in this frame, verified; each estimator judges them for itself.
+        relocalised: placed by its landmarks alone, without a prior; its odometry tells nothing.
+    """
+
+    index: int
+    timestamp: float
+    odometry: Odometry | None
+    observations: Observations
+    rejected: BoolArray
+    missed_ids: IntArray
+    pruned_ids: IntArray
+    loops: tuple[LoopClosure, ...] = ()
+    relocalised: bool = False
