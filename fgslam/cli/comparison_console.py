@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 from rich.table import Table
 
-from fgslam.report.comparison_table import value_at
+from fgslam.evaluation.metrics import value_at
 from fgslam.runs.baseline import Deviation
 from fgslam.runs.comparison import Compared
 from fgslam.runs.trial_results import failures_of, together

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from fgslam.core.atomic_files import write_text
-from fgslam.report.metrics import EstimatorMetrics
+from fgslam.evaluation.metrics import EstimatorMetrics, value_at
 
 RESULT_COLUMNS: tuple[tuple[str, str], ...] = (
     ("kind", "kind"),
@@ -90,14 +89,6 @@ def write_comparison_csv(
             cells = [_cell(value_at(values, where)) for _, where in columns]
             writer.writerow([run, title, *cells])
     write_text(path, buffer.getvalue())
-
-
-def value_at(values: Mapping[str, Any], where: str) -> Any:
-    """The value under a dotted path; None where there is none or it is not finite."""
-    at: Any = values
-    for key in where.split("."):
-        at = at.get(key) if isinstance(at, Mapping) else None
-    return None if isinstance(at, float) and not math.isfinite(at) else at
 
 
 def _cell(value: Any) -> str:

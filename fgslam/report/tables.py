@@ -13,7 +13,8 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.core.atomic_files import write_text
-from fgslam.report.metrics import JsonValue, plain
+from fgslam.evaluation.metrics import JsonValue
+from fgslam.report.metrics import plain
 
 Cell: TypeAlias = "str | bool | int | float | np.generic | None"
 

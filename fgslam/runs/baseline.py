@@ -11,8 +11,8 @@ from typing import Any, TypeAlias
 
 from fgslam.core.atomic_files import write_text
 from fgslam.core.errors import ConfigError
-from fgslam.report.comparison_table import RESULT_COLUMNS, value_at
-from fgslam.report.metrics import EstimatorMetrics
+from fgslam.evaluation.metrics import EstimatorMetrics, value_at
+from fgslam.report.comparison_table import RESULT_COLUMNS
 
 Results: TypeAlias = Mapping[str, Mapping[str, EstimatorMetrics]]
 """Metrics by the run's name and the estimator's title."""

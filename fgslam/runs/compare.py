@@ -7,8 +7,9 @@ from pathlib import Path
 
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.errors import ConfigError, OutputError
+from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
 from fgslam.report.comparison_table import write_comparison_csv
-from fgslam.report.metrics import EstimatorMetrics, JsonValue, read_metrics, write_metrics
+from fgslam.report.metrics import read_metrics, write_metrics
 from fgslam.runs.choosing import EVERY, Choice, choose
 from fgslam.runs.comparison import (
     COMPARISON_FILE,

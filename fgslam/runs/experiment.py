@@ -15,8 +15,8 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.features import StereoFeatures
 from fgslam.core.recordings import Sequence
 from fgslam.core.threads import one_blas_thread
+from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.report.comparison_table import write_comparison_csv
-from fgslam.report.metrics import EstimatorMetrics
 from fgslam.runs import checkpoint, map_entry, mapping
 from fgslam.runs.beginning import BegunRun, OpenedRun, Progress, begin, open_run
 from fgslam.runs.choosing import compared_with

@@ -13,8 +13,9 @@ from fgslam.core.estimates import Estimate, LandmarkMap
 from fgslam.core.recordings import MeasurementRecording
 from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.opening import open_measurements
+from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
-from fgslam.report.metrics import JsonValue, StageTime, write_timing
+from fgslam.report.metrics import StageTime, write_timing
 from fgslam.report.point_cloud import read_ply
 from fgslam.report.trajectories import read_covariances, read_tum, write_tum
 from fgslam.runs.checkpoint import save_log

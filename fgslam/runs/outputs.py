@@ -18,15 +18,11 @@ from fgslam import __version__
 from fgslam.core.atomic_files import make_subfolder, write_text
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.recordings import Sequence
+from fgslam.evaluation.judging import Truth, closure_counts
+from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
-from fgslam.report.metrics import (
-    EstimatorMetrics,
-    JsonValue,
-    StageTime,
-    write_metrics,
-    write_timing,
-)
+from fgslam.report.metrics import StageTime, write_metrics, write_timing
 from fgslam.report.point_cloud import MapPoints
 from fgslam.report.trajectories import write_tum
 from fgslam.runs.checkpoint import save_log
@@ -35,7 +31,6 @@ from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.estimator_files import write_estimate
 from fgslam.runs.folder import RUN_MARKER
 from fgslam.runs.homing.config import HomingExperiment
-from fgslam.runs.judging import Truth, verdicts
 from fgslam.runs.localisation.config import LocalisationConfig
 from fgslam.runs.places import closures_of, place_numbers, write_closures
 from fgslam.runs.recorder import STAGES, RunRecorder
@@ -96,7 +91,7 @@ class RunOutputs:
 
     def _with_kind(self, metrics: EstimatorMetrics) -> EstimatorMetrics:
         places = self.pipeline.places
-        told = {} if places is None else verdicts(places.taken)
+        told = {} if places is None else closure_counts(places.taken)
         more = {"kind": self.pipeline.estimator.kind} | dict(metrics.more) | told
         return dataclasses.replace(metrics, more=more)
 

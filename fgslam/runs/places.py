@@ -13,7 +13,7 @@ import numpy as np
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory
 from fgslam.evaluation.closures import JudgedClosure, judge_closures
-from fgslam.report.metrics import JsonValue
+from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.page import Column, Comparison
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.recorder import RunRecorder

@@ -9,8 +9,8 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import EgoMotionStatus, Estimate, Trajectory, correlation
-from fgslam.report.metrics import EstimatorMetrics, JsonValue, UpdateTime
-from fgslam.runs.judging import Answer, Truth, judge_answer
+from fgslam.evaluation.judging import Answer, Truth, judge_answer
+from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, UpdateTime
 from fgslam.runs.recorder import STAGES, RunRecorder
 from fgslam.slam.replay import peak_memory_mb
 

@@ -12,14 +12,10 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.evaluation.consistency import Consistency, Nees, judge
+from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, value_at
 from fgslam.evaluation.paired import MeanInterval, PairedTest, mean_interval, paired_test
-from fgslam.report.comparison_table import (
-    RESULT_COLUMNS,
-    TIME_COLUMNS,
-    value_at,
-    write_comparison_csv,
-)
-from fgslam.report.metrics import EstimatorMetrics, JsonValue, write_metrics
+from fgslam.report.comparison_table import RESULT_COLUMNS, TIME_COLUMNS, write_comparison_csv
+from fgslam.report.metrics import write_metrics
 
 FILTERS = frozenset({"landmark_kalman", "landmark_kalman_graph", "ekf"})
 SMOOTHERS = frozenset({"fixed_lag", "isam2", "batch"})

@@ -12,14 +12,14 @@ from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.evaluation.consistency import Nees
-from fgslam.report.metrics import EstimatorMetrics
+from fgslam.evaluation.judging import judge_replay
+from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.runs.checkpoint import LOG_FILE
 from fgslam.runs.choosing import EVERY, Choice, choose
 from fgslam.runs.comparison import Progress, load_truth
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.experiment import run_experiment
 from fgslam.runs.folder import RUN_MARKER, ExistingFolder, create_run_folder, is_run_folder
-from fgslam.runs.judging import judge_replay
 from fgslam.runs.map_entry import arrival_of
 from fgslam.runs.measured import holds_measurements, open_measured, write_recording
 from fgslam.runs.opening import open_sequence

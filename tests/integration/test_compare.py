@@ -15,7 +15,7 @@ from recordings import experiment
 from running import KIND, main, metrics_of, run_values, write_config
 
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.report.metrics import EstimatorMetrics
+from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.report.point_cloud import read_ply
 from fgslam.report.trajectories import read_covariances, read_tum
 from fgslam.runs.config import parse_config

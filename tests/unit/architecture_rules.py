@@ -16,7 +16,7 @@ ROOMS: dict[str, frozenset[str] | None] = {
     "cameras": frozenset({"core"}),
     "factors": frozenset({"core"}),
     "evaluation": frozenset({"core"}),
-    "report": frozenset({"core"}),
+    "report": frozenset({"core", "evaluation"}),
     "worlds": frozenset({"core", "cameras"}),
     "frontend": frozenset({"core", "cameras"}),
     "datasets": frozenset({"core", "cameras", "worlds"}),

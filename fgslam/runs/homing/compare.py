@@ -13,10 +13,10 @@ from fgslam.backend.homing.settings import HomingEstimatorSettings
 from fgslam.core.bearing_log import BearingLog
 from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.evaluation.homing import HomingErrors, homing_errors, summarise_homings
+from fgslam.evaluation.metrics import JsonValue, UpdateTime
 from fgslam.report.homing import TextTable
 from fgslam.report.homing.curves import Line, curve_figure
 from fgslam.report.homing.local_map import local_map_figure
-from fgslam.report.metrics import JsonValue, UpdateTime
 from fgslam.report.page.traces import Figure
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.choosing import EVERY, Choice

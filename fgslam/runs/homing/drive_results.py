@@ -10,6 +10,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import between
+from fgslam.evaluation.metrics import JsonValue, UpdateTime
 from fgslam.homing.drive_scores import (
     ARRIVED_M,
     Slope,
@@ -25,7 +26,6 @@ from fgslam.report.homing import Column, TextTable
 from fgslam.report.homing.curves import Line, curve_figure
 from fgslam.report.homing.local_map import local_map_figure
 from fgslam.report.homing.plan import PASS_RADIUS_M, catchment_figure, drive_figure
-from fgslam.report.metrics import JsonValue, UpdateTime
 from fgslam.report.page.traces import Figure
 from fgslam.runs.homing.config import DrivingConfig
 from fgslam.runs.homing.drive_files import (

@@ -11,12 +11,12 @@ import numpy as np
 
 from fgslam.core.errors import ConfigError, StoredMapError
 from fgslam.core.homing import OmniFeatures
+from fgslam.evaluation.metrics import JsonValue
 from fgslam.homing.linking import Answer, Link, Pair
 from fgslam.homing.third_views import InlierRows
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
 from fgslam.report.homing import Column, TextTable
 from fgslam.report.homing.network import Links, network_figure, unfolded
-from fgslam.report.metrics import JsonValue
 from fgslam.report.page.data import Picture
 from fgslam.report.page.traces import Figure
 from fgslam.report.tables import Cell, write_csv

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.homing import HomingVector, Refusal, RefusalReason
 from fgslam.core.planar import wrap
-from fgslam.report.metrics import JsonValue
+from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.tables import Cell, write_csv
 
 PAIR_COLUMNS = (

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
+from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.homing import Column, TextTable
 from fgslam.report.homing.curves import claimed_against_true, sorted_errors
 from fgslam.report.homing.network import Links, network_figure
-from fgslam.report.metrics import JsonValue
 from fgslam.report.page.traces import Figure
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.homing.config import HomingPairsConfig

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
+from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.homing import HomingPage, TextTable, write_homing_report
-from fgslam.report.metrics import JsonValue
 from fgslam.report.tables import write_json
 from fgslam.runs.folder import ExistingFolder, create_run_folder
 from fgslam.runs.homing.config import HomingExperiment

@@ -12,10 +12,10 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.atomic_files import make_subfolder
 from fgslam.datasets.omni.recording import OmniRecording
+from fgslam.evaluation.metrics import JsonValue, UpdateTime
 from fgslam.frontend.homing.video_tracking import ReplenishedTracker, TrackedImage
 from fgslam.report.homing import Column, TextTable
 from fgslam.report.homing.curves import Line, curve_figure
-from fgslam.report.metrics import JsonValue, UpdateTime
 from fgslam.report.page.data import Picture
 from fgslam.report.pictures.view_tracks import draw_view_tracks
 from fgslam.report.tables import write_csv

@@ -11,8 +11,8 @@ import numpy as np
 from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.geometry import yaw_pitch_roll
 from fgslam.evaluation.localisation import Bounds, LocalisationScore, Spread
+from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.homing import HomingPage, write_homing_report
-from fgslam.report.metrics import JsonValue
 from fgslam.report.page.data import Picture
 from fgslam.report.pictures.located import LocatedDrawing, draw_located
 from fgslam.report.tables import Cell, write_csv, write_json

@@ -10,14 +10,8 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import DatasetError
-from fgslam.report.metrics import (
-    EstimatorMetrics,
-    StageTime,
-    UpdateTime,
-    read_metrics,
-    write_metrics,
-    write_timing,
-)
+from fgslam.evaluation.metrics import EstimatorMetrics, UpdateTime
+from fgslam.report.metrics import StageTime, read_metrics, write_metrics, write_timing
 
 CONTRACT = {
     "ate_rmse_m",

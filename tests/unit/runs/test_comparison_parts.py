@@ -19,20 +19,15 @@ from fgslam.core.estimates import LandmarkMap
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LandmarkTruth
 from fgslam.evaluation.consistency import Nees
-from fgslam.report.comparison_table import (
-    RESULT_COLUMNS,
-    TIME_COLUMNS,
-    value_at,
-    write_comparison_csv,
-)
+from fgslam.evaluation.judging import seen_often
+from fgslam.evaluation.metrics import EstimatorMetrics, UpdateTime, value_at
+from fgslam.report.comparison_table import RESULT_COLUMNS, TIME_COLUMNS, write_comparison_csv
 from fgslam.report.landmark_truth import read_landmark_truth, write_landmark_truth
-from fgslam.report.metrics import EstimatorMetrics, UpdateTime
 from fgslam.report.point_cloud import MapPoints
 from fgslam.runs.baseline import check_baseline, read_baseline, write_baseline
 from fgslam.runs.choosing import Choice, all_kinds, choose, estimators_of
 from fgslam.runs.config import ExperimentConfig, parse_config
 from fgslam.runs.estimator_files import points_from_log
-from fgslam.runs.judging import seen_often
 from fgslam.runs.rendered_truth import points_under
 from fgslam.runs.trial_results import summarise, together
 

@@ -1,11 +1,13 @@
-"""Judges one estimator's answer against the truth: the numbers of metrics.json."""
+"""Accuracy, consistency and time of one estimator's result: the numbers of metrics.json."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import Estimate, Trajectory
@@ -13,6 +15,7 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LandmarkTruth
 from fgslam.evaluation.consistency import Consistency, Nees, judge, pose_nees
 from fgslam.evaluation.landmarks import LandmarkErrors, landmark_errors
+from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, UpdateTime
 from fgslam.evaluation.timing import time_growth
 from fgslam.evaluation.trajectory import (
     Alignment,
@@ -22,8 +25,6 @@ from fgslam.evaluation.trajectory import (
     evaluate_trajectory,
     to_estimate_world,
 )
-from fgslam.report.metrics import EstimatorMetrics, JsonValue, UpdateTime
-from fgslam.slam.replay import Replay
 
 LEAST_SIGHTINGS = 3
 """Landmarks are judged that were seen so often: `valid` of Se et al. (6.1), for all estimators."""
@@ -44,9 +45,62 @@ class Truth:
     landmark_sigma_m: float | None = None
 
 
+class Replayed(Protocol):
+    """What is judged of a replayed measurement log, as ``fgslam.slam.replay.Replay`` has it."""
+
+    @property
+    def kind(self) -> str:
+        """Which estimator it is."""
+        ...
+
+    @property
+    def estimate(self) -> Estimate:
+        """Trajectory, covariances and map as known at the end."""
+        ...
+
+    @property
+    def online(self) -> Trajectory:
+        """Each pose as first estimated."""
+        ...
+
+    @property
+    def online_covariances(self) -> FloatArray:
+        """(n, 6, 6) of those."""
+        ...
+
+    @property
+    def closed(self) -> tuple[bool, ...]:
+        """Of the loop closures offered, in order, whether each was taken."""
+        ...
+
+    @property
+    def failure(self) -> str:
+        """Why it ended early; else empty."""
+        ...
+
+    @property
+    def final_ms(self) -> float:
+        """Milliseconds for the final estimate."""
+        ...
+
+    @property
+    def memory_before_mb(self) -> float | None:
+        """Resident memory before the estimator was made, mebibytes."""
+        ...
+
+    @property
+    def peak_memory_mb(self) -> float | None:
+        """Its largest, mebibytes."""
+        ...
+
+    def column(self, name: str) -> npt.NDArray[Any]:
+        """(n,) one number of every frame: `nis`, `nis_dof`, `update_ms`, `solve_ms`."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """What an estimator said, live or replayed; row k of every array is frame k.
+    """Result of an estimator, live or replayed; row k of every array is frame k.
 
     Attributes:
         estimate: as known at the end.
@@ -65,7 +119,7 @@ class Answer:
     peak_memory_mb: float | None = None
 
     @staticmethod
-    def of(replay: Replay) -> Answer:
+    def of(replay: Replayed) -> Answer:
         """The answer of a replay."""
         return Answer(
             estimate=replay.estimate,
@@ -115,7 +169,7 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
         update_ms=UpdateTime.of(answer.update_ms),
         peak_memory_mb=answer.peak_memory_mb,
         more={
-            "frames": len(answer.online),
+            "frames": max(len(answer.online), len(final)),
             **_alignment_notes(aligned, first),
             "nees_pose": _as_json(judged["pose"]),
             "nees_landmark": _as_json(judged["landmark"]),
@@ -131,7 +185,7 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
     return Judgement(metrics, nees)
 
 
-def judge_replay(replay: Replay, truth: Truth) -> Judgement:
+def judge_replay(replay: Replayed, truth: Truth) -> Judgement:
     """As :func:`judge_answer`, with what only a replay knows."""
     judged = judge_answer(Answer.of(replay), truth)
     metrics = judged.metrics
@@ -143,13 +197,13 @@ def judge_replay(replay: Replay, truth: Truth) -> Judgement:
             "solve_ms": asdict(UpdateTime.of(replay.column("solve_ms").astype(np.float64))),
             "final_ms": replay.final_ms,
             "memory_before_mb": replay.memory_before_mb,
-            **verdicts(replay.closed),
+            **closure_counts(replay.closed),
         }
     )
     return Judgement(replace(metrics, more=more), judged.nees)
 
 
-def verdicts(closed: Sequence[bool]) -> dict[str, JsonValue]:
+def closure_counts(closed: Sequence[bool]) -> dict[str, JsonValue]:
     """How many loops an estimator closed, and closures it refused; nothing where none came."""
     if not closed:
         return {}

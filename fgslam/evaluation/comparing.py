@@ -1,0 +1,122 @@
+"""Estimators side by side as a data frame: one row an estimator, one column a number."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+
+from fgslam.core.errors import ConfigError
+from fgslam.core.estimates import Estimate, Trajectory
+from fgslam.core.recordings import LandmarkTruth
+from fgslam.evaluation.judging import Answer, Replayed, Truth, judge_answer, judge_replay
+from fgslam.evaluation.metrics import EstimatorMetrics, value_at
+
+if TYPE_CHECKING:
+    import pandas
+
+Comparable: TypeAlias = Replayed | Answer | Estimate
+"""A replayed log, an :class:`~fgslam.evaluation.judging.Answer`, or an estimate alone."""
+
+COLUMNS: tuple[tuple[str, str], ...] = (
+    ("kind", "kind"),
+    ("frames", "frames"),
+    ("ate_m", "ate_rmse_m"),
+    ("rpe_trans_m", "rpe_trans_m"),
+    ("rpe_rot_deg", "rpe_rot_deg"),
+    ("drift_percent", "drift_percent"),
+    ("end_error_m", "end_error_m"),
+    ("end_error_deg", "end_error_deg"),
+    ("nees", "nees_pose_per_dof"),
+    ("consistency", "nees_pose.verdict"),
+    ("landmarks", "landmarks"),
+    ("landmark_rmse_m", "landmark_rmse_m"),
+    ("nees_landmark", "nees_landmark_per_dof"),
+    ("ate_online_m", "online.ate_rmse_m"),
+    ("nees_online", "online.nees_pose_per_dof"),
+    ("nis", "nis_per_dof"),
+    ("ms", "update_ms.median"),
+    ("ms_p95", "update_ms.p95"),
+    ("ms_max", "update_ms.max"),
+    ("failure", "failure"),
+)
+"""Columns of :func:`compare`, and where each value is in metrics.json."""
+
+_TEXT = frozenset({"kind", "consistency", "failure"})
+
+
+def compare(
+    answers: Mapping[str, Comparable],
+    truth: Trajectory | None = None,
+    landmark_truth: LandmarkTruth | None = None,
+) -> pandas.DataFrame:
+    """Accuracy, consistency and speed of estimators on one recording, a row each.
+
+    Columns (NaN where a value cannot be known):
+
+    * ``kind``, ``frames``, ``landmarks``: which estimator, and how much it estimated.
+    * ``ate_m``: absolute trajectory error, root mean square, after SE3 alignment (Sturm et al.
+      2012, eq. 2); ``rpe_trans_m``, ``rpe_rot_deg``: relative pose error a frame (eq. 1).
+    * ``drift_percent``: ``end_error_m`` over the length of the true path; ``end_error_m``,
+      ``end_error_deg``: of the last pose, with the first pose aligned.
+    * ``nees``: normalised estimation error squared of the poses per degree of freedom, 1 being
+      right (Bar-Shalom, Li and Kirubarajan 2001, 5.4); ``consistency``: `consistent`,
+      `overconfident` or `conservative` by its 95 % chi-square band; ``nees_landmark`` alike.
+    * ``landmark_rmse_m``: distance of the landmarks from their true positions.
+    * ``ate_online_m``, ``nees_online``: the same of each pose as first estimated; ``nis``:
+      normalised innovation squared per degree of freedom.
+    * ``ms``, ``ms_p95``, ``ms_max``: milliseconds a frame, median, 95th percentile, longest.
+    * ``failure``: why an estimator ended early; empty where it did not.
+
+    Args:
+        answers: results by the name that their row shall have.
+        truth: true poses of the reference camera, in any world frame.
+        landmark_truth: true positions of landmarks, in the same world as ``truth``.
+
+    Raises:
+        ConfigError: one of the answers is none.
+    """
+    known = Truth(truth, landmark_truth)
+    return metrics_frame({name: _judged(name, one, known) for name, one in answers.items()})
+
+
+def metrics_frame(
+    estimators: Mapping[str, EstimatorMetrics], columns: tuple[tuple[str, str], ...] = COLUMNS
+) -> pandas.DataFrame:
+    """Metrics as a data frame with the names as index; ``columns`` as :data:`COLUMNS`."""
+    import pandas  # half a second, and only tables need it
+
+    rows = {
+        name: [value_at(metrics.as_json(), path) for _, path in columns]
+        for name, metrics in estimators.items()
+    }
+    names = [name for name, _ in columns]
+    frame = pandas.DataFrame.from_dict(rows, orient="index", columns=names)
+    frame.index.name = "estimator"
+    for name in names:
+        if name in _TEXT:
+            frame[name] = frame[name].fillna("").astype(str)
+        else:
+            frame[name] = pandas.to_numeric(frame[name])
+    return frame
+
+
+def _judged(name: str, answer: Comparable, truth: Truth) -> EstimatorMetrics:
+    if isinstance(answer, Estimate):
+        answer = _alone(answer)
+    if isinstance(answer, Answer):
+        return judge_answer(answer, truth).metrics
+    if not hasattr(answer, "estimate"):
+        raise ConfigError(
+            f"{name}: {type(answer).__name__} is no estimator's result; give what replay or "
+            "result returned"
+        )
+    return judge_replay(answer, truth).metrics
+
+
+def _alone(estimate: Estimate) -> Answer:
+    """An estimate of which nothing else is known: neither online poses nor times."""
+    online = Trajectory(np.empty(0), np.empty((0, 4, 4)))
+    none = np.empty(0)
+    return Answer(estimate, online, np.empty((0, 6, 6)), none, np.empty(0, np.int64), none)
