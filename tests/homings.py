@@ -8,8 +8,8 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray
 from fgslam.core.homing import HomingStart, HomingTruth, HomingVector, TrackedBearings
-from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
 from fgslam.frontend.homing.local_map import make_local_map
+from fgslam.frontend.homing.ransac import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
 from fgslam.worlds.simulated.bearings import simulate_homing

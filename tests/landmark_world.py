@@ -1,4 +1,4 @@
-"""A world of landmarks without images, and eyes that see them: behaviour is tested on it.
+"""A world of landmarks without images, and a front-end that sees them: behaviour is tested on it.
 
 Matching, tracking and their faults are simulated; homing vector, local map and estimators are the
 program's own.
@@ -28,12 +28,12 @@ from fgslam.core.homing import (
 from fgslam.core.planar import bearings, compose, wrap
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.homing.avoidance import NoAvoidance, ObstacleAvoider
+from fgslam.homing.bearing_consistency import parallax
 from fgslam.homing.closed_loop import Driver, follow
-from fgslam.homing.eyes import Sighting
+from fgslam.homing.drive_record import DriveRecord
+from fgslam.homing.front_end import Sighting
 from fgslam.homing.path_following import PathFollower
-from fgslam.homing.record import DriveRecord
 from fgslam.homing.settings import HomingBehaviourSettings
-from fgslam.homing.soundness import parallax
 from fgslam.homing.steering import Steering
 from fgslam.runs.homing.starting import start_from_matches
 
@@ -58,7 +58,7 @@ class LandmarkWorld:
     discs: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
 
     def image(self, time: float) -> ByteArray:
-        """Nothing: the simulated eyes look at the world itself."""
+        """Nothing: the simulated front-end looks at the world itself."""
         return DARK
 
     def scan(self) -> tuple[FloatArray, FloatArray]:
@@ -93,7 +93,7 @@ def ray_ranges(
 
 
 @dataclass
-class SimulatedEyes:
+class SimulatedFrontEnd:
     """Sees landmarks within reach; matches some wrongly; loses tracks.
 
     Attributes:
@@ -252,15 +252,15 @@ def _distance(points: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Setting:
-    """World, eyes and target poses of a path."""
+    """World, front-end and target poses of a path."""
 
     world: LandmarkWorld
-    eyes: SimulatedEyes
+    front_end: SimulatedFrontEnd
     targets: FloatArray
 
     def path(self) -> list[OmniFeatures]:
         """Target images, taken beforehand."""
-        return [self.eyes.features_at(pose) for pose in self.targets]
+        return [self.front_end.features_at(pose) for pose in self.targets]
 
 
 def winding_path(seed: int, legs: int, spacing: float, offset: float = 0.2) -> Setting:
@@ -273,7 +273,7 @@ def winding_path(seed: int, legs: int, spacing: float, offset: float = 0.2) -> S
     points = points_along(places, 14.0, rng)
     start = np.array([*rng.uniform(-offset, offset, 2), rng.uniform(-0.3, 0.3)])
     world = LandmarkWorld(points, start, rng)
-    return Setting(world, SimulatedEyes(world, rng), targets)
+    return Setting(world, SimulatedFrontEnd(world, rng), targets)
 
 
 def make_follower(
@@ -284,7 +284,7 @@ def make_follower(
     """Over the whole path."""
     kind = HomingEkfSettings() if estimator is None else estimator
     return PathFollower(
-        setting.eyes,
+        setting.front_end,
         setting.path(),
         lambda start: make_homing_estimator(start, kind),
         settings.control,

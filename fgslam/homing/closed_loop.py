@@ -11,13 +11,13 @@ import numpy as np
 
 from fgslam.core.arrays import ByteArray, FloatArray
 from fgslam.core.homing import HomingEstimate
+from fgslam.homing.active_homing import ActiveHoming
 from fgslam.homing.avoidance import ObstacleAvoider, RangeScan
 from fgslam.homing.command import Command, Drive
+from fgslam.homing.drive_record import STAGES, DriveRecord, HomingLog
 from fgslam.homing.path_following import PathFollower
-from fgslam.homing.record import STAGES, DriveRecord, HomingLog
 from fgslam.homing.settings import ClosedLoopSettings
 from fgslam.homing.steering import Steering
-from fgslam.homing.underway import HomingUnderWay
 
 
 class World(Protocol):
@@ -81,7 +81,7 @@ def follow(
         watch: called with every command and its image, for pictures of the drive.
 
     Raises:
-        FgslamError: what the world, the eyes and the estimator raise.
+        FgslamError: what the world, the front-end and the estimator raise.
     """
     dt = 1.0 / settings.images_per_s
     steps = max(1, int(np.ceil(settings.longest_s * settings.images_per_s)))
@@ -99,7 +99,7 @@ def follow(
         clock.lap()
         world.drive(drive.speed, drive.turn_rate, dt)
         clock.lap()
-        recorder.note(pose, command, drive, follower.controller.underway, clock.laps)
+        recorder.note(pose, command, drive, follower.controller.active, clock.laps)
         if watch is not None:
             watch(command, image)
         # The record ends with the robot at a stand: brakes need a few steps.
@@ -133,14 +133,14 @@ class _Recorder:
         self._rows: list[int] = []
         self._estimates: list[HomingEstimate | None] = []
         self._laps: list[list[float]] = []
-        self._logs: list[tuple[int, HomingUnderWay, int]] = []
+        self._logs: list[tuple[int, ActiveHoming, int]] = []
 
     def note(
         self,
         pose: FloatArray,
         command: Command,
         drive: Drive,
-        homing: HomingUnderWay | None,
+        homing: ActiveHoming | None,
         laps: list[float],
     ) -> None:
         """One step."""
@@ -151,12 +151,12 @@ class _Recorder:
         self._rows.append(-1 if homing is None else self._log(command, homing))
         self._commands.append(command)
 
-    def _log(self, command: Command, homing: HomingUnderWay) -> int:
+    def _log(self, command: Command, homing: ActiveHoming) -> int:
         if not self._logs or self._logs[-1][1] is not homing:
             self._logs.append((command.target, homing, len(self._commands)))
         return len(self._logs) - 1
 
-    def _closed(self, target: int, homing: HomingUnderWay, first_step: int) -> HomingLog:
+    def _closed(self, target: int, homing: ActiveHoming, first_step: int) -> HomingLog:
         times = np.array([c.time for c in self._commands])
         return HomingLog(
             target=target,

@@ -16,10 +16,10 @@ from fgslam.core.arrays import ByteArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import HomingVector, OmniFeatures, Refusal, RefusalReason
 from fgslam.core.planar import wrap
+from fgslam.homing.active_homing import ActiveHoming, EstimatorMaker, Fault
 from fgslam.homing.command import Command, HomingState
-from fgslam.homing.eyes import HomingEyes, Sighting
+from fgslam.homing.front_end import HomingFrontEnd, Sighting
 from fgslam.homing.settings import HomingControlSettings
-from fgslam.homing.underway import EstimatorMaker, Fault, HomingUnderWay
 
 _PROGRESS = 0.02  # parts of a leg; less is noise of the distance
 
@@ -28,23 +28,23 @@ class HomingController:
     """Brings the robot to one target image.
 
     Attributes:
-        underway: the homing since the target was last matched; None while it is not.
+        active: the homing since the target was last matched; None while it is not.
         initialisations: how often it was matched so far, 1 when nothing went wrong.
         remaining: part of the leg that is left, as last known.
     """
 
     def __init__(
         self,
-        eyes: HomingEyes,
+        front_end: HomingFrontEnd,
         target: OmniFeatures,
         make_estimator: EstimatorMaker,
         settings: HomingControlSettings,
     ) -> None:
-        self._eyes = eyes
+        self._front_end = front_end
         self._target = target
         self._make_estimator = make_estimator
         self._settings = settings
-        self.underway: HomingUnderWay | None = None
+        self.active: ActiveHoming | None = None
         self.initialisations = 0
         self.remaining = 1.0
         self._time: float | None = None
@@ -75,9 +75,9 @@ class HomingController:
         self._take_time(time)
         if self._ended is not None:
             return replace(self._ended, time=time)
-        if self.underway is None:
+        if self.active is None:
             return self._seek(image, time)
-        return self._go_on(self.underway, image, time)
+        return self._go_on(self.active, image, time)
 
     def held_up(self, seconds: float) -> None:
         """Obstacles, not homing, decided on the last ``seconds``: that is no lack of progress."""
@@ -97,8 +97,8 @@ class HomingController:
     # ----------------------------------------------------------------------------------------
     # Under way
 
-    def _go_on(self, homing: HomingUnderWay, image: ByteArray, time: float) -> Command:
-        fault = homing.update(self._eyes.track(image, time))
+    def _go_on(self, homing: ActiveHoming, image: ByteArray, time: float) -> Command:
+        fault = homing.update(self._front_end.track(image, time))
         if fault is not None and not fault.usable:
             return self._lose(image, time, fault.reason)
         home = homing.home
@@ -107,7 +107,7 @@ class HomingController:
         doubt = self._recognise(homing, image, time, arrival)
         if doubt is not None:
             return doubt
-        if arrival and homing.vouched:
+        if arrival and homing.supported:
             return self._end(time, HomingState.ARRIVED, arrival)
         if arrival and fault is None:
             fault = Fault(f"no track confirms it: {arrival}", True)
@@ -132,7 +132,7 @@ class HomingController:
         return ""
 
     def _recognise(
-        self, homing: HomingUnderWay, image: ByteArray, time: float, arrival: str
+        self, homing: ActiveHoming, image: ByteArray, time: float, arrival: str
     ) -> Command | None:
         """Near the target, it must be seen where the estimate has it; None to go on.
 
@@ -143,7 +143,7 @@ class HomingController:
         if self._recognised or not (due or arrival):
             return None
         self._next_look = time + self._settings.retry_s
-        answer = self._eyes.look(image, self._target)
+        answer = self._front_end.look(image, self._target)
         if isinstance(answer, Sighting):
             if homing.contradicts(answer.vector):
                 return self._seen_elsewhere(homing, answer, time)
@@ -154,7 +154,7 @@ class HomingController:
             return self._doubt(time, f"target not seen where it is believed: {answer.details}")
         return None
 
-    def _seen_elsewhere(self, homing: HomingUnderWay, seen: Sighting, time: float) -> Command:
+    def _seen_elsewhere(self, homing: ActiveHoming, seen: Sighting, time: float) -> Command:
         """At the target itself directions mean little: how near it is tells an error from that.
 
         Not so rotations: if they contradict, the parallaxes are of another place.
@@ -181,7 +181,7 @@ class HomingController:
             vector: what contradicts the estimate; it must be confirmed itself.
             left: part of the leg, as far as that is known.
         """
-        self.underway, self._pending, self._next_try = None, vector, time
+        self.active, self._pending, self._next_try = None, vector, time
         self.remaining, self._was_ahead, self._obstacle = left, False, why
         self._recognised = self._settings.near_fraction == 0.0
         self._progress.begin_anew(time)
@@ -189,7 +189,7 @@ class HomingController:
             return self._refuse(time, Refusal(RefusalReason.LOST, why))
         return self._hold(time, why)
 
-    def _renew(self, homing: HomingUnderWay, image: ByteArray, time: float, why: str) -> Command:
+    def _renew(self, homing: ActiveHoming, image: ByteArray, time: float, why: str) -> Command:
         """The estimate is usable, but weak: match anew while driving on by it."""
         if time < self._next_try:
             return self._drive(homing, time, why)
@@ -209,7 +209,7 @@ class HomingController:
         s = self._settings
         ahead = abs(self._heading) <= np.deg2rad(s.blind_heading_deg)
         self._blind_until = time + s.blind_s if ahead else -np.inf
-        self.underway, self._next_try = None, time
+        self.active, self._next_try = None, time
         return self._seek(image, time, why)
 
     # ----------------------------------------------------------------------------------------
@@ -238,13 +238,13 @@ class HomingController:
         self._pending = vector
         return self._refused(time, Refusal(RefusalReason.AMBIGUOUS, words))
 
-    def _begin(self, image: ByteArray, time: float) -> HomingUnderWay | Refusal:
+    def _begin(self, image: ByteArray, time: float) -> ActiveHoming | Refusal:
         self._next_try = time + self._settings.retry_s
-        answer = self._eyes.begin(image, self._target, time)
+        answer = self._front_end.begin(image, self._target, time)
         if isinstance(answer, Refusal):
             return answer
         try:
-            return HomingUnderWay(answer, self._make_estimator, self.remaining, self._settings)
+            return ActiveHoming(answer, self._make_estimator, self.remaining, self._settings)
         except EstimatorError as error:
             return Refusal(RefusalReason.UNCERTAIN, str(error))
 
@@ -255,11 +255,11 @@ class HomingController:
         turn = float(np.abs(wrap(np.array(vector.direction - self._pending.direction))))
         return bool(turn <= np.deg2rad(self._settings.contradiction_deg))
 
-    def _accept(self, homing: HomingUnderWay, why: str) -> Command:
+    def _accept(self, homing: ActiveHoming, why: str) -> Command:
         time = homing.start.time
         if self._standing_since is not None or self.initialisations == 0:
             self._progress.pause(time)
-        self.underway = homing
+        self.active = homing
         self._heading = homing.start.vector.direction
         self._was_ahead = self._was_ahead or abs(self._heading) <= np.pi / 2
         self._pending = self._standing_since = None
@@ -296,7 +296,7 @@ class HomingController:
     # ----------------------------------------------------------------------------------------
     # Commands
 
-    def _drive(self, homing: HomingUnderWay, time: float, why: str) -> Command:
+    def _drive(self, homing: ActiveHoming, time: float, why: str) -> Command:
         home = homing.home
         return Command(
             time=time,

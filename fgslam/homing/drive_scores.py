@@ -9,7 +9,7 @@ from scipy.stats import t as student_t
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.planar import wrap
-from fgslam.homing.record import DriveRecord
+from fgslam.homing.drive_record import DriveRecord
 
 ARRIVED_M = 0.5
 """Metres: a robot that claims an arrival and stands farther from the last target has not arrived.

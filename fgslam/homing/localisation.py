@@ -12,7 +12,7 @@ from scipy.sparse import diags
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason
-from fgslam.homing.linking import Linker
+from fgslam.homing.links import Linker
 from fgslam.homing.retrieval import VisualWords
 from fgslam.homing.settings import LocalisationSettings
 from fgslam.homing.topological_map import TopologicalMap

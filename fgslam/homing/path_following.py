@@ -9,11 +9,11 @@ from typing import Literal, TypeAlias
 from fgslam.core.arrays import ByteArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.homing import OmniFeatures
+from fgslam.homing.active_homing import EstimatorMaker
 from fgslam.homing.command import Command, HomingState
 from fgslam.homing.controller import HomingController
-from fgslam.homing.eyes import HomingEyes
+from fgslam.homing.front_end import HomingFrontEnd
 from fgslam.homing.settings import HomingControlSettings, PathFollowingSettings
-from fgslam.homing.underway import EstimatorMaker
 
 LegResult: TypeAlias = Literal["arrived", "skipped", "refused", "unfinished"]
 
@@ -54,7 +54,7 @@ class PathFollower:
 
     def __init__(
         self,
-        eyes: HomingEyes,
+        front_end: HomingFrontEnd,
         path: Sequence[OmniFeatures],
         make_estimator: EstimatorMaker,
         control: HomingControlSettings,
@@ -67,7 +67,7 @@ class PathFollower:
         """
         if not path:
             raise ConfigError("path: no target image; give at least one")
-        self._eyes = eyes
+        self._front_end = front_end
         self._path = tuple(path)
         self._make_estimator = make_estimator
         self._control = control
@@ -132,7 +132,7 @@ class PathFollower:
 
     def _new_controller(self) -> HomingController:
         return HomingController(
-            self._eyes, self._path[self._target], self._make_estimator, self._control
+            self._front_end, self._path[self._target], self._make_estimator, self._control
         )
 
     def _numbered(self, command: Command) -> Command:

@@ -21,12 +21,12 @@ from fgslam.homing.feature_file import (
     save_archive,
     unpack_features,
 )
-from fgslam.homing.link_checks import LinkChecks
-from fgslam.homing.linking import Answer, Link, Linker, Pair, link_pairs
+from fgslam.homing.link_consistency import LinkConsistency
+from fgslam.homing.links import Answer, Link, Linker, Pair, link_pairs
 from fgslam.homing.path_memory import PathMemory, read_names
 from fgslam.homing.retrieval import VisualWords, candidate_pairs
 from fgslam.homing.settings import TopologicalMapSettings
-from fgslam.homing.third_views import InlierRows, ThirdViews
+from fgslam.homing.third_view_consistency import InlierRows, ThirdViewConsistency
 
 FORMAT = "fgslam topological map"
 VERSION = 1
@@ -196,9 +196,9 @@ def map_of_answers(
     links, refused = link_pairs(answers, settings)
     seen: set[Pair] = set()
     if ordered and rows is not None:
-        links, seen, unseen = ThirdViews(images, links, rows, settings).confirmed()
+        links, seen, unseen = ThirdViewConsistency(images, links, rows, settings).confirmed()
         refused |= unseen
-    checks = LinkChecks(len(images), links, settings)
+    checks = LinkConsistency(len(images), links, settings)
     believed, rejected = checks.believed(ordered=ordered, witnessed=seen)
     costs = np.array([link_cost(link, settings) for link in believed])
     return TopologicalMap(memory.images, memory.names, tuple(believed), costs, refused | rejected)

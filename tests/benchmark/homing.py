@@ -28,8 +28,8 @@ from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatc
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from fgslam.homing.controller import HomingController
-from fgslam.homing.eyes import HomingEyes
-from fgslam.homing.image_eyes import EyesSettings, ImageEyes
+from fgslam.homing.front_end import HomingFrontEnd
+from fgslam.homing.image_front_end import FrontEndSettings, ImageFrontEnd
 from fgslam.homing.settings import HomingControlSettings
 from fgslam.worlds.house.omni_world import OmniWorld
 from fgslam.worlds.house.settings import HousePathSettings, OmniHouseSettings
@@ -75,18 +75,18 @@ def open_leg(seed: int) -> Leg:
     return Leg(world, tuple(images))
 
 
-class NotedEyes:
-    """Eyes that keep where the tracked points were seen in the camera's own images."""
+class NotedFrontEnd:
+    """FrontEnd that keep where the tracked points were seen in the camera's own images."""
 
     def __init__(self, world: OmniWorld) -> None:
-        settings = EyesSettings(
+        settings = FrontEndSettings(
             OmniFeatureSettings(),
             OmniMatchingSettings(),
             HomingVectorSettings(),
             OmniTrackingSettings(),
         )
         self._camera = world.camera
-        self.inner = ImageEyes(world.camera, settings, np.random.default_rng(1))
+        self.inner = ImageFrontEnd(world.camera, settings, np.random.default_rng(1))
         self.seen: list[TrackedBearings] = []
 
     def describe(self, image: Image) -> OmniFeatures:
@@ -112,25 +112,25 @@ class NotedEyes:
 
 def track_ratios(leg: Leg) -> list[float]:
     """The same for tracking alone."""
-    eyes = NotedEyes(leg.world)
-    eyes.begin(leg.images[0], eyes.describe(leg.world.targets[0]), 0.0)
-    return [ratio for ratio, _ in timed_against_klt(eyes, leg, eyes.track)]
+    front_end = NotedFrontEnd(leg.world)
+    front_end.begin(leg.images[0], front_end.describe(leg.world.targets[0]), 0.0)
+    return [ratio for ratio, _ in timed_against_klt(front_end, leg, front_end.track)]
 
 
 def update_ratios(leg: Leg, settings: HomingEstimatorSettings) -> list[tuple[float, int]]:
     """Each update's time over that of raw KLT from its image before; and the points' number."""
-    noted = NotedEyes(leg.world)
-    eyes: HomingEyes = noted  # type: ignore[assignment]
-    target = eyes.describe(leg.world.targets[0])
+    noted = NotedFrontEnd(leg.world)
+    front_end: HomingFrontEnd = noted  # type: ignore[assignment]
+    target = front_end.describe(leg.world.targets[0])
     controller = HomingController(
-        eyes, target, lambda start: make_homing_estimator(start, settings), CONTROL
+        front_end, target, lambda start: make_homing_estimator(start, settings), CONTROL
     )
     controller.step(leg.images[0], 0.0)
     return timed_against_klt(noted, leg, controller.step)
 
 
 def timed_against_klt(
-    noted: NotedEyes, leg: Leg, step: Callable[[Image, float], object]
+    noted: NotedFrontEnd, leg: Leg, step: Callable[[Image, float], object]
 ) -> list[tuple[float, int]]:
     """All later images, step by step."""
     greys = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in leg.images]
@@ -158,13 +158,15 @@ def front_end_ratios(leg: Leg) -> dict[str, float]:
     camera, image, other = leg.world.camera, leg.images[0], leg.world.targets[0]
     settings = OmniFeatureSettings()
     extractor = OmniFeatureExtractor(camera, settings)
-    eyes = NotedEyes(leg.world)
-    memory = eyes.describe(other)  # a target's features are remembered, never found anew
+    front_end = NotedFrontEnd(leg.world)
+    memory = front_end.describe(other)  # a target's features are remembered, never found anew
     times = interleaved(
         {
             "raw": lambda: cpu_seconds(lambda: raw_sift_matching(image, other)),
-            "own": lambda: cpu_seconds(lambda: initialise(eyes, leg, memory)),
-            "both": lambda: cpu_seconds(lambda: initialise(eyes, leg, eyes.describe(other))),
+            "own": lambda: cpu_seconds(lambda: initialise(front_end, leg, memory)),
+            "both": lambda: cpu_seconds(
+                lambda: initialise(front_end, leg, front_end.describe(other))
+            ),
             "columns": lambda: cpu_seconds(lambda: extractor.extract_columns(image)),
             "sift": lambda: cpu_seconds(lambda: extractor.extract_sift(image)),
         },
@@ -179,9 +181,9 @@ def front_end_ratios(leg: Leg) -> dict[str, float]:
     }
 
 
-def initialise(eyes: NotedEyes, leg: Leg, target: OmniFeatures) -> None:
+def initialise(front_end: NotedFrontEnd, leg: Leg, target: OmniFeatures) -> None:
     """The present image's features, matches, homing vector, local map, and start of tracking."""
-    eyes.begin(leg.images[0], target, 0.0)
+    front_end.begin(leg.images[0], target, 0.0)
 
 
 def raw_sift_matching(image: Image, other: Image) -> None:

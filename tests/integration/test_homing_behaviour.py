@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fgslam.core.planar import compose
+from fgslam.homing.drive_record import DriveRecord
 from fgslam.homing.drive_scores import cross_track, pass_distances, slope_by_leg, truly_arrived
-from fgslam.homing.record import DriveRecord
 from tests.landmark_world import drive_path, winding_path
 
 LEGS = 10
@@ -19,7 +19,7 @@ def drives(spacing: float, seeds: int, wrong: float = 0.1) -> list[DriveRecord]:
     out = []
     for seed in range(seeds):
         setting = winding_path(seed, LEGS, spacing)
-        setting.eyes.wrong = wrong
+        setting.front_end.wrong = wrong
         out.append(drive_path(setting))
     return out
 

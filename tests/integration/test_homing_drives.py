@@ -17,9 +17,9 @@ from fgslam.core.homing import TrackedBearings
 from fgslam.evaluation.homing import homing_errors
 from fgslam.homing.avoidance import NoAvoidance
 from fgslam.homing.closed_loop import Driver, follow
+from fgslam.homing.drive_record import DriveRecord
 from fgslam.homing.drive_scores import cross_track, pass_distances, truly_arrived
 from fgslam.homing.path_memory import PathMemory
-from fgslam.homing.record import DriveRecord
 from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import Steering
 from fgslam.runs.homing.config import PathFollowingConfig, parse_homing
@@ -201,14 +201,14 @@ def test_displaced_starts_stay_near_and_free() -> None:
     assert np.ptp(places[:, 2]) > 3.0
 
 
-class ShowingEyes:
-    """Eyes of the landmark world, with a grey picture whose columns are bearings in degrees."""
+class ShowingFrontEnd:
+    """FrontEnd of the landmark world, with a grey picture whose columns are bearings in degrees."""
 
-    def __init__(self, eyes: Any) -> None:
-        self._eyes = eyes
+    def __init__(self, front_end: Any) -> None:
+        self._front_end = front_end
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._eyes, name)
+        return getattr(self._front_end, name)
 
     def unwrapped(self, image: np.ndarray) -> np.ndarray:
         return np.full((30, 360), 90, np.uint8)
@@ -221,8 +221,8 @@ class ShowingEyes:
 def test_the_camera_s_last_view_of_each_leg_is_drawn(tmp_path: Path) -> None:
     setting, behaviour = winding_path(4, 3, 2.0), HomingBehaviourSettings()
     follower = make_follower(setting, behaviour, None)
-    assert not isinstance(setting.eyes, Unwrapping)
-    watcher = DriveWatcher(cast(Unwrapping, ShowingEyes(setting.eyes)), follower)
+    assert not isinstance(setting.front_end, Unwrapping)
+    watcher = DriveWatcher(cast(Unwrapping, ShowingFrontEnd(setting.front_end)), follower)
     driver = Driver(Steering(behaviour.steering), NoAvoidance())
     record = follow(setting.world, follower, driver, behaviour.loop, setting.targets, watch=watcher)
     assert record.arrived

@@ -10,9 +10,9 @@ from fgslam.core.homing import BearingMatches
 from fgslam.core.planar import wrap
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
+from fgslam.frontend.homing.bearing_tracking import BearingTracker
 from fgslam.frontend.homing.matching import match_features
-from fgslam.frontend.homing.trackable import move_to_trackable
-from fgslam.frontend.homing.tracking import BearingTracker
+from fgslam.frontend.homing.trackable_points import move_to_trackable
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from fgslam.worlds.house.omni_world import OmniWorld
 from fgslam.worlds.house.settings import HousePathSettings, OmniHouseSettings
@@ -45,11 +45,11 @@ class Leg:
         extractor = OmniFeatureExtractor(self.world.camera, OmniFeatureSettings())
         features = extractor.extract(self.images[0]), extractor.extract(other)
         matches = match_features(*features, OmniMatchingSettings())
-        steady = self.tracker.steady
+        stabilised = self.tracker.stabilised
         rows, pixels, moved = move_to_trackable(
-            steady.grey(self.images[0]), steady.view, matches, features, SETTINGS
+            stabilised.grey(self.images[0]), stabilised.view, matches, features, SETTINGS
         )
-        found = self.world.camera.pixels(steady.view.rays(pixels))
+        found = self.world.camera.pixels(stabilised.view.rays(pixels))
         return matches.taken(rows), moved, pixels, self.world.points(self.poses[0], found)
 
     def angles(self, pose: FloatArray, points: FloatArray) -> FloatArray:

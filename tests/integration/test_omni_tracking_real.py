@@ -16,8 +16,8 @@ from fgslam.datasets.omni.opening import open_omni
 from fgslam.datasets.omni.settings import OmniVideoSettings
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
-from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
 from fgslam.frontend.homing.matching import match_features
+from fgslam.frontend.homing.ransac import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from fgslam.frontend.homing.video_tracking import ReplenishedTracker

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.polynomial import polynomial
 
-from fgslam.cameras.omni.monotone import MonotoneInverse
+from fgslam.cameras.omni.monotone_inverse import MonotoneInverse
 from fgslam.cameras.omni.radial import MirrorFrame, RadialCamera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError

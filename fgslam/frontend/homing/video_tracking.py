@@ -10,7 +10,7 @@ import numpy as np
 from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.homing import TrackedBearings
-from fgslam.frontend.homing.tracking import BearingTracker
+from fgslam.frontend.homing.bearing_tracking import BearingTracker
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 
 
@@ -68,12 +68,12 @@ class ReplenishedTracker:
 
     def view(self, image: Image) -> Image:
         """(height, width) the unwrapped grey view of an image (h, w, 3)."""
-        return self._tracker.steady.grey(image)
+        return self._tracker.stabilised.grey(image)
 
     def _fill(self, image: Image) -> IntArray:
         """(k,) identities of the strongest corners away from the points that there are."""
         present = self._tracker.pixels()
-        corners = self._corners(self._tracker.steady.grey(image), present)
+        corners = self._corners(self._tracker.stabilised.grey(image), present)
         ids = self._next + np.arange(len(corners), dtype=np.int64)
         self._next += len(corners)
         self._tracker.add(ids, corners)

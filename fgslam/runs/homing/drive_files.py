@@ -12,8 +12,8 @@ from fgslam.core.bearing_log import BearingLog
 from fgslam.core.homing import HomingTruth
 from fgslam.core.planar import between, wrap
 from fgslam.homing.command import HomingState
+from fgslam.homing.drive_record import DriveRecord, HomingLog
 from fgslam.homing.drive_scores import cross_track, pass_distances
-from fgslam.homing.record import DriveRecord, HomingLog
 from fgslam.report.homing.plan import Drive
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.homing.logs import save_bearing_logs

@@ -12,9 +12,9 @@ import numpy as np
 from fgslam.core.arrays import ByteArray, FloatArray
 from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.homing import TrackedBearings
+from fgslam.homing.active_homing import ActiveHoming
 from fgslam.homing.command import Command
 from fgslam.homing.path_following import PathFollower
-from fgslam.homing.underway import HomingUnderWay
 from fgslam.report.page.data import Picture
 from fgslam.report.pictures.view_tracks import draw_view_tracks
 
@@ -24,7 +24,7 @@ _TRAIL = 15  # images
 
 @runtime_checkable
 class Unwrapping(Protocol):
-    """Eyes that can show what they see; those of landmark worlds cannot."""
+    """FrontEnd that can show what they see; those of landmark worlds cannot."""
 
     def unwrapped(self, image: ByteArray) -> ByteArray:
         """(h, w) grey view of an image."""
@@ -55,21 +55,21 @@ class LegView:
 class DriveWatcher:
     """Looks over the robot's shoulder; see :data:`fgslam.homing.closed_loop.Watcher`."""
 
-    def __init__(self, eyes: Unwrapping, follower: PathFollower) -> None:
-        self._eyes, self._follower = eyes, follower
-        self._homing: HomingUnderWay | None = None
+    def __init__(self, front_end: Unwrapping, follower: PathFollower) -> None:
+        self._front_end, self._follower = front_end, follower
+        self._homing: ActiveHoming | None = None
         self._trails: dict[int, FloatArray] = {}
         self._last: dict[int, tuple[ByteArray, dict[int, FloatArray], str]] = {}
 
     def __call__(self, command: Command, image: ByteArray) -> None:
         """Notes the image if the tracks are those in it."""
-        homing = self._follower.controller.underway
+        homing = self._follower.controller.active
         if homing is None or homing.tracked.time != command.time:
             return
         before = self._trails if homing is self._homing else {}
         self._homing = homing
         none = np.empty((0, 2))
-        places = self._eyes.places(homing.tracked)
+        places = self._front_end.places(homing.tracked)
         self._trails = {
             i: np.vstack([before.get(i, none)[1 - _TRAIL :], place])
             for i, place in zip(homing.tracked.ids.tolist(), places, strict=True)
@@ -88,7 +88,7 @@ class DriveWatcher:
 
     def _view(self, target: int) -> LegView:
         image, trails, told = self._last[target]
-        return LegView(target, self._eyes.unwrapped(image), tuple(trails.values()), told)
+        return LegView(target, self._front_end.unwrapped(image), tuple(trails.values()), told)
 
 
 def draw_leg_views(folder: Path, seed: int, views: Sequence[LegView]) -> tuple[Picture, ...]:

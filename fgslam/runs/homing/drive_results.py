@@ -11,6 +11,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import between
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
+from fgslam.homing.drive_record import STAGES, DriveRecord
 from fgslam.homing.drive_scores import (
     ARRIVED_M,
     Slope,
@@ -21,7 +22,6 @@ from fgslam.homing.drive_scores import (
     slope_by_leg,
     truly_arrived,
 )
-from fgslam.homing.record import STAGES, DriveRecord
 from fgslam.report.homing import Column, TextTable
 from fgslam.report.homing.curves import Line, curve_figure
 from fgslam.report.homing.local_map import local_map_figure

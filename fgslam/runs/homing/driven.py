@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fgslam.core.arrays import FloatArray
+from fgslam.homing.drive_record import DriveRecord
 from fgslam.homing.path_memory import PathMemory
-from fgslam.homing.record import DriveRecord
 from fgslam.runs.homing.drive_pictures import LegView
 
 

@@ -15,7 +15,7 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import OutputError
 from fgslam.homing.avoidance import make_avoider
 from fgslam.homing.closed_loop import Driver, World, follow
-from fgslam.homing.eyes import HomingEyes
+from fgslam.homing.front_end import HomingFrontEnd
 from fgslam.homing.path_following import PathFollower
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.steering import Steering
@@ -57,9 +57,9 @@ class PathWorld(World, Protocol):
         ...
 
 
-Opened: TypeAlias = tuple[PathWorld, HomingEyes]
+Opened: TypeAlias = tuple[PathWorld, HomingFrontEnd]
 Opener: TypeAlias = Callable[[DrivingConfig, int], Opened]
-"""Opens the world of one seed, and makes the eyes for it; of a module's top level."""
+"""Opens the world of one seed, and makes the front-end for it; of a module's top level."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,12 +101,12 @@ def run_driving(
 def perform_drive(task: DriveTask) -> DrivenSeed:
     """One drive from start to end."""
     config, behaviour = task.config, task.config.behaviour
-    world, eyes = task.opener(config, task.seed)
+    world, front_end = task.opener(config, task.seed)
     if config.start_offset_m > 0.0:
         world.put(_displaced(world, config.start_offset_m, np.random.default_rng((task.seed, 7))))
-    memory = PathMemory.of([eyes.describe(image) for image in world.targets])
+    memory = PathMemory.of([front_end.describe(image) for image in world.targets])
     follower = PathFollower(
-        eyes,
+        front_end,
         memory.images,
         lambda start: make_homing_estimator(start, config.estimator),
         behaviour.control,
@@ -115,7 +115,9 @@ def perform_drive(task: DriveTask) -> DrivenSeed:
     driver = Driver(Steering(behaviour.steering), make_avoider(behaviour.avoidance))
     start = np.array(world.true_pose)
     shown = config.output.pictures if task.seed == config.seed else 0
-    watcher = DriveWatcher(eyes, follower) if shown and isinstance(eyes, Unwrapping) else None
+    watcher = (
+        DriveWatcher(front_end, follower) if shown and isinstance(front_end, Unwrapping) else None
+    )
     record = follow(world, follower, driver, behaviour.loop, world.target_poses, watcher)
     leg = float(np.hypot(*(world.target_poses[0, :2] - start[:2])))
     views = () if watcher is None else watcher.views(shown)

@@ -10,12 +10,12 @@ import numpy as np
 
 from fgslam.core.homing import HomingVector, OmniFeatures, Refusal
 from fgslam.evaluation.metrics import JsonValue
-from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
 from fgslam.frontend.homing.matching import match_features
-from fgslam.homing.linking import Answer, Pair
+from fgslam.frontend.homing.ransac import estimate_homing_vector
+from fgslam.homing.links import Answer, Pair
 from fgslam.homing.localisation import Localiser
 from fgslam.homing.retrieval import VisualWords
-from fgslam.homing.third_views import InlierRows
+from fgslam.homing.third_view_consistency import InlierRows
 from fgslam.homing.topological_map import map_of_answers
 from fgslam.report.tables import write_csv
 from fgslam.runs.homing.config import TopologicalMapConfig

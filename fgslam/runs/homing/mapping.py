@@ -12,8 +12,8 @@ import numpy as np
 from fgslam.core.errors import ConfigError, StoredMapError
 from fgslam.core.homing import OmniFeatures
 from fgslam.evaluation.metrics import JsonValue
-from fgslam.homing.linking import Answer, Link, Pair
-from fgslam.homing.third_views import InlierRows
+from fgslam.homing.links import Answer, Link, Pair
+from fgslam.homing.third_view_consistency import InlierRows
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
 from fgslam.report.homing import Column, TextTable
 from fgslam.report.homing.network import Links, network_figure, unfolded

@@ -17,8 +17,8 @@ from fgslam.core.homing import (
     Refusal,
 )
 from fgslam.frontend.features.omni_settings import OmniMatchingSettings
-from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
 from fgslam.frontend.homing.matching import match_features
+from fgslam.frontend.homing.ransac import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.runs.homing.pair_answers import PairAnswer
 from fgslam.runs.homing.results import Progress, Stopped

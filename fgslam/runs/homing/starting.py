@@ -8,8 +8,8 @@ import numpy as np
 
 from fgslam.core.arrays import IntArray
 from fgslam.core.homing import BearingMatches, HomingStart, Refusal
-from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
 from fgslam.frontend.homing.local_map import make_local_map
+from fgslam.frontend.homing.ransac import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
 
 

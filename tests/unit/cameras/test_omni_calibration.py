@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from fgslam.cameras.omni.edge_straightness import upright_edges
 from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
 from fgslam.cameras.omni.panoramas import Cylinder
 from fgslam.cameras.omni.protocol import OmniCamera
@@ -15,7 +16,6 @@ from fgslam.cameras.omni.ring_calibration import (
     find_mirror_circle,
     mirror_offset,
 )
-from fgslam.cameras.omni.straightness import upright_edges
 from fgslam.cameras.omni.unwrapping import unwrap_maps
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError

@@ -1,4 +1,4 @@
-"""The state machine of one homing, on scripted eyes and on a world of landmarks."""
+"""The state machine of one homing, on scripted front-end and on a world of landmarks."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from fgslam.core.homing import (
     TrackedBearings,
 )
 from fgslam.core.planar import bearings, between, unit, wrap
+from fgslam.homing.active_homing import ActiveHoming
+from fgslam.homing.bearing_consistency import parallax
 from fgslam.homing.command import Command, HomingState
 from fgslam.homing.controller import HomingController
-from fgslam.homing.eyes import Sighting
+from fgslam.homing.front_end import Sighting
 from fgslam.homing.settings import HomingControlSettings
-from fgslam.homing.soundness import parallax
-from fgslam.homing.underway import HomingUnderWay
 from tests.homing import make_matches
 from tests.landmark_world import DARK, Setting, winding_path
 
@@ -86,7 +86,7 @@ class OracleEstimator:
 
 
 @dataclass
-class ScriptedEyes:
+class ScriptedFrontEnd:
     """Answers to ``begin`` from a list, the last one repeated; tracks of a robot that one sets."""
 
     answers: list[HomingVector | Refusal]
@@ -129,17 +129,17 @@ class ScriptedEyes:
 
 @dataclass
 class Bench:
-    """A controller with scripted eyes and an estimator that one can set."""
+    """A controller with scripted front-end and an estimator that one can set."""
 
-    eyes: ScriptedEyes
+    front_end: ScriptedFrontEnd
     settings: HomingControlSettings = SETTINGS
     estimators: list[OracleEstimator] = field(default_factory=list)
     time: float = -0.1
 
     def __post_init__(self) -> None:
         """Makes the controller."""
-        target = OmniFeatures(None, None)  # type: ignore[arg-type]  # scripted eyes do not look
-        self.controller = HomingController(self.eyes, target, self._make, self.settings)
+        target = OmniFeatures(None, None)  # type: ignore[arg-type]  # never looked at
+        self.controller = HomingController(self.front_end, target, self._make, self.settings)
 
     def _make(self, start: HomingStart) -> OracleEstimator:
         self.estimators.append(OracleEstimator(start))
@@ -147,8 +147,8 @@ class Bench:
 
     def at(self, x: float, y: float = 0.0, psi: float = 0.0) -> None:
         """Puts the robot, truth and belief alike, into the start frame."""
-        self.eyes.robot = np.array([x, y, psi])
-        self.estimators[-1].robot = self.eyes.robot
+        self.front_end.robot = np.array([x, y, psi])
+        self.estimators[-1].robot = self.front_end.robot
 
     def step(self, dt: float = 0.1) -> Command:
         """One image later."""
@@ -158,7 +158,7 @@ class Bench:
 
 def bench(*answers: HomingVector | Refusal, **changes: float) -> Bench:
     """With these answers to ``begin``."""
-    return Bench(ScriptedEyes(list(answers)), replace(SETTINGS, **changes))  # type: ignore[arg-type]
+    return Bench(ScriptedFrontEnd(list(answers)), replace(SETTINGS, **changes))  # type: ignore[arg-type]
 
 
 FEW = Refusal(RefusalReason.TOO_FEW_MATCHES, "2 matches, of 8 needed")
@@ -186,7 +186,7 @@ def test_reached_and_stays_reached() -> None:
     assert arrived.stop
     later = b.step()
     assert (later.state, later.time) == (HomingState.ARRIVED, b.time)
-    assert len(b.eyes.begun) == 1
+    assert len(b.front_end.begun) == 1
 
 
 def test_passed_target_counts_as_reached_only_when_near() -> None:
@@ -225,7 +225,7 @@ def test_refused_target_is_tried_for_a_while_and_then_given_up() -> None:
     assert all(c.stop for c in commands)
     assert commands[-1].state is HomingState.REFUSED
     assert commands[-1].refusal is FEW
-    assert np.all(np.diff(b.eyes.begun) > SETTINGS.retry_s - 0.01)
+    assert np.all(np.diff(b.front_end.begun) > SETTINGS.retry_s - 0.01)
     assert commands[0].reason == FEW.details
 
 
@@ -243,7 +243,7 @@ def test_few_tracks_match_anew_while_driving_on() -> None:
     b.step()
     b.at(0.4)
     b.step()
-    b.eyes.tracks = SETTINGS.min_tracks - 1
+    b.front_end.tracks = SETTINGS.min_tracks - 1
     refused = b.step(SETTINGS.retry_s)
     assert refused.state is HomingState.DRIVE
     assert FEW.details in refused.reason
@@ -252,7 +252,7 @@ def test_few_tracks_match_anew_while_driving_on() -> None:
     assert b.controller.initialisations == 2
     assert any("matched anew" in c.reason for c in renewed)
     assert all(c.state is HomingState.DRIVE for c in renewed)
-    assert len(b.eyes.begun) == 3
+    assert len(b.front_end.begun) == 3
 
 
 def test_remaining_goes_on_in_the_old_unit() -> None:
@@ -261,9 +261,9 @@ def test_remaining_goes_on_in_the_old_unit() -> None:
     b.step()
     b.at(0.6)
     b.step()
-    b.eyes.tracks = 9
+    b.front_end.tracks = 9
     assert b.step(SETTINGS.retry_s).remaining == pytest.approx(0.4)
-    b.eyes.tracks = 20
+    b.front_end.tracks = 20
     b.at(0.5)  # half of the new leg
     command = b.step()
     assert command.remaining == pytest.approx(0.2)
@@ -292,7 +292,7 @@ def test_estimate_without_a_covariance_is_uncertain() -> None:
     command = b.step(SETTINGS.retry_s)
     assert command.state is HomingState.DRIVE
     assert "no covariance" in command.reason
-    assert len(b.eyes.begun) == 2
+    assert len(b.front_end.begun) == 2
     b.at(0.999)
     assert b.step().state is HomingState.DRIVE
     b.estimators[-1].sigma = 1e-3
@@ -308,7 +308,7 @@ def test_arrival_needs_tracks_in_the_map() -> None:
     command = b.step(SETTINGS.retry_s)
     assert command.state is HomingState.DRIVE
     assert "no track confirms it: reached" in command.reason
-    assert len(b.eyes.begun) == 2
+    assert len(b.front_end.begun) == 2
     b.estimators[-1].mapped = 3
     assert b.step().state is HomingState.ARRIVED
 
@@ -317,10 +317,10 @@ def test_arrival_needs_tracks_in_the_map() -> None:
 def test_averages_without_map_and_covariance_drive(settings: HomingEstimatorSettings) -> None:
     """They never have any; that is no fault of theirs."""
     start = start_at(0.0, vector_to(0.0))
-    homing = HomingUnderWay(start, lambda s: make_homing_estimator(s, settings), 1.0, SETTINGS)
-    eyes = ScriptedEyes([FEW], robot=np.array([0.2, 0.0, 0.0]))
-    assert homing.update(eyes.track(DARK, 0.1)) is None
-    assert homing.vouched
+    homing = ActiveHoming(start, lambda s: make_homing_estimator(s, settings), 1.0, SETTINGS)
+    front_end = ScriptedFrontEnd([FEW], robot=np.array([0.2, 0.0, 0.0]))
+    assert homing.update(front_end.track(DARK, 0.1)) is None
+    assert homing.supported
 
 
 def test_diverged_estimate_is_not_driven_by() -> None:
@@ -334,7 +334,7 @@ def test_diverged_estimate_is_not_driven_by() -> None:
     assert command.state is HomingState.BLIND
     assert "diverged" in command.reason
     assert command.reason.endswith(FEW.details)
-    assert len(b.eyes.begun) == 2
+    assert len(b.front_end.begun) == 2
 
 
 def test_all_tracks_lost_in_one_frame_heals_in_the_same() -> None:
@@ -343,7 +343,7 @@ def test_all_tracks_lost_in_one_frame_heals_in_the_same() -> None:
     b.step()
     b.at(0.3)
     b.step()
-    b.eyes.tracks = 0
+    b.front_end.tracks = 0
     command = b.step()
     assert command.state is HomingState.DRIVE
     assert b.controller.initialisations == 2
@@ -356,7 +356,7 @@ def test_blind_is_short_then_stands_then_refuses() -> None:
     b = bench(vector_to(0.0), FEW, farther_tries=0)
     b.step()
     b.step()
-    b.eyes.tracks = 0
+    b.front_end.tracks = 0
     commands = [b.step() for _ in range(60)]
     states = [c.state for c in commands]
     blind = states.count(HomingState.BLIND)
@@ -374,7 +374,7 @@ def test_blind_only_where_home_was_ahead() -> None:
     b = bench(vector_to(1.0), FEW)
     b.step()
     b.step()
-    b.eyes.tracks = 0
+    b.front_end.tracks = 0
     assert b.step().state is HomingState.WAIT
 
 
@@ -383,12 +383,12 @@ def test_image_that_flips_is_not_believed() -> None:
     b = bench(vector_to(0.0))
     b.step()
     b.step()
-    b.eyes.turned = np.pi
-    b.eyes.answers = [FEW]
+    b.front_end.turned = np.pi
+    b.front_end.answers = [FEW]
     b.step()
-    assert b.controller.underway is None
-    b.eyes.turned = 0.0
-    b.eyes.answers = [vector_to(np.pi)]
+    assert b.controller.active is None
+    b.front_end.turned = 0.0
+    b.front_end.answers = [vector_to(np.pi)]
     healed = [b.step() for _ in range(6)][-1]
     assert healed.state is HomingState.DRIVE
     assert b.controller.initialisations == 2
@@ -398,10 +398,10 @@ def test_flip_is_named() -> None:
     """The reason tells what was seen."""
     b = bench(vector_to(0.0))
     b.step()
-    underway = b.controller.underway
-    assert underway is not None
-    b.eyes.turned = np.pi
-    fault = underway.update(b.eyes.track(DARK, 0.1))
+    active = b.controller.active
+    assert active is not None
+    b.front_end.turned = np.pi
+    fault = active.update(b.front_end.track(DARK, 0.1))
     assert fault is not None
     assert not fault.usable
     assert "turned by" in fault.reason
@@ -423,12 +423,12 @@ def test_contradicting_vector_is_confirmed_before_it_is_driven_by() -> None:
     b = bench(vector_to(0.0), vector_to(2.0), vector_to(2.1))
     b.step()
     b.step()
-    b.eyes.tracks = 9
+    b.front_end.tracks = 9
     doubt = b.step(SETTINGS.retry_s)
     assert doubt.state is HomingState.CONFIRM
     assert doubt.stop
-    b.eyes.tracks = 20
-    b.eyes.robot = np.zeros(3)
+    b.front_end.tracks = 20
+    b.front_end.robot = np.zeros(3)
     confirmed = b.step()
     assert confirmed.state is HomingState.DRIVE
     assert confirmed.heading == pytest.approx(2.1)
@@ -440,7 +440,7 @@ def test_vectors_that_keep_contradicting_end_the_homing() -> None:
     b = bench(*answers, farther_tries=0)
     b.step()
     b.step()
-    b.eyes.tracks = 9
+    b.front_end.tracks = 9
     commands = [b.step(SETTINGS.retry_s) for _ in range(12)]
     assert all(c.stop for c in commands)
     assert commands[-1].state is HomingState.REFUSED
@@ -491,7 +491,7 @@ def test_answer_after_an_ambiguous_one_needs_another_image() -> None:
     driven = states.index(HomingState.DRIVE)
     assert all(c.stop for c in commands[:driven])
     assert commands[driven].heading == pytest.approx(0.12)
-    assert len(b.eyes.begun) == 4
+    assert len(b.front_end.begun) == 4
 
 
 def test_near_the_target_one_look_confirms_it() -> None:
@@ -500,25 +500,25 @@ def test_near_the_target_one_look_confirms_it() -> None:
     b.step()
     b.at(1.0 - 1.1 * SETTINGS.near_fraction)
     b.step()
-    assert b.eyes.looked == 0
+    assert b.front_end.looked == 0
     b.at(1.0 - 0.9 * SETTINGS.near_fraction)
     assert b.step().state is HomingState.DRIVE
     b.at(0.95)
     assert b.step().state is HomingState.ARRIVED
-    assert b.eyes.looked == 1
+    assert b.front_end.looked == 1
     assert b.controller.initialisations == 1
 
 
 def test_target_seen_elsewhere_begins_the_leg_anew() -> None:
     """A wrong vector that was sure of itself: two images that agree on another one win."""
     b = bench(vector_to(0.0), vector_to(1.5))
-    b.eyes.looks = [Sighting(vector_to(1.4), 3.0)]
+    b.front_end.looks = [Sighting(vector_to(1.4), 3.0)]
     b.step()
     b.at(0.8)
     doubt = b.step()
     assert doubt.state is HomingState.CONFIRM
     assert "seen elsewhere" in doubt.reason
-    b.eyes.robot, b.eyes.looks = np.zeros(3), []
+    b.front_end.robot, b.front_end.looks = np.zeros(3), []
     anew = b.step()
     assert anew.state is HomingState.DRIVE
     assert anew.heading == pytest.approx(1.5)
@@ -541,10 +541,10 @@ def test_how_near_the_target_is_seen_decides(
     """Seen elsewhere than expected: at the target itself that is an arrival, else an error."""
     b = bench(vector_to(0.0))
     b.step()
-    start = b.controller.underway
+    start = b.controller.active
     assert start is not None
     before = parallax(start.start.matches, 0.0)
-    b.eyes.looks = [Sighting(vector, part * before)]
+    b.front_end.looks = [Sighting(vector, part * before)]
     b.at(0.8)
     command = b.step()
     assert command.state is state
@@ -555,10 +555,10 @@ def test_estimate_in_doubt_is_driven_by_no_more_not_even_blind() -> None:
     """Matched anew within the time that may be driven blind; then no look shows the target."""
     b = bench(vector_to(0.0), FEW, vector_to(0.0), FEW, blind_s=5.0)
     b.step()
-    b.eyes.tracks = 0
+    b.front_end.tracks = 0
     assert b.step().state is HomingState.BLIND
-    b.eyes.tracks, b.eyes.looks = 20, [FEW]
-    while b.controller.underway is None:
+    b.front_end.tracks, b.front_end.looks = 20, [FEW]
+    while b.controller.active is None:
         b.step()
     b.at(0.99)
     doubt = b.step()
@@ -572,20 +572,20 @@ def test_estimate_that_takes_another_s_place_is_looked_at_itself() -> None:
     b.step()
     b.at(0.8)
     b.step()
-    assert b.eyes.looked == 1
-    b.eyes.tracks = 9
+    assert b.front_end.looked == 1
+    b.front_end.tracks = 9
     assert b.step(SETTINGS.retry_s).state is HomingState.CONFIRM
-    b.eyes.robot, b.eyes.tracks = np.zeros(3), 20
+    b.front_end.robot, b.front_end.tracks = np.zeros(3), 20
     assert b.step().state is HomingState.DRIVE
     b.at(*(0.8 * unit(np.array(1.5))))
     b.step()
-    assert b.eyes.looked == 2
+    assert b.front_end.looked == 2
 
 
 def test_no_arrival_where_the_target_is_not_seen() -> None:
     """The estimate is there, the look is refused: given up, then matched again or refused."""
     b = bench(vector_to(0.0), FEW)
-    b.eyes.looks = [FEW]
+    b.front_end.looks = [FEW]
     b.step()
     b.at(0.99)
     commands = [b.step() for _ in range(300)]
@@ -599,7 +599,7 @@ def test_no_arrival_where_the_target_is_not_seen() -> None:
 def test_look_from_the_target_itself_is_arrival() -> None:
     """Both views are from one place, whatever the estimate says of the last bit."""
     b = bench(vector_to(0.0))
-    b.eyes.looks = [Refusal(RefusalReason.AT_TARGET, "median parallax 0.1 deg", 0.0)]
+    b.front_end.looks = [Refusal(RefusalReason.AT_TARGET, "median parallax 0.1 deg", 0.0)]
     b.step()
     b.at(0.85)
     assert b.step().state is HomingState.ARRIVED
@@ -622,7 +622,7 @@ def test_time_must_run_forward(time: float) -> None:
     b.step()
     with pytest.raises(EstimatorError, match="give images in the order of their times"):
         b.controller.step(DARK, time)
-    assert len(b.eyes.begun) == 1
+    assert len(b.front_end.begun) == 1
     assert b.step().state is HomingState.DRIVE
 
 
@@ -631,7 +631,10 @@ def real_controller(
 ) -> HomingController:
     """On the world's first target with the program's own estimator."""
     return HomingController(
-        setting.eyes, setting.path()[0], lambda start: make_homing_estimator(start, kind), SETTINGS
+        setting.front_end,
+        setting.path()[0],
+        lambda start: make_homing_estimator(start, kind),
+        SETTINGS,
     )
 
 
@@ -641,7 +644,7 @@ def test_real_estimators_survive_a_dark_second(
 ) -> None:
     """All tracks lost in one frame, light again after a second; the robot's pose is frozen."""
     setting = winding_path(3, 1, 2.0)
-    setting.eyes.dark = lambda t: 0.95 < t < 1.95
+    setting.front_end.dark = lambda t: 0.95 < t < 1.95
     controller = real_controller(setting, kind)
     states = []
     for k in range(40):
@@ -659,7 +662,7 @@ def test_real_estimators_survive_a_dark_second(
 def test_dark_from_the_beginning_is_refused() -> None:
     """The refusal's own reason is kept."""
     setting = winding_path(3, 1, 2.0)
-    setting.eyes.dark = lambda _: True
+    setting.front_end.dark = lambda _: True
     controller = real_controller(setting, HomingEkfSettings())
     commands = [controller.step(DARK, 0.1 * k) for k in range(250)]
     assert commands[-1].refusal is not None

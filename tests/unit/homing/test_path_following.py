@@ -13,9 +13,9 @@ from fgslam.core.errors import ConfigError, EstimatorError
 from fgslam.core.planar import between
 from fgslam.homing.avoidance import RangeScan
 from fgslam.homing.command import Drive, HomingState
+from fgslam.homing.drive_record import STAGES, DriveRecord
 from fgslam.homing.drive_scores import corners, cross_track, pass_distances, slope_by_leg
 from fgslam.homing.path_following import PathFollower
-from fgslam.homing.record import STAGES, DriveRecord
 from fgslam.homing.settings import (
     ClosedLoopSettings,
     HomingBehaviourSettings,
@@ -106,12 +106,12 @@ def test_graph_drives_as_well() -> None:
 def follower_with_unknown(count: int, path: PathFollowingSettings) -> PathFollower:
     """Two targets on a path, the first ``count`` replaced by images from elsewhere."""
     setting = winding_path(9, count + 1, 1.0)
-    elsewhere = setting.eyes.features_at(np.array([80.0, 80.0, 0.0]))
+    elsewhere = setting.front_end.features_at(np.array([80.0, 80.0, 0.0]))
     images = [elsewhere] * count + setting.path()[count:]
     kind = HomingEkfSettings()
     control = replace(HomingControlSettings(), give_up_s=0.5, farther_tries=0)
     return PathFollower(
-        setting.eyes, images, lambda start: make_homing_estimator(start, kind), control, path
+        setting.front_end, images, lambda start: make_homing_estimator(start, kind), control, path
     )
 
 
@@ -129,7 +129,7 @@ def test_target_that_cannot_be_matched_is_skipped() -> None:
 def test_refusal_does_not_end_a_drive() -> None:
     """Blind for longer than a refused target is tried at a stand: looked for from farther on."""
     setting = winding_path(7, 2, 2.0)
-    setting.eyes.dark = lambda t: t < 5.0
+    setting.front_end.dark = lambda t: t < 5.0
     record = drive_path(setting)
     assert HomingState.SEARCH.value in record.state
     assert [leg.result for leg in record.legs] == ["arrived", "arrived"]
@@ -187,7 +187,7 @@ def test_bad_input_is_told() -> None:
     setting = winding_path(7, 1, 2.0)
     with pytest.raises(ConfigError, match="no target image"):
         PathFollower(
-            setting.eyes, [], lambda _: pytest.fail("no start"), HomingControlSettings(),
+            setting.front_end, [], lambda _: pytest.fail("no start"), HomingControlSettings(),
             PathFollowingSettings(),
         )  # fmt: skip
     follower = make_follower(setting, HomingBehaviourSettings())

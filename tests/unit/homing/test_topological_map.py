@@ -13,10 +13,10 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import HomingVector, OmniFeatures, Refusal, RefusalReason
 from fgslam.core.planar import between, wrap
-from fgslam.frontend.homing.homing_ransac import estimate_homing_vector
+from fgslam.frontend.homing.ransac import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.homing.link_checks import LinkChecks, between_misfit, heading_residuals
-from fgslam.homing.linking import Answer, Link, link_pair
+from fgslam.homing.link_consistency import LinkConsistency, between_misfit, heading_residuals
+from fgslam.homing.links import Answer, Link, link_pair
 from fgslam.homing.localisation import Localiser
 from fgslam.homing.retrieval import VisualWords, candidate_pairs
 from fgslam.homing.settings import LocalisationSettings, RetrievalSettings, TopologicalMapSettings
@@ -153,7 +153,7 @@ def test_false_links_are_found_and_true_ones_kept(seed: int) -> None:
         turned(link, *rng.uniform(0.6, 2.5, 2) * rng.choice([-1, 1], 2)) if k in wrong else link
         for k, link in enumerate(links)
     ]
-    believed, rejected = LinkChecks(16, spoiled, SETTINGS).believed(ordered=False)
+    believed, rejected = LinkConsistency(16, spoiled, SETTINGS).believed(ordered=False)
     false = {(links[k].a, links[k].b) for k in wrong}
     assert false == set(rejected)
     assert len(believed) == len(links) - len(false)
@@ -164,10 +164,10 @@ def test_long_link_between_lookalikes_needs_a_witness() -> None:
     poses = np.column_stack([np.arange(8.0), np.zeros(8), np.zeros(8)])
     chain = [true_link(poses, k, k + 1, 20) for k in range(7)]
     long = turned(true_link(poses, 1, 6, SETTINGS.lone_support - 1), 0.0, 1.0)
-    believed, rejected = LinkChecks(8, [*chain, long], SETTINGS).believed(ordered=True)
+    believed, rejected = LinkConsistency(8, [*chain, long], SETTINGS).believed(ordered=True)
     assert [(k.a, k.b) for k in believed] == [(k, k + 1) for k in range(7)]
     assert "no third image" in rejected[1, 6]
-    unordered, _ = LinkChecks(8, chain, SETTINGS).believed(ordered=False)
+    unordered, _ = LinkConsistency(8, chain, SETTINGS).believed(ordered=False)
     assert unordered == []  # order is the only witness there was
 
 
@@ -177,7 +177,7 @@ def test_strong_lone_link_that_is_turned_breaks_a_loop() -> None:
     poses = np.column_stack([4.0 * np.cos(angle), 4.0 * np.sin(angle), angle])
     ring = [true_link(poses, *sorted((k, (k + 1) % 10)), 120) for k in range(10)]
     across = turned(true_link(poses, 2, 7, 110), np.deg2rad(90.0))
-    believed, rejected = LinkChecks(10, [*ring, across], SETTINGS).believed(ordered=True)
+    believed, rejected = LinkConsistency(10, [*ring, across], SETTINGS).believed(ordered=True)
     assert set(rejected) == {(2, 7)}
     assert "off all other rotations" in rejected[2, 7]
     assert len(believed) == 10

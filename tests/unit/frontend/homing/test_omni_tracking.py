@@ -1,4 +1,4 @@
-"""Tracking on a steady view: accuracy against truth, turns, light, loss, bad input."""
+"""Tracking on a stabilised view: accuracy against truth, turns, light, loss, bad input."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import EstimatorError, FrameError
 from fgslam.core.homing import TrackedBearings
 from fgslam.core.planar import wrap
-from fgslam.frontend.homing.tracking import BearingTracker
+from fgslam.frontend.homing.bearing_tracking import BearingTracker
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from tests.textured_room import CAMERA, angles, hits, picture
 

@@ -12,16 +12,21 @@ from fgslam.core.homing import FeatureKind, Refusal, RefusalReason
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
-from fgslam.homing.image_eyes import EyesSettings, ImageEyes, mixed_with_wrong, surest_all_around
+from fgslam.homing.image_front_end import (
+    FrontEndSettings,
+    ImageFrontEnd,
+    mixed_with_wrong,
+    surest_all_around,
+)
 from tests.homing import two_views
 
 
-def eyes() -> ImageEyes:
+def front_end() -> ImageFrontEnd:
     features = OmniFeatureSettings()
-    settings = EyesSettings(
+    settings = FrontEndSettings(
         features, features.matching, HomingVectorSettings(), OmniTrackingSettings()
     )
-    return ImageEyes(Equirectangular(256, 128), settings, np.random.default_rng(0))
+    return ImageFrontEnd(Equirectangular(256, 128), settings, np.random.default_rng(0))
 
 
 def test_share_of_wrong_matches_is_as_asked_and_none_is_right() -> None:
@@ -41,7 +46,7 @@ def test_share_of_wrong_matches_is_as_asked_and_none_is_right() -> None:
     [(0, RefusalReason.TOO_DARK), (5, RefusalReason.TOO_DARK), (128, RefusalReason.NO_FEATURES)],
 )
 def test_dark_and_blank_images_are_refused(level: int, reason: RefusalReason) -> None:
-    robot = eyes()
+    robot = front_end()
     rng = np.random.default_rng(2)
     target = robot.describe(rng.integers(0, 255, (128, 256, 3)).astype(np.uint8))
     answer = robot.begin(np.full((128, 256, 3), level, dtype=np.uint8), target, 0.0)

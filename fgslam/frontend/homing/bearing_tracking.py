@@ -1,8 +1,8 @@
-"""Tracking of features from image to image: KLT on a steady view (Goedemé et al. IV-A).
+"""Tracking of features from image to image: KLT on a stabilised view (Goedemé et al. IV-A).
 
 Eq. 2's matrix is summed over the window. A point is lost for good when it cannot be tracked
 back to where it came from, when it no longer looks as it did when its tracking began
-(:mod:`fgslam.frontend.homing.anchored_patches`), or when it leaves the view.
+(:mod:`fgslam.frontend.homing.reference_patches`), or when it leaves the view.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import TrackedBearings
-from fgslam.frontend.homing.anchored_patches import AnchoredPatches, align, anchor
-from fgslam.frontend.homing.steady_view import SteadyImage, SteadyView
+from fgslam.frontend.homing.reference_patches import ReferencePatches, align, anchor
+from fgslam.frontend.homing.stabilised_view import StabilisedImage, StabilisedView
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 
 Float32 = npt.NDArray[np.float32]
@@ -31,19 +31,19 @@ class BearingTracker:
 
     def __init__(self, camera: OmniCamera, settings: OmniTrackingSettings) -> None:
         self._settings = settings
-        self.steady = SteadyView(
+        self.stabilised = StabilisedView(
             camera, settings.max_view_width, settings.window_px, settings.pyramid_levels
         )
-        self._last: SteadyImage | None = None
+        self._last: StabilisedImage | None = None
         self._places: FloatArray = np.empty((0, 2))
-        self._patches: AnchoredPatches | None = None
+        self._patches: ReferencePatches | None = None
         self._ids: IntArray = np.empty(0, dtype=np.int64)
         self._time = -np.inf
 
     @property
     def view(self) -> OmniCamera:
         """The camera whose pixels the tracked points are."""
-        return self.steady.view
+        return self.stabilised.view
 
     def start(self, image: Image, time: float, ids: IntArray, pixels: FloatArray) -> None:
         """Tracks these points from now on, instead of any before.
@@ -54,8 +54,8 @@ class BearingTracker:
             ids: (n,) ascending.
             pixels: (n, 2) in the view.
         """
-        self._last = self.steady.make(image, None, 0.0)
-        self._places = self.steady.to_steady(pixels, self._last)
+        self._last = self.stabilised.make(image, None, 0.0)
+        self._places = self.stabilised.to_stabilised(pixels, self._last)
         self._patches = self._anchored(self._last, self._places)
         self._ids, self._time = ids.copy(), time
 
@@ -63,7 +63,7 @@ class BearingTracker:
         """Tracks these points of the last image, too; identities above those before."""
         if self._last is None or self._patches is None:
             raise EstimatorError("no image was tracked yet: start before adding points")
-        places = self.steady.to_steady(pixels, self._last)
+        places = self.stabilised.to_stabilised(pixels, self._last)
         self._patches = self._patches.joined(self._anchored(self._last, places))
         self._places = np.vstack([self._places, places])
         self._ids = np.concatenate([self._ids, ids])
@@ -81,8 +81,8 @@ class BearingTracker:
             raise EstimatorError(
                 f"an image at {time:.9f} s follows one at {self._time:.9f} s; give images in order"
             )
-        turn = _MAX_TURN * self.steady.period / (2.0 * np.pi)
-        now = self.steady.make(image, self._last, turn)
+        turn = _MAX_TURN * self.stabilised.period / (2.0 * np.pi)
+        now = self.stabilised.make(image, self._last, turn)
         if len(self._ids):
             places, kept = self._follow(self._last, now)
             self._settle(now, places[kept], self._ids[kept], self._patches.taken(kept))
@@ -97,14 +97,14 @@ class BearingTracker:
         """(n, 2) where the points are in the view of the last image."""
         if self._last is None:
             return np.empty((0, 2))
-        return self.steady.from_steady(self._places, self._last)
+        return self.stabilised.from_stabilised(self._places, self._last)
 
-    def _anchored(self, image: SteadyImage, places: FloatArray) -> AnchoredPatches:
+    def _anchored(self, image: StabilisedImage, places: FloatArray) -> ReferencePatches:
         s = self._settings
         return anchor(image.grey, places, s.patch_px, s.patch_noise_grey, s.patch_deformation)
 
     def _settle(
-        self, now: SteadyImage, places: FloatArray, ids: IntArray, patches: AnchoredPatches
+        self, now: StabilisedImage, places: FloatArray, ids: IntArray, patches: ReferencePatches
     ) -> None:
         """Aligns each point with its first patch, and keeps those that look like it."""
         patches, places, correlation = align(patches, now.grey, places)
@@ -116,10 +116,12 @@ class BearingTracker:
 
     def _centred(self, places: FloatArray) -> FloatArray:
         """Places between the margins; who crossed the seam goes on at the other end."""
-        margin, period = self.steady.margin, self.steady.period
+        margin, period = self.stabilised.margin, self.stabilised.period
         return np.column_stack([(places[:, 0] - margin) % period + margin, places[:, 1]])
 
-    def _follow(self, before: SteadyImage, now: SteadyImage) -> tuple[FloatArray, BoolArray]:
+    def _follow(
+        self, before: StabilisedImage, now: StabilisedImage
+    ) -> tuple[FloatArray, BoolArray]:
         """(n, 2) places in the new view, and (n,) whether they are to be trusted."""
         s = self._settings
         origin = self._places.astype(np.float32)
@@ -145,15 +147,15 @@ class BearingTracker:
 
     def _inside(self, places: Float32 | FloatArray) -> BoolArray:
         """(n,) whether a point's window lies mostly in the view; rows have no continuation."""
-        rim, rows = self._settings.window_px / 4.0, self.steady.view.height
+        rim, rows = self._settings.window_px / 4.0, self.stabilised.view.height
         good = (places[:, 1] >= rim) & (places[:, 1] <= rows - 1 - rim)
-        columns = 2 * self.steady.margin + self.steady.period
+        columns = 2 * self.stabilised.margin + self.stabilised.period
         return np.asarray(good & (places[:, 0] >= 0.0) & (places[:, 0] <= columns - 1.0))
 
     def _bearings(self, time: float) -> TrackedBearings:
-        s, view = self._settings, self.steady.view
+        s, view = self._settings, self.stabilised.view
         pixels = self.pixels()
-        a_column = 2.0 * np.pi / self.steady.period
+        a_column = 2.0 * np.pi / self.stabilised.period
         a_row = (view.top_elevation - view.bottom_elevation) / (view.height - 1)
         deformation = np.empty(0) if self._patches is None else self._patches.deformation()
         sigma = np.hypot(s.sigma_px, s.sigma_deformed_px * deformation)

@@ -13,8 +13,8 @@ from fgslam.core.arrays import BoolArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import HomeVector, HomingStart, HomingVector, TrackedBearings
 from fgslam.core.planar import wrap
+from fgslam.homing.bearing_consistency import common_turn, parallax, target_misfit, tracked_misfit
 from fgslam.homing.settings import HomingControlSettings
-from fgslam.homing.soundness import common_turn, parallax, target_misfit, tracked_misfit
 
 EstimatorMaker: TypeAlias = Callable[[HomingStart], HomingEstimator]
 
@@ -32,7 +32,7 @@ class Fault:
     usable: bool
 
 
-class HomingUnderWay:
+class ActiveHoming:
     """An estimator that is fed with tracks, and what tells whether to believe it.
 
     Attributes:
@@ -74,7 +74,7 @@ class HomingUnderWay:
         return HomeVector(self.unit * home.distance, home.direction, home.rotation, covariance)
 
     @property
-    def vouched(self) -> bool:
+    def supported(self) -> bool:
         """Whether tracks in the map and a covariance stand behind the estimate.
 
         Without them a filter or graph only carries the last motion on, and so might into the

@@ -28,7 +28,7 @@ _FARTHEST_PX = 4.0  # of one alignment; the tracker was closer than this, or els
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AnchoredPatches:
+class ReferencePatches:
     """Patches of n points, m pixels each.
 
     Attributes:
@@ -50,11 +50,11 @@ class AnchoredPatches:
     def __len__(self) -> int:
         return len(self.maps)
 
-    def taken(self, which: BoolArray) -> AnchoredPatches:
+    def taken(self, which: BoolArray) -> ReferencePatches:
         """Those alone."""
         if which.all():
             return self
-        return AnchoredPatches(
+        return ReferencePatches(
             self.size,
             self.first[which],
             self.light[which],
@@ -63,9 +63,9 @@ class AnchoredPatches:
             self.maps[which],
         )
 
-    def joined(self, others: AnchoredPatches) -> AnchoredPatches:
+    def joined(self, others: ReferencePatches) -> ReferencePatches:
         """These, then others of the same size."""
-        return AnchoredPatches(
+        return ReferencePatches(
             self.size,
             np.concatenate([self.first, others.first]),
             np.concatenate([self.light, others.light]),
@@ -81,7 +81,7 @@ class AnchoredPatches:
 
 def anchor(
     grey: Image, places: FloatArray, size: int, noise: float, deformation: float
-) -> AnchoredPatches:
+) -> ReferencePatches:
     """Patches around places (n, 2) of a view.
 
     Args:
@@ -107,7 +107,7 @@ def anchor(
     prior = np.diag([_FLAT, _FLAT] + 4 * [(noise / deformation) ** 2])
     weighted = slopes_only * weight
     step = np.linalg.solve(weighted @ slopes_only.transpose(0, 2, 1) + prior, weighted)
-    return AnchoredPatches(
+    return ReferencePatches(
         size,
         first,
         light.astype(np.float32),
@@ -118,8 +118,8 @@ def anchor(
 
 
 def align(
-    patches: AnchoredPatches, grey: Image, places: FloatArray
-) -> tuple[AnchoredPatches, FloatArray, FloatArray]:
+    patches: ReferencePatches, grey: Image, places: FloatArray
+) -> tuple[ReferencePatches, FloatArray, FloatArray]:
     """Moves places so that the patches fit the view.
 
     Args:
@@ -144,7 +144,7 @@ def align(
     correlation = 1.0 / np.hypot(1.0, unlike)
     good = (level[:, 1] > _GAIN[0]) & (level[:, 1] < _GAIN[1])
     good &= np.hypot(move[:, 0], move[:, 1]) < _FARTHEST_PX
-    fitted = AnchoredPatches(
+    fitted = ReferencePatches(
         patches.size,
         patches.first,
         patches.light,

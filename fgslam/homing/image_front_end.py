@@ -1,4 +1,4 @@
-"""The eyes of a robot with one omnidirectional camera: features, homing vector, tracking."""
+"""The front-end of homing for one omnidirectional camera: features, homing vector, tracking."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from fgslam.core.homing import (
 )
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
-from fgslam.frontend.homing.homing_ransac import estimate_homing_vector, paired_anew
+from fgslam.frontend.homing.bearing_tracking import BearingTracker
 from fgslam.frontend.homing.local_map import make_local_map, triangulable
 from fgslam.frontend.homing.matching import joined, match_features
+from fgslam.frontend.homing.ransac import estimate_homing_vector, paired_anew
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.frontend.homing.trackable import move_to_trackable
-from fgslam.frontend.homing.tracking import BearingTracker
+from fgslam.frontend.homing.trackable_points import move_to_trackable
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
-from fgslam.homing.eyes import Sighting
-from fgslam.homing.soundness import parallax
+from fgslam.homing.bearing_consistency import parallax
+from fgslam.homing.front_end import Sighting
 
 _SECTORS = 8  # of 45 degrees
 _DARK = 8.0  # mean grey value of what the camera sees
@@ -35,7 +35,7 @@ _MAX_RELATIVE_SIGMA = 1.0  # of a distance; whoever knows less of a feature wait
 
 
 @dataclass(frozen=True, slots=True)
-class EyesSettings:
+class FrontEndSettings:
     """What every stage of the front-end is set to.
 
     ``wrong_matches`` is the share of wrong ones that is mixed into all matches, to try how much the
@@ -49,11 +49,11 @@ class EyesSettings:
     wrong_matches: float = 0.0
 
 
-class ImageEyes:
-    """Homing's front-end for one camera; see :class:`fgslam.homing.eyes.HomingEyes`."""
+class ImageFrontEnd:
+    """Homing's front-end for one camera; see :class:`fgslam.homing.front_end.HomingFrontEnd`."""
 
     def __init__(
-        self, camera: OmniCamera, settings: EyesSettings, rng: np.random.Generator
+        self, camera: OmniCamera, settings: FrontEndSettings, rng: np.random.Generator
     ) -> None:
         """``rng`` chooses RANSAC's samples."""
         self._settings = settings
@@ -87,7 +87,7 @@ class ImageEyes:
 
     def unwrapped(self, image: ByteArray) -> ByteArray:
         """(height, width) grey view that points are tracked in. Raises as :meth:`track`."""
-        return self._tracker.steady.grey(image)
+        return self._tracker.stabilised.grey(image)
 
     def places(self, tracked: TrackedBearings) -> FloatArray:
         """(m, 2) column and row of tracked points in that view."""
@@ -118,10 +118,10 @@ class ImageEyes:
         features: tuple[OmniFeatures, OmniFeatures],
     ) -> HomingStart | Refusal:
         """Trackable points of the inliers, triangulated; those in front are tracked from now on."""
-        steady = self._tracker.steady
+        stabilised = self._tracker.stabilised
         _, pixels, points = move_to_trackable(
-            steady.grey(image),
-            steady.view,
+            stabilised.grey(image),
+            stabilised.view,
             matches.taken(vector.inliers),
             features,
             self._settings.tracking,

@@ -18,7 +18,7 @@ import numpy as np
 from fgslam.core.arrays import IntArray
 from fgslam.core.homing import OmniFeatures
 from fgslam.core.planar import wrap
-from fgslam.homing.linking import Link, Pair
+from fgslam.homing.links import Link, Pair
 from fgslam.homing.settings import TopologicalMapSettings
 
 InlierRows: TypeAlias = Mapping[Pair, IntArray]
@@ -27,7 +27,7 @@ InlierRows: TypeAlias = Mapping[Pair, IntArray]
 _SAME = 0.02  # radians, in bearing and elevation: one thing has several features side by side
 
 
-class ThirdViews:
+class ThirdViewConsistency:
     """Links of an ordered set, and the features that make them."""
 
     def __init__(

@@ -9,7 +9,7 @@ from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings
 from fgslam.homing.path_following import LegOutcome
 
 STAGES = ("image", "homing", "steering", "drive")
-"""What a step's seconds are split into: camera; eyes, estimator and command; steering and
+"""What a step's seconds are split into: camera; front_end, estimator and command; steering and
 avoidance; the world's own motion."""
 
 

@@ -1,4 +1,4 @@
-"""The view that points are tracked in: unwrapped, continued over its seam, and held steady.
+"""The view that points are tracked in: unwrapped, continued over its seam, and held stabilised.
 
 On an unwrapped view a turn of the robot is a shift of the whole picture. It is measured from the
 picture as a whole and undone, so that what is left for the tracker are the small motions of
@@ -29,7 +29,7 @@ _HIGHEST = np.deg2rad(60.0)  # beyond, a panorama's rows are stretched many time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SteadyImage:
+class StabilisedImage:
     """One image's view.
 
     Attributes:
@@ -43,7 +43,7 @@ class SteadyImage:
     shift: int
 
 
-class SteadyView:
+class StabilisedView:
     """Makes views of one camera's images."""
 
     def __init__(self, camera: OmniCamera, max_width: int, window: int, levels: int) -> None:
@@ -74,7 +74,9 @@ class SteadyView:
         view = cv2.remap(grey, *self._maps, cv2.INTER_LINEAR, borderMode=self._border)
         return np.asarray(view, dtype=np.uint8)
 
-    def make(self, image: Image, before: SteadyImage | None, max_shift: float) -> SteadyImage:
+    def make(
+        self, image: Image, before: StabilisedImage | None, max_shift: float
+    ) -> StabilisedImage:
         """The view of an image, shifted as the image before was, and by the turn since.
 
         Args:
@@ -92,15 +94,15 @@ class SteadyView:
         first = (-shift - self.margin) % self.period
         last = first + self.period + 2 * self.margin
         repeated = np.concatenate([grey] * -(-last // self.period), axis=1)
-        return SteadyImage(repeated[:, first:last], bands, shift)
+        return StabilisedImage(repeated[:, first:last], bands, shift)
 
-    def to_steady(self, pixels: FloatArray, image: SteadyImage) -> FloatArray:
+    def to_stabilised(self, pixels: FloatArray, image: StabilisedImage) -> FloatArray:
         """(n, 2) places in the padded view of places (n, 2) in the view itself."""
         columns = (pixels[:, 0] + image.shift) % self.period + self.margin
         return np.column_stack([columns, pixels[:, 1]])
 
-    def from_steady(self, places: FloatArray, image: SteadyImage) -> FloatArray:
-        """The inverse of :meth:`to_steady`."""
+    def from_stabilised(self, places: FloatArray, image: StabilisedImage) -> FloatArray:
+        """The inverse of :meth:`to_stabilised`."""
         columns = (places[:, 0] - self.margin - image.shift) % self.period
         return np.column_stack([columns, places[:, 1]])
 

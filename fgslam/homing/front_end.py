@@ -21,14 +21,15 @@ class Sighting:
 
     Attributes:
         vector: the homing vector.
-        parallax: median of its inliers, radians, see :func:`fgslam.homing.soundness.parallax`.
+        parallax: median of its inliers, radians; see
+            :func:`fgslam.homing.bearing_consistency.parallax`.
     """
 
     vector: HomingVector
     parallax: float
 
 
-class HomingEyes(Protocol):
+class HomingFrontEnd(Protocol):
     """Features, matches and tracks of a stream of images (h, w, 3).
 
     ``begin`` and ``track`` are called with times that never decrease. One image may be given to

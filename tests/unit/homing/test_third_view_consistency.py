@@ -9,9 +9,9 @@ import pytest
 
 from fgslam.core.arrays import IntArray
 from fgslam.core.homing import HomingVector, OmniFeatures
-from fgslam.homing.linking import Answer, Link, Pair
+from fgslam.homing.links import Answer, Link, Pair
 from fgslam.homing.settings import TopologicalMapSettings
-from fgslam.homing.third_views import ThirdViews
+from fgslam.homing.third_view_consistency import ThirdViewConsistency
 from fgslam.homing.topological_map import TopologicalMap, map_of_answers
 from tests.landmark_world import landmark_features
 
@@ -47,11 +47,11 @@ def rows_of(pairs: list[Pair], seed: int | None = None) -> dict[Pair, IntArray]:
     return out
 
 
-def checked(far: list[Pair], seed: int | None) -> ThirdViews:
+def checked(far: list[Pair], seed: int | None) -> ThirdViewConsistency:
     """A walk, and links from one end of it to the other whose matches are true or by lot."""
     walk = [(k, k + 1) for k in range(COUNT - 1)]
     rows = rows_of(walk) | rows_of(far, seed)
-    return ThirdViews([view()] * COUNT, [link(p) for p in (*walk, *far)], rows, SETTINGS)
+    return ThirdViewConsistency([view()] * COUNT, [link(p) for p in (*walk, *far)], rows, SETTINGS)
 
 
 NEIGHBOURS = [FAR, (1, 8), (1, 10), (2, 9), (0, 9)]
@@ -93,7 +93,7 @@ def test_walk_vouches_for_a_few_steps_but_not_across_a_gap() -> None:
     by_lot = rows_of([short], 1)
     for steps, believed in ((walk, True), ([p for p in walk if p != (4, 5)], False)):
         links = [link(p) for p in (*steps, short)]
-        views = ThirdViews([view()] * COUNT, links, rows_of(steps) | by_lot, SETTINGS)
+        views = ThirdViewConsistency([view()] * COUNT, links, rows_of(steps) | by_lot, SETTINGS)
         assert (short not in views.confirmed()[2]) is believed
 
 

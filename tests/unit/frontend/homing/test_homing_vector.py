@@ -12,9 +12,9 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import BearingMatches, HomingVector, LocalMap, Refusal, RefusalReason
 from fgslam.core.planar import wrap
 from fgslam.frontend.homing.epipolar import EpipolarTest
-from fgslam.frontend.homing.homing_ransac import _cells, estimate_homing_vector
-from fgslam.frontend.homing.homing_refinement import HomingRefinement, RefinementPrior
 from fgslam.frontend.homing.local_map import make_local_map, triangulable, triangulate
+from fgslam.frontend.homing.ransac import _cells, estimate_homing_vector
+from fgslam.frontend.homing.refinement import HomingRefinement, RefinementPrior
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from tests.homing import TwoViews, make_matches, two_views
 

@@ -16,13 +16,13 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.homing import BearingMatches, HomingVector, Refusal, RefusalReason
 from fgslam.core.planar import unit, wrap
 from fgslam.frontend.homing.epipolar import EpipolarTest
-from fgslam.frontend.homing.homing_refinement import HomingRefinement, Refined, RefinementPrior
-from fgslam.frontend.homing.match_odds import (
+from fgslam.frontend.homing.match_probability import (
     COMMON_CHANCE,
     gain,
     log_likelihood_ratio,
     right_probability,
 )
+from fgslam.frontend.homing.refinement import HomingRefinement, Refined, RefinementPrior
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_point import TwoPointSamples, solve_two_point
 

@@ -16,7 +16,7 @@ from fgslam.core.homing import (
 from fgslam.core.planar import wrap
 from fgslam.frontend.features.colour_sift import empty_features
 from fgslam.frontend.features.column_segments import empty_segments
-from fgslam.frontend.homing.trackable import move_to_trackable
+from fgslam.frontend.homing.trackable_points import move_to_trackable
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from tests.homing import make_matches
 from tests.textured_room import CAMERA, angles, hits, picture
@@ -27,7 +27,7 @@ TARGET = np.array([0.3, 0.1, -0.5])
 
 
 def view_of(pose: FloatArray) -> Image:
-    """(h, period) as the tracker's steady view gives it."""
+    """(h, period) as the tracker's stabilised view gives it."""
     return np.ascontiguousarray(picture(pose)[:, :-1, 0])
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import wrap
-from fgslam.homing.linking import Link, Pair
+from fgslam.homing.links import Link, Pair
 from fgslam.homing.settings import TopologicalMapSettings
 
 _SIGMAS = 3.0
@@ -23,7 +23,7 @@ _ROUNDS = 10  # of the rotation averaging's reweighting
 _HUBER = np.deg2rad(5.0)  # residual from which on a link's rotation counts less
 
 
-class LinkChecks:
+class LinkConsistency:
     """All links of a map under examination."""
 
     def __init__(self, count: int, links: Iterable[Link], settings: TopologicalMapSettings) -> None:
