@@ -33,10 +33,10 @@ check: setup ## linter, formatter and type checker; changes nothing
 	.venv/bin/mypy
 
 bench: setup ## measure speed as ratios, write bench.json
-	.venv/bin/python -m tests.benchmark.bench
+	.venv/bin/python -m benchmarks speed
 
 bench-long: setup ## estimators over 2,500 frames beside batch, write bench_long.json (minutes, 2 GB)
-	.venv/bin/python -m tests.benchmark.long_drive
+	.venv/bin/python -m benchmarks long_drive
 
 # `make baseline BASELINE=write BASELINES="lab_trials outliers"` writes them anew.
 BASELINE ?= check

@@ -9,8 +9,8 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from scripts.results import lasting
-from scripts.results.runs import experiment
+from benchmarks.evidence import lasting
+from benchmarks.runs import experiment
 
 
 @pytest.mark.parametrize("name", list(lasting.VARIANTS))

@@ -13,7 +13,7 @@ from fgslam.runs.localisation.results import Scored, scored
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from scripts.results import recognised
+from benchmarks.evidence import recognised
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 QUIET = ("output.pictures=false", "output.report=false", "output.checkpoint_seconds=3600")

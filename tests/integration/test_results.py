@@ -1,4 +1,4 @@
-"""What docs/results.md claims, as regression tests with their bounds."""
+"""What docs/results claims, as regression tests with their bounds."""
 
 from __future__ import annotations
 
@@ -11,10 +11,8 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from fgslam.evaluation.trajectory import Alignment
-from scripts.results import chess, epi, noise, person, real, variants
-from scripts.results.report import Table, shown, write_json
-from scripts.results.runs import (
+from benchmarks.evidence import chess, epi, noise, paper_views, person, real, variants
+from benchmarks.runs import (
     Run,
     experiment,
     find_features,
@@ -23,6 +21,8 @@ from scripts.results.runs import (
     run_whole,
     trajectory_error,
 )
+from benchmarks.tables import Table, shown, write_json
+from fgslam.evaluation.trajectory import Alignment
 
 # ----------------------------------------------------------------------------------------------
 # The instruments themselves: fast
@@ -239,3 +239,14 @@ def test_three_real_cameras(shared_data: Path) -> None:
         dropped = judged.precision(~judged.confirmed)
         assert judged.precision(judged.confirmed) >= 0.98
         assert judged.precision(judged.confirmed) > dropped + 0.02
+
+
+@pytest.mark.slow
+def test_tables_of_the_paper_s_views_hold_every_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(paper_views, "STARTS", range(0, 10, 10))
+    features, matches, gates, frames, *estimates = paper_views.tables()
+    assert features.column("image") == ["top", "left", "right"]
+    assert len(matches.rows) == 6
+    assert len(gates.rows) == 10
+    assert len(frames.rows) == 6
+    assert [len(table.rows) for table in estimates] == [16, 16]

@@ -10,8 +10,8 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from scripts.results import visits
-from scripts.results.runs import experiment
+from benchmarks.evidence import visits
+from benchmarks.runs import experiment
 
 
 @pytest.mark.parametrize("name", list(visits.VISITS))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from scripts.results.report import Cell, Table
-from scripts.results.runs import Run, experiment, run_whole
+from benchmarks.runs import Run, experiment, run_whole
+from benchmarks.tables import Cell, Table
 
 COLUMNS = (
     "seed", "ATE cm", "end cm", "yaw deg", "pitch deg", "roll deg",

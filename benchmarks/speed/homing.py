@@ -13,14 +13,16 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from benchmarks.speed.drives import cpu_seconds, interleaved
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.backend.homing.settings import (
     HomingEkfSettings,
     HomingEstimatorSettings,
     HomingGraphSettings,
 )
-from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.arrays import Image
 from fgslam.core.homing import OmniFeatures, TrackedBearings
 from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
@@ -33,7 +35,6 @@ from fgslam.homing.image_front_end import FrontEndSettings, ImageFrontEnd
 from fgslam.homing.settings import HomingControlSettings
 from fgslam.worlds.house.omni_world import OmniWorld
 from fgslam.worlds.house.settings import HousePathSettings, OmniHouseSettings
-from tests.benchmark.drives import cpu_seconds, interleaved
 
 LIMITS = {
     "homing_track_over_raw_klt": 2.0,
@@ -90,24 +91,28 @@ class NotedFrontEnd:
         self.seen: list[TrackedBearings] = []
 
     def describe(self, image: Image) -> OmniFeatures:
+        """Features of a target."""
         return self.inner.describe(image)
 
     def begin(self, image: Image, target: OmniFeatures, time: float) -> object:
+        """First measurement of a leg."""
         return self.inner.begin(image, target, time)
 
     def look(self, image: Image, target: OmniFeatures) -> object:
+        """Homing vector to a target."""
         return self.inner.look(image, target)
 
     def track(self, image: Image, time: float) -> TrackedBearings:
+        """Bearings tracked into the image, kept for :meth:`pixels`."""
         self.seen.append(self.inner.track(image, time))
         return self.seen[-1]
 
-    def pixels(self, k: int) -> FloatArray:
+    def pixels(self, k: int) -> NDArray[np.float32]:
         """(n, 1, 2) float32, where update ``k`` found its points."""
         b = self.seen[k]
         rays = np.column_stack([np.cos(b.bearing), np.sin(b.bearing), np.tan(b.elevation)])
         found = self._camera.pixels(rays)
-        return found[np.isfinite(found[:, 0])].astype(np.float32)[:, None]
+        return np.asarray(found[np.isfinite(found[:, 0])].astype(np.float32)[:, None])
 
 
 def track_ratios(leg: Leg) -> list[float]:
@@ -133,7 +138,7 @@ def timed_against_klt(
     noted: NotedFrontEnd, leg: Leg, step: Callable[[Image, float], object]
 ) -> list[tuple[float, int]]:
     """All later images, step by step."""
-    greys = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in leg.images]
+    greys = [np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8) for image in leg.images]
     found = []
     for k in range(1, len(leg.images)):
         before = len(noted.seen)
@@ -146,7 +151,7 @@ def timed_against_klt(
     return found
 
 
-def raw_klt(before: Image, now: Image, points: FloatArray) -> float:
+def raw_klt(before: Image, now: Image, points: NDArray[np.float32]) -> float:
     """Seconds of OpenCV's tracker with its own window, levels and criteria."""
     return cpu_seconds(
         lambda: cv2.calcOpticalFlowPyrLK(before, now, points, None)  # type: ignore[call-overload]

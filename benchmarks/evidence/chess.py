@@ -8,6 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.evidence import epi
+from benchmarks.runs import DATA, experiment, find_features, say
+from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.recordings import Sequence
 from fgslam.datasets.recording_settings import LightFieldSettings
@@ -16,9 +19,6 @@ from fgslam.frontend.features.settings import Appearance
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.runs.config import ExperimentConfig
 from fgslam.slam.feature_stream import FeatureFrame
-from scripts.results import epi
-from scripts.results.report import Cell, Table
-from scripts.results.runs import DATA, experiment, find_features, say
 
 LEAST_LANDMARKS = 400
 CORRECT_PX = 1.0

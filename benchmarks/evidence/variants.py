@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scripts.results.report import Cell, Table
-from scripts.results.runs import (
+from benchmarks.runs import (
     DATA,
     FoundFeatures,
     experiment,
@@ -19,6 +18,7 @@ from scripts.results.runs import (
     say,
     trajectory_error,
 )
+from benchmarks.tables import Cell, Table
 
 PAPER_LITERALLY = (
     "frontend.appearance.mode=paper",

@@ -18,11 +18,19 @@ from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.runs.config import ExperimentConfig
 from fgslam.worlds import wheel_odometry
 from fgslam.worlds.lab_settings import RenderedLabSettings
+from fgslam.worlds.places import PlaceChoice
 from fgslam.worlds.rendering.image_effects import apply_effects
 from fgslam.worlds.world import World, camera_offsets, open_room
 
 FORWARD_M = 0.10
 CLOCKWISE_DEG = 5.0
+
+
+def place_of(settings: RenderedLabSettings) -> PlaceChoice:
+    """The place that the recording of these settings is rendered in."""
+    return PlaceChoice(
+        settings.place, settings.room_seed, settings.visit, settings.posters == "identical"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +52,7 @@ class LabViews:
         self.settings, self.seed = config.dataset, config.seed
         self.sequence = RenderedLabSequence(self.settings, self.seed)
         self.rig = self.sequence.rig
-        self._world = World(self.rig, open_room(self.settings.room_seed, self.settings.visit))
+        self._world = World(self.rig, open_room(place_of(self.settings)))
         sift = SiftExtractor(config.frontend.sift, config.frontend.appearance.mode)
         self._extract = sift.extract
 

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.runs import EXPERIMENTS, say
+from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import LandmarkAppearances, StereoFeatures
@@ -25,8 +27,6 @@ from fgslam.runs.map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map, tr
 from fgslam.runs.opening import open_sequence
 from fgslam.slam.factory import make_relocaliser, make_stereo_matcher, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
-from scripts.results.report import Cell, Table
-from scripts.results.runs import EXPERIMENTS, say
 
 SEEDS = (0, 1, 2, 3)
 KEPT = {"all": 1.0, "three in ten": 0.3, "none": 0.0}

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.runs import experiment, say
+from benchmarks.tables import Table
 from fgslam.core.arrays import BoolArray
 from fgslam.core.saved_map import SavedMap, load_map
 from fgslam.datasets.rendered_lab import RenderedLabSequence
@@ -17,8 +19,6 @@ from fgslam.runs.map_entry import MAP_FILE
 from fgslam.runs.mapping import first_config
 from fgslam.worlds.lab import build_lab
 from fgslam.worlds.rendering.patches import Thing
-from scripts.results.report import Table
-from scripts.results.runs import experiment, say
 
 EXPERIMENT = "two_visits"
 UNCHANGED = "nothing moved"

@@ -6,10 +6,10 @@ import statistics
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
+from benchmarks.runs import EXPERIMENTS
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.arrays import FloatArray
@@ -37,7 +37,7 @@ class MeasuredDrive:
 
 def open_drive(experiment: str, overrides: tuple[str, ...] = ()) -> MeasuredDrive:
     """Simulates the measurements of ``experiments/NAME.yaml`` with its seed."""
-    config = load_config(Path("experiments") / f"{experiment}.yaml", overrides)
+    config = load_config(EXPERIMENTS / f"{experiment}.yaml", overrides)
     assert isinstance(config.dataset, MeasurementDatasetSettings)
     recording = open_measurements(config.dataset, config.seed, config.odometry)
     assert recording.ground_truth is not None
@@ -54,17 +54,20 @@ class Clocked:
     _spent: float = 0.0
 
     def predict(self, odometry: Odometry | None) -> Prediction:
+        """The prediction of the timed estimator."""
         start = time.process_time()
         found = self.inner.predict(odometry)
         self._spent = time.process_time() - start
         return found
 
     def landmarks(self) -> LandmarkMap:
+        """The landmarks of the timed estimator."""
         return self.inner.landmarks()
 
     def update(
         self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
     ) -> UpdateStats:
+        """The update of the timed estimator."""
         cpu, wall = time.process_time(), time.perf_counter()
         stats = self.inner.update(increment, tracking, motion)
         self.wall.append(time.perf_counter() - wall)

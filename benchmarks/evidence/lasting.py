@@ -7,15 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.recordings import Sequence
-from fgslam.core.saved_map import SavedMap
-from fgslam.frontend.tracking.permanence import reliable, seen_past
-from fgslam.frontend.tracking.settings import PermanenceSettings
-from fgslam.slam.pipeline import FrameReport, SlamPipeline
-from scripts.results.person import position_errors
-from scripts.results.report import Cell, Table
-from scripts.results.runs import (
+from benchmarks.evidence.person import position_errors
+from benchmarks.runs import (
     FoundFeatures,
     experiment,
     find_features,
@@ -23,6 +16,13 @@ from scripts.results.runs import (
     process,
     trajectory_error,
 )
+from benchmarks.tables import Cell, Table
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.recordings import Sequence
+from fgslam.core.saved_map import SavedMap
+from fgslam.frontend.tracking.permanence import reliable, seen_past
+from fgslam.frontend.tracking.settings import PermanenceSettings
+from fgslam.slam.pipeline import FrameReport, SlamPipeline
 
 COVER = (110, 140)
 VARIANTS: dict[str, tuple[str, ...]] = {

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from scripts.results.report import Cell, Table
-from scripts.results.runs import DATA, Run, experiment, run_whole
+from benchmarks.runs import DATA, Run, experiment, run_whole
+from benchmarks.tables import Cell, Table
 
 
 @dataclass(frozen=True)

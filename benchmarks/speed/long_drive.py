@@ -1,17 +1,14 @@
 """2,500 frames, eight times round a corridor: does a frame's cost stay, and how near is batch?
 
-`make bench-long`, or `python -m tests.benchmark.long_drive`: some ten minutes and 2 GB, most of it
+`make bench-long`, or `python -m benchmarks long_drive`: some ten minutes and 2 GB, most of it
 batch; the parts without batch belong to `make bench`, too.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-from pathlib import Path
-
 import numpy as np
 
+from benchmarks.speed.drives import MeasuredDrive, Player, cpu_seconds, open_drive, play
 from fgslam.backend.common_settings import KernelSettings
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.backend.settings import EstimatorSettings
@@ -19,7 +16,6 @@ from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, I
 from fgslam.core.estimates import Estimate
 from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
-from tests.benchmark.drives import MeasuredDrive, Player, cpu_seconds, open_drive, play
 
 KEYFRAMES = Isam2Settings(keyframe_every=4, update_every=40, ordering_window=10)
 WINDOW = 500
@@ -78,7 +74,9 @@ def without_batch(drive: MeasuredDrive) -> dict[str, float]:
 def ate_cm(estimate: Estimate, drive: MeasuredDrive) -> float:
     """After alignment by a rigid motion."""
     found = evaluate_trajectory(estimate.trajectory, drive.truth, Alignment.SE3)
-    return 100.0 * float(found.ate_rmse_m)
+    if found.ate_rmse_m is None:
+        raise ValueError("an accuracy needs ground truth")
+    return 100.0 * found.ate_rmse_m
 
 
 def with_batch(drive: MeasuredDrive) -> dict[str, float]:
@@ -96,18 +94,7 @@ def with_batch(drive: MeasuredDrive) -> dict[str, float]:
 
 
 @one_blas_thread()
-def main() -> None:
-    """Writes bench_long.json."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("bench_long.json"))
-    arguments = parser.parse_args()
+def ratios_beside_batch() -> dict[str, float]:
+    """Everything measured on the 2,500 frames, batch included (some ten minutes, 2 GB)."""
     drive = open_drive("long_drive")
-    ratios = fixed_lag_flat(drive) | with_batch(drive)
-    arguments.out.write_text(json.dumps(ratios, indent=2) + "\n")
-    for name, value in ratios.items():
-        limit = LIMITS.get(name)
-        print(f"{name:40s} {value:9.3f}" + ("" if limit is None else f"   at most {limit}"))
-
-
-if __name__ == "__main__":
-    main()
+    return fixed_lag_flat(drive) | with_batch(drive)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.runs import DATA, experiment, find_features, say
+from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import LandmarkAppearances, StereoFeatures
@@ -15,8 +17,6 @@ from fgslam.core.geometry import inverse
 from fgslam.evaluation.trajectory import rotation_angles
 from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
 from fgslam.slam.factory import make_relocaliser, make_stereo_matcher
-from scripts.results.report import Cell, Table
-from scripts.results.runs import DATA, experiment, find_features, say
 
 NEIGHBOURS = 1  # frames this near in the recording are no revisit
 SAME_M, SAME_DEG = 2.0, 30.0
@@ -53,8 +53,13 @@ class Links:
     def surer(self, sigma_m: float, sigma_deg: float) -> Links:
         """Only those links are believed whose pose is known as well as that."""
         sure = self.linked & (self.sigma_m <= sigma_m) & (self.sigma_deg <= sigma_deg)
-        errors = (np.where(sure, e, np.nan) for e in (self.error_m, self.error_deg))
-        return Links(self.same, sure, self.right & sure, *errors, self.sigma_m, self.sigma_deg)
+        return replace(
+            self,
+            linked=sure,
+            right=self.right & sure,
+            error_m=np.where(sure, self.error_m, np.nan),
+            error_deg=np.where(sure, self.error_deg, np.nan),
+        )
 
     @property
     def precision(self) -> float:

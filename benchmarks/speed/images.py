@@ -1,20 +1,14 @@
-"""Speed as ratios within one run: `make bench` prints a table and writes bench.json.
-
-Four parts: the whole system over images, here; the estimators over simulated measurements, in
-`estimators.py` and `long_drive.py`; growth with the map, in `maps.py` and `relocalising.py`; visual
-homing, in `homing.py`. `--part` runs one of them.
+"""Time of the whole system over images as ratios to raw SIFT on the same images.
 
 The drive goes round and round the rendered lab, so that the map saturates. It is cut into blocks.
 On each block raw SIFT is timed on the block's images in the best threading found, then the block
 goes through the system: whole (features found ahead, in threads, beside the loop) and with its
 features found beforehand (all that is not SIFT), in turn. Neighbours in time are compared, so
-that a shared machine's moods cancel; medians over the blocks are quoted.
+that what else a shared machine does cancels; medians over the blocks are quoted.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import resource
 import statistics
 import time
@@ -25,25 +19,21 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
+from benchmarks.runs import EXPERIMENTS
 from fgslam.cli.console import progress_bar
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.estimates import Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame, Sequence
 from fgslam.core.sensors import CameraRig
-from fgslam.core.threads import one_blas_thread
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.recorder import RunRecorder
 from fgslam.slam.factory import make_pipeline, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.pipeline import SlamPipeline
-from tests.benchmark import estimators, homing, long_drive, maps, relocalising
-from tests.benchmark.drives import open_drive
 
 BLOCK = 40
 LIMITS = {
@@ -52,14 +42,6 @@ LIMITS = {
     "time_last_fifth_over_first": 1.2,
     "memory_without_log_end_over_middle": 1.1,
 }
-EVERY_LIMIT = (
-    LIMITS
-    | estimators.LIMITS
-    | long_drive.LIMITS
-    | homing.LIMITS
-    | maps.LIMITS
-    | relocalising.LIMITS
-)
 
 
 @dataclass(frozen=True)
@@ -71,35 +53,43 @@ class Preloaded:
 
     @property
     def name(self) -> str:
+        """Name of the whole recording."""
         return self.whole.name
 
     @property
     def rig(self) -> CameraRig:
+        """Rig of the whole recording."""
         return self.whole.rig
 
     @property
     def timestamps(self) -> FloatArray:
+        """Times (n,) of the whole recording, seconds."""
         return self.whole.timestamps
 
     @property
     def identity(self) -> str:
+        """Identity of the whole recording."""
         return self.whole.identity
 
     @property
     def ground_truth(self) -> Trajectory | None:
+        """Truth of the whole recording."""
         return self.whole.ground_truth
 
     @property
     def notes(self) -> tuple[str, ...]:
+        """Remarks of the whole recording."""
         return self.whole.notes
 
     def __len__(self) -> int:
         return max(self.frames) + 1
 
     def frame(self, i: int) -> Frame:
+        """Frame ``i``, from memory."""
         return self.frames[i]
 
     def odometry(self, i: int) -> Odometry | None:
+        """Odometry of frame ``i``."""
         return self.whole.odometry(i)
 
 
@@ -136,7 +126,7 @@ def raw_sift(config: ExperimentConfig) -> list[Callable[[Iterable[Frame]], None]
         True,
     )
 
-    def one(image: object) -> None:
+    def one(image: Image) -> None:
         sift.detectAndCompute(image, None)
 
     def own_threads(frames: Iterable[Frame]) -> None:
@@ -262,54 +252,10 @@ def ratios_of(series: Series) -> dict[str, float]:
 
 def over_images(frames: int) -> dict[str, float]:
     """The whole system over images, beside raw SIFT."""
-    config = load_config(Path("experiments/lab_laps.yaml"), [f"dataset.stop={frames}"])
+    config = load_config(EXPERIMENTS / "lab_laps.yaml", [f"dataset.stop={frames}"])
     with progress_bar() as tell:
         sequence = open_sequence(config, lambda done, total: tell("rendering", done, total))
         series, landmarks = run_blocks(
             config, sequence, lambda done: tell("timing", done, len(sequence))
         )
     return ratios_of(series) | {"landmarks_at_the_end": float(landmarks)}
-
-
-@one_blas_thread()
-def over_measurements() -> dict[str, float]:
-    """The estimators on simulated measurements."""
-    found = estimators.ratios_of_estimators()
-    return found | long_drive.without_batch(open_drive("long_drive"))
-
-
-def show(ratios: dict[str, float]) -> None:
-    """The table."""
-    table = Table(title="speed")
-    for column in ("ratio", "measured", "at most"):
-        table.add_column(column)
-    for name, value in ratios.items():
-        limit = EVERY_LIMIT.get(name)
-        shown = f"{value:.3f}" if value == 0.0 or abs(value) >= 1e-3 else f"{value:.1e}"
-        table.add_row(name, shown, "" if limit is None else f"{limit:g}")
-    Console().print(table)
-
-
-def main() -> None:
-    """Runs what is asked for and writes bench.json."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=2000, help="length of the drive over images")
-    parts = ("all", "images", "estimators", "maps", "homing")
-    parser.add_argument("--part", choices=parts, default="all")
-    parser.add_argument("--out", type=Path, default=Path("bench.json"))
-    arguments = parser.parse_args()
-    ratios: dict[str, float] = {}
-    if arguments.part in ("all", "images"):
-        ratios |= over_images(arguments.frames)
-    if arguments.part in ("all", "estimators"):
-        ratios |= over_measurements()
-    if arguments.part in ("all", "maps"):
-        ratios |= maps.ratios_of_maps() | relocalising.ratios_of_relocalising()
-    if arguments.part in ("all", "homing"):
-        ratios |= homing.ratios_of_homing()
-    arguments.out.write_text(json.dumps(ratios, indent=2) + "\n")
-    show(ratios)
-
-
-if __name__ == "__main__":
-    main()

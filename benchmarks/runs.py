@@ -19,8 +19,8 @@ from fgslam.slam.factory import make_pipeline, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 
-EXPERIMENTS = Path(__file__).parents[2] / "experiments"
-DATA = Path(__file__).parents[3] / "shared" / "data"
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+DATA = Path(__file__).parents[2] / "shared" / "data"
 """Where the real recordings are looked for, one folder beside the checkout."""
 
 _FOLDERS = {

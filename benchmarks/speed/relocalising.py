@@ -15,11 +15,11 @@ from __future__ import annotations
 import statistics
 import time
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 
+from benchmarks.runs import EXPERIMENTS
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap, Prediction, Trajectory
 from fgslam.core.features import LandmarkAppearances, StereoFeatures
@@ -95,7 +95,7 @@ class Lost:
 
 def drive() -> Driven:
     """Features one image after the other, stereo, tracking: all of it timed together."""
-    config = load_config(Path("experiments/lab_loop.yaml"), [f"dataset.stop={FRAMES}"])
+    config = load_config(EXPERIMENTS / "lab_loop.yaml", [f"dataset.stop={FRAMES}"])
     sequence, frontend = open_sequence(config), config.frontend
     extractor = SiftExtractor(frontend.sift, frontend.appearance.mode)
     stereo = make_stereo_matcher(sequence.rig, frontend)
@@ -189,7 +189,7 @@ def ratios_of_relocalising() -> dict[str, float]:
     cv2.setNumThreads(1)
     try:
         driven = drive()
-        config = load_config(Path("experiments/lab_loop.yaml"))
+        config = load_config(EXPERIMENTS / "lab_loop.yaml")
         rig = open_sequence(config).rig
         robots = {
             size: Lost.among(saved(building(driven, size), rig), config.frontend) for size in SIZES
@@ -211,8 +211,3 @@ def ratios_of_relocalising() -> dict[str, float]:
         out[f"{name}_worst_over_frontend"] = max(robot.seconds) / frontend
         out[f"{name}_right"] = robot.right / (ROUNDS * len(driven.queries))
     return out
-
-
-if __name__ == "__main__":
-    for name, value in ratios_of_relocalising().items():
-        print(f"{name:40s} {value:.3f}")

@@ -12,6 +12,15 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from benchmarks.speed.drives import (
+    MeasuredDrive,
+    Played,
+    cpu_seconds,
+    interleaved,
+    largest_offset_mm,
+    open_drive,
+    play,
+)
 from fgslam.backend.common_settings import KernelSettings
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
@@ -27,15 +36,6 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.pipeline import replay_frame
 from fgslam.slam.replay import replay_motion
-from tests.benchmark.drives import (
-    MeasuredDrive,
-    Played,
-    cpu_seconds,
-    interleaved,
-    largest_offset_mm,
-    open_drive,
-    play,
-)
 
 LIMITS = {
     "isam2_windowed_over_own_ordering": 0.5,

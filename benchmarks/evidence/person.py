@@ -7,20 +7,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.recordings import Sequence
-from fgslam.datasets.rendered_lab import RenderedLabSequence
-from fgslam.evaluation.trajectory import to_estimate_world
-from fgslam.slam.pipeline import FrameReport, SlamPipeline
-from fgslam.worlds.lab_settings import RenderedLabSettings
-from scripts.results.report import Cell, Table
-from scripts.results.runs import (
+from benchmarks.runs import (
     experiment,
     find_features,
     make_system,
     process,
     trajectory_error,
 )
+from benchmarks.tables import Cell, Table
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.recordings import Sequence
+from fgslam.datasets.rendered_lab import RenderedLabSequence
+from fgslam.evaluation.trajectory import to_estimate_world
+from fgslam.slam.pipeline import FrameReport, SlamPipeline
+from fgslam.worlds.lab_settings import RenderedLabSettings
 
 JUMP_BOUND_M = 0.05
 _NAME = "person"

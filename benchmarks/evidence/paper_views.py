@@ -6,6 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from benchmarks.evidence.views import LabViews, View, ViewPair, make_pair
+from benchmarks.runs import experiment, say
+from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotion, Trajectory
 from fgslam.evaluation.trajectory import end_pose
@@ -16,9 +19,6 @@ from fgslam.runs.config import ExperimentConfig
 from fgslam.slam.factory import make_pipeline
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.pipeline import FrameReport
-from scripts.results.report import Cell, Table
-from scripts.results.runs import experiment, say
-from scripts.results.views import LabViews, View, ViewPair, make_pair
 
 STARTS = range(0, 250, 10)
 """Frames of the drive from which the two small motions start; the first one is the example."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from benchmarks.runs import Run, experiment, run_whole
+from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import IntArray
-from scripts.results.report import Cell, Table
-from scripts.results.runs import Run, experiment, run_whole
 
 # Frames that Figure 4 of the paper shows, and the last one.
 _SHOWN = (1, 60, 120, 180, 249)

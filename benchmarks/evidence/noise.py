@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.runs import FoundFeatures, experiment, find_features, make_system, process, say
+from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.geometry import inverse, transform_to_camera
 from fgslam.core.measurements import Observations
@@ -13,8 +15,6 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.stereo.matching import StereoMatcher
-from scripts.results.report import Cell, Table
-from scripts.results.runs import FoundFeatures, experiment, find_features, make_system, process, say
 
 APART = (1, 2, 5, 10, 20, 40)
 """Frames between two sightings of a landmark."""

@@ -1,0 +1,1 @@
+"""What the project measures: speed as ratios, accuracy beside bounds, and the pages of results."""

@@ -1,0 +1,170 @@
+"""Pages of results under docs/results, made from the committed measurements."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+from benchmarks.rows import RESULTS, Record, Section, load_record, shown_bound, shown_number
+from benchmarks.tables import Cell, Table, shown
+
+PAGES = Path(__file__).parents[1] / "docs" / "results"
+WIDTH = 118
+_NOTE = "<!-- Made by `python -m benchmarks pages` from benchmarks/results/{}.json: edit that. -->"
+_WORDS = {True: "met", False: "**missed**", None: ""}
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "Mapping and localisation": (
+        "paper_drive",
+        "real_recordings",
+        "three_cameras",
+        "moving_person",
+        "ablations",
+    ),
+    "Filters and smoothers": ("filter_or_smoother", "robustness"),
+    "Maps": ("lasting_landmarks", "saved_maps", "relocalisation", "loops"),
+    "Homing": ("homing_vectors", "homing_drives", "topological_maps", "homing_estimators"),
+    "Speed": ("speed",),
+}
+"""Pages in the order of the site."""
+
+
+def write_pages(results: Path = RESULTS, folder: Path = PAGES) -> None:
+    """Writes one page for each file of measurements, and the overview."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in all_pages(results).items():
+        (folder / f"{name}.md").write_text(text, encoding="utf-8")
+
+
+def all_pages(results: Path = RESULTS) -> dict[str, str]:
+    """Text of every page by its name; ``index`` is the overview."""
+    records = {
+        name: load_record(results / f"{name}.json") for group in GROUPS.values() for name in group
+    }
+    pages = {name: page(record) for name, record in records.items()}
+    return pages | {"index": overview(records)}
+
+
+def overview(records: dict[str, Record]) -> str:
+    """Every bound of every page in one list, with what was measured."""
+    rows = [row for record in records.values() for row in record.rows]
+    missed = sum(row.met is False for row in rows)
+    lines = [
+        "# Results",
+        "",
+        "<!-- Made by `python -m benchmarks pages`. -->",
+        "",
+        *_wrapped(
+            f"{len(rows)} bounds, {len(rows) - missed} met, {missed} missed. Each page gives the "
+            "number, the bound and the command that measures it; slow tests hold most bounds."
+        ),
+    ]
+    for group, names in GROUPS.items():
+        lines += ["", f"## {group}"]
+        for name in names:
+            record = records[name]
+            lines += ["", f"### [{record.title}]({name}.md)", "", *_bounds(record.sections)]
+    return _joined(lines)
+
+
+def page(record: Record) -> str:
+    """One page: each section with its command, bounds and tables."""
+    lines = [f"# {record.title}", "", _NOTE.format(record.name), ""]
+    for paragraph in record.text:
+        lines += [*_wrapped(paragraph), ""]
+    lines.append(f"Measured with fgslam {record.version} on {record.date}.")
+    for section in record.sections:
+        lines += ["", f"## {section.title}", "", *_section(section)]
+    return _joined(lines)
+
+
+def _section(section: Section) -> Iterator[str]:
+    for paragraph in section.text:
+        yield from (*_wrapped(paragraph), "")
+    if section.commands:
+        yield from ("```sh", *_continued(section.commands), "```", "")
+    if section.rows:
+        yield from (*_bounds([section]), "")
+    for table in section.tables:
+        if table.title:
+            yield from (f"**{table.title}**", "")
+        yield from (*fitted(table), "")
+        for note in table.notes:
+            yield from (*_wrapped(note), "")
+
+
+def _bounds(sections: Iterable[Section]) -> list[str]:
+    rows: list[Sequence[str]] = [
+        (row.name, shown_number(row), shown_bound(row), _WORDS[row.met])
+        for section in sections
+        for row in section.rows
+    ]
+    if not rows:
+        return ["No bound; see the page."]
+    return grid(("", "measured", "bound", ""), rows)
+
+
+def fitted(table: Table, width: int = WIDTH) -> list[str]:
+    """The table in Markdown, turned on its side or cut into several where it is too wide."""
+    cells = [tuple(map(_cell, row)) for row in table.rows]
+    lines = grid(table.columns, cells)
+    if _width(lines) <= width:
+        return lines
+    turned = list(zip(table.columns, *cells, strict=True))
+    lines = grid(turned[0], turned[1:])
+    if _width(lines) <= width:
+        return lines
+    return _cut(table.columns, cells, width)
+
+
+def _cut(columns: Sequence[str], rows: list[tuple[str, ...]], width: int) -> list[str]:
+    """Several tables below each other, each beginning with the first column."""
+    parts: list[list[int]] = [[]]
+    for k in range(1, len(columns)):
+        if parts[-1] and _width(_picked(columns, rows, [*parts[-1], k])) > width:
+            parts.append([])
+        parts[-1].append(k)
+    lines = [line for part in parts for line in (*_picked(columns, rows, part), "")][:-1]
+    if _width(lines) > width:
+        raise ValueError(f"a column of the table {columns} is wider than {width} characters")
+    return lines
+
+
+def _picked(columns: Sequence[str], rows: list[tuple[str, ...]], part: list[int]) -> list[str]:
+    keep = [0, *part]
+    return grid([columns[k] for k in keep], [[row[k] for k in keep] for row in rows])
+
+
+def grid(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """A Markdown table without padding."""
+    line = "|" + "---|" * len(columns)
+    return [_line(columns), line, *(_line(row) for row in rows)]
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _cell(cell: Cell) -> str:
+    return "" if cell is None else shown(cell)
+
+
+def _width(lines: Iterable[str]) -> int:
+    return max(map(len, lines))
+
+
+def _wrapped(paragraph: str) -> list[str]:
+    return textwrap.wrap(paragraph, WIDTH, break_long_words=False, break_on_hyphens=False)
+
+
+def _continued(commands: Iterable[str]) -> Iterator[str]:
+    """Commands as a shell reads them, long ones on several lines."""
+    for command in commands:
+        lines = textwrap.wrap(command, WIDTH - 4, break_long_words=False, break_on_hyphens=False)
+        yield from (f"{'    ' if k else ''}{line} \\" for k, line in enumerate(lines[:-1]))
+        yield f"{'    ' if len(lines) > 1 else ''}{lines[-1]}"
+
+
+def _joined(lines: Iterable[str]) -> str:
+    return "\n".join(line.rstrip() for line in lines).rstrip() + "\n"

@@ -1,0 +1,1 @@
+"""Speed as ratios within one process, so that numbers of different machines compare."""
