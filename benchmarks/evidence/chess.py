@@ -13,7 +13,7 @@ from benchmarks.runs import DATA, experiment, find_features, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.recordings import Sequence
-from fgslam.datasets.recording_settings import LightFieldSettings
+from fgslam.datasets.settings import LightFieldSettings
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.features.settings import Appearance
 from fgslam.frontend.stereo.matching import StereoMatcher

@@ -14,7 +14,7 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.datasets.opening import open_recording
-from fgslam.datasets.recording_settings import LightFieldSettings
+from fgslam.datasets.settings import LightFieldSettings
 
 HALF_PATCH = 3
 _KEEP = 0.6  # share of the views that must see the point: the best ones count

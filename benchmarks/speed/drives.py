@@ -16,8 +16,8 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotion, LandmarkMap, Prediction, Trajectory, UpdateStats
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Odometry
-from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.opening import open_measurements
+from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.runs.config import load_config

@@ -24,8 +24,8 @@ from fgslam.datasets.asl_files import (
     read_camera_frames,
 )
 from fgslam.datasets.recording import Recording, recording_identity
-from fgslam.datasets.recording_settings import EurocSettings
 from fgslam.datasets.selection import select_frames
+from fgslam.datasets.settings import EurocSettings
 from fgslam.datasets.stereo_files import StereoFiles, check_sizes, missing_notes, require_folder
 from fgslam.datasets.trajectories import trajectory_at_frames
 

@@ -24,8 +24,8 @@ from fgslam.datasets.recorded_odometry import (
     read_speed_log,
 )
 from fgslam.datasets.recording import OdometrySource, Recording, recording_identity
-from fgslam.datasets.recording_settings import ImageFolderSettings
 from fgslam.datasets.selection import select_frames
+from fgslam.datasets.settings import ImageFolderSettings
 from fgslam.datasets.stereo_files import StereoFiles, check_sizes, missing_notes, require_folder
 from fgslam.datasets.tables import Table, read_table, require_increasing
 from fgslam.datasets.trajectories import read_tum_table, trajectory_at_frames

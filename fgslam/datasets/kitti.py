@@ -17,8 +17,8 @@ from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, right_from_le
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.images import list_numbered_images
 from fgslam.datasets.recording import Recording, recording_identity
-from fgslam.datasets.recording_settings import KittiSettings
 from fgslam.datasets.selection import select_frames
+from fgslam.datasets.settings import KittiSettings
 from fgslam.datasets.stereo_files import (
     StereoFiles,
     check_sizes,

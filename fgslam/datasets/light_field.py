@@ -26,8 +26,8 @@ from fgslam.core.sensors import CameraRig
 from fgslam.datasets.calibration import pixels, read_json_object
 from fgslam.datasets.images import read_grey_image
 from fgslam.datasets.recording import Recording, recording_identity
-from fgslam.datasets.recording_settings import LightFieldSettings
 from fgslam.datasets.selection import select_frames
+from fgslam.datasets.settings import LightFieldSettings
 from fgslam.datasets.stereo_files import require_folder
 from fgslam.datasets.tables import read_lines
 

@@ -2,35 +2,28 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
 from fgslam.core.recordings import MeasurementRecording
 from fgslam.datasets.euroc import open_euroc
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.kitti import open_kitti
 from fgslam.datasets.light_field import open_light_field
-from fgslam.datasets.measurements.settings import (
-    MeasurementDatasetSettings,
-    StereoTracksSettings,
-    UtiasRangeBearingSettings,
-    UtiasStereoSettings,
-)
 from fgslam.datasets.measurements.simulated import open_simulated_measurements
 from fgslam.datasets.measurements.stereo_tracks import open_stereo_tracks
 from fgslam.datasets.measurements.utias_range_bearing import open_lost_in_the_woods
 from fgslam.datasets.measurements.utias_stereo import open_starry_night
 from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.recording_settings import (
+from fgslam.datasets.settings import (
     EurocSettings,
+    FileRecordingSettings,
     ImageFolderSettings,
     KittiSettings,
     LightFieldSettings,
-)
-from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
-
-FileRecordingSettings: TypeAlias = (
-    ImageFolderSettings | KittiSettings | EurocSettings | LightFieldSettings
+    MeasurementDatasetSettings,
+    SimulatedMeasurementsSettings,
+    StereoTracksSettings,
+    UtiasRangeBearingSettings,
+    UtiasStereoSettings,
 )
 
 

@@ -22,7 +22,7 @@ from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
 from fgslam.worlds import wheel_odometry
-from fgslam.worlds.lab_settings import LabSettings
+from fgslam.worlds.lab_settings import LabSettings, RenderedLabSettings
 from fgslam.worlds.paths import PosesInTime
 from fgslam.worlds.person import Stance, make_walk
 from fgslam.worlds.places import PlaceChoice, first_pose, plan_in_place
@@ -75,9 +75,7 @@ class RenderedLabSequence:
         self._settings = settings
         self._seed = seed
         self._rig = make_rig(settings.rig)
-        self._place = PlaceChoice(
-            settings.place, settings.room_seed, settings.visit, settings.posters == "identical"
-        )
+        self._place = _place_of(settings)
         self._drive = plan_in_place(self._place, settings.drive, self._rig)
         self._indices = _selection(len(self._drive.timestamps), start, stop, stride)
         self._body = self._drive.body_poses(self._drive.timestamps)
@@ -276,6 +274,24 @@ class RenderedLabSequence:
             return np.array([stamp])
         spread = (np.arange(blur.samples) + 0.5) / blur.samples - 0.5
         return np.asarray(stamp + blur.exposure_s * spread)
+
+
+def first_camera_pose(settings: RenderedLabSettings) -> FloatArray:
+    """(4, 4) pose in the room of the reference camera at the first frame that is used.
+
+    Raises:
+        ConfigError: the path cannot be driven.
+    """
+    rig = make_rig(settings.rig)
+    drive = plan_in_place(_place_of(settings), settings.drive, rig)
+    first = drive.timestamps[settings.start : settings.start + 1]
+    return np.asarray(drive.body_poses(first)[0] @ rig.bTc)
+
+
+def _place_of(settings: LabSettings) -> PlaceChoice:
+    return PlaceChoice(
+        settings.place, settings.room_seed, settings.visit, settings.posters == "identical"
+    )
 
 
 def _selection(count: int, start: int, stop: int | None, stride: int) -> IntArray:

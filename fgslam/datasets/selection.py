@@ -8,7 +8,7 @@ import numpy as np
 
 from fgslam.core.arrays import IntArray
 from fgslam.core.errors import DatasetError
-from fgslam.datasets.recording_settings import RecordingSettings
+from fgslam.datasets.settings import RecordingSettings
 
 
 class Selection(Protocol):

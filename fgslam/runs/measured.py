@@ -11,8 +11,8 @@ import numpy as np
 from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Estimate, LandmarkMap
 from fgslam.core.recordings import MeasurementRecording
-from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.opening import open_measurements
+from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
 from fgslam.report.metrics import StageTime, write_timing

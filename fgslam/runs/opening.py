@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 from fgslam.core.errors import ConfigError
 from fgslam.core.recordings import Sequence
-from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.odometry_settings import (
     OdometrySettings,
     RecordedOdometrySettings,
@@ -14,9 +13,9 @@ from fgslam.datasets.odometry_settings import (
 )
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.rendered_lab import RenderedLabSequence
+from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
 from fgslam.datasets.synthetic_odometry import SyntheticOdometry
 from fgslam.runs.config import ExperimentConfig
-from fgslam.worlds.lab_settings import RenderedLabSettings
 
 
 def open_sequence(

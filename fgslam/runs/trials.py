@@ -11,6 +11,7 @@ from pathlib import Path
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.datasets.settings import RenderedLabSettings, SimulatedMeasurementsSettings
 from fgslam.evaluation.consistency import Nees
 from fgslam.evaluation.judging import judge_replay
 from fgslam.evaluation.metrics import EstimatorMetrics
@@ -28,8 +29,6 @@ from fgslam.runs.outputs import write_config
 from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.runs.trial_results import TrialSummary, summarise, write_trials
 from fgslam.slam.replay import replay
-from fgslam.worlds.lab_settings import RenderedLabSettings
-from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 
 DEFAULT_FOLDER = "trials"
 _OUTPUT = OutputSettings(pictures=False, report=False, checkpoint_seconds=1e9)

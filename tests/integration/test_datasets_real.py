@@ -18,7 +18,7 @@ from fgslam.datasets.kitti import open_kitti
 from fgslam.datasets.light_field import open_light_field
 from fgslam.datasets.odometry_settings import RecordedOdometrySettings, SyntheticOdometrySettings
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.recording_settings import (
+from fgslam.datasets.settings import (
     ImageFolderSettings,
     KittiSettings,
     LightFieldSettings,

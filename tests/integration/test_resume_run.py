@@ -36,7 +36,7 @@ from fgslam.core.measurement_log import load_arrays
 from fgslam.core.measurements import Odometry
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.recording_settings import ImageFolderSettings
+from fgslam.datasets.settings import ImageFolderSettings
 from fgslam.runs.beginning import resume_command
 from fgslam.runs.checkpoint import write_arrays
 

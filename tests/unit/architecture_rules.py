@@ -34,7 +34,6 @@ ROOMS: dict[str, frozenset[str] | None] = {
             "backend",
             "slam",
             "homing",
-            "worlds",
         }
     ),
     "cli": None,

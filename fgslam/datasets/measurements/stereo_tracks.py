@@ -29,9 +29,9 @@ from fgslam.datasets.measurements.files import (
     make_increments,
     make_log,
 )
-from fgslam.datasets.measurements.settings import StereoTracksSettings
 from fgslam.datasets.odometry_settings import OdometrySettings
 from fgslam.datasets.selection import select_of
+from fgslam.datasets.settings import StereoTracksSettings
 from fgslam.datasets.tables import Table, read_table
 
 _INSIDE = {"00s": "00s", "00": "00", "large": "_large"}

@@ -30,9 +30,9 @@ from fgslam.datasets.measurements.files import (
     make_log,
 )
 from fgslam.datasets.measurements.matlab_files import MatlabFile, read_matlab
-from fgslam.datasets.measurements.settings import UtiasRangeBearingSettings
 from fgslam.datasets.odometry_settings import OdometrySettings
 from fgslam.datasets.selection import select_of
+from fgslam.datasets.settings import UtiasRangeBearingSettings
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,9 +28,9 @@ from fgslam.datasets.measurements.files import (
     make_log,
 )
 from fgslam.datasets.measurements.matlab_files import MatlabFile, read_matlab
-from fgslam.datasets.measurements.settings import UtiasStereoSettings
 from fgslam.datasets.odometry_settings import OdometrySettings
 from fgslam.datasets.selection import select_of
+from fgslam.datasets.settings import UtiasStereoSettings
 
 # (column, row, disparity) of the right camera, from left column and row, right column and row.
 _MEASURE: FloatArray = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.5, 0.0, 0.5], [1.0, 0.0, -1.0, 0.0]])

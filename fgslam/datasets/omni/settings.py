@@ -1,4 +1,4 @@
-"""Settings of recordings of an omnidirectional camera, a tagged union over ``kind``."""
+"""Settings of recordings for homing; of an omnidirectional camera a tagged union over ``kind``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,18 @@ from fgslam.cameras.omni.settings import (
     OmniCameraSettings,
 )
 from fgslam.core.settings import STRICT
-from fgslam.datasets.recording_settings import RecordingSettings
+from fgslam.datasets.settings import RecordingSettings
+from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
+from fgslam.worlds.house.settings import OmniHouseSettings
+
+__all__ = [
+    "OmniDatasetSettings",
+    "OmniHouseSettings",
+    "OmniPathSettings",
+    "OmniVideoSettings",
+    "PanoramasSettings",
+    "SimulatedBearingsSettings",
+]
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -14,7 +14,11 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from fgslam.backend.homing.settings import HomingEstimatorSettings, HomingGraphSettings
 from fgslam.core.errors import ConfigError
-from fgslam.datasets.omni.settings import OmniDatasetSettings
+from fgslam.datasets.omni.settings import (
+    OmniDatasetSettings,
+    OmniHouseSettings,
+    SimulatedBearingsSettings,
+)
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
@@ -32,8 +36,6 @@ from fgslam.runs.config_reading import (
     with_default_kind,
 )
 from fgslam.runs.homing.output_settings import HomingOutputSettings
-from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
-from fgslam.worlds.house.settings import OmniHouseSettings
 
 _TAKEN_FOLDERS = ("pictures", "compare", "logs", "runs")
 _GROUPS_OF_KINDS = ("dataset", "estimator")

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.datasets.omni.house import open_house
 from fgslam.homing.image_front_end import FrontEndSettings, ImageFrontEnd
 from fgslam.runs.homing.config import DrivingConfig
 from fgslam.runs.homing.driving import Opened
-from fgslam.worlds.house.omni_world import OmniWorld
 
 
 def open_house_drive(config: DrivingConfig, seed: int) -> Opened:
     """World and front-end of one seed. Raises FgslamError where the house cannot be built."""
-    world = OmniWorld(config.dataset, seed)
+    world = open_house(config.dataset, seed)
     settings = FrontEndSettings(
         config.features,
         config.features.matching,

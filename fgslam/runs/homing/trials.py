@@ -11,6 +11,7 @@ import numpy as np
 
 from fgslam.core.bearing_log import BearingLog
 from fgslam.core.homing import Refusal
+from fgslam.datasets.simulated_homing import open_simulated_homing
 from fgslam.evaluation.homing import homing_errors
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.homing.config import HomingTrialsConfig
@@ -21,8 +22,6 @@ from fgslam.runs.homing.starting import start_from_matches
 from fgslam.runs.homing.trial_data import HomingTrial, TriedEstimator
 from fgslam.runs.homing.trial_results import finish_trials
 from fgslam.runs.processes import WorkerEnded, run_apart
-from fgslam.worlds.bearing_settings import with_outliers
-from fgslam.worlds.simulated.bearings import simulate_homing
 
 _BLOCK = 20  # trials a process: starting one takes as long as some trials
 
@@ -74,7 +73,7 @@ def perform_trial(config: HomingTrialsConfig, share: int, trial: int) -> HomingT
     """One trial; its noise depends on the seed, the share's number and its own number alone."""
     rng = np.random.default_rng((config.seed, share, trial))
     part = config.outliers[share]
-    simulated = simulate_homing(with_outliers(config.dataset, part), rng)
+    simulated = open_simulated_homing(config.dataset, part, rng)
     begun = start_from_matches(simulated.time, simulated.matches, config.homing_vector, rng)
     if isinstance(begun, Refusal):
         return HomingTrial(part, trial, begun.reason.value, 0, 0, {})

@@ -8,13 +8,11 @@ from pathlib import Path
 from fgslam.datasets.checks.findings import Finding, by_severity, share
 from fgslam.datasets.checks.recording import inspect_sequence
 from fgslam.datasets.layouts import kitti_drives, recognise_layout
-from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
-from fgslam.datasets.recording_settings import KittiSettings
+from fgslam.datasets.settings import KittiSettings, MeasurementDatasetSettings, RenderedLabSettings
 from fgslam.runs.config import ExperimentConfig, load_config, make_config
 from fgslam.runs.inspection.matches import judge_matches, look_at_frames, match_facts
 from fgslam.runs.inspection.report import Facts, render_report
 from fgslam.runs.opening import open_sequence
-from fgslam.worlds.lab_settings import RenderedLabSettings
 
 Progress = Callable[[str, int, int], None]
 """Called with what is under way, how much is done, and of how much."""

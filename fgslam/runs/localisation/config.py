@@ -14,9 +14,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.errors import ConfigError
-from fgslam.datasets.measurements.settings import MeasurementDatasetSettings
 from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
-from fgslam.datasets.settings import DatasetSettings
+from fgslam.datasets.settings import DatasetSettings, MeasurementDatasetSettings
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.config_reading import Reader, apply_overrides, read_mapping, with_default_kind
 from fgslam.runs.homing.config import HomingExperiment, make_experiment

@@ -12,14 +12,12 @@ from fgslam.core.errors import FgslamError
 from fgslam.core.geometry import inverse, pose, transform_to_world
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap
-from fgslam.datasets.rendered_lab import RenderedLabSequence
+from fgslam.datasets.rendered_lab import RenderedLabSequence, first_camera_pose
+from fgslam.datasets.settings import RenderedLabSettings
 from fgslam.evaluation.trajectory import align, associate
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.config_reading import Reader
 from fgslam.runs.opening import open_sequence
-from fgslam.worlds.lab_settings import RenderedLabSettings
-from fgslam.worlds.places import PlaceChoice, plan_in_place
-from fgslam.worlds.world import make_rig
 
 _SAME_TIME_S = 1e-3
 _MOST_SLACK_RAD = 0.5  # of positions whose errors are all made of it: at most, not likely
@@ -94,11 +92,9 @@ def _of_rendered(
         return None
     if not isinstance(now, RenderedLabSettings) or now.place != then.place:
         return None
-    rig = make_rig(then.rig)
-    choice = PlaceChoice(then.place, then.room_seed, then.visit, then.posters == "identical")
-    drive = plan_in_place(choice, then.drive, rig)
-    start = drive.body_poses(drive.timestamps[then.start : then.start + 1])[0] @ rig.bTc
-    poses = inverse(start) @ sequence.room_from_world @ sequence.ground_truth.poses
+    poses = (
+        inverse(first_camera_pose(then)) @ sequence.room_from_world @ sequence.ground_truth.poses
+    )
     return TruthInMap(poses, "truth in the world of the map's first frame, exactly")
 
 

@@ -17,7 +17,7 @@ from fgslam.datasets.checks.recording import check_calibration, check_timing, in
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.odometry_settings import RecordedOdometrySettings, SyntheticOdometrySettings
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.recording_settings import ImageFolderSettings
+from fgslam.datasets.settings import ImageFolderSettings
 from fgslam.datasets.synthetic_odometry import SyntheticOdometry
 
 

@@ -23,7 +23,7 @@ from fgslam.datasets.recorded_odometry import (
     steps_covered,
 )
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.recording_settings import ImageFolderSettings
+from fgslam.datasets.settings import ImageFolderSettings
 
 DEFAULT = RecordedOdometrySettings()
 

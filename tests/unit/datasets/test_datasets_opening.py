@@ -15,7 +15,7 @@ from fgslam.datasets.odometry_settings import (
     SyntheticOdometrySettings,
 )
 from fgslam.datasets.opening import open_recording
-from fgslam.datasets.recording_settings import EurocSettings, ImageFolderSettings, KittiSettings
+from fgslam.datasets.settings import EurocSettings, ImageFolderSettings, KittiSettings
 
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 

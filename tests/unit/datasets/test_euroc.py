@@ -25,7 +25,7 @@ from fgslam.core.recordings import Sequence
 from fgslam.datasets.asl_files import AslCamera, read_camera
 from fgslam.datasets.euroc import open_euroc, rectifier
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.recording_settings import EurocSettings
+from fgslam.datasets.settings import EurocSettings
 
 # Two cameras that look along the body's x axis, slightly turned against each other, 11 cm apart.
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

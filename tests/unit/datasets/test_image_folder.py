@@ -20,7 +20,7 @@ from fgslam.core.recordings import Sequence
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.images import read_grey_image
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.recording_settings import ImageFolderSettings
+from fgslam.datasets.settings import ImageFolderSettings
 
 
 def opened(root: Path, **settings: object) -> Recording:

@@ -10,7 +10,7 @@ from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, Fram
 from fgslam.core.recordings import Sequence
 from fgslam.datasets.kitti import open_kitti
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.recording_settings import KittiSettings
+from fgslam.datasets.settings import KittiSettings
 
 
 def opened(root: Path, **settings: object) -> Recording:

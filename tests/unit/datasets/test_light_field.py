@@ -13,7 +13,7 @@ from fgslam.core.geometry import project, transform_to_camera
 from fgslam.core.recordings import Sequence
 from fgslam.datasets.light_field import open_light_field, shift_image
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.recording_settings import LightFieldSettings
+from fgslam.datasets.settings import LightFieldSettings
 
 WIDTH, HEIGHT, COLUMNS, ROWS = 120, 90, 9, 3
 FOCAL, PITCH, FOCAL_DEPTH = 100.0, 0.005, 0.6

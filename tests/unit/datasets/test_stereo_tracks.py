@@ -19,9 +19,9 @@ from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.estimates import Prediction
 from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.measurements.settings import StereoTracksSettings
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.datasets.opening import open_measurements
+from fgslam.datasets.settings import StereoTracksSettings
 from fgslam.evaluation.trajectory import evaluate_trajectory
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
@@ -233,7 +233,7 @@ def test_gtsam_is_found_and_not_loaded() -> None:
     script = (
         "import sys\n"
         "from fgslam.datasets.opening import open_measurements\n"
-        "from fgslam.datasets.measurements.settings import StereoTracksSettings\n"
+        "from fgslam.datasets.settings import StereoTracksSettings\n"
         "open_measurements(StereoTracksSettings(file='large'), 0)\n"
         "print('gtsam' in sys.modules)"
     )

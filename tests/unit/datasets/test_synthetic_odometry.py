@@ -15,7 +15,7 @@ from fgslam.core.recordings import Sequence
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.odometry_settings import SyntheticOdometrySettings
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.recording_settings import ImageFolderSettings
+from fgslam.datasets.settings import ImageFolderSettings
 from fgslam.datasets.synthetic_odometry import SyntheticOdometry
 
 SETTINGS = SyntheticOdometrySettings()

@@ -10,7 +10,7 @@ import yaml
 
 from fgslam.core.errors import ConfigError
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
-from fgslam.datasets.recording_settings import ImageFolderSettings
+from fgslam.datasets.settings import ImageFolderSettings
 from fgslam.frontend.places.settings import LoopSettings
 from fgslam.runs.config import ExperimentConfig, load_config, parse_config
 from fgslam.runs.homing.config import is_homing
