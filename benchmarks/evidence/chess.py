@@ -13,8 +13,8 @@ from benchmarks.runs import DATA, experiment, find_features, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.recordings import Sequence
-from fgslam.datasets.settings import LightFieldSettings
 from fgslam.datasets.rendered_lab import RenderedLabSequence
+from fgslam.datasets.settings import LightFieldSettings
 from fgslam.frontend.features.settings import Appearance
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.runs.config import ExperimentConfig
