@@ -13,8 +13,8 @@ from typing import Any
 from fgslam.core.recordings import Sequence
 from fgslam.evaluation.trajectory import Alignment, TrajectoryError, evaluate_trajectory
 from fgslam.runs.config import ExperimentConfig, load_config
-from fgslam.runs.experiment import RunResult, run_experiment
 from fgslam.runs.opening import open_sequence
+from fgslam.runs.tasks.slam import RunResult, run_experiment
 from fgslam.slam.factory import make_pipeline, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.pipeline import FrameReport, SlamPipeline

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from fgslam.runs.config import ExperimentConfig
-from fgslam.runs.homing.config import TASKS
-from fgslam.runs.localisation.config import LocalisationConfig
+from fgslam.runs.homing_config import TASKS
+from fgslam.runs.localisation_config import LocalisationConfig
 
 Node: TypeAlias = dict[str, Any]
 

@@ -19,12 +19,12 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CameraRig
 from fgslam.evaluation.trajectory import rotation_angles
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
-from fgslam.runs.localisation.config import LocalisationConfig, load_experiment
-from fgslam.runs.localisation.experiment import run_localisation
-from fgslam.runs.localisation.submap import Window, submap_features
-from fgslam.runs.localisation.truth import truth_in_map
-from fgslam.runs.map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map, trusted
+from fgslam.runs.localisation_config import LocalisationConfig, load_experiment
 from fgslam.runs.opening import open_sequence
+from fgslam.runs.tasks.localisation import run_localisation
+from fgslam.runs.tasks.localisation_submap import Window, submap_features
+from fgslam.runs.tasks.localisation_truth import truth_in_map
+from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map, trusted
 from fgslam.slam.factory import make_relocaliser, make_stereo_matcher, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 

@@ -14,9 +14,9 @@ from benchmarks.tables import Table
 from fgslam.core.arrays import BoolArray
 from fgslam.core.saved_map import SavedMap, load_map
 from fgslam.datasets.rendered_lab import RenderedLabSequence
-from fgslam.runs.experiment import RunResult, run_experiment
-from fgslam.runs.map_entry import MAP_FILE
-from fgslam.runs.mapping import first_config
+from fgslam.runs.tasks.slam import RunResult, run_experiment
+from fgslam.runs.tasks.slam_map_entry import MAP_FILE
+from fgslam.runs.tasks.slam_mapping import first_config
 from fgslam.worlds.lab import build_lab
 from fgslam.worlds.rendering.patches import Thing
 

@@ -30,7 +30,7 @@ from fgslam.core.recordings import Frame, Sequence
 from fgslam.core.sensors import CameraRig
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.opening import open_sequence
-from fgslam.runs.recorder import RunRecorder
+from fgslam.runs.tasks.slam_recorder import RunRecorder
 from fgslam.slam.factory import make_pipeline, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.pipeline import SlamPipeline

@@ -17,11 +17,11 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from fgslam.runs.summary import frame_problems, run_numbers
+from fgslam.runs.tasks.slam_summary import frame_problems, run_numbers
 
 if TYPE_CHECKING:
-    from fgslam.runs.beginning import Progress as Tell
-    from fgslam.runs.experiment import RunResult
+    from fgslam.runs.tasks.slam import RunResult
+    from fgslam.runs.tasks.slam_beginning import Progress as Tell
 
 _PROBLEMS_SHOWN = 5
 

@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 
 from fgslam.report.homing import TextTable
-from fgslam.runs.homing.results import METRICS_FILE, REPORT_FILE, HomingResult
+from fgslam.runs.homing_results import METRICS_FILE, REPORT_FILE, HomingResult
 
 _REMARKS_SHOWN = 8
 _WIDTH_OF_FILES = 130

@@ -7,8 +7,8 @@ from pathlib import Path
 from rich.console import Console
 
 from fgslam.cli.homing_console import text_table
-from fgslam.runs.localisation.files import LOCALISATION_FILE, METRICS_FILE, REPORT_FILE
-from fgslam.runs.localisation.results import LocalisationResult, details, told
+from fgslam.runs.tasks.localisation_files import LOCALISATION_FILE, METRICS_FILE, REPORT_FILE
+from fgslam.runs.tasks.localisation_results import LocalisationResult, details, told
 
 _NAME_WIDTH = 18
 _WIDTH_OF_FILES = 130

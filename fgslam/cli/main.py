@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from fgslam.runs.comparison import Compared
     from fgslam.runs.config import ExperimentConfig
     from fgslam.runs.folder import ExistingFolder
-    from fgslam.runs.homing.config import HomingExperiment
-    from fgslam.runs.localisation.config import LocalisationConfig
+    from fgslam.runs.homing_config import HomingExperiment
+    from fgslam.runs.localisation_config import LocalisationConfig
 
 EXIT_USER = 2
 EXIT_FAULT = 1
@@ -71,9 +71,9 @@ def run(
     Ctrl-C ends it early with all files valid; --resume goes on from there.
     """
     from fgslam.core.errors import ConfigError
-    from fgslam.runs.homing.config import HomingExperiment
-    from fgslam.runs.localisation.config import LocalisationConfig, load_experiment
-    from fgslam.runs.measured import holds_measurements
+    from fgslam.runs.homing_config import HomingExperiment
+    from fgslam.runs.localisation_config import LocalisationConfig, load_experiment
+    from fgslam.runs.tasks.slam_measurements import holds_measurements
 
     if overwrite and resume:
         raise ConfigError("--overwrite and --resume exclude each other; give one of them")
@@ -93,7 +93,7 @@ def run(
 def _run_homing(settings: HomingExperiment, folder: Path, existing: ExistingFolder) -> None:
     from fgslam.cli.console import progress_bar
     from fgslam.cli.homing_console import show_homing
-    from fgslam.runs.homing.run import run_homing
+    from fgslam.runs.homing_run import run_homing
 
     with stop_flag() as stopped, progress_bar() as progress:
         result = run_homing(settings, folder, existing, progress, stopped)
@@ -105,7 +105,7 @@ def _run_homing(settings: HomingExperiment, folder: Path, existing: ExistingFold
 def _run_localisation(settings: LocalisationConfig, folder: Path, existing: ExistingFolder) -> None:
     from fgslam.cli.console import progress_bar
     from fgslam.cli.localisation_console import show_localisation
-    from fgslam.runs.localisation.experiment import run_localisation
+    from fgslam.runs.tasks.localisation import run_localisation
 
     with stop_flag() as stopped, progress_bar() as progress:
         tell = stoppable(progress, stopped)
@@ -118,8 +118,8 @@ def _run_localisation(settings: LocalisationConfig, folder: Path, existing: Exis
 def _run_images(settings: ExperimentConfig, folder: Path, existing: ExistingFolder) -> None:
     from fgslam.cli.comparison_console import show_comparisons
     from fgslam.cli.console import progress_bar, show_result
-    from fgslam.runs.beginning import resume_command
-    from fgslam.runs.experiment import run_experiment
+    from fgslam.runs.tasks.slam import run_experiment
+    from fgslam.runs.tasks.slam_beginning import resume_command
 
     with stop_flag() as stopped, progress_bar() as progress:
         result = run_experiment(settings, folder, existing, stoppable(progress, stopped), stopped)
@@ -134,7 +134,7 @@ def _run_images(settings: ExperimentConfig, folder: Path, existing: ExistingFold
 def _run_measurements(settings: ExperimentConfig, folder: Path, existing: ExistingFolder) -> None:
     from fgslam.cli.comparison_console import show_comparisons
     from fgslam.cli.console import progress_bar
-    from fgslam.runs.measured import run_measured
+    from fgslam.runs.tasks.slam_measurements import run_measured
 
     with stop_flag() as stopped, progress_bar() as progress:
         compared = run_measured(settings, folder, existing, progress, stopped)
@@ -173,7 +173,7 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     from fgslam.core.errors import ConfigError
     from fgslam.runs.baseline import read_baseline
     from fgslam.runs.choosing import Choice
-    from fgslam.runs.homing.compare import all_homing
+    from fgslam.runs.homing_compare import all_homing
 
     names = None if estimators is None else tuple(estimators.split(","))
     choice, existing = Choice(names, tuple(overrides or ())), _existing(overwrite)
@@ -206,7 +206,7 @@ def _compare_homing(
 ) -> None:
     from fgslam.cli.console import progress_bar
     from fgslam.cli.homing_console import show_homing
-    from fgslam.runs.homing.compare import compare_homing_runs
+    from fgslam.runs.homing_compare import compare_homing_runs
 
     with stop_flag() as stopped, progress_bar() as progress:
         results = compare_homing_runs(runs, choice, out, existing, jobs, progress, stopped)
@@ -311,8 +311,8 @@ def localize(
     """
     from fgslam.cli.console import progress_bar
     from fgslam.cli.localisation_console import show_localisation
-    from fgslam.runs.localisation.command import Wanted
-    from fgslam.runs.localisation.command import localize as locate
+    from fgslam.runs.tasks.localisation_command import Wanted
+    from fgslam.runs.tasks.localisation_command import localize as locate
 
     wanted = Wanted(
         map_file, recording, tuple(overrides or ()), frame, frames, out, _existing(overwrite)
@@ -403,7 +403,7 @@ def inspect(
     Exits with 0 whatever the report says, with 2 where the recording cannot be opened at all.
     """
     from fgslam.cli.console import progress_bar
-    from fgslam.runs.inspection.recording import inspect_recording
+    from fgslam.runs.inspection import inspect_recording
 
     with stop_flag() as stopped, progress_bar() as progress:
         report = inspect_recording(dataset, overrides or (), frames, stoppable(progress, stopped))

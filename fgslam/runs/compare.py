@@ -23,8 +23,8 @@ from fgslam.runs.comparison import (
 )
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.folder import ExistingFolder, create_run_folder, is_run_folder
-from fgslam.runs.outputs import write_config
 from fgslam.runs.report import report_from_folder
+from fgslam.runs.tasks.slam_outputs import write_config
 
 DEFAULT_FOLDER = "compare"
 METRICS_FILE = "metrics.json"

@@ -17,12 +17,12 @@ from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, read_landmark_truth
 from fgslam.report.point_cloud import MapPoints, read_ply
 from fgslam.report.trajectories import read_tum
-from fgslam.runs.checkpoint import LOG_FILE
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.estimator_files import write_replay
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
-from fgslam.runs.map_entry import arrival_of
 from fgslam.runs.processes import WorkerEnded, run_apart
+from fgslam.runs.tasks.slam_checkpoint import LOG_FILE
+from fgslam.runs.tasks.slam_map_entry import arrival_of
 from fgslam.slam.replay import replay
 
 COMPARISON_FILE = "comparison.csv"

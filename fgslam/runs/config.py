@@ -72,7 +72,7 @@ def load_config(path: Path, overrides: Iterable[str] = ()) -> ExperimentConfig:
 
     Raises:
         ConfigError: the file is missing or no YAML mapping, a key or value is wrong, or it is
-            about homing (:func:`fgslam.runs.homing.config.load_experiment` reads both).
+            about homing (:func:`fgslam.runs.homing_config.load_experiment` reads both).
     """
     return make_config(read_mapping(path), overrides, str(path))
 

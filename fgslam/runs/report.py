@@ -25,10 +25,10 @@ from fgslam.report.metrics import read_metrics
 from fgslam.report.page import Comparison, EstimatorReport, ReportData, write_report
 from fgslam.report.point_cloud import MapPoints, read_ply
 from fgslam.report.trajectories import read_covariances, read_tum
-from fgslam.runs.checkpoint import LOG_FILE
 from fgslam.runs.folder import RUN_MARKER
-from fgslam.runs.places import LOOPS_FILE, read_closures
 from fgslam.runs.report_parts import comparison_table, sample_pictures
+from fgslam.runs.tasks.slam_checkpoint import LOG_FILE
+from fgslam.runs.tasks.slam_places import LOOPS_FILE, read_closures
 
 REPORT = "report.html"
 _UP = np.array([0.0, -1.0, 0.0])

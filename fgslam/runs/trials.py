@@ -15,18 +15,18 @@ from fgslam.datasets.settings import RenderedLabSettings, SimulatedMeasurementsS
 from fgslam.evaluation.consistency import Nees
 from fgslam.evaluation.judging import judge_replay
 from fgslam.evaluation.metrics import EstimatorMetrics
-from fgslam.runs.checkpoint import LOG_FILE
 from fgslam.runs.choosing import EVERY, Choice, choose
 from fgslam.runs.comparison import Progress, load_truth
 from fgslam.runs.config import ExperimentConfig, load_config
-from fgslam.runs.experiment import run_experiment
 from fgslam.runs.folder import RUN_MARKER, ExistingFolder, create_run_folder, is_run_folder
-from fgslam.runs.map_entry import arrival_of
-from fgslam.runs.measured import holds_measurements, open_measured, write_recording
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.output_settings import OutputSettings
-from fgslam.runs.outputs import write_config
 from fgslam.runs.processes import WorkerEnded, run_apart
+from fgslam.runs.tasks.slam import run_experiment
+from fgslam.runs.tasks.slam_checkpoint import LOG_FILE
+from fgslam.runs.tasks.slam_map_entry import arrival_of
+from fgslam.runs.tasks.slam_measurements import holds_measurements, open_measured, write_recording
+from fgslam.runs.tasks.slam_outputs import write_config
 from fgslam.runs.trial_results import TrialSummary, summarise, write_trials
 from fgslam.slam.replay import replay
 

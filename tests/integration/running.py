@@ -20,9 +20,9 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.report.point_cloud import read_ply
 from fgslam.report.trajectories import read_covariances, read_tum
 from fgslam.runs.config import parse_config
-from fgslam.runs.experiment import RunResult, run_experiment
 from fgslam.runs.folder import ExistingFolder
-from fgslam.runs.recorder import STAGES
+from fgslam.runs.tasks.slam import RunResult, run_experiment
+from fgslam.runs.tasks.slam_recorder import STAGES
 
 KIND = "landmark_kalman"
 SAME_BYTES = (

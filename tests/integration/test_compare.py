@@ -19,7 +19,7 @@ from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.report.point_cloud import read_ply
 from fgslam.report.trajectories import read_covariances, read_tum
 from fgslam.runs.config import parse_config
-from fgslam.runs.measured import run_measured
+from fgslam.runs.tasks.slam_measurements import run_measured
 
 CONTRACT = set(EstimatorMetrics().as_json())
 FRAMES = 30

@@ -22,15 +22,15 @@ from fgslam.homing.drive_scores import cross_track, pass_distances, truly_arrive
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import Steering
-from fgslam.runs.homing.config import PathFollowingConfig, parse_homing
-from fgslam.runs.homing.drive_files import bearing_log, drive_of
-from fgslam.runs.homing.drive_pictures import DriveWatcher, Unwrapping, draw_leg_views
-from fgslam.runs.homing.drive_results import drive_numbers, finish_drives
-from fgslam.runs.homing.driven import DrivenSeed
-from fgslam.runs.homing.driving import _displaced, with_one_leg
-from fgslam.runs.homing.logs import load_bearing_logs
-from fgslam.runs.homing.replay import replay_homing
-from fgslam.runs.homing.results import begin
+from fgslam.runs.homing_config import PathFollowingConfig, parse_homing
+from fgslam.runs.homing_logs import load_bearing_logs
+from fgslam.runs.homing_replay import replay_homing
+from fgslam.runs.homing_results import begin
+from fgslam.runs.tasks.homing_drive_files import bearing_log, drive_of
+from fgslam.runs.tasks.homing_drive_pictures import DriveWatcher, Unwrapping, draw_leg_views
+from fgslam.runs.tasks.homing_drive_results import drive_numbers, finish_drives
+from fgslam.runs.tasks.homing_driven import DrivenSeed
+from fgslam.runs.tasks.homing_drives import _displaced, with_one_leg
 
 EKF = {"kind": "homing_ekf"}
 

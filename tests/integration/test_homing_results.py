@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from fgslam.runs.homing.config import load_homing
-from fgslam.runs.homing.run import run_homing
+from fgslam.runs.homing_config import load_homing
+from fgslam.runs.homing_run import run_homing
 
 pytestmark = pytest.mark.slow
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from fgslam.runs.localisation.config import LocalisationConfig, load_experiment
-from fgslam.runs.localisation.experiment import run_localisation
-from fgslam.runs.localisation.results import Scored, scored
+from fgslam.runs.localisation_config import LocalisationConfig, load_experiment
+from fgslam.runs.tasks.localisation import run_localisation
+from fgslam.runs.tasks.localisation_results import Scored, scored
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgslam.runs.localisation.config import parse_localisation
-from fgslam.runs.localisation.experiment import run_localisation
+from fgslam.runs.localisation_config import parse_localisation
+from fgslam.runs.tasks.localisation import run_localisation
 
 RIG = {"width": 160, "height": 120}
 VALUES: dict[str, Any] = {

@@ -26,7 +26,7 @@ from fgslam.core.errors import ConfigError, EstimatorError, FgslamError, MapErro
 from fgslam.core.saved_map import load_map, save_map
 from fgslam.report.point_cloud import read_ply
 from fgslam.report.trajectories import read_tum
-from fgslam.runs.map_entry import arrival_of
+from fgslam.runs.tasks.slam_map_entry import arrival_of
 
 CUT = 7
 EVERY = (

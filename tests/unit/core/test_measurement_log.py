@@ -16,7 +16,7 @@ from fgslam.core.errors import MeasurementLogError
 from fgslam.core.measurement_log import MeasurementLog, load_arrays
 from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
 from fgslam.core.sensors import CameraRig, RangeBearingSensor
-from fgslam.runs.checkpoint import save_log, write_arrays
+from fgslam.runs.tasks.slam_checkpoint import save_log, write_arrays
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 

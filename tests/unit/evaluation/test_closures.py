@@ -17,8 +17,14 @@ from fgslam.core.estimates import Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, LoopClosure, Observations
 from fgslam.evaluation.closures import judge_closures
-from fgslam.runs.places import LOOPS_FILE, closures_of, place_numbers, read_closures, write_closures
-from fgslam.runs.recorder import RunRecorder
+from fgslam.runs.tasks.slam_places import (
+    LOOPS_FILE,
+    closures_of,
+    place_numbers,
+    read_closures,
+    write_closures,
+)
+from fgslam.runs.tasks.slam_recorder import RunRecorder
 
 COUNT = 12
 

@@ -28,7 +28,7 @@ from fgslam.runs.baseline import check_baseline, read_baseline, write_baseline
 from fgslam.runs.choosing import Choice, all_kinds, choose, estimators_of
 from fgslam.runs.config import ExperimentConfig, parse_config
 from fgslam.runs.estimator_files import points_from_log
-from fgslam.runs.rendered_truth import points_under
+from fgslam.runs.tasks.rendered_truth import points_under
 from fgslam.runs.trial_results import summarise, together
 
 LAB: dict[str, Any] = {"name": "x", "dataset": {"kind": "rendered_lab"}}

@@ -13,7 +13,7 @@ from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.datasets.settings import ImageFolderSettings
 from fgslam.frontend.places.settings import LoopSettings
 from fgslam.runs.config import ExperimentConfig, load_config, parse_config
-from fgslam.runs.homing.config import is_homing
+from fgslam.runs.homing_config import is_homing
 from fgslam.worlds.lab_settings import RenderedLabSettings
 
 EXPERIMENTS = [

@@ -9,8 +9,8 @@ from types import ModuleType
 import pytest
 
 from fgslam.runs.config import ExperimentConfig
-from fgslam.runs.homing.config import TASKS
-from fgslam.runs.localisation.config import LocalisationConfig
+from fgslam.runs.homing_config import TASKS
+from fgslam.runs.localisation_config import LocalisationConfig
 
 ROOT = Path(__file__).parents[3]
 

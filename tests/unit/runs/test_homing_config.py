@@ -11,7 +11,7 @@ import yaml
 from fgslam.backend.homing.settings import HomingEkfSettings, HomingGraphSettings
 from fgslam.core.errors import ConfigError
 from fgslam.runs.config import ExperimentConfig, load_config
-from fgslam.runs.homing.config import (
+from fgslam.runs.homing_config import (
     TASKS,
     HomingExperiment,
     HomingTrialsConfig,
@@ -20,7 +20,7 @@ from fgslam.runs.homing.config import (
     load_homing,
     parse_homing,
 )
-from fgslam.runs.localisation.config import load_experiment as load_any
+from fgslam.runs.localisation_config import load_experiment as load_any
 
 EXPERIMENTS = [
     path

@@ -11,7 +11,7 @@ import pytest
 from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import HomingVector, Refusal, RefusalReason
 from fgslam.core.planar import compose, wrap
-from fgslam.runs.homing.pair_answers import (
+from fgslam.runs.tasks.homing_pair_answers import (
     PairAnswer,
     answer_numbers,
     error_numbers,

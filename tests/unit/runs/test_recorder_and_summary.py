@@ -23,9 +23,9 @@ from fgslam.core.measurements import Increment, Observations
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
 from fgslam.evaluation.judging import Truth
-from fgslam.runs.checkpoint import write_arrays
-from fgslam.runs.recorder import STAGES, FrameRow, RunRecorder
-from fgslam.runs.summary import estimator_metrics, frame_problems, run_numbers
+from fgslam.runs.tasks.slam_checkpoint import write_arrays
+from fgslam.runs.tasks.slam_recorder import STAGES, FrameRow, RunRecorder
+from fgslam.runs.tasks.slam_summary import estimator_metrics, frame_problems, run_numbers
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.pipeline import FrameReport
 

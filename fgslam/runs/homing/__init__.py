@@ -1,1 +1,0 @@
-"""Homing experiments: what `fgslam run` does for each task."""

@@ -1,0 +1,280 @@
+"""`fgslam compare` on homing runs: the bearings they logged, through other estimators."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.backend.homing.settings import HomingEstimatorSettings
+from fgslam.core.bearing_log import BearingLog
+from fgslam.core.errors import ConfigError, DatasetError, OutputError
+from fgslam.evaluation.homing import HomingErrors, homing_errors, summarise_homings
+from fgslam.evaluation.metrics import JsonValue, UpdateTime
+from fgslam.report.homing import TextTable
+from fgslam.report.homing.curves import Line, curve_figure
+from fgslam.report.homing.local_map import local_map_figure
+from fgslam.report.page.traces import Figure
+from fgslam.report.tables import Cell, write_csv
+from fgslam.runs.choosing import EVERY, Choice
+from fgslam.runs.folder import RUN_MARKER, ExistingFolder, is_run_folder
+from fgslam.runs.homing_choosing import choose_homing
+from fgslam.runs.homing_config import HomingExperiment, is_homing, load_homing
+from fgslam.runs.homing_logs import load_bearing_logs
+from fgslam.runs.homing_replay import ReplayedHoming, replay_homing
+from fgslam.runs.homing_results import (
+    HomingResult,
+    Progress,
+    Status,
+    Stopped,
+    begin,
+    write_document,
+    write_page,
+)
+from fgslam.runs.processes import WorkerEnded, run_apart
+from fgslam.runs.tasks.homing_trial_results import TRIAL_COLUMNS, summary_numbers, trial_row
+
+DEFAULT_FOLDER = "compare"
+COMPARISON_FILE = "comparison.csv"
+ESTIMATES_FILE = "estimates.csv"
+_LEFT = 0.199
+"""Judged where a fifth of the leg is left, as simulated homings end there: nearer to the target its
+direction means less and less."""
+_ESTIMATE_COLUMNS = (
+    "log",
+    "estimator",
+    "time",
+    "distance_legs",
+    "direction_deg",
+    "rotation_deg",
+    "sigma_distance_legs",
+    "sigma_direction_deg",
+    "sigma_rotation_deg",
+    "direction_error_deg",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Task:
+    logs: dict[str, BearingLog]
+    settings: HomingEstimatorSettings
+
+
+def compare_homing_runs(
+    runs: Sequence[Path],
+    choice: Choice = EVERY,
+    out: Path | None = None,
+    existing: ExistingFolder = "refuse",
+    jobs: int = 1,
+    progress: Progress = lambda what, done, total: None,
+    stopped: Stopped = lambda: False,
+) -> list[HomingResult]:
+    """Replays the bearing logs of homing runs through estimators.
+
+    Args:
+        runs: run folders.
+        choice: which estimators.
+        out: folder of the results; of several runs each gets one below it, by its folder's name.
+            None: `compare` inside each run.
+        existing: what to do where results are already.
+        jobs: processes at a time; more than one disturbs the times.
+        progress: told of each estimator that is done.
+        stopped: True ends the replays; what was finished is kept.
+
+    Raises:
+        FgslamError: a run cannot be read, a name is unknown, or the results cannot be written.
+    """
+    found = []
+    for run in runs:
+        config = load_homing(run / RUN_MARKER)
+        found.append((run, config, load_bearing_logs(run), choose_homing(config, choice)))
+    folders = [_folder(run, out, len(runs)) for run in runs]
+    for run, folder in zip(runs, folders, strict=True):
+        _require_apart(run, folder, existing)
+    results = []
+    for (run, config, logs, estimators), folder in zip(found, folders, strict=True):
+        begin(config, folder, existing, {"run": str(run)})
+        tasks = [_Task(logs, settings) for settings in estimators]
+        replays = _replay_all(tasks, jobs, progress, stopped)
+        status: Status = "interrupted" if stopped() else "finished"
+        results.append(_finish(config, folder, status, logs, replays))
+    return results
+
+
+def _replay_all(
+    tasks: Sequence[_Task], jobs: int, progress: Progress, stopped: Stopped
+) -> dict[str, dict[str, ReplayedHoming]]:
+    """By title, then by log; every estimator in a process of its own."""
+    found: dict[int, dict[str, ReplayedHoming]] = {}
+    progress("replaying", 0, len(tasks))
+    for index, result in run_apart(_perform, tasks, jobs, stopped, single_threaded=True):
+        settings = tasks[index].settings
+        if isinstance(result, WorkerEnded):
+            ended = ReplayedHoming(settings.title, settings.kind, (), np.empty(0), result.why)
+            result = dict.fromkeys(tasks[index].logs, ended)
+        found[index] = result
+        progress("replaying", len(found), len(tasks))
+    return {task.settings.title: found[k] for k, task in enumerate(tasks)}
+
+
+def _perform(task: _Task) -> dict[str, ReplayedHoming]:
+    shown = next(iter(task.logs), None)  # the local map that is drawn is the first log's
+    return {
+        name: replay_homing(log.start, log.images, task.settings, landmarks=name == shown)
+        for name, log in task.logs.items()
+    }
+
+
+# --------------------------------------------------------------------------------------------
+# Results
+
+
+def _finish(
+    config: HomingExperiment,
+    folder: Path,
+    status: Status,
+    logs: dict[str, BearingLog],
+    replays: dict[str, dict[str, ReplayedHoming]],
+) -> HomingResult:
+    errors = {
+        title: {name: _errors(one, logs[name]) for name, one in by_log.items()}
+        for title, by_log in replays.items()
+    }
+    rows, numbers = [], {}
+    for title, by_log in replays.items():
+        judged = {name: _errors(one, logs[name], _LEFT) for name, one in by_log.items()}
+        row, values = _judged(by_log, judged)
+        rows.append((title, row))
+        numbers[title] = values
+    with_truth = sum(log.truth is not None for log in logs.values())
+    heading = f"{len(logs)} homings replayed, {with_truth} with ground truth"
+    tables = (TextTable("compared", heading, "estimator", TRIAL_COLUMNS, tuple(rows)),)
+    result = HomingResult(
+        config, folder, status, (f"{heading}.",), tables, tuple(_failures(replays))
+    )
+    write_csv(folder / ESTIMATES_FILE, _ESTIMATE_COLUMNS, _estimate_rows(replays, errors))
+    columns = ("estimator", *(column.name for column in TRIAL_COLUMNS))
+    write_csv(folder / COMPARISON_FILE, columns, [[title, *row] for title, row in rows])
+    write_document(result, {"logs": sorted(logs)}, numbers)
+    figures = tuple(_figures(logs, replays, errors))
+    write_page(result, "bearing logs replayed", figures=figures, series=tuple(replays))
+    return result
+
+
+def _errors(replayed: ReplayedHoming, log: BearingLog, left: float = 0.0) -> HomingErrors | None:
+    """Errors of all images up to the last one with so much of the leg left; None without truth."""
+    if log.truth is None or not replayed.estimates:
+        return None
+    robots = log.truth.robots[: len(replayed.estimates)]
+    away = np.hypot(*(log.truth.target[:2] - robots[:, :2]).T) / log.truth.leg_m
+    far = np.flatnonzero(away >= left)
+    count = int(far[-1]) + 1 if len(far) else 1
+    seen = dataclasses.replace(log.truth, robots=robots[:count])
+    return homing_errors(replayed.estimates[:count], seen)
+
+
+def _judged(
+    by_log: dict[str, ReplayedHoming], errors: dict[str, HomingErrors | None]
+) -> tuple[tuple[str, ...], dict[str, JsonValue]]:
+    """The estimator's row, and its numbers for metrics.json."""
+    failed = sum(bool(one.failure) for one in by_log.values())
+    whole = [e for name, e in errors.items() if e is not None and not by_log[name].failure]
+    summary = summarise_homings(whole) if whole else None
+    times = [one.update_ms for one in by_log.values()]
+    time = UpdateTime.of(np.concatenate(times)) if times else UpdateTime()
+    kind = next(iter(by_log.values())).kind if by_log else ""
+    values: dict[str, JsonValue] = {
+        "kind": kind,
+        **summary_numbers(summary),
+        "update_ms": dataclasses.asdict(time),
+        "failures": [f"{name}: {one.failure}" for name, one in by_log.items() if one.failure],
+    }
+    return trial_row(summary, failed, time), values
+
+
+def _failures(replays: dict[str, dict[str, ReplayedHoming]]) -> Iterator[str]:
+    for title, by_log in replays.items():
+        for name, one in by_log.items():
+            if one.failure:
+                yield f"{title} failed on {name}: {one.failure}"
+
+
+def _estimate_rows(
+    replays: dict[str, dict[str, ReplayedHoming]],
+    errors: dict[str, dict[str, HomingErrors | None]],
+) -> Iterator[list[Cell]]:
+    for title, by_log in replays.items():
+        for name, one in by_log.items():
+            known = errors[title][name]
+            for k, estimate in enumerate(one.estimates):
+                home = estimate.home()
+                sigma = np.sqrt(np.maximum(np.diagonal(home.covariance), 0.0))
+                angles = np.rad2deg([home.direction, home.rotation]).tolist()
+                error = None if known is None else float(np.rad2deg(known.direction[k]))
+                spread = [float(sigma[0]), *np.rad2deg(sigma[1:]).tolist()]
+                yield [name, title, estimate.time, home.distance, *angles, *spread, error]
+
+
+def _figures(
+    logs: dict[str, BearingLog],
+    replays: dict[str, dict[str, ReplayedHoming]],
+    errors: dict[str, dict[str, HomingErrors | None]],
+) -> Iterator[Figure]:
+    """Of the first log: each estimator's error over time, and the first one's local map."""
+    first = next(iter(logs))
+    lines = []
+    for i, (title, by_log) in enumerate(replays.items()):
+        known, estimates = errors[title][first], by_log[first].estimates
+        if known is not None:
+            time = np.array([e.time for e in estimates]) - logs[first].start.time
+            lines.append(Line(title, i, time, np.abs(np.rad2deg(known.direction))))
+    words = (
+        "direction-error",
+        f"Error of the home direction, {first}",
+        "Angle between the estimated and the true direction of the target, image by image.",
+    )
+    yield curve_figure(words, lines, ("time (s)", "error (degrees)"), y={"rangemode": "tozero"})
+    for i, (title, by_log) in enumerate(replays.items()):
+        estimates = by_log[first].estimates
+        if estimates and np.isfinite(estimates[-1].landmarks).any():
+            heading = f"The local map of {title}, {first}"
+            yield local_map_figure(estimates, logs[first].truth, f"local-map-{i}", heading)
+            return
+
+
+# --------------------------------------------------------------------------------------------
+# Folders
+
+
+def _folder(run: Path, out: Path | None, count: int) -> Path:
+    if out is None:
+        return run / DEFAULT_FOLDER
+    return out if count == 1 else out / run.resolve().name
+
+
+def _require_apart(run: Path, folder: Path, existing: ExistingFolder) -> None:
+    """A comparison may replace an earlier one, never the run that it is made from."""
+    if folder.resolve() == run.resolve() or folder.resolve() in run.resolve().parents:
+        raise ConfigError(f"--out {folder}: holds the run itself; choose another folder")
+    if existing == "refuse" and is_run_folder(folder):
+        raise OutputError(
+            f"{folder} holds results already; choose another --out, or add --overwrite"
+        )
+
+
+def all_homing(runs: Sequence[Path]) -> bool:
+    """Whether all runs are of homing; False where none is.
+
+    Raises:
+        FgslamError: some are and some are not, or one is no run folder.
+    """
+    kinds = [is_run_folder(run) and is_homing(run / RUN_MARKER) for run in runs]
+    if any(kinds) and not all(kinds):
+        other = runs[kinds.index(False)]
+        raise DatasetError(
+            f"{other}: is no homing run, others are; compare homing runs by themselves"
+        )
+    return all(kinds)

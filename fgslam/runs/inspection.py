@@ -1,0 +1,92 @@
+"""What is in a recording, and every problem found, in words (docs/inspect.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from fgslam.datasets.checks.findings import Finding, by_severity, share
+from fgslam.datasets.checks.recording import inspect_sequence
+from fgslam.datasets.layouts import kitti_drives, recognise_layout
+from fgslam.datasets.settings import KittiSettings, MeasurementDatasetSettings, RenderedLabSettings
+from fgslam.runs.config import ExperimentConfig, load_config, make_config
+from fgslam.runs.inspection_matches import judge_matches, look_at_frames, match_facts
+from fgslam.runs.inspection_report import Facts, render_report
+from fgslam.runs.opening import open_sequence
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is under way, how much is done, and of how much."""
+
+_READ_AT_LEAST = 300  # frames whose images are read; a few seconds
+_YAML = (".yaml", ".yml")
+
+
+def inspect_recording(
+    dataset: Path,
+    overrides: Sequence[str] = (),
+    frames: int = 12,
+    progress: Progress = lambda what, done, total: None,
+) -> str:
+    """The report on a recording, as text.
+
+    Args:
+        dataset: folder of a recording in any known layout, or an experiment's .yaml.
+        overrides: ``a.b=value`` for the configuration, that of the file or the default one.
+        frames: in how many frames, spread over the recording, features are matched.
+        progress: told after each frame.
+
+    Raises:
+        FgslamError: the recording cannot be opened at all, or the configuration is wrong.
+    """
+    config = configure(dataset, overrides)
+    sequence = open_sequence(config, lambda done, total: progress("rendering", done, total))
+    read = max(frames, _READ_AT_LEAST)
+    general = inspect_sequence(sequence, read, lambda done, total: progress("reading", done, total))
+    looks = look_at_frames(
+        sequence, config.frontend, frames, lambda done, total: progress("matching", done, total)
+    )
+    stereo = config.frontend.stereo
+    findings: tuple[Finding, ...] = (
+        *general.findings,
+        *judge_matches(looks, sequence.rig, stereo),
+    )
+    seen: Facts = (
+        ("images read", _images_read(min(read, len(sequence)), len(sequence))),
+        *match_facts(looks, sequence.rig, stereo),
+    )
+    return render_report((*general.facts, *_opening_facts(config)), seen, by_severity(findings))
+
+
+def _images_read(read: int, frames: int) -> str:
+    all_of_them = "" if read == frames else f", evenly spread; --frames {frames} reads all"
+    return f"{share(read, frames)} frames{all_of_them}"
+
+
+def configure(dataset: Path, overrides: Sequence[str]) -> ExperimentConfig:
+    """The experiment's configuration, or the default one for a folder in a known layout.
+
+    Raises:
+        FgslamError: the layout is not known, or the configuration is wrong.
+    """
+    if dataset.suffix.lower() in _YAML:
+        return load_config(dataset, overrides)
+    # The kind is named so that an override of one of its keys finds it.
+    odometry = {"kind": "recorded"}
+    values = {"name": "inspect", "dataset": recognise_layout(dataset), "odometry": odometry}
+    return make_config(values, overrides, str(dataset))
+
+
+def _opening_facts(config: ExperimentConfig) -> Facts:
+    """What to write into an experiment's configuration to use this recording."""
+    dataset = config.dataset
+    if isinstance(dataset, RenderedLabSettings | MeasurementDatasetSettings):
+        return (("opened as", f"{dataset.kind}, seed {config.seed}"),)
+    opened = f"dataset.kind {dataset.kind}, dataset.path {dataset.path}"
+    if not isinstance(dataset, KittiSettings):
+        return (("opened as", opened),)
+    facts = [("opened as", f'{opened}, dataset.sequence "{dataset.sequence}"')]
+    others = [d for d in kitti_drives(Path(dataset.path)) if d != dataset.sequence]
+    if others:
+        folder = Path(dataset.path) / "sequences"
+        facts.append(("other drives", f"{', '.join(others)}: inspect {folder}/NN"))
+    return tuple(facts)

@@ -1,1 +1,0 @@
-"""What is in a recording, and every problem found, in words."""

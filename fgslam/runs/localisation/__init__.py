@@ -1,1 +1,0 @@
-"""Frames sought in a saved map: `fgslam localize`, and experiments of the task `localisation`."""

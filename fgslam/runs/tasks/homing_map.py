@@ -1,0 +1,341 @@
+"""Task `topological_map`: views as nodes, homings that agree as edges, routes and localisation."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.core.errors import ConfigError, StoredMapError
+from fgslam.core.homing import OmniFeatures
+from fgslam.evaluation.metrics import JsonValue
+from fgslam.homing.links import Answer, Link, Pair
+from fgslam.homing.third_view_consistency import InlierRows
+from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
+from fgslam.report.homing import Column, TextTable
+from fgslam.report.homing.network import Links, network_figure, unfolded
+from fgslam.report.page.data import Picture
+from fgslam.report.page.traces import Figure
+from fgslam.report.tables import Cell, write_csv
+from fgslam.runs.folder import ExistingFolder
+from fgslam.runs.homing_config import TopologicalMapConfig
+from fgslam.runs.homing_results import (
+    HomingResult,
+    Progress,
+    Stopped,
+    begin,
+    jobs_of,
+    write_document,
+    write_page,
+)
+from fgslam.runs.tasks.homing_map_localising import (
+    Localised,
+    localise,
+    localised_numbers,
+    write_localised,
+)
+from fgslam.runs.tasks.homing_pair_answers import PairAnswer
+from fgslam.runs.tasks.homing_pair_pictures import draw_pair
+from fgslam.runs.tasks.homing_pair_search import PairSearch, answer_pairs, inlier_rows
+from fgslam.runs.tasks.homing_views import Views, extract_features, open_views
+
+MAP_FILE = "map.npz"
+LINKS_FILE = "links.csv"
+ROUTES_FILE = "routes.csv"
+_LINK_COLUMNS = (
+    "from",
+    "to",
+    "direction_deg",
+    "sigma_direction_deg",
+    "rotation_deg",
+    "sigma_rotation_deg",
+    "back_deg",
+    "inliers",
+    "cost",
+    "places_apart",
+    "distance_m",
+)
+_UNKNOWN = "-"
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Route:
+    """A way on the map that was asked for.
+
+    Attributes:
+        asked: names of the nodes, start first; further ones must lie one link apart.
+        found: names of the cheapest way's nodes; empty where there is none.
+        reason: why there is none, or which link of those asked for is absent; empty if all is
+            well.
+    """
+
+    asked: tuple[str, ...]
+    found: tuple[str, ...]
+    reason: str
+
+
+def run_topological_map(
+    config: TopologicalMapConfig,
+    folder: Path,
+    existing: ExistingFolder,
+    progress: Progress,
+    stopped: Stopped,
+) -> HomingResult:
+    """Features once a view, homings of all candidates both ways, the map of those believed."""
+    views = open_views(config.dataset)
+    _require_nodes(config, views.names)
+    begin(config, folder, existing, {"dataset": views.provenance})
+    jobs = jobs_of(config)
+    features = extract_features(views, config.features, jobs, progress, stopped)
+    rng = np.random.default_rng(config.seed)
+    half = map_candidates(features, config.map, rng, ordered=config.ordered)
+    pairs = tuple(pair for a, b in half for pair in ((a, b), (b, a)))
+    search = PairSearch(
+        tuple(features), pairs, config.features.matching, config.homing_vector, config.seed
+    )
+    found, failures = answer_pairs(search, jobs, progress, stopped)
+    answers: dict[Pair, Answer] = {(answer.a, answer.b): answer.found for answer in found}
+    names, rows = views.names[: len(features)], inlier_rows(found)
+    topology = map_of_answers(
+        features, answers, config.map, ordered=config.ordered, names=names, rows=rows
+    )
+    kilobytes = topology.save(folder / MAP_FILE)
+    routes = [_route(topology, asked) for asked in config.routes]
+    located = _localised(config, features, answers, rows, names, progress, stopped)
+    whole = len(features) == len(views) and len(found) == len(pairs) and not stopped()
+    numbers = _numbers(topology, views, answers, kilobytes) | _of_routes(routes)
+    numbers |= {"localisation": localised_numbers(located)}
+    result = HomingResult(
+        config,
+        folder,
+        "finished" if whole else "interrupted",
+        _verdict(topology, routes, located),
+        (_table(topology, views),),
+        _remarks(views, failures, routes),
+    )
+    write_csv(folder / LINKS_FILE, _LINK_COLUMNS, _link_rows(topology, views))
+    write_csv(folder / ROUTES_FILE, ("asked", "found", "reason"), _route_rows(routes))
+    write_localised(folder, located)
+    write_document(result, numbers)
+    pictures = _pictures(folder, views, search, topology, answers, config.output.pictures)
+    write_page(
+        result,
+        f"{len(topology)} views of {views.recording.name}",
+        figures=(_figure(topology, views),),
+        pictures=pictures,
+    )
+    return result
+
+
+def _require_nodes(config: TopologicalMapConfig, names: Sequence[str]) -> None:
+    for route in config.routes:
+        for name in route:
+            if name not in names:
+                raise ConfigError(
+                    f"routes: there is no view {name}; {config.dataset.path} has "
+                    f"{names[0]} to {names[-1]}"
+                )
+
+
+def _route(topology: TopologicalMap, asked: tuple[str, ...]) -> Route:
+    """The cheapest way between the ends, and whether every step that was asked for is a link."""
+    try:
+        nodes = [topology.names.index(name) for name in asked]
+        way = topology.route(nodes[0], nodes[-1])
+    except (StoredMapError, ValueError) as error:
+        return Route(asked, (), str(error))
+    links = {(link.a, link.b) for link in topology.links}
+    absent = [
+        f"{topology.names[a]}-{topology.names[b]}"
+        for a, b in itertools.pairwise(nodes)
+        if len(nodes) > 2 and (min(a, b), max(a, b)) not in links
+    ]
+    reason = f"no link {', '.join(absent)}" if absent else ""
+    return Route(asked, tuple(topology.names[k] for k in way), reason)
+
+
+def _localised(
+    config: TopologicalMapConfig,
+    features: Sequence[OmniFeatures],
+    answers: dict[Pair, Answer],
+    rows: InlierRows,
+    names: Sequence[str],
+    progress: Progress,
+    stopped: Stopped,
+) -> Localised | None:
+    if not config.held_out_every or stopped():
+        return None
+    return localise(config, features, answers, rows, names, progress, stopped)
+
+
+# --------------------------------------------------------------------------------------------
+# Numbers and words
+
+
+def _remarks(views: Views, failures: Sequence[str], routes: Sequence[Route]) -> tuple[str, ...]:
+    missing = [f"route {'-'.join(r.asked)}: {r.reason}" for r in routes if r.reason]
+    return (*views.recording.notes, *failures, *missing)
+
+
+def _numbers(
+    topology: TopologicalMap, views: Views, answers: dict[Pair, Answer], kilobytes: float
+) -> dict[str, JsonValue]:
+    parts = topology.components()
+    gaps = [link.b - link.a for link in topology.links]
+    lengths = _lengths(topology, views)
+    return {
+        "nodes": len(topology),
+        "homings_tried": len(answers),
+        "links": len(topology.links),
+        "components": len(parts),
+        "largest_component": len(parts[0]) if parts else 0,
+        "outside_largest": [topology.names[k] for part in parts[1:] for k in part.tolist()],
+        "longest_link_places": max(gaps, default=None),
+        "longest_link_m": None if lengths is None or not len(lengths) else float(lengths.max()),
+        "least_support": min((link.support for link in topology.links), default=None),
+        "pairs_not_linked": len(topology.rejected),
+        "kilobytes_per_view": kilobytes,
+    }
+
+
+def _lengths(topology: TopologicalMap, views: Views) -> np.ndarray | None:
+    """(m,) true lengths of the links, metres; None without poses."""
+    if views.poses is None:
+        return None
+    ends = [(views.poses[k.a, :2], views.poses[k.b, :2]) for k in topology.links]
+    return np.array([float(np.hypot(*(b - a))) for a, b in ends])
+
+
+def _of_routes(routes: Sequence[Route]) -> dict[str, JsonValue]:
+    found = [
+        {"asked": list(r.asked), "found": list(r.found), "reason": r.reason or None} for r in routes
+    ]
+    return {"routes": found, "routes_found": sum(not r.reason for r in routes)}
+
+
+def _verdict(
+    topology: TopologicalMap, routes: Sequence[Route], located: Localised | None
+) -> tuple[str, ...]:
+    parts = topology.components()
+    largest = len(parts[0]) if parts else 0
+    lines = [
+        f"{largest} of {len(topology)} views hang together by {len(topology.links)} links; "
+        f"there are {len(parts)} parts."
+    ]
+    lines += [
+        f"From {r.asked[0]} to {r.asked[-1]}: {'-'.join(r.found) or 'no way'}." for r in routes
+    ]
+    if located is not None and len(located):
+        lines.append(
+            f"Localisation finds {located.right} of {len(located)} held-out views at a neighbour."
+        )
+    return tuple(lines)
+
+
+def _table(topology: TopologicalMap, views: Views) -> TextTable:
+    numbers = _numbers(topology, views, {}, 0.0)
+    rows = (
+        ("nodes", "nodes"),
+        ("links", "links"),
+        ("parts", "components"),
+        ("views in the largest part", "largest_component"),
+        ("longest link, places apart in the recording", "longest_link_places"),
+        ("longest link, metres", "longest_link_m"),
+        ("fewest inliers of a link", "least_support"),
+        ("pairs tried and not linked", "pairs_not_linked"),
+    )
+    told = tuple((name, (_value(numbers[key]),)) for name, key in rows)
+    column = Column("value", "of the whole map; links.csv has each link")
+    return TextTable("map", "The map", "quantity", (column,), told)
+
+
+def _value(value: JsonValue) -> str:
+    if value is None:
+        return _UNKNOWN
+    return f"{value:.2f}" if isinstance(value, float) else str(value)
+
+
+# --------------------------------------------------------------------------------------------
+# Rows, figures, pictures
+
+
+def _link_rows(topology: TopologicalMap, views: Views) -> Iterator[list[Cell]]:
+    lengths = _lengths(topology, views)
+    for k, link in enumerate(topology.links):
+        sigma = np.rad2deg(np.sqrt(np.diagonal(link.covariance)))
+        angles = np.rad2deg([link.direction, link.rotation, link.back])
+        yield [
+            topology.names[link.a],
+            topology.names[link.b],
+            angles[0],
+            sigma[0],
+            angles[1],
+            sigma[1],
+            angles[2],
+            link.support,
+            float(topology.costs[k]),
+            link.b - link.a,
+            None if lengths is None else float(lengths[k]),
+        ]
+
+
+def _route_rows(routes: Sequence[Route]) -> Iterator[list[Cell]]:
+    for route in routes:
+        yield ["-".join(route.asked), "-".join(route.found), route.reason]
+
+
+def _figure(topology: TopologicalMap, views: Views) -> Figure:
+    pairs = tuple((link.a, link.b) for link in topology.links)
+    surveyed = views.poses is not None
+    places = (
+        unfolded(len(topology), pairs) if views.poses is None else views.poses[: len(topology), :2]
+    )
+    told = tuple(_told(topology, link) for link in topology.links)
+    rejected = tuple(sorted(topology.rejected))
+    why = tuple(
+        f"{topology.names[a]} to {topology.names[b]}: {topology.rejected[a, b]}"
+        for a, b in rejected
+    )
+    kinds = (
+        Links("links", 0, pairs, told),
+        Links("tried, no link", 1, rejected, why, shown=False),
+    )
+    where = (
+        "Views at their true places."
+        if surveyed
+        else "There are no true places: views are drawn so that distances are as along the links."
+    )
+    words = ("map", "The topological map", f"{where} A line is a homing that is believed.")
+    axes = ("x (m)", "y (m)") if surveyed else ("", "")
+    return network_figure(words, places, topology.names, kinds, axes)
+
+
+def _told(topology: TopologicalMap, link: Link) -> str:
+    return (
+        f"{topology.names[link.a]} to {topology.names[link.b]}: {link.support} inliers, rotation "
+        f"{np.rad2deg(link.rotation):.0f} degrees"
+    )
+
+
+def _pictures(
+    folder: Path,
+    views: Views,
+    search: PairSearch,
+    topology: TopologicalMap,
+    answers: dict[Pair, Answer],
+    count: int,
+) -> tuple[Picture, ...]:
+    """The doubtful links: half of them the longest ones, half those with the fewest inliers."""
+    lengths = _lengths(topology, views)
+    gaps = np.array([float(link.b - link.a) for link in topology.links])
+    length = gaps if lengths is None else lengths
+    support = np.array([link.support for link in topology.links])
+    longest = np.argsort(-length, kind="stable")[: (count + 1) // 2].tolist()
+    weakest = np.argsort(support, kind="stable")[: count // 2].tolist()
+    chosen = [topology.links[k] for k in dict.fromkeys([*longest, *weakest])]
+    return tuple(
+        draw_pair(folder, views, search, PairAnswer(k.a, k.b, answers[k.a, k.b], 0)) for k in chosen
+    )

@@ -1,0 +1,130 @@
+"""Localisation on a map by views that are not in it: every so many are held out, and sought."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.core.homing import HomingVector, OmniFeatures, Refusal
+from fgslam.evaluation.metrics import JsonValue
+from fgslam.frontend.homing.matching import match_features
+from fgslam.frontend.homing.ransac import estimate_homing_vector
+from fgslam.homing.links import Answer, Pair
+from fgslam.homing.localisation import Localiser
+from fgslam.homing.retrieval import VisualWords
+from fgslam.homing.third_view_consistency import InlierRows
+from fgslam.homing.topological_map import map_of_answers
+from fgslam.report.tables import write_csv
+from fgslam.runs.homing_config import TopologicalMapConfig
+from fgslam.runs.homing_results import Progress, Stopped
+
+LOCALISATION_FILE = "localisation.csv"
+
+
+@dataclass(frozen=True, slots=True)
+class Localised:
+    """What became of the held-out views, in their order.
+
+    Attributes:
+        views: names of the views.
+        nodes: names of the nodes that the belief then liked best.
+        probabilities: of these nodes.
+        near: whether the node is the next one before or after the view in the recording.
+    """
+
+    views: tuple[str, ...]
+    nodes: tuple[str, ...]
+    probabilities: tuple[float, ...]
+    near: tuple[bool, ...]
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    @property
+    def right(self) -> int:
+        """How many were found at a neighbour."""
+        return sum(self.near)
+
+
+def localise(
+    config: TopologicalMapConfig,
+    features: Sequence[OmniFeatures],
+    answers: dict[Pair, Answer],
+    rows: InlierRows,
+    names: Sequence[str],
+    progress: Progress,
+    stopped: Stopped,
+) -> Localised:
+    """Holds out every so many views, maps the others, and walks through those held out.
+
+    Nothing is known at first; from then on the belief goes along the map's links.
+    """
+    every = config.held_out_every or 0
+    out = list(range(every - 1, len(features), every))
+    kept = [k for k in range(len(features)) if k not in set(out)]
+    number = {view: k for k, view in enumerate(kept)}
+    nodes = [features[k] for k in kept]
+    among = {
+        (number[a], number[b]): answer
+        for (a, b), answer in answers.items()
+        if a in number and b in number
+    }
+    kept_rows = {
+        (number[a], number[b]): inliers
+        for (a, b), inliers in rows.items()
+        if a in number and b in number
+    }
+    topology = map_of_answers(
+        nodes,
+        among,
+        config.map,
+        ordered=config.ordered,
+        names=[names[k] for k in kept],
+        rows=kept_rows,
+    )
+    rng = np.random.default_rng((config.seed, 1))
+
+    def linker(image: OmniFeatures, node: OmniFeatures) -> HomingVector | Refusal:
+        matches = match_features(image, node, config.features.matching)
+        return estimate_homing_vector(matches, config.homing_vector, rng)
+
+    words = VisualWords(nodes, config.map.retrieval, rng)
+    localiser = Localiser(topology, words, linker, config.localisation)
+    told = []
+    progress("localising", 0, len(out))
+    for done, view in enumerate(out):
+        if stopped():
+            break
+        localiser.update(features[view])
+        node, probability = localiser.best()
+        told.append((names[view], names[kept[node]], probability, _next_to(view, kept, node)))
+        progress("localising", done + 1, len(out))
+    return Localised(*zip(*told, strict=True)) if told else Localised((), (), (), ())
+
+
+def localised_numbers(found: Localised | None) -> JsonValue:
+    """For metrics.json; null where nothing was held out."""
+    if found is None:
+        return None
+    return {
+        "held_out": len(found),
+        "at_a_neighbour": found.right,
+        "last_probability": found.probabilities[-1] if len(found) else None,
+    }
+
+
+def write_localised(folder: Path, found: Localised | None) -> None:
+    """localisation.csv; nothing where nothing was held out. Raises OutputError."""
+    if found is not None:
+        columns = ("view", "node", "probability", "neighbour")
+        rows = zip(found.views, found.nodes, found.probabilities, found.near, strict=True)
+        write_csv(folder / LOCALISATION_FILE, columns, rows)
+
+
+def _next_to(view: int, kept: Sequence[int], node: int) -> bool:
+    """Whether no other node lies between a view and its node in the recording."""
+    low, high = sorted((view, kept[node]))
+    return not any(low < k < high for k in kept if k != kept[node])

@@ -1,0 +1,127 @@
+"""Homing vectors of many pairs of views, in processes; each pair's answer is its own."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.core.arrays import IntArray
+from fgslam.core.homing import (
+    BearingMatches,
+    FeatureKind,
+    HomingVector,
+    OmniFeatures,
+    Refusal,
+)
+from fgslam.frontend.features.omni_settings import OmniMatchingSettings
+from fgslam.frontend.homing.matching import match_features
+from fgslam.frontend.homing.ransac import estimate_homing_vector
+from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.runs.homing_results import Progress, Stopped
+from fgslam.runs.processes import WorkerEnded, run_apart
+from fgslam.runs.tasks.homing_pair_answers import PairAnswer
+
+PLAIN_MATCHING = OmniMatchingSettings(
+    ratio=0.8, root=False, max_colour_distance=1e9, planar_gates=False
+)
+"""Lowe's ratio test alone."""
+PLAIN_INLIERS = 25
+"""A plain answer counts from here on (issue 4, 5.3)."""
+
+_BLOCKS_A_JOB = 4  # so that progress moves, and no process waits long for the last one
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairSearch:
+    """Some pairs for one process.
+
+    Attributes:
+        features: of all views.
+        pairs: numbers (a, b) of views; b is the target.
+        matching, vector: settings.
+        seed: of the experiment; each pair draws from a generator of its own.
+    """
+
+    features: tuple[OmniFeatures, ...]
+    pairs: tuple[tuple[int, int], ...]
+    matching: OmniMatchingSettings
+    vector: HomingVectorSettings
+    seed: int
+
+
+def never_refusing(settings: HomingVectorSettings) -> HomingVectorSettings:
+    """RANSAC's answer whatever speaks against it, but for the number of its inliers."""
+    return dataclasses.replace(
+        settings,
+        min_inliers=PLAIN_INLIERS,
+        max_false_alarms=1e300,
+        rival_log_odds=0.0,
+        max_direction_sigma_deg=180.0,
+        at_target_parallax_deg=0.0,
+    )
+
+
+def pairs_of(count: int, *, both_ways: bool) -> list[tuple[int, int]]:
+    """Pairs (a, b) of views, a before b; both ways also (b, a)."""
+    return [(a, b) for a in range(count) for b in range(count) if a < b or (both_ways and a != b)]
+
+
+def pair_generator(seed: int, a: int, b: int) -> np.random.Generator:
+    """What RANSAC draws from for one pair, whichever process and order."""
+    return np.random.default_rng((seed, a, b))
+
+
+def answer_pair(search: PairSearch, a: int, b: int) -> tuple[PairAnswer, BearingMatches]:
+    """One pair's answer and its tentative matches."""
+    matches = match_features(search.features[a], search.features[b], search.matching)
+    rng = pair_generator(search.seed, a, b)
+    found = estimate_homing_vector(matches, search.vector, rng)
+    return PairAnswer(a, b, found, len(matches), _inlier_rows(found, matches)), matches
+
+
+def answer_pairs(
+    search: PairSearch, jobs: int, progress: Progress, stopped: Stopped, what: str = "pairs"
+) -> tuple[list[PairAnswer], list[str]]:
+    """All pairs in their order (stopped early, those that are done), and what went wrong."""
+    pairs = search.pairs
+    blocks = [search_of(search, part) for part in _parts(pairs, _BLOCKS_A_JOB * jobs)]
+    answers: list[PairAnswer] = []
+    failures: list[str] = []
+    progress(what, 0, len(pairs))
+    for _, result in run_apart(_perform, blocks, jobs, stopped, single_threaded=True):
+        if isinstance(result, WorkerEnded):
+            failures.append(f"{len(result.argument.pairs)} pairs: {result.why}")
+        else:
+            answers += result
+        progress(what, len(answers), len(pairs))
+    place = {pair: k for k, pair in enumerate(pairs)}
+    return sorted(answers, key=lambda answer: place[answer.a, answer.b]), failures
+
+
+def inlier_rows(answers: Sequence[PairAnswer]) -> dict[tuple[int, int], IntArray]:
+    """Of each answered pair (a, b): (k, 2) SIFT features of both views that are inliers."""
+    return {(k.a, k.b): k.rows for k in answers if k.rows is not None}
+
+
+def search_of(search: PairSearch, pairs: Sequence[tuple[int, int]]) -> PairSearch:
+    """The same search for some pairs only."""
+    return PairSearch(search.features, tuple(pairs), search.matching, search.vector, search.seed)
+
+
+def _inlier_rows(found: HomingVector | Refusal, matches: BearingMatches) -> IntArray | None:
+    if isinstance(found, Refusal):
+        return None
+    kept = matches.taken(found.inliers & (matches.kind == FeatureKind.SIFT))
+    return np.column_stack([kept.index_a, kept.index_b])
+
+
+def _perform(search: PairSearch) -> list[PairAnswer]:
+    return [answer_pair(search, a, b)[0] for a, b in search.pairs]
+
+
+def _parts(pairs: Sequence[tuple[int, int]], count: int) -> list[Sequence[tuple[int, int]]]:
+    """Pairs in at most so many parts; neighbours in different ones, as their work is alike."""
+    return [pairs[k::count] for k in range(count) if pairs[k::count]]

@@ -1,0 +1,184 @@
+"""The files of a localisation run: a row for each query, numbers, a picture and a page."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.core.atomic_files import make_subfolder
+from fgslam.core.geometry import yaw_pitch_roll
+from fgslam.evaluation.localisation import Bounds, LocalisationScore, Spread
+from fgslam.evaluation.metrics import JsonValue
+from fgslam.report.homing import HomingPage, write_homing_report
+from fgslam.report.page.data import Picture
+from fgslam.report.pictures.located import LocatedDrawing, draw_located
+from fgslam.report.tables import Cell, write_csv, write_json
+from fgslam.runs.tasks.localisation_results import (
+    LocalisationResult,
+    Scored,
+    bounds_of,
+    in_frames,
+    scored,
+    sigmas_of,
+    verdict_of,
+)
+from fgslam.runs.tasks.slam_map_entry import GivenMap
+from fgslam.runs.tasks.slam_outputs import versions
+
+LOCALISATION_FILE = "localisation.csv"
+METRICS_FILE = "metrics.json"
+REPORT_FILE = "report.html"
+TIMING_FILE = "timing.csv"
+_COLUMNS = (
+    "frame",
+    "frames",
+    "verdict",
+    "x_m",
+    "y_m",
+    "z_m",
+    "yaw_deg",
+    "pitch_deg",
+    "roll_deg",
+    "sigma_position_m",
+    "sigma_rotation_deg",
+    "features",
+    "candidates",
+    "inliers",
+    "expected",
+    "second",
+    "residual_px",
+    "visible",
+    "familiar",
+    "error_m",
+    "error_deg",
+    "nees",
+    "nees_dof",
+    "why",
+)
+
+
+def write_results(result: LocalisationResult, given: GivenMap, subtitle: str) -> None:
+    """All files of a run into its folder, which holds its config.yaml. Raises OutputError."""
+    folder = result.folder
+    if folder is None:
+        return
+    judged = scored(result.config, result.asked)
+    rows = (row for one in judged for row in _rows(one))
+    write_csv(folder / LOCALISATION_FILE, _COLUMNS, rows)
+    timing = ((a.frame, a.frames, a.milliseconds, a.frontend_ms) for a in result.asked.attempts)
+    write_csv(folder / TIMING_FILE, ("frame", "frames", "locate_ms", "frontend_ms"), timing)
+    write_json(folder / METRICS_FILE, _document(result, judged))
+    output = result.config.output
+    pictures: tuple[Picture, ...] = ()
+    if output.pictures:
+        bounds = bounds_of(result.config)
+        pictures = tuple(_draw(folder, given, one, bounds) for one in judged)
+    if output.report:
+        page = HomingPage(
+            title=result.config.name,
+            subtitle=subtitle,
+            verdict=result.verdict,
+            tables=result.tables,
+            pictures=pictures,
+            notes=result.notes,
+            config_yaml=(folder / "config.yaml").read_text(encoding="utf-8"),
+            versions=versions(),
+        )
+        write_homing_report(folder / REPORT_FILE, page)
+
+
+def _rows(judged: Scored) -> Iterator[tuple[Cell, ...]]:
+    for k, attempt in enumerate(judged.attempts):
+        errors = judged.errors
+        judgement = errors.metres[k], np.rad2deg(errors.radians[k]), errors.nees[k], errors.dof[k]
+        found = attempt.found
+        sighted = attempt.sighted
+        in_view = [n if n >= 0 else None for n in (sighted.visible, sighted.familiar)]
+        if found is None:
+            nothing = [None] * (len(_COLUMNS) - 4)
+            yield (attempt.frame, attempt.frames, "no_image", *nothing, attempt.problem)
+            continue
+        posed = np.isfinite(found.covariance).all()
+        pose = (*found.wTc[:3, 3], *np.rad2deg(yaw_pitch_roll(found.wTc)), *sigmas_of(found))
+        yield (
+            attempt.frame,
+            attempt.frames,
+            found.verdict.value,
+            *(pose if posed else [None] * len(pose)),
+            attempt.features,
+            found.candidates,
+            len(found.ids),
+            found.expected,
+            found.second,
+            found.residual_px,
+            *in_view,
+            *judgement,
+            found.why,
+        )
+
+
+def _document(result: LocalisationResult, judged: Sequence[Scored]) -> dict[str, JsonValue]:
+    return {
+        "name": result.config.name,
+        "task": result.config.task,
+        "status": result.status,
+        "landmarks": len(result.asked.landmarks),
+        "alignment": result.asked.alignment,
+        "notes": list(result.notes),
+        "queries": {str(one.frames): _numbers(one) for one in judged},
+    }
+
+
+def _numbers(judged: Scored) -> dict[str, JsonValue]:
+    milliseconds = np.array([a.milliseconds for a in judged.attempts])
+    frontend = np.array([a.frontend_ms for a in judged.attempts])
+    return {
+        **_score_numbers(judged.counts),
+        "familiar_view": _score_numbers(judged.familiar),
+        "too_few_in_view": _score_numbers(judged.apart),
+        "verdicts": dict(sorted(Counter(verdict_of(a) for a in judged.attempts).items())),
+        "locate_ms": _spread_numbers(Spread.of(milliseconds)),
+        "frontend_ms": _spread_numbers(Spread.of(frontend)),
+    }
+
+
+def _score_numbers(counts: LocalisationScore) -> dict[str, JsonValue]:
+    return {
+        "asked": counts.queries,
+        "accepted": counts.accepted,
+        "with_truth": counts.known,
+        "right": counts.right,
+        "inexact": counts.inexact,
+        "false": counts.false,
+        "share_right": counts.share_right,
+        "error_m": _spread_numbers(counts.metres),
+        "error_deg": _spread_numbers(counts.degrees),
+        "nees_per_dof": counts.nees_per_dof,
+        "share_in_95_percent": counts.held,
+    }
+
+
+def _spread_numbers(values: Spread) -> dict[str, JsonValue]:
+    return {"median": values.median, "p95": values.p95, "max": values.largest}
+
+
+def _draw(folder: Path, given: GivenMap, judged: Scored, bounds: Bounds) -> Picture:
+    path = make_subfolder(folder, "pictures") / f"localisation_{judged.frames}.png"
+    answers, errors = judged.answers, judged.errors
+    title = f"Found from {in_frames(judged.frames)}"
+    false = (errors.metres > bounds.wrong_m) | (errors.radians > bounds.wrong_rad)
+    drawing = LocatedDrawing(
+        landmarks=given.saved.landmarks.positions,
+        path=given.saved.trajectory.poses,
+        found=answers.accepted,
+        poses=answers.poses,
+        covariances=answers.covariances,
+        truth=answers.truth,
+        false=np.asarray(false),
+        title=title,
+    )
+    draw_located(path, drawing)
+    return Picture(title, path.read_bytes())

@@ -1,0 +1,218 @@
+"""Asks a map where the frames of a recording were taken: one by one, or in short submaps."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import ConfigError, MapError
+from fgslam.core.estimates import LandmarkMap, Relocalisation
+from fgslam.core.floor import Floor
+from fgslam.core.recordings import Sequence
+from fgslam.core.saved_map import require_rig
+from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
+from fgslam.frontend.stereo.matching import StereoMatcher
+from fgslam.runs.localisation_config import LocalisationConfig
+from fgslam.runs.tasks.localisation_sights import Sighted, TrueSights
+from fgslam.runs.tasks.localisation_submap import Window, submap_features
+from fgslam.runs.tasks.localisation_truth import TruthInMap, truth_in_map
+from fgslam.runs.tasks.slam_map_entry import GivenMap, trusted
+from fgslam.slam.factory import make_relocaliser, make_stereo_matcher, make_stream
+from fgslam.slam.feature_stream import FeatureFrame
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is under way, how much is done, and of how much."""
+
+_STREAM = 13  # of random numbers, beside those of the recording
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attempt:
+    """One query and its answer.
+
+    Attributes:
+        i: place of the query's last frame among the selected ones.
+        frame: its number in the recording.
+        frames: how many frames it had.
+        features: that were looked up.
+        found: the answer; of a frame that could not be read None.
+        problem: why it could not; empty where it could.
+        truth: (4, 4) true pose in the map's world; NaN where unknown.
+        sighted: landmarks truly in view of it.
+        milliseconds: for the answer, without features.
+        frontend_ms: for the frame's features in all images, and for matching them.
+    """
+
+    i: int
+    frame: int
+    frames: int
+    features: int
+    found: Relocalisation | None
+    problem: str
+    truth: FloatArray
+    sighted: Sighted
+    milliseconds: float
+    frontend_ms: float
+
+    @property
+    def accepted(self) -> bool:
+        """Whether there is a pose to be believed."""
+        return self.found is not None and self.found.found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Asked:
+    """All queries of a run.
+
+    Attributes:
+        attempts: by frames of a query, then in order.
+        landmarks: that could be recognised.
+        alignment: how truth and map were brought together, in words.
+        whole: whether all that was wanted has been done.
+    """
+
+    attempts: tuple[Attempt, ...]
+    landmarks: LandmarkMap
+    alignment: str
+    whole: bool
+
+    def of(self, frames: int) -> tuple[Attempt, ...]:
+        """The queries of so many frames."""
+        return tuple(one for one in self.attempts if one.frames == frames)
+
+
+def nothing_asked(why: str) -> Asked:
+    """No query at all, and why."""
+    nobody = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+    return Asked((), nobody, why, whole=False)
+
+
+class Asker:
+    """A map that has been learnt, and what it takes to ask it."""
+
+    def __init__(self, config: LocalisationConfig, given: GivenMap, sequence: Sequence) -> None:
+        """Learns the map.
+
+        Raises:
+            MapError: other cameras made it, or it holds no landmark.
+        """
+        require_rig(given.saved, sequence.rig, str(given.path))
+        frontend = config.frontend
+        self.landmarks, looks = trusted(given.saved, frontend.database.valid_hits)
+        if not len(self.landmarks):
+            raise MapError(f"{given.path}: holds no trusted landmark; make the map anew")
+        self._config, self._sequence = config, sequence
+        self._stereo: StereoMatcher = make_stereo_matcher(sequence.rig, frontend)
+        self._relocaliser: Relocaliser = make_relocaliser(sequence.rig, frontend)
+        self._relocaliser.learn(self.landmarks, looks)
+        self._floor = Floor.under(sequence.rig, frontend.ego_motion.dof)
+        self.truth: TruthInMap = truth_in_map(given.saved, sequence, config.as_experiment())
+        self._sights = TrueSights(given.saved, self.landmarks, sequence, frontend)
+
+    def ask(self, found: list[FeatureFrame], sighted: Sighted) -> Attempt:
+        """One query: consecutive frames, the last of which is to be located.
+
+        Args:
+            found: the frames with their features.
+            sighted: landmarks truly in view of the last one.
+        """
+        last = found[-1]
+        frame = self._frame_number(last.i)
+        blank = Attempt(
+            i=last.i,
+            frame=frame,
+            frames=len(found),
+            features=0,
+            found=None,
+            problem=last.problem,
+            truth=self.truth.poses[last.i],
+            sighted=sighted,
+            milliseconds=float("nan"),
+            frontend_ms=last.sift_ms,
+        )
+        if last.frame is None:
+            return blank
+        rng = np.random.default_rng([self._config.seed, _STREAM, frame, len(found)])
+        start = time.perf_counter()
+        if len(found) == 1:
+            features, spread = self._stereo.match(last.features), None
+        else:
+            window = Window(self._sequence, found[0].i, len(found))
+            features, spread = submap_features(
+                window, found, self._config.frontend, self._config.odometry
+            )
+        matched = time.perf_counter()
+        answer = self._relocaliser.locate(features, rng)
+        done = time.perf_counter()
+        if spread is not None and np.isfinite(answer.covariance).all():
+            own = self._floor.allowed_part(answer.wTc, spread)
+            answer = dataclasses.replace(answer, covariance=answer.covariance + own)
+        return dataclasses.replace(
+            blank,
+            features=len(features),
+            found=answer,
+            milliseconds=1e3 * (done - matched),
+            frontend_ms=last.sift_ms + 1e3 * (matched - start),
+        )
+
+    def sighted(self, i: int) -> Sighted:
+        """Landmarks truly in view of the selected frame ``i``."""
+        return self._sights.of(i, self.truth.poses[i])
+
+    def _frame_number(self, i: int) -> int:
+        dataset = self._config.dataset
+        return dataset.start + i * dataset.stride
+
+
+def ask_all(
+    config: LocalisationConfig,
+    given: GivenMap,
+    sequence: Sequence,
+    progress: Progress,
+    stopped: Callable[[], bool],
+) -> Asked:
+    """All queries of a configuration.
+
+    Raises:
+        MapError: the map cannot be used with these cameras, or is empty.
+        ConfigError: the recording is shorter than a query.
+    """
+    wanted = config.localisation
+    if len(sequence) < max(wanted.frames):
+        raise ConfigError(
+            f"{sequence.name}: {len(sequence)} frames are selected, and a query takes "
+            f"{max(wanted.frames)}; lower the frames of a query, or select more"
+        )
+    asker = Asker(config, given, sequence)
+    queries = len(range(max(wanted.frames) - 1, len(sequence), wanted.every))
+    attempts: list[Attempt] = []
+    done = 0
+    for found in _queries(config, sequence):
+        sighted = asker.sighted(found[-1].i)
+        attempts += [asker.ask(found[len(found) - n :], sighted) for n in wanted.frames]
+        done += 1
+        progress("localising", done, queries)
+        if stopped():
+            break
+    attempts.sort(key=lambda one: (wanted.frames.index(one.frames), one.i))
+    return Asked(tuple(attempts), asker.landmarks, asker.truth.alignment, done == queries)
+
+
+def _queries(config: LocalisationConfig, sequence: Sequence) -> Iterator[list[FeatureFrame]]:
+    """The frames of each query, the longest submap's; each frame's features are found once."""
+    longest, every = max(config.localisation.frames), config.localisation.every
+    held: deque[FeatureFrame] = deque(maxlen=longest)
+    stream = make_stream(sequence, config.frontend)()
+    try:
+        for found in stream:
+            held.append(found)
+            if found.i >= longest - 1 and (found.i - longest + 1) % every == 0:
+                yield list(held)
+    finally:
+        stream.close()

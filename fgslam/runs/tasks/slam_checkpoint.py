@@ -1,0 +1,117 @@
+"""The state of a run on disk, so that it can be resumed to the same bytes."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.core.arrays import StateArrays
+from fgslam.core.atomic_files import write_bytes
+from fgslam.core.errors import OutputError
+from fgslam.core.measurement_log import MeasurementLog, load_arrays
+from fgslam.runs.tasks.slam_recorder import RunRecorder
+from fgslam.slam.pipeline import SlamPipeline
+
+STATE_FILE = "checkpoint.npz"
+LOG_FILE = "measurements.npz"
+
+
+def save(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
+    """Writes the state. The log must have been written before: it may not lack a frame of it."""
+    write_arrays(folder / STATE_FILE, state_of(pipeline, recorder))
+
+
+def state_of(pipeline: SlamPipeline, recorder: RunRecorder) -> StateArrays:
+    """All that changes during a run but its log, as arrays named ``part/name``."""
+    parts = {
+        "database": pipeline.tracker.database.state(),
+        "estimator": pipeline.estimator.state(),
+        "motion": pipeline.motion.state(),
+        "recorder": recorder.state(),
+    }
+    if pipeline.places is not None:
+        parts["places"] = pipeline.places.state()
+    return {
+        f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()
+    }
+
+
+def restore(
+    state: StateArrays, log: MeasurementLog, pipeline: SlamPipeline, recorder: RunRecorder
+) -> None:
+    """Continues from :func:`state_of` and the log.
+
+    Raises:
+        KeyError, ValueError, IndexError: the state is another's.
+    """
+    pipeline.tracker.database.restore(_part(state, "database"))
+    pipeline.estimator.restore(_part(state, "estimator"))
+    pipeline.motion.restore(_part(state, "motion"))
+    recorder.restore(_part(state, "recorder"), log)
+    if pipeline.places is not None:
+        pipeline.places.restore(_part(state, "places"), recorder.log)
+
+
+def save_log(folder: Path, log: MeasurementLog) -> None:
+    """Writes the measurement log."""
+    write_arrays(folder / LOG_FILE, log.to_arrays())
+
+
+def exists(folder: Path) -> bool:
+    """Whether there is a state to continue from."""
+    return (folder / STATE_FILE).is_file()
+
+
+def require(folder: Path) -> None:
+    """Raises OutputError where there is nothing to continue from."""
+    if not exists(folder):
+        raise OutputError(
+            f"{folder}: nothing to resume (no {STATE_FILE}): the run has finished, or never got "
+            "to its first checkpoint; use --overwrite to run again"
+        )
+
+
+def load(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
+    """Continues from a checkpoint.
+
+    Raises:
+        OutputError: there is none, or state and log do not belong to each other or to this fgslam.
+        MeasurementLogError: one of the two files cannot be read.
+    """
+    require(folder)
+    state = load_arrays(folder / STATE_FILE)
+    log = MeasurementLog.load(folder / LOG_FILE)
+    try:
+        restore(state, log, pipeline, recorder)
+    except (KeyError, ValueError, IndexError) as error:
+        raise OutputError(
+            f"{folder / STATE_FILE}: not a state that this fgslam wrote ({error}); start again "
+            "with --overwrite"
+        ) from None
+    if len(recorder.log) < len(recorder):
+        raise OutputError(
+            f"{folder / LOG_FILE}: holds {len(log)} frames, the checkpoint {len(recorder)}; "
+            "restore it, or start again with --overwrite"
+        )
+
+
+def write_arrays(path: Path, arrays: StateArrays) -> None:
+    """Writes an uncompressed ``.npz``, atomically; the same arrays give the same bytes."""
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def _part(state: StateArrays, part: str) -> StateArrays:
+    return {
+        name.removeprefix(f"{part}/"): array
+        for name, array in state.items()
+        if name.startswith(f"{part}/")
+    }
+
+
+def remove(folder: Path) -> None:
+    """Drops the state once the run has finished."""
+    (folder / STATE_FILE).unlink(missing_ok=True)

@@ -1,0 +1,239 @@
+"""Runs that go on where one stopped, or leave a map behind."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fgslam import __version__
+from fgslam.core.arrays import StateArrays
+from fgslam.core.atomic_files import require_writable
+from fgslam.core.errors import ConfigError, MapError, MeasurementLogError
+from fgslam.core.estimates import Estimate
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.recordings import Sequence
+from fgslam.core.saved_map import SavedMap, require_rig, save_map
+from fgslam.runs.config import ExperimentConfig, parse_config
+from fgslam.runs.tasks import slam_checkpoint as checkpoint
+from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, entry_of
+from fgslam.runs.tasks.slam_outputs import RunOutputs
+from fgslam.runs.tasks.slam_recorder import RunRecorder
+from fgslam.slam.map_settings import MapSettings
+from fgslam.slam.pipeline import SlamPipeline
+
+_LOG = "log/"
+_TIMES = "recorder/stage_ms"
+_SAME_SETTINGS = ("seed", "odometry", "frontend", "estimator")
+
+
+def first_config(config: ExperimentConfig, folder: Path) -> ExperimentConfig | None:
+    """The drive that makes the map of a run in ``folder``; None where none is asked for."""
+    first = config.map.made_from
+    if first is None:
+        return None
+    return config.model_copy(
+        update={
+            "name": f"{config.name}_{FIRST_FOLDER}",
+            "seed": config.seed if first.seed is None else first.seed,
+            "dataset": first.dataset,
+            "odometry": first.odometry,
+            "compare": (),
+            "map": MapSettings(save=str(folder / MAP_FILE)),
+        }
+    )
+
+
+def require_savable(settings: MapSettings, run: Path) -> None:
+    """Refuses, before the drive, a map file that could not be written after it.
+
+    The folder ``run`` of the run itself is none of its business.
+
+    Raises:
+        MapError: the name is a folder's.
+        OutputError: its folder does not exist or is not writable.
+    """
+    if settings.save is None:
+        return
+    path = Path(settings.save)
+    if path.is_dir():
+        raise MapError(f"{path}: is a folder; name the map's file, e.g. {path / MAP_FILE}")
+    if path.parent.resolve() != run.resolve():
+        require_writable(path.parent)
+
+
+# --------------------------------------------------------------------------------------------
+# Going on where it stopped
+
+
+def window(config: ExperimentConfig, given: GivenMap) -> ExperimentConfig:
+    """The configuration with the frames that the map's run had, too: it goes on after them.
+
+    Raises:
+        MapError: the map keeps no session, or one of other settings.
+    """
+    saved, where = given.saved, str(given.path)
+    drive = _last_drive(saved)
+    if not saved.session or "settings" not in drive:
+        raise MapError(
+            f"{where}: was saved without its session, so no run can go on with it; save with "
+            "map.session true, or use map.start last"
+        )
+    now, then = config.as_values(), _settings_of(drive, where)
+    for name in _SAME_SETTINGS:
+        if now[name] != then[name]:
+            raise MapError(
+                f"{where}: its run had another {name}; map.start continue needs the same one, "
+                "map.start last does not"
+            )
+    start, stride = then["dataset"]["start"], then["dataset"]["stride"]
+    after = start + stride * drive["frames"]
+    same = {name: value for name, value in then["dataset"].items() if name not in ("start", "stop")}
+    if any(now["dataset"].get(name) != value for name, value in same.items()):
+        raise MapError(
+            f"{where}: its run had another dataset; map.start continue needs the same one, "
+            "map.start last does not"
+        )
+    if config.dataset.start not in (start, after):
+        raise MapError(
+            f"{where}: its run stopped before frame {after}; set dataset.start to {after}, or as "
+            f"it was, to {start}"
+        )
+    dataset = dataclasses.replace(config.dataset, start=start)
+    return config.model_copy(update={"dataset": dataset})
+
+
+def require_continuable(given: GivenMap, sequence: Sequence) -> None:
+    """Refuses a session of another recording, of another fgslam, or with nothing left to do.
+
+    Raises:
+        MapError: which it is.
+    """
+    saved, where, drive = given.saved, str(given.path), _last_drive(given.saved)
+    require_rig(saved, sequence.rig, where)
+    done = drive["frames"]
+    same = drive["recording"]["identity"] == sequence.identity
+    stamps = saved.session.get(f"{_LOG}timestamp", np.empty(0))
+    if not same or not np.array_equal(sequence.timestamps[:done], stamps):
+        raise MapError(
+            f"{where}: was made of another recording than {sequence.name}, or it has changed; "
+            "map.start continue needs the same one, map.start last does not"
+        )
+    if drive["fgslam"] != __version__:
+        raise MapError(
+            f"{where}: its session is of fgslam {drive['fgslam']}, this is {__version__}; use "
+            "that one, or map.start last"
+        )
+    if done >= len(sequence):
+        raise MapError(
+            f"{where}: its run had all {done} frames up to dataset.stop already; nothing is left "
+            "to go on with"
+        )
+
+
+def entered_by(given: GivenMap) -> dict[str, Any] | None:
+    """How the run that is gone on with entered a map of its own; None where it had none."""
+    return _last_drive(given.saved).get("entered")
+
+
+def go_on(given: GivenMap, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
+    """Takes the session up where it stopped. Raises MapError where its arrays do not fit."""
+    session, where = given.saved.session, str(given.path)
+    logged = {n.removeprefix(_LOG): a for n, a in session.items() if n.startswith(_LOG)}
+    try:
+        log = MeasurementLog.from_arrays(logged, where)
+        checkpoint.restore(session, log, pipeline, recorder)
+    except (KeyError, ValueError, IndexError, MeasurementLogError) as error:
+        raise MapError(
+            f"{where}: its session is not one that this fgslam wrote ({error}); use map.start last"
+        ) from None
+
+
+def _settings_of(drive: dict[str, Any], where: str) -> dict[str, Any]:
+    """A drive's settings, with the defaults of keys that are newer than it."""
+    try:
+        return parse_config({"name": drive["name"], **drive["settings"]}, where).as_values()
+    except ConfigError as error:
+        raise MapError(
+            f"{where}: its run had settings that this fgslam does not know ({error}); use "
+            "map.start last"
+        ) from None
+
+
+def _last_drive(saved: SavedMap) -> dict[str, Any]:
+    drives = saved.about.get("drives")
+    last = drives[-1] if isinstance(drives, list) and drives else {}
+    return last if isinstance(last, dict) else {}
+
+
+# --------------------------------------------------------------------------------------------
+# The map that is left
+
+
+def save(outputs: RunOutputs, given: GivenMap | None) -> str:
+    """Writes the map where the configuration wants it; a line about it, empty without."""
+    if outputs.config.map.save is None:
+        return ""
+    path, saved = Path(outputs.config.map.save), _saved_map(outputs, given)
+    size = save_map(saved, path)
+    return (
+        f"{path}: {len(saved)} landmarks, {int(saved.permanent.sum())} of them permanent, "
+        f"{size / 1e6:.1f} MB"
+    )
+
+
+def _saved_map(outputs: RunOutputs, given: GivenMap | None) -> SavedMap:
+    """The estimator's geometry joined with the database's looks and counts."""
+    database, estimate = outputs.pipeline.tracker.database, outputs.pipeline.estimator.estimate()
+    landmarks, places = estimate.landmarks, outputs.pipeline.places
+    if places is not None:  # no later frame of this run ends them
+        landmarks = landmarks.without(places.ending)
+    rows = database.rows(landmarks.ids)
+    return SavedMap(
+        rig=outputs.sequence.rig,
+        landmarks=landmarks,
+        appearances=database.appearances(landmarks.ids),
+        hits=database.hits[rows],
+        misses=database.misses[rows],
+        permanent=database.lasting[rows],
+        colour=database.colour[rows],
+        trajectory=estimate.trajectory,
+        about={"drives": [*_drives_before(outputs, given), _drive(outputs, estimate)]},
+        session=_session(outputs) if outputs.config.map.session else {},
+    )
+
+
+def _drives_before(outputs: RunOutputs, given: GivenMap | None) -> list[Any]:
+    if given is None:
+        return []
+    before = list(given.saved.about.get("drives", ()))
+    return before[:-1] if outputs.config.map.start == "continue" else before
+
+
+def _drive(outputs: RunOutputs, estimate: Estimate) -> dict[str, Any]:
+    config, values = outputs.config, outputs.config.as_values()
+    settings = {name: values[name] for name in (*_SAME_SETTINGS, "dataset")}
+    settings["dataset"]["start"] = outputs.first_frame
+    entry = entry_of(outputs.folder)
+    return {
+        "name": config.name,
+        "fgslam": __version__,
+        "recording": {"name": outputs.sequence.name, "identity": outputs.sequence.identity},
+        "frames": len(outputs.recorder),
+        "entered": None if entry is None else entry.as_values(),
+        "estimator": outputs.pipeline.estimator.kind,
+        "valid_hits": config.frontend.database.valid_hits,
+        "remark": outputs.remark,
+        "remarks": list(estimate.remarks),
+        "settings": settings,
+    }
+
+
+def _session(outputs: RunOutputs) -> StateArrays:
+    """What the run needs to go on; its times are the clock's, and no part of it."""
+    log = outputs.recorder.log.to_arrays()
+    state = checkpoint.state_of(outputs.pipeline, outputs.recorder)
+    state[_TIMES] = np.full_like(state[_TIMES], np.nan)
+    return state | {f"{_LOG}{name}": array for name, array in log.items()}

@@ -1,0 +1,167 @@
+"""Runs a recording of measurements, which needs no front-end: every estimator replays it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.core.errors import ConfigError
+from fgslam.core.estimates import Estimate, LandmarkMap
+from fgslam.core.recordings import MeasurementRecording
+from fgslam.datasets.opening import open_measurements
+from fgslam.datasets.settings import MeasurementDatasetSettings
+from fgslam.evaluation.metrics import JsonValue
+from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
+from fgslam.report.metrics import StageTime, write_timing
+from fgslam.report.point_cloud import read_ply
+from fgslam.report.trajectories import read_covariances, read_tum, write_tum
+from fgslam.runs.choosing import estimators_of
+from fgslam.runs.compare import write_comparison
+from fgslam.runs.comparison import (
+    GROUND_TRUTH_FILE,
+    Compared,
+    Progress,
+    remark_of,
+    replay_apart,
+    tasks_of,
+)
+from fgslam.runs.config import ExperimentConfig
+from fgslam.runs.estimator_files import FRAMES_FILE, read_frames
+from fgslam.runs.folder import ExistingFolder, create_run_folder
+from fgslam.runs.tasks.slam_checkpoint import save_log
+from fgslam.runs.tasks.slam_outputs import write_config
+from fgslam.runs.tasks.slam_pictures import RunFigures, draw_run
+from fgslam.runs.tasks.slam_summary import spread
+from fgslam.slam.replay import ReplayRow
+
+
+def holds_measurements(config: ExperimentConfig) -> bool:
+    """Whether the configuration's data set has measurements instead of images."""
+    return isinstance(config.dataset, MeasurementDatasetSettings)
+
+
+def open_measured(config: ExperimentConfig, seed: int | None = None) -> MeasurementRecording:
+    """The recording that the configuration names, simulated with its seed or another one.
+
+    Raises:
+        FgslamError: it cannot be opened; images are no measurements (ConfigError).
+    """
+    if not isinstance(config.dataset, MeasurementDatasetSettings):
+        raise ConfigError(f"dataset.kind {config.dataset.kind} holds images, no measurements")
+    seed = config.seed if seed is None else seed
+    return open_measurements(config.dataset, seed, config.odometry)
+
+
+def run_measured(
+    config: ExperimentConfig,
+    folder: Path,
+    existing: ExistingFolder = "refuse",
+    progress: Progress = lambda what, done, total: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Compared:
+    """Replays the recording through the configuration's estimators, into a run folder.
+
+    Args:
+        config: an experiment on measurements.
+        folder: the run folder itself.
+        existing: what to do where it holds a run already; `resume` is refused.
+        progress: told of each estimator that is done.
+        stopped: True ends the replays; what was finished is kept.
+
+    Raises:
+        FgslamError: of any kind, with a message for the user.
+    """
+    if existing == "resume":
+        raise ConfigError(
+            f"{folder}: a run on measurements cannot be resumed, it starts anew in seconds; use "
+            "--overwrite"
+        )
+    if existing == "refuse" and folder.exists():
+        create_run_folder(folder, existing)  # refuses before anything is simulated
+    recording = open_measured(config)
+    create_run_folder(folder, existing)
+    write_recording(folder, config, recording)
+    tasks = tasks_of(config, folder, folder, estimators_of(config))
+    metrics = replay_apart(tasks, 1, progress, stopped)
+    rows = _live_rows(folder, config)
+    _write_times(folder, recording, rows)
+    about = _about(config, recording, rows, "interrupted" if stopped() else "finished")
+    pictures: tuple[Path, ...] = ()
+    if config.output.pictures and rows:
+        pictures = tuple(draw_run(folder, _figures(folder, config, recording, rows)))
+    write_comparison(folder, config, len(recording.log), metrics, about, folder)
+    notes = recording.notes
+    return Compared(config.name, folder, folder, len(recording.log), metrics, notes, pictures)
+
+
+def write_recording(
+    folder: Path, config: ExperimentConfig, recording: MeasurementRecording
+) -> None:
+    """What every estimator's replay starts from: configuration, log, truth."""
+    provenance = {"dataset": {"name": recording.name, "identity": recording.identity}}
+    write_config(folder, config, provenance)
+    save_log(folder, recording.log)
+    if recording.ground_truth is not None:
+        write_tum(folder / GROUND_TRUTH_FILE, recording.ground_truth)
+    if recording.landmark_truth is not None:
+        exact = np.zeros(len(recording.landmark_truth))
+        write_landmark_truth(folder / LANDMARK_TRUTH_FILE, recording.landmark_truth, exact)
+
+
+def _live_rows(folder: Path, config: ExperimentConfig) -> list[ReplayRow]:
+    """Frame by frame, what the estimator of `estimator.kind` did; nothing where it gave none."""
+    path = folder / config.estimator.title / FRAMES_FILE
+    return read_frames(path) if path.is_file() else []
+
+
+def _write_times(folder: Path, recording: MeasurementRecording, rows: list[ReplayRow]) -> None:
+    increments = recording.log.increments[: len(rows)]
+    times = [
+        StageTime(increment.index, increment.timestamp, stage, milliseconds)
+        for increment, row in zip(increments, rows, strict=True)
+        for stage, milliseconds in (("track", row.solve_ms), ("update", row.update_ms))
+    ]
+    write_timing(folder / "timing.csv", times)
+
+
+def _about(
+    config: ExperimentConfig, recording: MeasurementRecording, rows: list[ReplayRow], status: str
+) -> dict[str, JsonValue]:
+    return {
+        "name": config.name,
+        "status": status,
+        "frames_in_recording": len(recording.log),
+        "odometry": config.odometry.kind,
+        "remark": remark_of(config) or None,
+        "notes": list(recording.notes),
+        "status_counts": dict(sorted(Counter(row.status for row in rows).items())),
+        "landmark_matches": spread(np.array([row.inliers for row in rows[1:]], np.int64)),
+    }
+
+
+def _figures(
+    folder: Path,
+    config: ExperimentConfig,
+    recording: MeasurementRecording,
+    rows: list[ReplayRow],
+) -> RunFigures:
+    """From the files of the first estimator."""
+    own = folder / config.estimator.title
+    points = read_ply(own / "map.ply")
+    landmarks = LandmarkMap(points.ids, points.positions, points.covariances)
+    covariances = read_covariances(own / "covariance.csv")[1]
+    counts = np.array([(r.matched, r.inliers, r.landmarks) for r in rows], np.int64).T
+    return RunFigures(
+        name=config.name,
+        synthetic=False,
+        estimate=Estimate(read_tum(own / "final.tum"), covariances, landmarks),
+        truth=recording.ground_truth,
+        valid=points.valid,
+        frames=np.array([i.index for i in recording.log.increments[: len(rows)]], np.int64),
+        matched=counts[0],
+        inliers=counts[1],
+        landmarks=counts[2],
+    )

@@ -1,0 +1,118 @@
+"""What place recognition did in a run: loops.csv, its numbers, its table in the report."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import astuple, fields
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.core.errors import DatasetError
+from fgslam.core.estimates import Trajectory
+from fgslam.evaluation.closures import JudgedClosure, judge_closures
+from fgslam.evaluation.metrics import JsonValue
+from fgslam.report.page import Column, Comparison
+from fgslam.report.tables import Cell, write_csv
+from fgslam.runs.tasks.slam_recorder import RunRecorder
+
+LOOPS_FILE = "loops.csv"
+_NAMES = ("frame", "returned_to", *(f.name for f in fields(JudgedClosure)), "false")
+_COLUMNS = (
+    Column("taken", "whether the estimator closed the loop; one it refused changed nothing"),
+    Column("returned to", "number of the frame whose place was recognised"),
+    Column("matches", "landmarks of that place seen again"),
+    Column("made one", "landmarks of the return found to be earlier ones"),
+    Column("correction (cm)", "how far closing the loop moved the pose"),
+    Column("error before (cm)", "of the position just before, in the world of the first pose"),
+    Column("error after (cm)", "of the position just after"),
+    Column("closure's error (cm)", "of the relative position that the closure measured"),
+    Column("closure's error (deg)", "of the relative heading that the closure measured"),
+)
+
+
+def closures_of(
+    recorder: RunRecorder, taken: Sequence[bool], truth: Trajectory | None
+) -> list[JudgedClosure]:
+    """The closures of a run, judged by the truth where there is one.
+
+    Args:
+        recorder: the run's.
+        taken: of each closure of the log, in its order, whether the run's estimator took it.
+        truth: true poses.
+    """
+    offered = [(k, loop) for k, step in enumerate(recorder.log) for loop in step.loops]
+    closures = [(*which, so) for which, so in zip(offered, taken, strict=True)]
+    if not closures:
+        return []
+    stamps = np.array([increment.timestamp for increment in recorder.log], np.float64)
+    online = Trajectory(stamps, np.array(recorder.online_poses).reshape(-1, 4, 4))
+    tracked = np.array(recorder.tracked_poses).reshape(-1, 4, 4)
+    return judge_closures(closures, tracked, online, truth)
+
+
+def place_numbers(recorder: RunRecorder, closures: list[JudgedClosure]) -> dict[str, JsonValue]:
+    """For metrics.json: loops closed and, of these, false ones; closures refused; relocalised."""
+    closed = [closure for closure in closures if closure.taken]
+    known = [closure.false for closure in closed if closure.false is not None]
+    return {
+        "closures": len(closed),
+        "false_closures": sum(known) if len(known) == len(closed) else None,
+        "refused_closures": len(closures) - len(closed),
+        "relocalised": sum(increment.relocalised for increment in recorder.log),
+    }
+
+
+def write_closures(folder: Path, recorder: RunRecorder, closures: list[JudgedClosure]) -> None:
+    """loops.csv, one line a closure; no file where there was none, nor an earlier run's."""
+    if not closures:
+        (folder / LOOPS_FILE).unlink(missing_ok=True)
+        return
+    numbers = [increment.index for increment in recorder.log]
+    rows: list[tuple[Cell, ...]] = [
+        (numbers[one.at], numbers[one.to], *astuple(one), one.false) for one in closures
+    ]
+    write_csv(folder / LOOPS_FILE, _NAMES, rows)
+
+
+def read_closures(path: Path) -> tuple[Comparison, list[tuple[int, int]]]:
+    """The report's table of a loops.csv, and (closing, returned to) of the loops closed.
+
+    A file of an older run does not tell which were refused: there all count as taken.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        rows = list(csv.DictReader(io.StringIO(text)))
+        lines = tuple((_title(row), _values(row)) for row in rows)
+        closed = [(int(row["at"]), int(row["to"])) for row in rows if _taken(row) != "no"]
+        return Comparison(_COLUMNS, lines), closed
+    except (OSError, UnicodeDecodeError, KeyError, ValueError, TypeError) as error:
+        raise DatasetError(
+            f"{path}: not a table of closed loops ({error}); run the experiment again"
+        ) from None
+
+
+def _title(row: dict[str, str]) -> str:
+    return f"frame {row['frame']}" + (" (false)" if row["false"] == "true" else "")
+
+
+def _taken(row: dict[str, str]) -> str:
+    return {"true": "yes", "false": "no"}.get(row.get("taken", ""), "-")
+
+
+def _values(row: dict[str, str]) -> tuple[str, ...]:
+    lengths = ("correction_m", "before_m", "after_m", "error_m")
+    return (
+        _taken(row),
+        row["returned_to"],
+        row["matches"],
+        row["merged"],
+        *(_text(row[name], 100.0, ".1f") for name in lengths),
+        _text(row["error_deg"], 1.0, ".2f"),
+    )
+
+
+def _text(value: str, scale: float, spec: str) -> str:
+    return format(scale * float(value), spec) if value else "-"
