@@ -19,7 +19,7 @@ help: ## list the targets
 setup: .venv/.dev-stamp ## make .venv with the package and the development tools
 
 demo: .venv/.runtime-stamp ## render the lab, run the paper's drive through it, write runs/demo
-	.venv/bin/fgslam run experiments/lab_loop.yaml --out $(DEMO_OUT) --overwrite
+	.venv/bin/fgslam demo --out $(DEMO_OUT)
 
 test: setup ## the tests that take seconds
 	$(PYTEST)

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fgslam.cli import compare_options as options
+from fgslam.cli import options
 from fgslam.cli.interruption import stop_flag, stoppable
 from fgslam.core.errors import FgslamError
+from fgslam.runs.named_experiments import find_experiment
 
 if TYPE_CHECKING:
     from fgslam.runs.baseline import Results
@@ -31,38 +32,24 @@ _UsageError: type[typer.BadParameter] = typer.BadParameter.__bases__[0]
 app = typer.Typer(
     name="fgslam",
     help="Stereo, trinocular and omnidirectional SLAM: filters and smoothers on one log.",
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
 
 @app.callback()
-def _root() -> None:
+def _root(version: options.Version = False) -> None:
     """Filters and smoothers on one measurement log."""
 
 
 @app.command()
 def run(
-    config: Annotated[Path, typer.Argument(help="experiment, e.g. experiments/lab_loop.yaml")],
-    out: Annotated[
-        Path | None, typer.Option(help="the run folder itself; default runs/NAME")
-    ] = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="A.B=VALUE", help="override one key; may be repeated"),
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier run")] = False,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="continue an interrupted run to the same bytes")
-    ] = False,
-    map_in: Annotated[
-        Path | None,
-        typer.Option("--map-in", metavar="MAP", help="saved map to go on with; sets map.load"),
-    ] = None,
-    map_out: Annotated[
-        Path | None,
-        typer.Option("--map-out", metavar="MAP", help="where to save the map; sets map.save"),
-    ] = None,
+    config: options.Experiment,
+    out: options.RunFolder = None,
+    overrides: options.Overrides = None,
+    overwrite: options.Overwrite = False,
+    resume: options.Resume = False,
+    map_in: options.MapIn = None,
+    map_out: options.MapOut = None,
 ) -> None:
     """Run an experiment: images in, run folder out; measurements, localisation, homing, too.
 
@@ -88,6 +75,19 @@ def run(
         return _run_localisation(settings, folder, existing)
     run_it = _run_measurements if holds_measurements(settings) else _run_images
     return run_it(settings, folder, existing)
+
+
+@app.command()
+def demo(
+    out: Annotated[
+        Path, typer.Option(help="the run folder; replaced where it is there already")
+    ] = Path("runs/demo"),
+) -> None:
+    """Drive the paper's loop through the rendered lab: the experiment lab_loop, in a minute.
+
+    Needs no recording. The page it ends with, report.html, shows path, map and numbers.
+    """
+    run(find_experiment(Path("lab_loop")), out, overwrite=True)
 
 
 def _run_homing(settings: HomingExperiment, folder: Path, existing: ExistingFolder) -> None:
@@ -281,13 +281,7 @@ def _check_baseline(expected: dict[str, Any], results: Results) -> bool:
 @app.command()
 def localize(
     map_file: Annotated[Path, typer.Argument(metavar="MAP", help="a saved map")],
-    recording: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RECORDING",
-            help="a recording's folder, or an experiment's .yaml for its data set",
-        ),
-    ],
+    recording: options.Recording,
     frame: Annotated[
         int | None,
         typer.Option(min=0, help="the recording's frame to locate; default all, one by one"),
@@ -295,14 +289,11 @@ def localize(
     frames: Annotated[
         int, typer.Option(min=1, max=100, help="locate a submap of so many frames, ending there")
     ] = 1,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="A.B=VALUE", help="override one key of the experiment"),
-    ] = None,
+    overrides: options.Overrides = None,
     out: Annotated[
         Path | None, typer.Option(help="folder for table, numbers, picture and page; default none")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier one")] = False,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Where in a map were these frames taken? Without any prior.
 
@@ -359,7 +350,7 @@ def merge(
     first: Annotated[Path, typer.Argument(metavar="MAP", help="the map whose world it will be")],
     second: Annotated[Path, typer.Argument(metavar="MAP", help="the map to lay onto it")],
     out: Annotated[Path, typer.Option(metavar="MAP", help="where to write both as one")],
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier one")] = False,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Make two saved maps of one place into one; refuses what does not overlap beyond doubt."""
     from fgslam.runs.map_merging import merge_files
@@ -383,17 +374,8 @@ def view(
 
 @app.command()
 def inspect(
-    dataset: Annotated[
-        Path,
-        typer.Argument(
-            metavar="DATASET",
-            help="a recording's folder, or an experiment's .yaml for its data set",
-        ),
-    ],
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="A.B=VALUE", help="override one key of the experiment"),
-    ] = None,
+    recording: options.Recording,
+    overrides: options.Overrides = None,
     frames: Annotated[
         int, typer.Option(min=1, help="in how many frames, evenly spread, features are matched")
     ] = 12,
@@ -406,7 +388,7 @@ def inspect(
     from fgslam.runs.inspection import inspect_recording
 
     with stop_flag() as stopped, progress_bar() as progress:
-        report = inspect_recording(dataset, overrides or (), frames, stoppable(progress, stopped))
+        report = inspect_recording(recording, overrides or (), frames, stoppable(progress, stopped))
     typer.echo(report)
 
 

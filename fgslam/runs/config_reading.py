@@ -18,6 +18,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from fgslam.core.errors import ConfigError
+from fgslam.runs.named_experiments import suggestion
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -107,7 +108,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
         values = yaml.safe_load(text)
         repeated = _repeated_key(yaml.SafeLoader(text).get_single_node())
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; give a YAML file, e.g. of experiments/") from None
+        raise ConfigError(f"{path}: no such file; {suggestion(path)}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read ({error}); give a YAML text file") from None
     except yaml.YAMLError as error:

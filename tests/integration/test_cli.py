@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from running import (
     write_config,
 )
 
+import fgslam
 from fgslam.report.point_cloud import read_ply
 from fgslam.report.trajectories import read_kitti, read_tum
 
@@ -53,7 +55,7 @@ def test_help_of_the_whole(monkeypatch: Patch, capfd: Capture) -> None:
 @pytest.mark.parametrize(
     ("verb", "words"),
     [
-        ("run", ("experiments/lab_loop.yaml", "--out", "--set", "--overwrite", "--resume")),
+        ("run", ("e.g. lab_loop", "--out", "--set", "--overwrite", "--resume")),
         ("export", ("--map", ".ply", ".pcd", ".off", "--trajectory", ".tum", ".kitti")),
         ("export", ("--graph", ".g2o", "--estimator")),
         ("view", ("rerun viewer", "--save", ".rrd")),
@@ -70,16 +72,46 @@ def test_help_of_a_verb(
         assert word in out
 
 
+@pytest.mark.parametrize("program", [[sys.executable, "-m", "fgslam"], command()])
+def test_version_is_printed_by_program_and_module(program: list[str]) -> None:
+    said = subprocess.run([*program, "--version"], capture_output=True, text=True, check=True)  # noqa: S603
+    assert said.stdout == f"fgslam {fgslam.__version__}\n"
+
+
+def test_shells_complete_commands_and_names_of_experiments() -> None:
+    for words, expected in (("fgslam ins", "inspect"), ("fgslam run kitti0", "kitti06")):
+        given = {"COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+        completed = subprocess.run(  # noqa: S603
+            command(),
+            env=os.environ | given | {"_FGSLAM_COMPLETE": "complete_bash"},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert expected in completed.stdout.split()
+
+
+def test_demo_is_the_loop_of_the_paper(monkeypatch: Patch, tmp_path: Path) -> None:
+    ran: list[tuple[str, Path, str]] = []
+    monkeypatch.setattr(
+        "fgslam.cli.main._run_images",
+        lambda settings, folder, existing: ran.append((settings.name, folder, existing)),
+    )
+    assert main(monkeypatch, "demo", "--out", tmp_path / "demo") == 0
+    assert ran == [("lab_loop", tmp_path / "demo", "overwrite")]
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (("run",), "fgslam run: Missing argument 'config'; see fgslam run --help"),
+        (("run",), "fgslam run: Missing argument 'EXPERIMENT'; see fgslam run --help"),
         (("run", "c.yaml", "--outt", "x"), "fgslam run: No such option: --outt"),
         (("rum",), "fgslam: No such command 'rum'"),
         (("--version-please",), "fgslam: No such option: --version-please"),
         (("inspect", "x", "--frames", "many"), "fgslam inspect: Invalid value for '--frames'"),
         (("run", "c.yaml", "--resume", "--overwrite"), "exclude each other; give one of them"),
         (("run", "absent.yaml"), "absent.yaml: no such file"),
+        (("run", "lab_lop"), "lab_lop: no such file; the experiment lab_loop comes with fgslam"),
     ],
 )
 def test_mistyped_commands(

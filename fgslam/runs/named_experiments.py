@@ -1,0 +1,47 @@
+"""The experiments that come with fgslam, found by name.
+
+A wheel carries them in ``fgslam/experiments`` (see ``setup.py``); a checkout, and so an editable
+install, has them beside the package.
+"""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from functools import cache
+from pathlib import Path
+
+_PACKAGE = Path(__file__).parents[1]
+_FOLDERS = (_PACKAGE / "experiments", _PACKAGE.parent / "experiments")
+
+
+@cache
+def experiments_folder() -> Path:
+    """Folder of the experiments that come with this installation of fgslam."""
+    return next((folder for folder in _FOLDERS if folder.is_dir()), _FOLDERS[0])
+
+
+def experiment_names() -> tuple[str, ...]:
+    """Names that :func:`find_experiment` knows, sorted."""
+    return tuple(sorted(path.stem for path in experiments_folder().glob("*.yaml")))
+
+
+def find_experiment(given: Path) -> Path:
+    """Path of an experiment's file.
+
+    Args:
+        given: a path, or the bare name of an experiment that comes with fgslam, e.g. ``lab_loop``.
+
+    Returns:
+        The file of that name; ``given`` itself where it is a file, or no known name.
+    """
+    if given.is_file() or given.name != str(given) or given.name not in experiment_names():
+        return given
+    return experiments_folder() / f"{given.name}.yaml"
+
+
+def suggestion(missing: Path) -> str:
+    """What to give in place of a file that is not there."""
+    close = get_close_matches(missing.stem, experiment_names(), n=1, cutoff=0.75)
+    if close:
+        return f"the experiment {close[0]} comes with fgslam: give its name"
+    return "give a YAML file, or the name of an experiment that comes with fgslam, e.g. lab_loop"
