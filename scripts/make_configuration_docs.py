@@ -1,4 +1,4 @@
-"""Writes docs/configuration.md from the schema: every key, its default, range and meaning.
+"""Writes docs/reference/settings.md from the schema: every key, its default, range and meaning.
 
 ``python scripts/make_configuration_docs.py`` rewrites the page; a test fails while it is stale.
 """

@@ -1,4 +1,4 @@
-"""The real recordings (docs/results.md, sections 3 and 4)."""
+"""The real recordings (docs/results/paper_drive.md, sections 3 and 4)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Settings of the behaviour: homing, steering, avoidance, path following, maps, localisation.
 
-Where the paper leaves a number open, `docs/homing.md` says where the default comes from. *Legs* are
+Where the paper leaves a number open, `docs/concepts/homing.md` says where the default comes from. *Legs* are
 distances from start to target: the scale of images is not known.
 """
 
@@ -329,7 +329,7 @@ class TopologicalMapSettings:
         Field(
             ge=0.0,
             description="such confirmations an inlier, on average, that a link so far needs; "
-            "`docs/homing.md` has what true and false ones got",
+            "`docs/concepts/homing.md` has what true and false ones got",
         ),
     ] = 1.0
     mutual_deg: Annotated[

@@ -28,7 +28,7 @@ def seen_past(places: FloatArray, seen: FloatArray, settings: PermanenceSettings
     Near the place in the image something lies behind it, and nothing before it that might hide it.
     That what surrounds a missed landmark is recognised says nothing: true landmarks are missed in
     many frames in a row for their scale or direction, while others beside them are not
-    (docs/maps.md has the numbers).
+    (docs/concepts/maps.md has the numbers).
 
     Args:
         places: (m, 3) predicted (column, row, disparity) of missed landmarks.

@@ -284,7 +284,7 @@ def test_an_empty_map() -> None:
 
 
 def test_memory_is_what_is_said() -> None:
-    """docs/maps.md tells it."""
+    """docs/concepts/maps.md tells it."""
     assert LandmarkDatabase(RIG, DatabaseSettings(), 40.0).bytes_per_landmark == 54 + 166
     several = LandmarkDatabase(RIG, VIEWS, 40.0)
     assert several.bytes_per_view == 166

@@ -1,4 +1,4 @@
-"""docs/configuration.md says what the schema says."""
+"""docs/reference/settings.md says what the schema says."""
 
 from __future__ import annotations
 
