@@ -16,7 +16,7 @@ from fgslam.runs.localisation_config import LocalisationConfig
 
 Node: TypeAlias = dict[str, Any]
 
-PAGE = Path(__file__).parents[1] / "docs" / "configuration.md"
+PAGE = Path(__file__).parents[1] / "docs" / "reference" / "settings.md"
 _UNWRITTEN = ("kind", "task", "provenance")
 _TOLD_ELSEWHERE = ("map.made_from.dataset", "map.made_from.odometry")
 _INTRODUCTION = """# Configuration

@@ -1,4 +1,4 @@
-"""Three real cameras (docs/results/paper_drive.md, section 5): does the top image raise the precision?"""
+"""Three real cameras (docs/results): does the top image raise the precision?"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Landmarks that last (docs/results/lasting_landmarks.md): blocked cameras, who is permanent, who is demoted."""
+"""Landmarks that last (docs/results): blocked cameras, who is permanent, who is demoted."""
 
 from __future__ import annotations
 

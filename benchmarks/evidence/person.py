@@ -1,4 +1,4 @@
-"""A person in the lab (docs/results/paper_drive.md, section 6): does the pose jump, are they forgotten?"""
+"""A person in the lab (docs/results): does the pose jump, are they forgotten?"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The real recordings (docs/results/paper_drive.md, sections 3 and 4)."""
+"""The real recordings (docs/results)."""
 
 from __future__ import annotations
 

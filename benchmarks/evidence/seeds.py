@@ -1,4 +1,4 @@
-"""Ten other seeds of image noise and odometry on the paper's drive (docs/results/paper_drive.md, section 2)."""
+"""Ten other seeds of image noise and odometry on the paper's drive (docs/results)."""
 
 from __future__ import annotations
 

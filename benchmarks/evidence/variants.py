@@ -1,4 +1,4 @@
-"""Variants of the system against each other (docs/results/paper_drive.md, section 8), on equal features."""
+"""Variants of the system against each other (docs/results), on equal features."""
 
 from __future__ import annotations
 

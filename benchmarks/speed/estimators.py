@@ -1,4 +1,4 @@
-"""Speed of the estimators as ratios, on simulated measurements (docs/results/paper_drive.md).
+"""Speed of the estimators as ratios, on simulated measurements (docs/results).
 
 Every ratio is of processor times in this process, taken in turns; medians are quoted.
 """

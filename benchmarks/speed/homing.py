@@ -1,4 +1,4 @@
-"""Speed of visual homing as ratios to raw OpenCV calls on the same images (docs/results/paper_drive.md).
+"""Speed of visual homing as ratios to raw OpenCV calls on the same images (docs/results).
 
 Processor times of this process, one thread each for OpenCV and BLAS; medians are quoted. The images
 are those of a homing in the rendered house: the paper's camera, 320x240 pixels.

@@ -2,7 +2,7 @@
 
 Points are (n, 3) in the sensor's frame, axes as a camera's (x right, y down, z forward), metres;
 measurements (azimuth, elevation, range), radians and metres, as in
-:class:`fgslam.core.sensors.RangeBearingSensor`. Derived in docs/concepts/derivations/range_bearing.md.
+:class:`fgslam.core.sensors.RangeBearingSensor`. Derived in docs/derivations/range_bearing.md.
 """
 
 from __future__ import annotations

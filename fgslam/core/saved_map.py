@@ -1,8 +1,8 @@
 """The saved map: landmarks with their looks and counts, the drive that made them, one file.
 
 The file is a zip of plain ``.npy`` arrays with a JSON header, as ``numpy.load`` reads it, without
-pickle; docs/concepts/maps.md has its table. The header holds the SHA-256 of all contents. The same map gives
-the same bytes, and a file is written whole or not at all.
+pickle; docs/concepts/maps.md has its table. The header holds the SHA-256 of all contents. The same
+map gives the same bytes, and a file is written whole or not at all.
 """
 
 from __future__ import annotations

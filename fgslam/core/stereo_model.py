@@ -1,6 +1,6 @@
 """The rig's linear model: raw pixels of its images and (column, row, disparity).
 
-Derived in docs/concepts/derivations/stereo_measurement.md. Front-end and simulation share it, so that both
+Derived in docs/derivations/stereo_measurement.md. Front-end and simulation share it, so that both
 mean the same by a measurement and its covariance.
 """
 

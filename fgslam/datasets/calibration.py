@@ -50,7 +50,7 @@ def read_json_object(path: Path) -> Mapping[str, Any]:
     except OSError as cause:
         raise CalibrationError(
             f"calibration {path} cannot be read: {cause.strerror}; put it there (its keys are in "
-            "docs/reference/recordings/image_folder.md), and check dataset.path"
+            "docs/datasets/image_folder.md), and check dataset.path"
         ) from cause
     except RecursionError:
         raise CalibrationError(f"{path} is nested too deeply; correct the file") from None

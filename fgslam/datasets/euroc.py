@@ -1,4 +1,4 @@
-"""EuRoC MAV in its native (ASL) layout, rectified on reading (docs/reference/recordings/euroc.md)."""
+"""EuRoC MAV in its native (ASL) layout, rectified on reading (docs/datasets/euroc.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Our own layout: left/, right/[, top/], calib.json, times.txt (docs/reference/recordings/image_folder.md)."""
+"""Our own layout: left/, right/[, top/], calib.json, times.txt (docs/datasets/image_folder.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""KITTI odometry in its native layout (docs/reference/recordings/kitti.md).
+"""KITTI odometry in its native layout (docs/datasets/kitti.md).
 
 ``sequences/NN/{image_0,image_1,calib.txt,times.txt}`` and, for the training drives,
 ``poses/NN.txt``: rectified grey pairs, camera 0 is the left one.

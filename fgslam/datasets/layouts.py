@@ -87,6 +87,6 @@ def _unknown(folder: Path) -> str:
         for name, parts in wanted.items()
     ]
     return (
-        f"{folder} has none of the known layouts: {'; '.join(missing)}; docs/reference/recordings/ describes "
+        f"{folder} has none of the known layouts: {'; '.join(missing)}; docs/datasets/ describes "
         "each"
     )

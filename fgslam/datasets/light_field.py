@@ -7,7 +7,7 @@ Shifting each view by ``-s`` pixels per grid step makes this ``cx + fx X p - fx 
 ``p' = p - 1/Z0 + s / (fx * step)``: the image of a pinhole camera at the same place, of a scene
 whose inverse depths have an offset. Hence any shift, focal length and principal point leave a
 camera that moves in its image plane consistent with a rigid scene: the trajectory is right in the
-gantry's units, only the scene's depth has the offset. docs/reference/recordings/light_field.md has the details.
+gantry's units, only the scene's depth has the offset. docs/datasets/light_field.md has the details.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ class RecordedOdometrySettings:
 
     The rates are taken as constant over one step, so each standard deviation is multiplied by the
     step's duration. Defaults: measured on KITTI raw 2011_09_26 against its truth (step 0.206 s,
-    7.5 m/s), where truth's own noise is included; docs/reference/recordings/image_folder.md has the numbers.
+    7.5 m/s), where truth's own noise is included; docs/datasets/image_folder.md has the numbers.
     """
 
     kind: Literal["recorded"] = "recorded"

@@ -50,7 +50,7 @@ class RecordingSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class ImageFolderSettings(RecordingSettings):
-    """Our own layout, left/ right/ [top/] calib.json times.txt: docs/reference/recordings/image_folder.md."""
+    """Our own layout, left/ right/ [top/] calib.json times.txt: docs/datasets/image_folder.md."""
 
     kind: Literal["image_folder"] = "image_folder"
     use_top: Annotated[bool, Field(description="use the third camera where the folder has one")] = (
@@ -81,7 +81,7 @@ class ImageFolderSettings(RecordingSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class KittiSettings(RecordingSettings):
-    """KITTI odometry in its native layout (docs/reference/recordings/kitti.md)."""
+    """KITTI odometry in its native layout (docs/datasets/kitti.md)."""
 
     kind: Literal["kitti"] = "kitti"
     sequence: Annotated[
@@ -91,7 +91,7 @@ class KittiSettings(RecordingSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class EurocSettings(RecordingSettings):
-    """EuRoC MAV in its native layout, rectified on reading (docs/reference/recordings/euroc.md)."""
+    """EuRoC MAV in its native layout, rectified on reading (docs/datasets/euroc.md)."""
 
     kind: Literal["euroc"] = "euroc"
     pairing_tolerance_ms: Annotated[
@@ -110,7 +110,7 @@ class EurocSettings(RecordingSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class LightFieldSettings(RecordingSettings):
-    """A gantry's grid of views read as a trinocular walk (docs/reference/recordings/light_field.md)."""
+    """A gantry's grid of views read as a trinocular walk (docs/datasets/light_field.md)."""
 
     kind: Literal["light_field"] = "light_field"
     row: Annotated[int, Field(ge=0, description="grid row along which the reference walks")] = 8
@@ -144,7 +144,7 @@ class LightFieldSettings(RecordingSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class StereoTracksSettings(MeasurementSelection):
-    """Stereo feature tracks of KITTI drives, inside GTSAM (docs/reference/recordings/stereo_tracks.md)."""
+    """Stereo feature tracks of KITTI drives, inside GTSAM (docs/datasets/stereo_tracks.md)."""
 
     kind: Literal["stereo_tracks"] = "stereo_tracks"
     file: Annotated[
@@ -159,7 +159,7 @@ class StereoTracksSettings(MeasurementSelection):
         float,
         Field(
             gt=0.0,
-            description="noise of one image coordinate, pixels (measured: docs/reference/recordings/"
+            description="noise of one image coordinate, pixels (measured: docs/datasets/"
             "stereo_tracks.md)",
         ),
     ] = 0.25
@@ -171,7 +171,7 @@ class StereoTracksSettings(MeasurementSelection):
 
 @dataclass(frozen=True, config=STRICT)
 class UtiasStereoSettings(RecordingSettings):
-    """UTIAS "Starry Night": stereo pixels, body rates, truth (docs/reference/recordings/utias.md)."""
+    """UTIAS "Starry Night": stereo pixels, body rates, truth (docs/datasets/utias.md)."""
 
     path: Annotated[str, Field(min_length=1, description="the .mat file of dataset 3")]
     kind: Literal["utias_stereo"] = "utias_stereo"
@@ -192,7 +192,7 @@ class UtiasStereoSettings(RecordingSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class UtiasRangeBearingSettings(RecordingSettings):
-    """UTIAS "Lost in the Woods": laser ranges, wheel odometry, truth (docs/reference/recordings/utias.md)."""
+    """UTIAS "Lost in the Woods": laser ranges, wheel odometry, truth (docs/datasets/utias.md)."""
 
     path: Annotated[str, Field(min_length=1, description="the .mat file of dataset 2")]
     kind: Literal["utias_range_bearing"] = "utias_range_bearing"

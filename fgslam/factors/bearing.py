@@ -3,7 +3,7 @@
 Variables: planar poses of the start, of every image on the way and of the target (``Pose2``),
 velocities in the robot's axes, landmarks in the plane, and their heights where elevations are
 used. GTSAM's own factors serve wherever there is one; residuals are specified in
-:mod:`fgslam.factors.bearing_residuals`. Derivation: docs/concepts/derivations/homing_graph.md.
+:mod:`fgslam.factors.bearing_residuals`. Derivation: docs/derivations/homing_graph.md.
 """
 
 from __future__ import annotations

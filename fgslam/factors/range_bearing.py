@@ -24,7 +24,7 @@ class RangeBearingFactors:
     directions that the measured bearing has, which are then the predicted one's, too. Close to
     them a covariance that differs by direction would be mixed up, and a stereo camera turned
     towards the bearing takes over, whose directions are fixed: the same measurement to first
-    order. Derivation: docs/concepts/derivations/factors.md.
+    order. Derivation: docs/derivations/factors.md.
     """
 
     def __init__(self, whitening: Whitening) -> None:

@@ -4,7 +4,7 @@ The paper's reference is the right camera, GTSAM's stereo camera the left one. T
 pose variable stays the right camera's; the left one sits ``baseline`` along its -x axis and is
 told to the factor as the sensor's place on the body. GTSAM measures (u_left, u_right, v), which
 is linear in ours: ``u_left = c + d, u_right = c, v = r``; its covariance follows exactly.
-Derivation: docs/concepts/derivations/factors.md.
+Derivation: docs/derivations/factors.md.
 """
 
 from __future__ import annotations

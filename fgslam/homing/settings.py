@@ -1,7 +1,7 @@
 """Settings of the behaviour: homing, steering, avoidance, path following, maps, localisation.
 
-Where the paper leaves a number open, `docs/concepts/homing.md` says where the default comes from. *Legs* are
-distances from start to target: the scale of images is not known.
+Where the paper leaves a number open, `docs/concepts/homing.md` says where the default comes from.
+*Legs* are distances from start to target: the scale of images is not known.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What docs/results/homing_drives.md states, held to its bounds. Slow: minutes."""
+"""What docs/results states, held to its bounds. Slow: minutes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What docs/results/lasting_landmarks.md claims of landmarks that last, as regression tests with their bounds."""
+"""What docs/results claims of landmarks that last, as regression tests with their bounds."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_blocked_cameras_cost_nothing_of_a_lasting_map() -> None:
 
 @pytest.mark.slow
 def test_who_lasts_and_who_is_demoted() -> None:
-    """The defaults' reasons: docs/results/lasting_landmarks.md, thresholds."""
+    """The defaults' reasons: docs/results, thresholds."""
     visits = lasting.visit_twice()
     demotion = lasting.demotion_table(visits)
     share = dict(zip(demotion.column("landmarks that last"), demotion.rows, strict=True))

@@ -1,4 +1,4 @@
-"""What docs/results/lasting_landmarks.md claims of the kidnapped robot, as regression tests with their bounds."""
+"""What docs/results claims of the kidnapped robot, as regression tests with their bounds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What docs/results/lasting_landmarks.md claims of a second visit in the first one's map."""
+"""What docs/results claims of a second visit in the first one's map."""
 
 from __future__ import annotations
 

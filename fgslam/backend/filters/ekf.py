@@ -2,7 +2,7 @@
 
 The costly alternative that Se, Lowe and Little (2001, 6) name and set aside; Smith, Self and
 Cheeseman (1990). In the graph's terms a smoother that marginalises every past pose and never
-linearises a measurement anew. Derivation: docs/concepts/derivations/ekf.md.
+linearises a measurement anew. Derivation: docs/derivations/ekf.md.
 """
 
 from __future__ import annotations

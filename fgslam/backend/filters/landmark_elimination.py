@@ -3,7 +3,7 @@
 Every landmark is given a copy of the frame's pose of its own, whose prior is the pose's covariance.
 Eliminating the copy leaves ``R + J P J^T`` as the measurement's noise. That the copies know nothing
 of each other, nor of next frame's, is all that distinguishes the paper's filter from the full
-graph; see docs/concepts/derivations/landmark_filter_as_graph.md.
+graph; see docs/derivations/landmark_filter_as_graph.md.
 """
 
 from __future__ import annotations

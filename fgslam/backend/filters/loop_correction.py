@@ -25,7 +25,7 @@ _OLD = 5  # submaps
 _TIE_FACTOR = 5.0
 """On the deviations of a pose tracked by old landmarks, which lie about their homes as the drift
 has bent them. Measured on four rounds of the lab: up to 20 the corrected drive is as accurate,
-below 5 true closures are taken for impossible (docs/results/lasting_landmarks.md)."""
+below 5 true closures are taken for impossible (docs/results)."""
 
 
 class DriveBook:

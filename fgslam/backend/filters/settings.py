@@ -13,7 +13,7 @@ from fgslam.core.settings import STRICT
 
 @dataclass(frozen=True, config=STRICT)
 class LoopCorrectionSettings:
-    """What closing a loop does to the drive so far (docs/concepts/derivations/submaps.md)."""
+    """What closing a loop does to the drive so far (docs/derivations/submaps.md)."""
 
     submap_frames: Annotated[
         int,

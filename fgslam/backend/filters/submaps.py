@@ -4,7 +4,7 @@ A drive is a chain of steps, each as uncertain as it was tracked. Closing a loop
 weighted changes to the chain under which it meets itself: the minimum of a pose graph. Its
 variables are the poses at which submaps begin; within a submap the change is spread over the
 frames as their steps' uncertainty has it, so that nothing tears. Derivation:
-docs/concepts/derivations/submaps.md.
+docs/derivations/submaps.md.
 """
 
 from __future__ import annotations

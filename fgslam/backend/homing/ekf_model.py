@@ -1,7 +1,7 @@
 """State, motion and measurements of the homing filters (eqs 3 to 9, corrected).
 
 The state is (x, y, psi, v; D, theta, psi_t; d_1, delta_1, d_2, ...): robot, target, features, in
-the start frame. Derivation: docs/concepts/derivations/homing_filters.md.
+the start frame. Derivation: docs/derivations/homing_filters.md.
 """
 
 from __future__ import annotations

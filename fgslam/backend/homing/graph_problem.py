@@ -2,7 +2,7 @@
 
 Start, target and every image on the way are planar poses, landmarks points. The start's and the
 target's bearings enter once, with the landmark; scale is the leg from start to target.
-Derivation: docs/concepts/derivations/homing_graph.md.
+Derivation: docs/derivations/homing_graph.md.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ and landmarks are its border C, with what each image sees of them, B, between::
     [B' C] [border] = - [b]
 
 A is factored as a band, then the Schur complement C - B' A^-1 B. Everything is linearised anew
-each time, and one covariance costs a few columns. Derivation: docs/concepts/derivations/homing_graph.md.
+each time, and one covariance costs a few columns. Derivation: docs/derivations/homing_graph.md.
 """
 
 from __future__ import annotations

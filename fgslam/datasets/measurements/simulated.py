@@ -1,4 +1,4 @@
-"""Simulated measurements as a recording (docs/reference/recordings/simulated_measurements.md)."""
+"""Simulated measurements as a recording (docs/datasets/simulated_measurements.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""GTSAM's stereo feature tracks of KITTI drives (docs/reference/recordings/stereo_tracks.md).
+"""GTSAM's stereo feature tracks of KITTI drives (docs/datasets/stereo_tracks.md).
 
 The files lie inside the installed gtsam wheel; they are read as text, GTSAM is not loaded.
 """

@@ -1,4 +1,4 @@
-"""UTIAS "Lost in the Woods": a wheeled robot among 17 tubes, with truth (docs/reference/recordings/utias.md).
+"""UTIAS "Lost in the Woods": a wheeled robot among 17 tubes, with truth (docs/datasets/utias.md).
 
 Variables, after Barfoot's course notes (data set 2): ``t``; ``v``, ``om`` measured speed and turn
 rate; ``r``, ``b`` laser range and bearing (positive to the left) to each landmark, 0 where unseen;

@@ -1,4 +1,4 @@
-"""UTIAS "Starry Night": a stereo camera over 20 landmarks, with truth (docs/reference/recordings/utias.md).
+"""UTIAS "Starry Night": a stereo camera over 20 landmarks, with truth (docs/datasets/utias.md).
 
 Variables, after Barfoot's course notes (State Estimation for Robotics, assignment of data set 3):
 ``theta_vk_i``, ``r_i_vk_i`` true rotation vector and position of the vehicle; ``w_vk_vk_i``,

@@ -1,4 +1,4 @@
-"""A folder of a mirror camera's pictures along a path (docs/reference/recordings/mirror_images.md)."""
+"""A folder of a mirror camera's pictures along a path (docs/datasets/mirror_images.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A folder of panoramas, with or without surveyed poses (docs/reference/recordings/panoramas.md)."""
+"""A folder of panoramas, with or without surveyed poses (docs/datasets/panoramas.md)."""
 
 from __future__ import annotations
 

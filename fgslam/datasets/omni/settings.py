@@ -30,7 +30,7 @@ __all__ = [
 
 @dataclass(frozen=True, config=STRICT)
 class PanoramasSettings(RecordingSettings):
-    """A folder of panoramas, with or without ``poses.csv`` (docs/reference/recordings/panoramas.md)."""
+    """A folder of panoramas, with or without ``poses.csv`` (docs/datasets/panoramas.md)."""
 
     kind: Literal["panoramas"] = "panoramas"
     camera: EquirectangularSettings = EquirectangularSettings()
@@ -47,7 +47,7 @@ class PanoramasSettings(RecordingSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class OmniPathSettings(RecordingSettings):
-    """A folder of a mirror camera's pictures along a path (docs/reference/recordings/mirror_images.md)."""
+    """A folder of a mirror camera's pictures along a path (docs/datasets/mirror_images.md)."""
 
     kind: Literal["omni_path"] = "omni_path"
     camera: OmniCameraSettings = HyperbolicMirrorSettings()
@@ -63,7 +63,7 @@ class OmniPathSettings(RecordingSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class OmniVideoSettings(RecordingSettings):
-    """A mirror camera's video file; ``path`` is the file (docs/reference/recordings/mirror_images.md)."""
+    """A mirror camera's video file; ``path`` is the file (docs/datasets/mirror_images.md)."""
 
     kind: Literal["omni_video"] = "omni_video"
     camera: OmniCameraSettings = BloggieSettings()

@@ -1,4 +1,4 @@
-"""A mirror camera's video, frame by frame (docs/reference/recordings/mirror_images.md)."""
+"""A mirror camera's video, frame by frame (docs/datasets/mirror_images.md)."""
 
 from __future__ import annotations
 

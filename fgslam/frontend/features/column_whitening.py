@@ -1,6 +1,6 @@
 """Distance of column segments: the measured spread of their descriptors between views of one thing.
 
-Measured on ``omni_home`` (docs/concepts/derivations/omni_features.md, 4): matches of panoramas that see each
+Measured on ``omni_home`` (docs/derivations/omni_features.md, 4): matches of panoramas that see each
 other, both ends of which lie within 0.7 degrees of where the true pose puts them; selected by the
 covariance itself, from a diagonal guess in three rounds, without the 3 % furthest.
 """

@@ -1,7 +1,7 @@
 """Settings of the omnidirectional features and of their matching (Goedemé et al. III-A).
 
 Defaults that the paper leaves open were measured on the pairs of ``omni_home``; the tables are in
-``docs/concepts/derivations/omni_features.md``.
+``docs/derivations/omni_features.md``.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ class OmniTrackingSettings:
         Field(
             ge=0.0,
             description="for each unit of its patch's deformation, added in squares: measured on "
-            "the rendered house (docs/concepts/derivations/omni_tracking.md)",
+            "the rendered house (docs/derivations/omni_tracking.md)",
         ),
     ] = 1.0
     search_px: Annotated[

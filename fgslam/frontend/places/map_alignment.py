@@ -2,7 +2,7 @@
 
 Tentative matches by appearance, RANSAC over triples, least squares weighted by both covariances,
 then every landmark that the alignment brings near one that looks like it. The verdict refuses
-rather than guesses. docs/concepts/derivations/map_alignment.md.
+rather than guesses. docs/derivations/map_alignment.md.
 """
 
 from __future__ import annotations

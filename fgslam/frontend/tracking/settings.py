@@ -64,7 +64,7 @@ class PermanenceSettings:
             ge=0.0,
             lt=1.0,
             description="a landmark becomes permanent when hits / (hits + misses) exceeds this; "
-            "unstated in 6.2, chosen by measurement (docs/results/lasting_landmarks.md)",
+            "unstated in 6.2, chosen by measurement (docs/results)",
         ),
     ] = 0.3
     hits: Annotated[

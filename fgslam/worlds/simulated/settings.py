@@ -144,7 +144,7 @@ class MovedLandmarksSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class SimulatedMeasurementsSettings(MeasurementSelection):
-    """A simulated drive without images (docs/reference/recordings/simulated_measurements.md)."""
+    """A simulated drive without images (docs/datasets/simulated_measurements.md)."""
 
     kind: Literal["simulated_measurements"] = "simulated_measurements"
     world: MeasurementWorldSettings = MeasurementWorldSettings()

@@ -27,7 +27,7 @@ def maker() -> ModuleType:
 
 
 def test_the_page_is_current(maker: ModuleType) -> None:
-    page = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "settings.md").read_text(encoding="utf-8")
     assert page == maker.configuration_page(), "stale: run scripts/make_configuration_docs.py"
 
 

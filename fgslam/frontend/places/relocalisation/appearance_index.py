@@ -4,7 +4,7 @@ An inverted file (Sivic and Zisserman 2003; Jegou et al. 2011): descriptors lie 
 fixed vocabulary, and a query compares those of the nearest cells only, exactly. Small contents are
 compared in full. The vocabulary does not depend on the content, and equally near descriptors come
 in the order in which they are held: so a map that was saved and loaded answers as before, to the
-bit. Measured against libraries' indices in docs/results/lasting_landmarks.md.
+bit. Measured against libraries' indices in docs/results.
 """
 
 from __future__ import annotations

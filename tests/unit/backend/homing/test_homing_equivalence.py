@@ -1,6 +1,6 @@
 """The homing filters are the graph, linearised once, with past poses eliminated.
 
-docs/concepts/derivations/homing_graph.md. The graph side is made of GTSAM's linear factors, at the points
+docs/derivations/homing_graph.md. The graph side is made of GTSAM's linear factors, at the points
 where the filter linearised. What has no variance in the filter is no variable of the graph.
 """
 
