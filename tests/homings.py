@@ -11,7 +11,7 @@ from fgslam.core.homing import HomingStart, HomingTruth, HomingVector, TrackedBe
 from fgslam.frontend.homing.local_map import make_local_map
 from fgslam.frontend.homing.ransac import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.worlds.bearing_settings import SimulatedBearingsSettings
+from fgslam.worlds.simulated.bearing_settings import SimulatedBearingsSettings
 from fgslam.worlds.simulated.bearings import simulate_homing
 
 LEVEL = HomingVectorSettings(tilt_sigma_deg=0.0, height_sigma=0.0, max_direction_sigma_deg=15.0)

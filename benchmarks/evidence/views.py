@@ -16,11 +16,11 @@ from fgslam.core.sensors import CameraRig
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.runs.config import ExperimentConfig
-from fgslam.worlds import wheel_odometry
-from fgslam.worlds.lab_settings import RenderedLabSettings
-from fgslam.worlds.places import PlaceChoice
+from fgslam.worlds.driving import wheel_odometry
+from fgslam.worlds.lab.places import PlaceChoice
+from fgslam.worlds.lab.settings import RenderedLabSettings
+from fgslam.worlds.lab.world import World, camera_offsets, open_room
 from fgslam.worlds.rendering.image_effects import apply_effects
-from fgslam.worlds.world import World, camera_offsets, open_room
 
 FORWARD_M = 0.10
 CLOCKWISE_DEG = 5.0

@@ -33,8 +33,8 @@ from fgslam.homing.controller import HomingController
 from fgslam.homing.front_end import HomingFrontEnd
 from fgslam.homing.image_front_end import FrontEndSettings, ImageFrontEnd
 from fgslam.homing.settings import HomingControlSettings
-from fgslam.worlds.house.omni_world import OmniWorld
 from fgslam.worlds.house.settings import HousePathSettings, OmniHouseSettings
+from fgslam.worlds.house.world import OmniWorld
 
 LIMITS = {
     "homing_track_over_raw_klt": 2.0,

@@ -21,15 +21,15 @@ from fgslam.core.estimates import Trajectory
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
-from fgslam.worlds import wheel_odometry
-from fgslam.worlds.lab_settings import LabSettings, RenderedLabSettings
-from fgslam.worlds.paths import PosesInTime
-from fgslam.worlds.person import Stance, make_walk
-from fgslam.worlds.places import PlaceChoice, first_pose, plan_in_place
+from fgslam.worlds.driving import wheel_odometry
+from fgslam.worlds.driving.paths import PosesInTime
+from fgslam.worlds.lab.person import Stance, make_walk
+from fgslam.worlds.lab.places import PlaceChoice, first_pose, plan_in_place
+from fgslam.worlds.lab.settings import LabSettings, RenderedLabSettings
+from fgslam.worlds.lab.world import World, camera_offsets, make_rig, open_room
 from fgslam.worlds.rendering.cache import RenderCache, content_hash
 from fgslam.worlds.rendering.image_effects import apply_effects, is_blocked
 from fgslam.worlds.rendering.pinhole import Layer
-from fgslam.worlds.world import World, camera_offsets, make_rig, open_room
 
 RENDER_VERSION = 7
 """Part of the cache's key: raised whenever the same settings give other pixels."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.worlds.bearing_settings import SimulatedBearingsSettings, with_outliers
+from fgslam.worlds.simulated.bearing_settings import SimulatedBearingsSettings, with_outliers
 from fgslam.worlds.simulated.bearings import SimulatedHoming, simulate_homing
 
 

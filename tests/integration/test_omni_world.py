@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.worlds.house.omni_world import OmniWorld
 from fgslam.worlds.house.panoramas import render_panoramas
 from fgslam.worlds.house.settings import (
     HouseLightSettings,
@@ -15,6 +14,7 @@ from fgslam.worlds.house.settings import (
     HouseTiltSettings,
     OmniHouseSettings,
 )
+from fgslam.worlds.house.world import OmniWorld
 
 SETTINGS = OmniHouseSettings(path=HousePathSettings(legs=3, spacing_m=2.0))
 DISTURBED = replace(SETTINGS, people=3, tilt=HouseTiltSettings(constant_deg=1.0, sway_deg=1.0))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from fgslam.worlds.house.omni_world import OmniWorld
 from fgslam.worlds.house.settings import OmniHouseSettings
+from fgslam.worlds.house.world import OmniWorld
 
 
 def open_house(settings: OmniHouseSettings, seed: int) -> OmniWorld:

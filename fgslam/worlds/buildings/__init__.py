@@ -1,1 +1,1 @@
-"""Buildings: floor plans of rooms, corridors and doors, and what stands in them."""
+"""What stands where: plans, furniture, and the lab, office, corridors and house made of them."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.worlds import furniture
+from fgslam.worlds.buildings import furniture
 from fgslam.worlds.buildings.floor_plan import HALF_WALL, Opening, Room
 from fgslam.worlds.rendering.patches import Patch, Surface, Thing, placed
 

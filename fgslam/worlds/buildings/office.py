@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.worlds import furniture
+from fgslam.worlds.buildings import furniture
 from fgslam.worlds.buildings.fitting import FittingStyle, RoomFitter
 from fgslam.worlds.buildings.floor_plan import (
     FloorPlan,

@@ -1,1 +1,1 @@
-"""Simulated omnidirectional camera, colour world, wheelchair and bearings."""
+"""A wheelchair with an omnidirectional camera in a rendered house: settings, world, people."""

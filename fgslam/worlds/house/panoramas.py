@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image
-from fgslam.worlds.house.floor_plan import room_at
-from fgslam.worlds.house.omni_world import OmniWorld
+from fgslam.worlds.buildings.house_plan import room_at
+from fgslam.worlds.house.world import OmniWorld
 
 # A place's surroundings are taken at these elevations for judging what two places share, degrees.
 _ELEVATIONS_DEG = (-25.0, -12.0, 0.0, 10.0)

@@ -9,7 +9,7 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.planar import unit
-from fgslam.worlds.person import Stance, person
+from fgslam.worlds.lab.person import Stance, person
 from fgslam.worlds.rendering.colour_bank import ColourBank
 from fgslam.worlds.rendering.colour_textures import SHIRTS
 from fgslam.worlds.rendering.lighting import flat_light

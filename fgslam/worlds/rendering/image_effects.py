@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.core.arrays import Image
-from fgslam.worlds.lab_settings import LabEffectsSettings, LabExposureSettings
+from fgslam.worlds.lab.settings import LabEffectsSettings, LabExposureSettings
 
 _COVER_SEED = 7
 

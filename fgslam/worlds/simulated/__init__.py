@@ -1,1 +1,1 @@
-"""Simulated measurements without images: landmark drives and homings of bearings."""
+"""Measurements and bearings simulated without images."""

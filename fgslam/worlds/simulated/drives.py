@@ -1,6 +1,7 @@
 """Drives for worlds without images: the lab's own, rounds, sharp turns, and long corridors.
 
-Room frame as in :mod:`fgslam.worlds.paths`: x east, y north, metres, heading counter-clockwise.
+Room frame as in :mod:`fgslam.worlds.driving.paths`: x east, y north, metres; heading
+counter-clockwise.
 """
 
 from __future__ import annotations
@@ -11,14 +12,14 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.worlds.lab_settings import LabDriveSettings
-from fgslam.worlds.paths import (
+from fgslam.worlds.driving.paths import (
     PlanarPath,
     drive_along,
     plan_path,
     planar_poses,
     straights_and_turns,
 )
+from fgslam.worlds.lab.settings import LabDriveSettings
 from fgslam.worlds.simulated.settings import MeasurementDriveSettings
 
 CORRIDOR_WIDTH_M = 2.4

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.worlds.lab import build_lab
+from fgslam.worlds.buildings.lab import build_lab
 from fgslam.worlds.rendering.patches import stack
 from fgslam.worlds.simulated.drives import CORRIDOR_WIDTH_M
 from fgslam.worlds.simulated.settings import MeasurementWorldSettings

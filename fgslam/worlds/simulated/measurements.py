@@ -19,12 +19,12 @@ from fgslam.core.estimates import Trajectory
 from fgslam.core.measurements import Increment, Observations, Odometry
 from fgslam.core.sensors import CameraRig
 from fgslam.core.stereo_model import measurement_map, pixel_model, vertical_to_horizontal
+from fgslam.worlds.lab.world import make_rig
 from fgslam.worlds.simulated.drives import plan_measured_drive
 from fgslam.worlds.simulated.identities import IdentityBook, Sightings
 from fgslam.worlds.simulated.landmarks import LandmarkWorld, build_world
+from fgslam.worlds.simulated.odometry import simulate_odometry
 from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
-from fgslam.worlds.simulated_odometry import simulate_odometry
-from fgslam.worlds.world import make_rig
 
 # Streams of random numbers, apart so that one imperfection does not redraw another's.
 _DETECTION, _PIXELS, _ODOMETRY, _WRONG = 1, 2, 3, 4

@@ -8,7 +8,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT, MeasurementSelection
-from fgslam.worlds.lab_settings import LabRigSettings, WheelOdometrySettings
+from fgslam.worlds.lab.settings import LabRigSettings, WheelOdometrySettings
 
 Correlation: TypeAlias = Annotated[float, Field(gt=-1.0, lt=1.0)]
 

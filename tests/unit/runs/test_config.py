@@ -14,7 +14,7 @@ from fgslam.datasets.settings import ImageFolderSettings
 from fgslam.frontend.places.settings import LoopSettings
 from fgslam.runs.config import ExperimentConfig, load_config, parse_config
 from fgslam.runs.homing_config import is_homing
-from fgslam.worlds.lab_settings import RenderedLabSettings
+from fgslam.worlds.lab.settings import RenderedLabSettings
 
 EXPERIMENTS = [
     path

@@ -6,14 +6,15 @@ import pytest
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.planar import between, wrap
-from fgslam.worlds.floor_space import FloorSpace
+from fgslam.worlds.buildings.house import House, build_house
+from fgslam.worlds.buildings.house_plan import DEPTH, WIDTH, room_at
+from fgslam.worlds.driving.floor_space import FloorSpace
+from fgslam.worlds.driving.range_scan import RangeSensor
+from fgslam.worlds.driving.reference_paths import PathPlanner
+from fgslam.worlds.driving.wheelchair import Wheelchair
+from fgslam.worlds.house.camera import make_house_camera
 from fgslam.worlds.house.disturbances import CameraTilt, camera_pose, exposed, noisy
-from fgslam.worlds.house.floor_plan import DEPTH, WIDTH, room_at
-from fgslam.worlds.house.house import House, build_house
-from fgslam.worlds.house.house_camera import make_house_camera
 from fgslam.worlds.house.people import Walker
-from fgslam.worlds.house.range_scan import RangeSensor
-from fgslam.worlds.house.reference_paths import PathPlanner
 from fgslam.worlds.house.settings import (
     HouseExposureSettings,
     HouseMirrorSettings,
@@ -21,7 +22,6 @@ from fgslam.worlds.house.settings import (
     RangeSensorSettings,
     WheelchairSettings,
 )
-from fgslam.worlds.house.wheelchair import Wheelchair
 from fgslam.worlds.rendering.patches import PatchArrays, Surface, Thing, box, stack
 from fgslam.worlds.rendering.raycaster import RayCaster
 

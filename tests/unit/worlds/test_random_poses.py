@@ -10,18 +10,18 @@ from fgslam.core import geometry
 from fgslam.core.errors import ConfigError
 from fgslam.datasets import rendered_lab
 from fgslam.datasets.rendered_lab import RenderedLabSequence
-from fgslam.worlds.floor_space import FloorSpace
-from fgslam.worlds.lab_settings import (
+from fgslam.worlds.driving.floor_space import FloorSpace
+from fgslam.worlds.lab.places import PlaceChoice, build_place, plan_in_place
+from fgslam.worlds.lab.settings import (
     LabDriveSettings,
     LabRigSettings,
     LabSettings,
     RandomPosesSettings,
     RenderedLabSettings,
 )
-from fgslam.worlds.places import PlaceChoice, build_place, plan_in_place
+from fgslam.worlds.lab.world import make_rig
 from fgslam.worlds.rendering.cache import content_hash
 from fgslam.worlds.rendering.patches import stack
-from fgslam.worlds.world import make_rig
 
 RIG = make_rig(LabRigSettings(width=32, height=24))
 LAB = PlaceChoice("lab", 0, 1, identical_posters=False)

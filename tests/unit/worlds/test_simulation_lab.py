@@ -3,15 +3,15 @@ import sys
 import numpy as np
 import pytest
 
-from fgslam.worlds.lab import HALF_SIDE, HEIGHT, build_lab
-from fgslam.worlds.lab_settings import LabDriveSettings, LabPersonSettings, LabRigSettings
-from fgslam.worlds.paths import plan_drive
-from fgslam.worlds.person import across_view, person
+from fgslam.worlds.buildings.lab import HALF_SIDE, HEIGHT, build_lab
+from fgslam.worlds.driving.paths import plan_drive
+from fgslam.worlds.lab.person import across_view, person
+from fgslam.worlds.lab.settings import LabDriveSettings, LabPersonSettings, LabRigSettings
+from fgslam.worlds.lab.world import make_rig
 from fgslam.worlds.rendering.patches import Thing, stack
 from fgslam.worlds.rendering.raycaster import RayCaster
 from fgslam.worlds.rendering.texture_library import PHOTOGRAPHS, build_library, photograph
 from fgslam.worlds.rendering.textures import book_row
-from fgslam.worlds.world import make_rig
 
 VISITS = (1, 2, 3)
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import ConfigError
-from fgslam.worlds.lab_settings import LabDriveSettings
-from fgslam.worlds.paths import Drive, plan_drive
+from fgslam.worlds.driving.paths import Drive, plan_drive
+from fgslam.worlds.lab.settings import LabDriveSettings
 
 SQUARE = ((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0))
 

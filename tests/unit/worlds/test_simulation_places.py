@@ -8,12 +8,12 @@ import pytest
 
 from fgslam.core.errors import ConfigError
 from fgslam.core.geometry import wrap_angle
-from fgslam.worlds.buildings import alike, office
-from fgslam.worlds.floor_space import FloorSpace
-from fgslam.worlds.lab import build_lab
-from fgslam.worlds.lab_settings import LabDriveSettings, LabRigSettings, PathName, PlaceName
-from fgslam.worlds.paths import Drive, round_corners
-from fgslam.worlds.places import (
+from fgslam.worlds.buildings import corridors as alike
+from fgslam.worlds.buildings import office
+from fgslam.worlds.buildings.lab import build_lab
+from fgslam.worlds.driving.floor_space import FloorSpace
+from fgslam.worlds.driving.paths import Drive, round_corners
+from fgslam.worlds.lab.places import (
     PATHS,
     PlaceChoice,
     build_place,
@@ -21,12 +21,18 @@ from fgslam.worlds.places import (
     place_path,
     plan_in_place,
 )
+from fgslam.worlds.lab.settings import (
+    LabDriveSettings,
+    LabRigSettings,
+    PathName,
+    PlaceName,
+)
+from fgslam.worlds.lab.world import make_rig
 from fgslam.worlds.rendering.lighting import bake
 from fgslam.worlds.rendering.mipmap import TextureBank
 from fgslam.worlds.rendering.patches import Surface, Thing, box, rectangle, stack
 from fgslam.worlds.rendering.pinhole import Layer, Pinhole, Renderer
 from fgslam.worlds.rendering.raycaster import RayCaster
-from fgslam.worlds.world import make_rig
 
 RIG = make_rig(LabRigSettings(width=80, height=60))
 ROOMS = PlaceChoice("rooms", 0, 1, identical_posters=False)

@@ -13,16 +13,16 @@ import numpy as np
 
 from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.arrays import BoolArray, FloatArray, Image
-from fgslam.worlds.floor_space import FloorSpace
+from fgslam.worlds.buildings.house import build_house
+from fgslam.worlds.buildings.house_plan import DEPTH, WIDTH
+from fgslam.worlds.driving.floor_space import FloorSpace
+from fgslam.worlds.driving.range_scan import RangeSensor
+from fgslam.worlds.driving.reference_paths import PathPlanner
+from fgslam.worlds.driving.wheelchair import Wheelchair
 from fgslam.worlds.house import disturbances
-from fgslam.worlds.house.floor_plan import DEPTH, WIDTH
-from fgslam.worlds.house.house import build_house
-from fgslam.worlds.house.house_camera import make_house_camera
+from fgslam.worlds.house.camera import make_house_camera
 from fgslam.worlds.house.people import PERSON_RADIUS, People
-from fgslam.worlds.house.range_scan import RangeSensor
-from fgslam.worlds.house.reference_paths import PathPlanner
 from fgslam.worlds.house.settings import OmniHouseSettings
-from fgslam.worlds.house.wheelchair import Wheelchair
 from fgslam.worlds.rendering.colour_bank import ColourBank
 from fgslam.worlds.rendering.colour_textures import build_colour_library
 from fgslam.worlds.rendering.lighting import bake

@@ -13,12 +13,11 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.sensors import CameraRig
-from fgslam.worlds import lab
-from fgslam.worlds.buildings import alike, office
+from fgslam.worlds.buildings import corridors as alike
+from fgslam.worlds.buildings import lab, office
 from fgslam.worlds.buildings.wall_textures import building_library, corridor_library
-from fgslam.worlds.floor_space import FloorSpace
-from fgslam.worlds.lab_settings import LabDriveSettings, PathName, PlaceName
-from fgslam.worlds.paths import (
+from fgslam.worlds.driving.floor_space import FloorSpace
+from fgslam.worlds.driving.paths import (
     PlanarPath,
     PosesInTime,
     drive_along,
@@ -26,7 +25,8 @@ from fgslam.worlds.paths import (
     planar_poses,
     round_corners,
 )
-from fgslam.worlds.random_poses import draw_poses
+from fgslam.worlds.driving.random_poses import draw_poses
+from fgslam.worlds.lab.settings import LabDriveSettings, PathName, PlaceName
 from fgslam.worlds.rendering.lighting import LIGHT_SPACING_M
 from fgslam.worlds.rendering.patches import Thing, stack
 from fgslam.worlds.rendering.texture_library import build_library

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.worlds import furniture
+from fgslam.worlds.buildings import furniture
 from fgslam.worlds.rendering.patches import Patch, Surface, Thing, placed, rectangle
 from fgslam.worlds.rendering.texture_library import PHOTOGRAPHS, POSTERS
 

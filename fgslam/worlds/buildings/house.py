@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.worlds import furniture
+from fgslam.worlds.buildings import furniture
+from fgslam.worlds.buildings import home_furniture as home
 from fgslam.worlds.buildings.fitting import FittingStyle, RoomFitter
 from fgslam.worlds.buildings.floor_plan import (
     HALF_WALL,
@@ -21,8 +22,7 @@ from fgslam.worlds.buildings.floor_plan import (
     lamp_things,
     shell,
 )
-from fgslam.worlds.house import home_furniture as home
-from fgslam.worlds.house.floor_plan import house_plan
+from fgslam.worlds.buildings.house_plan import house_plan
 from fgslam.worlds.rendering.colour_textures import PAINTINGS
 from fgslam.worlds.rendering.patches import Patch, Surface, Thing, placed
 from fgslam.worlds.rendering.texture_library import PHOTOGRAPHS, POSTERS

@@ -9,8 +9,8 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.sensors import CameraRig
-from fgslam.worlds.lab_settings import LabPersonSettings, LabSettings
-from fgslam.worlds.paths import PosesInTime
+from fgslam.worlds.driving.paths import PosesInTime
+from fgslam.worlds.lab.settings import LabPersonSettings, LabSettings
 from fgslam.worlds.rendering.patches import Patch, Surface, Thing, box, placed, prism
 
 _STRIDE_M = 1.3

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.worlds import furniture
+from fgslam.worlds.buildings import furniture
 from fgslam.worlds.buildings.floor_plan import DOOR_HEIGHT, HEIGHT
 from fgslam.worlds.rendering.patches import Patch, Surface, Thing, box, placed, rectangle
 

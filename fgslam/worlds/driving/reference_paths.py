@@ -18,8 +18,8 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.planar import unit, wrap
 from fgslam.worlds.buildings.floor_plan import Room
-from fgslam.worlds.floor_space import FloorSpace
-from fgslam.worlds.house.floor_plan import ROOMS
+from fgslam.worlds.buildings.house_plan import ROOMS
+from fgslam.worlds.driving.floor_space import FloorSpace
 
 # A closed walk through the house: every room, and the corridor twice.
 _TOUR = ("hall", "office", "corridor", "studio", "workshop", "library", "corridor")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.worlds import furniture
+from fgslam.worlds.buildings import furniture
 from fgslam.worlds.rendering.patches import Patch, Surface, box, placed, prism, rectangle
 
 _POT = Surface("bricks", 0.8)

@@ -9,9 +9,9 @@ import numpy as np
 from fgslam.core import geometry
 from fgslam.core.arrays import FloatArray
 from fgslam.core.sensors import CameraRig
-from fgslam.worlds.lab_settings import LabRigSettings
-from fgslam.worlds.person import Stance, person
-from fgslam.worlds.places import PlaceChoice, build_place, build_textures
+from fgslam.worlds.lab.person import Stance, person
+from fgslam.worlds.lab.places import PlaceChoice, build_place, build_textures
+from fgslam.worlds.lab.settings import LabRigSettings
 from fgslam.worlds.rendering.lighting import bake, flat_light
 from fgslam.worlds.rendering.mipmap import TextureBank
 from fgslam.worlds.rendering.patches import stack

@@ -7,7 +7,7 @@ import numpy as np
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.measurements import Odometry
-from fgslam.worlds import wheel_odometry
+from fgslam.worlds.driving import wheel_odometry
 from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 
 

@@ -12,9 +12,9 @@ from scipy import ndimage
 
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.worlds.floor_space import FloorSpace
-from fgslam.worlds.lab_settings import LabDriveSettings
-from fgslam.worlds.paths import planar_poses
+from fgslam.worlds.driving.floor_space import FloorSpace
+from fgslam.worlds.driving.paths import planar_poses
+from fgslam.worlds.lab.settings import LabDriveSettings
 
 _STREAM = 31  # of random numbers, apart from the world's
 _BLOCK, _BLOCKS = 64, 200

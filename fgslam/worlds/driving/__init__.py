@@ -1,0 +1,1 @@
+"""How robots move through places: paths, free floor, wheels, wheelchair, range sensor."""
