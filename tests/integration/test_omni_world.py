@@ -1,4 +1,4 @@
-"""The rendered house as a whole: images, targets, driving, truth, sets of panoramas."""
+"""The rendered house as a whole: images, targets, driving, truth, panoramas."""
 
 from dataclasses import replace
 
@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.worlds.house.panoramas import render_panoramas
 from fgslam.worlds.house.settings import (
     HouseLightSettings,
     HousePanoramaSettings,
@@ -129,13 +128,8 @@ def test_people_walk_about() -> None:
     assert np.std(changed) > 0.0005
 
 
-def test_panorama_set_knows_what_its_places_share() -> None:
+def test_panorama_camera_takes_pictures_of_its_size() -> None:
     settings = replace(SETTINGS, camera=HousePanoramaSettings(width=256, height=128))
-    world = OmniWorld(settings, 0)
-    poses = np.array([[8.0, 3.0, 0.0], [7.0, 5.0, 2.0], [17.5, 11.5, 0.0]])
-    found = render_panoramas(world, poses)
-    assert [image.shape for image in found.images] == [(128, 256, 3)] * 3
-    assert found.rooms == ("hall", "hall", "studio")
-    assert np.array_equal(np.diag(found.shared), np.ones(3))
-    assert found.shared[0, 1] > 0.6
-    assert found.shared[0, 2] < 0.05
+    picture = OmniWorld(settings, 0).picture(np.array([8.0, 3.0, 0.0]), 1000)
+    assert picture.shape == (128, 256, 3)
+    assert count_sift(picture) > 50

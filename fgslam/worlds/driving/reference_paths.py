@@ -18,7 +18,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.planar import unit, wrap
 from fgslam.worlds.buildings.floor_plan import Room
-from fgslam.worlds.buildings.house_plan import ROOMS
+from fgslam.worlds.buildings.house import ROOMS
 from fgslam.worlds.driving.floor_space import FloorSpace
 
 # A closed walk through the house: every room, and the corridor twice.

@@ -13,8 +13,7 @@ import numpy as np
 
 from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.arrays import BoolArray, FloatArray, Image
-from fgslam.worlds.buildings.house import build_house
-from fgslam.worlds.buildings.house_plan import DEPTH, WIDTH
+from fgslam.worlds.buildings.house import DEPTH, WIDTH, build_house
 from fgslam.worlds.driving.floor_space import FloorSpace
 from fgslam.worlds.driving.range_scan import RangeSensor
 from fgslam.worlds.driving.reference_paths import PathPlanner

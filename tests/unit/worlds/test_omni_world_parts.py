@@ -6,8 +6,7 @@ import pytest
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.planar import between, wrap
-from fgslam.worlds.buildings.house import House, build_house
-from fgslam.worlds.buildings.house_plan import DEPTH, WIDTH, room_at
+from fgslam.worlds.buildings.house import DEPTH, WIDTH, House, build_house, house_plan
 from fgslam.worlds.driving.floor_space import FloorSpace
 from fgslam.worlds.driving.range_scan import RangeSensor
 from fgslam.worlds.driving.reference_paths import PathPlanner
@@ -203,7 +202,7 @@ def test_reference_path_is_drivable(space: FloorSpace, spacing: float, within: s
         part = np.linspace(0.0, 1.0, 25)[:, None]
         for start, move in zip(poses[:-1, :2], step, strict=True):
             assert space.clearance(start + part * move).min() > 0.52
-        names = {room.name for x, y, _ in poses if (room := room_at(x, y))}
+        names = {room.name for x, y, _ in poses if (room := house_plan(1.2).room_at(x, y))}
         assert within is None or names == {within}
         rooms |= names
     np.testing.assert_array_equal(poses, planner.reference_path(spacing, 10, rng(4), within))
