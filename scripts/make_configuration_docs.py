@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from fgslam.runs.config import ExperimentConfig
-from fgslam.runs.homing_config import TASKS
-from fgslam.runs.localisation_config import LocalisationConfig
+from fgslam.runs.config_models import HOMING_TASKS, TASKS, LocalisationConfig
 
 Node: TypeAlias = dict[str, Any]
 
@@ -76,8 +75,8 @@ def _homing() -> Iterator[str]:
     """The keys of each task, then the groups of all of them, each once."""
     yield _HOMING
     groups: dict[str, None] = {}
-    for task, model in TASKS.items():
-        schema = model.model_json_schema()
+    for task in HOMING_TASKS:
+        schema = TASKS[task].model_json_schema()
         told = " ".join(schema.get("description", "").split())
         yield "\n".join([f"### Task `{task}`", "", told, "", *_table(schema, schema)])
         for name, node in schema["properties"].items():

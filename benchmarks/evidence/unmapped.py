@@ -19,7 +19,8 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CameraRig
 from fgslam.evaluation.trajectory import rotation_angles
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
-from fgslam.runs.localisation_config import LocalisationConfig, load_experiment
+from fgslam.runs.config import load_experiment
+from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.tasks.localisation import run_localisation
 from fgslam.runs.tasks.localisation_submap import Window, submap_features

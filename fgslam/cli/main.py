@@ -19,9 +19,8 @@ if TYPE_CHECKING:
     from fgslam.runs.choosing import Choice
     from fgslam.runs.comparison import Compared
     from fgslam.runs.config import ExperimentConfig
+    from fgslam.runs.config_models import HomingExperiment, LocalisationConfig
     from fgslam.runs.folder import ExistingFolder
-    from fgslam.runs.homing_config import HomingExperiment
-    from fgslam.runs.localisation_config import LocalisationConfig
 
 EXIT_USER = 2
 EXIT_FAULT = 1
@@ -58,9 +57,8 @@ def run(
     Ctrl-C ends it early with all files valid; --resume goes on from there.
     """
     from fgslam.core.errors import ConfigError
-    from fgslam.runs.homing_config import HomingExperiment
-    from fgslam.runs.localisation_config import LocalisationConfig, load_experiment
-    from fgslam.runs.tasks.slam_measurements import holds_measurements
+    from fgslam.runs.config import load_experiment
+    from fgslam.runs.config_models import HomingExperiment, LocalisationConfig
 
     if overwrite and resume:
         raise ConfigError("--overwrite and --resume exclude each other; give one of them")
@@ -73,7 +71,9 @@ def run(
         return _run_homing(settings, folder, existing)
     if isinstance(settings, LocalisationConfig):
         return _run_localisation(settings, folder, existing)
-    run_it = _run_measurements if holds_measurements(settings) else _run_images
+    if not isinstance(settings, ExperimentConfig):
+        raise ConfigError(f"task {settings.task_name}: cannot be run")
+    run_it = _run_measurements if settings.on_measurements else _run_images
     return run_it(settings, folder, existing)
 
 

@@ -8,9 +8,9 @@ from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.report.metrics import read_metrics
 from fgslam.report.point_cloud import read_ply, write_map
 from fgslam.report.trajectories import read_tum, write_trajectory
+from fgslam.runs.config import is_homing
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
 from fgslam.runs.graph_export import export_graph
-from fgslam.runs.homing_config import is_homing
 from fgslam.runs.map_export import export_map
 from fgslam.runs.tasks.slam_checkpoint import LOG_FILE
 

@@ -19,10 +19,10 @@ from fgslam.report.homing.curves import Line, curve_figure
 from fgslam.report.homing.local_map import local_map_figure
 from fgslam.report.page.traces import Figure
 from fgslam.report.tables import Cell, write_csv
-from fgslam.runs.choosing import EVERY, Choice
+from fgslam.runs.choosing import EVERY, Choice, choose
+from fgslam.runs.config import is_homing, load_homing
+from fgslam.runs.config_models import HomingExperiment
 from fgslam.runs.folder import RUN_MARKER, ExistingFolder, is_run_folder
-from fgslam.runs.homing_choosing import choose_homing
-from fgslam.runs.homing_config import HomingExperiment, is_homing, load_homing
 from fgslam.runs.homing_logs import load_bearing_logs
 from fgslam.runs.homing_replay import ReplayedHoming, replay_homing
 from fgslam.runs.homing_results import (
@@ -90,7 +90,7 @@ def compare_homing_runs(
     found = []
     for run in runs:
         config = load_homing(run / RUN_MARKER)
-        found.append((run, config, load_bearing_logs(run), choose_homing(config, choice)))
+        found.append((run, config, load_bearing_logs(run), choose(config, choice)))
     folders = [_folder(run, out, len(runs)) for run in runs]
     for run, folder in zip(runs, folders, strict=True):
         _require_apart(run, folder, existing)

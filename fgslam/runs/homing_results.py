@@ -11,8 +11,8 @@ from typing import Any, Literal, TypeAlias
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.homing import HomingPage, TextTable, write_homing_report
 from fgslam.report.tables import write_json
+from fgslam.runs.config_models import HomingExperiment
 from fgslam.runs.folder import ExistingFolder, create_run_folder
-from fgslam.runs.homing_config import HomingExperiment
 from fgslam.runs.tasks.slam_outputs import versions, write_config
 
 METRICS_FILE = "metrics.json"

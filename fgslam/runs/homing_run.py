@@ -6,8 +6,7 @@ from pathlib import Path
 
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.threads import one_blas_thread
-from fgslam.runs.folder import ExistingFolder, is_run_folder
-from fgslam.runs.homing_config import (
+from fgslam.runs.config_models import (
     HomingConfig,
     HomingExperiment,
     HomingPairsConfig,
@@ -16,6 +15,7 @@ from fgslam.runs.homing_config import (
     PathFollowingConfig,
     TopologicalMapConfig,
 )
+from fgslam.runs.folder import ExistingFolder, is_run_folder
 from fgslam.runs.homing_results import HomingResult, Progress, Stopped
 from fgslam.runs.tasks.homing_drives import run_driving, with_one_leg
 from fgslam.runs.tasks.homing_house import open_house_drive

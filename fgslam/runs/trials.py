@@ -20,12 +20,12 @@ from fgslam.runs.comparison import Progress, load_truth
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.folder import RUN_MARKER, ExistingFolder, create_run_folder, is_run_folder
 from fgslam.runs.opening import open_sequence
-from fgslam.runs.output_settings import OutputSettings
 from fgslam.runs.processes import WorkerEnded, run_apart
+from fgslam.runs.settings import OutputSettings
 from fgslam.runs.tasks.slam import run_experiment
 from fgslam.runs.tasks.slam_checkpoint import LOG_FILE
 from fgslam.runs.tasks.slam_map_entry import arrival_of
-from fgslam.runs.tasks.slam_measurements import holds_measurements, open_measured, write_recording
+from fgslam.runs.tasks.slam_measurements import open_measured, write_recording
 from fgslam.runs.tasks.slam_outputs import write_config
 from fgslam.runs.trial_results import TrialSummary, summarise, write_trials
 from fgslam.slam.replay import replay
@@ -122,7 +122,7 @@ def perform_trial(task: TrialTask) -> Trial:
         config = task.config.model_copy(
             update={"seed": task.seed, "compare": (), "map": maps, "output": _OUTPUT}
         )
-        if holds_measurements(config):
+        if config.on_measurements:
             run.mkdir()
             write_recording(run, config, open_measured(config))
         else:
@@ -167,7 +167,7 @@ def _experiment(source: Path) -> ExperimentConfig:
 
 def _prepare(config: ExperimentConfig, progress: Progress) -> None:
     """Renders what is not in the cache once, before several processes would do so at a time."""
-    if not holds_measurements(config):
+    if not config.on_measurements:
         open_sequence(config, lambda done, total: progress("rendering", done, total))
 
 

@@ -14,8 +14,8 @@ from running import main, write_config
 
 from fgslam.core.bearing_log import BearingLog
 from fgslam.core.errors import DatasetError
+from fgslam.runs.config import load_homing, parse_homing
 from fgslam.runs.folder import RUN_MARKER
-from fgslam.runs.homing_config import load_homing, parse_homing
 from fgslam.runs.homing_run import run_homing
 from fgslam.runs.report import report_from_folder
 

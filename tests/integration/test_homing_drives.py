@@ -22,7 +22,8 @@ from fgslam.homing.drive_scores import cross_track, pass_distances, truly_arrive
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import Steering
-from fgslam.runs.homing_config import PathFollowingConfig, parse_homing
+from fgslam.runs.config import parse_homing
+from fgslam.runs.config_models import PathFollowingConfig
 from fgslam.runs.homing_logs import load_bearing_logs
 from fgslam.runs.homing_replay import replay_homing
 from fgslam.runs.homing_results import begin

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from fgslam.runs.homing_config import load_homing
+from fgslam.runs.config import load_homing
 from fgslam.runs.homing_run import run_homing
 
 pytestmark = pytest.mark.slow

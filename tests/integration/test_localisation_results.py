@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from fgslam.runs.localisation_config import LocalisationConfig, load_experiment
+from fgslam.runs.config import load_experiment
+from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.tasks.localisation import run_localisation
 from fgslam.runs.tasks.localisation_results import Scored, scored
 

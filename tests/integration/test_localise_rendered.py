@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgslam.runs.localisation_config import parse_localisation
+from fgslam.runs.config import parse_localisation
 from fgslam.runs.tasks.localisation import run_localisation
 
 RIG = {"width": 160, "height": 120}

@@ -15,7 +15,8 @@ from recordings import experiment, write_calibration
 from running import main, run_values
 
 from fgslam.core.errors import ConfigError
-from fgslam.runs.localisation_config import LocalisationConfig, load_experiment, parse_localisation
+from fgslam.runs.config import load_experiment, parse_localisation
+from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.tasks.localisation import run_localisation
 
 

@@ -27,7 +27,7 @@ from fgslam.report.homing.curves import Line, curve_figure
 from fgslam.report.homing.local_map import local_map_figure
 from fgslam.report.homing.plan import PASS_RADIUS_M, catchment_figure, drive_figure
 from fgslam.report.page.traces import Figure
-from fgslam.runs.homing_config import DrivingConfig
+from fgslam.runs.config_models import DrivingConfig
 from fgslam.runs.homing_replay import replay_homing
 from fgslam.runs.homing_results import HomingResult, Status, write_document, write_page
 from fgslam.runs.tasks.homing_drive_files import (

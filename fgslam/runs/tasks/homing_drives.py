@@ -19,8 +19,8 @@ from fgslam.homing.front_end import HomingFrontEnd
 from fgslam.homing.path_following import PathFollower
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.steering import Steering
+from fgslam.runs.config_models import DrivingConfig
 from fgslam.runs.folder import ExistingFolder
-from fgslam.runs.homing_config import DrivingConfig
 from fgslam.runs.homing_results import HomingResult, Progress, Status, Stopped, begin, jobs_of
 from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.runs.tasks.homing_drive_pictures import DriveWatcher, Unwrapping

@@ -6,7 +6,7 @@ import numpy as np
 
 from fgslam.datasets.omni.house import open_house
 from fgslam.homing.image_front_end import FrontEndSettings, ImageFrontEnd
-from fgslam.runs.homing_config import DrivingConfig
+from fgslam.runs.config_models import DrivingConfig
 from fgslam.runs.tasks.homing_drives import Opened
 
 

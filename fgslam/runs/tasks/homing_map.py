@@ -20,8 +20,8 @@ from fgslam.report.homing.network import Links, network_figure, unfolded
 from fgslam.report.page.data import Picture
 from fgslam.report.page.traces import Figure
 from fgslam.report.tables import Cell, write_csv
+from fgslam.runs.config_models import TopologicalMapConfig
 from fgslam.runs.folder import ExistingFolder
-from fgslam.runs.homing_config import TopologicalMapConfig
 from fgslam.runs.homing_results import (
     HomingResult,
     Progress,

@@ -18,7 +18,7 @@ from fgslam.homing.retrieval import VisualWords
 from fgslam.homing.third_view_consistency import InlierRows
 from fgslam.homing.topological_map import map_of_answers
 from fgslam.report.tables import write_csv
-from fgslam.runs.homing_config import TopologicalMapConfig
+from fgslam.runs.config_models import TopologicalMapConfig
 from fgslam.runs.homing_results import Progress, Stopped
 
 LOCALISATION_FILE = "localisation.csv"

@@ -13,8 +13,8 @@ from fgslam.report.homing import Column, TextTable
 from fgslam.report.homing.curves import claimed_against_true, sorted_errors
 from fgslam.report.homing.network import Links, network_figure
 from fgslam.report.page.traces import Figure
+from fgslam.runs.config_models import HomingPairsConfig
 from fgslam.runs.folder import ExistingFolder
-from fgslam.runs.homing_config import HomingPairsConfig
 from fgslam.runs.homing_results import (
     HomingResult,
     Progress,

@@ -15,7 +15,7 @@ from fgslam.report.homing import Column, TextTable
 from fgslam.report.homing.curves import sorted_errors
 from fgslam.report.page.traces import Figure
 from fgslam.report.tables import Cell, write_csv
-from fgslam.runs.homing_config import HomingTrialsConfig
+from fgslam.runs.config_models import HomingTrialsConfig
 from fgslam.runs.homing_results import HomingResult, Status, write_document, write_page
 from fgslam.runs.tasks.homing_trial_data import HomingTrial
 

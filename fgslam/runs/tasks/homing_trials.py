@@ -13,8 +13,8 @@ from fgslam.core.bearing_log import BearingLog
 from fgslam.core.homing import Refusal
 from fgslam.datasets.simulated_homing import open_simulated_homing
 from fgslam.evaluation.homing import homing_errors
+from fgslam.runs.config_models import HomingTrialsConfig
 from fgslam.runs.folder import ExistingFolder
-from fgslam.runs.homing_config import HomingTrialsConfig
 from fgslam.runs.homing_logs import save_bearing_logs
 from fgslam.runs.homing_replay import replay_homing
 from fgslam.runs.homing_results import HomingResult, Progress, Stopped, begin, jobs_of

@@ -19,8 +19,8 @@ from fgslam.report.homing.curves import Line, curve_figure
 from fgslam.report.page.data import Picture
 from fgslam.report.pictures.view_tracks import draw_view_tracks
 from fgslam.report.tables import write_csv
+from fgslam.runs.config_models import OmniVideoConfig
 from fgslam.runs.folder import ExistingFolder
-from fgslam.runs.homing_config import OmniVideoConfig
 from fgslam.runs.homing_results import (
     HomingResult,
     Progress,

@@ -10,8 +10,8 @@ from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import require_rig
 from fgslam.core.threads import one_blas_thread
+from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.folder import ExistingFolder, create_run_folder, is_run_folder
-from fgslam.runs.localisation_config import LocalisationConfig
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.tasks.localisation_files import write_results
 from fgslam.runs.tasks.localisation_queries import Progress, ask_all, nothing_asked

@@ -12,9 +12,15 @@ from fgslam.core.recordings import Sequence as Recording
 from fgslam.core.saved_map import SavedMap, require_rig
 from fgslam.core.threads import one_blas_thread
 from fgslam.datasets.layouts import recognise_layout
-from fgslam.runs.config import ExperimentConfig, load_config
+from fgslam.runs.config import (
+    ExperimentConfig,
+    as_task,
+    load_config,
+    load_experiment,
+    make_experiment,
+)
+from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.folder import ExistingFolder, create_run_folder, is_run_folder
-from fgslam.runs.localisation_config import LocalisationConfig, load_experiment, make_localisation
 from fgslam.runs.tasks.localisation import answer, open_queries, write_run_config
 from fgslam.runs.tasks.localisation_files import write_results
 from fgslam.runs.tasks.localisation_queries import Progress
@@ -93,7 +99,8 @@ def _config(wanted: Wanted, saved: SavedMap) -> LocalisationConfig:
     kept = {name: value for name, value in values.items() if name in known}
     queries = {**kept.get("localisation", {}), "frames": [wanted.frames], "every": 1}
     kept |= {"task": "localisation", "localisation": queries, "map": {"load": str(wanted.map_file)}}
-    return _of_one_frame(make_localisation(kept, overrides, where), wanted)
+    config = as_task(LocalisationConfig, make_experiment(kept, overrides, where), where)
+    return _of_one_frame(config, wanted)
 
 
 def settings_of_map(saved: SavedMap) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import require_rig
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 from fgslam.frontend.stereo.matching import StereoMatcher
-from fgslam.runs.localisation_config import LocalisationConfig
+from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.tasks.localisation_sights import Sighted, TrueSights
 from fgslam.runs.tasks.localisation_submap import Window, submap_features
 from fgslam.runs.tasks.localisation_truth import TruthInMap, truth_in_map

@@ -24,7 +24,7 @@ from fgslam.evaluation.localisation import (
     score,
 )
 from fgslam.report.homing import Column, TextTable
-from fgslam.runs.localisation_config import LocalisationConfig
+from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.tasks.localisation_queries import Asked, Attempt
 
 _UNKNOWN = "-"

@@ -17,7 +17,6 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.report.comparison_table import write_comparison_csv
-from fgslam.runs.choosing import compared_with
 from fgslam.runs.comparison import COMPARISON_FILE, Compared, replay_apart, tasks_of
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.folder import ExistingFolder
@@ -176,7 +175,7 @@ def _compare(
 ) -> Compared | None:
     """Replays the run's log through the other estimators that the configuration names."""
     config, folder = outputs.config, outputs.folder
-    others = compared_with(config)
+    others = config.estimators[1:]
     if not others:
         return None
     metrics = {outputs.title: live}

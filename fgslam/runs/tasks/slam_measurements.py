@@ -18,7 +18,6 @@ from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_tru
 from fgslam.report.metrics import StageTime, write_timing
 from fgslam.report.point_cloud import read_ply
 from fgslam.report.trajectories import read_covariances, read_tum, write_tum
-from fgslam.runs.choosing import estimators_of
 from fgslam.runs.compare import write_comparison
 from fgslam.runs.comparison import (
     GROUND_TRUTH_FILE,
@@ -36,11 +35,6 @@ from fgslam.runs.tasks.slam_outputs import write_config
 from fgslam.runs.tasks.slam_pictures import RunFigures, draw_run
 from fgslam.runs.tasks.slam_summary import spread
 from fgslam.slam.replay import ReplayRow
-
-
-def holds_measurements(config: ExperimentConfig) -> bool:
-    """Whether the configuration's data set has measurements instead of images."""
-    return isinstance(config.dataset, MeasurementDatasetSettings)
 
 
 def open_measured(config: ExperimentConfig, seed: int | None = None) -> MeasurementRecording:
@@ -84,7 +78,7 @@ def run_measured(
     recording = open_measured(config)
     create_run_folder(folder, existing)
     write_recording(folder, config, recording)
-    tasks = tasks_of(config, folder, folder, estimators_of(config))
+    tasks = tasks_of(config, folder, folder, config.estimators)
     metrics = replay_apart(tasks, 1, progress, stopped)
     rows = _live_rows(folder, config)
     _write_times(folder, recording, rows)

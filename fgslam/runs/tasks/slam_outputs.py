@@ -27,10 +27,9 @@ from fgslam.report.point_cloud import MapPoints
 from fgslam.report.trajectories import write_tum
 from fgslam.runs.comparison import GROUND_TRUTH_FILE, load_truth, remark_of
 from fgslam.runs.config import ExperimentConfig
+from fgslam.runs.config_models import HomingExperiment, LocalisationConfig
 from fgslam.runs.estimator_files import write_estimate
 from fgslam.runs.folder import RUN_MARKER
-from fgslam.runs.homing_config import HomingExperiment
-from fgslam.runs.localisation_config import LocalisationConfig
 from fgslam.runs.tasks.rendered_truth import rendered_landmark_truth
 from fgslam.runs.tasks.slam_checkpoint import save_log
 from fgslam.runs.tasks.slam_places import closures_of, place_numbers, write_closures

@@ -25,7 +25,7 @@ from fgslam.report.comparison_table import RESULT_COLUMNS, TIME_COLUMNS, write_c
 from fgslam.report.landmark_truth import read_landmark_truth, write_landmark_truth
 from fgslam.report.point_cloud import MapPoints
 from fgslam.runs.baseline import check_baseline, read_baseline, write_baseline
-from fgslam.runs.choosing import Choice, all_kinds, choose, estimators_of
+from fgslam.runs.choosing import Choice, all_kinds, choose
 from fgslam.runs.config import ExperimentConfig, parse_config
 from fgslam.runs.estimator_files import points_from_log
 from fgslam.runs.tasks.rendered_truth import points_under
@@ -91,7 +91,7 @@ def test_overrides_that_are_none(override: str, words: str) -> None:
 
 def test_the_same_estimator_twice_is_one() -> None:
     run = config(compare=["odometry", "landmark_kalman", "odometry"])
-    assert [s.title for s in estimators_of(run)] == ["landmark_kalman", "odometry"]
+    assert [s.title for s in run.estimators] == ["landmark_kalman", "odometry"]
 
 
 # --------------------------------------------------------------------------------------------

@@ -13,13 +13,13 @@ from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.datasets.settings import ImageFolderSettings
 from fgslam.frontend.places.settings import LoopSettings
 from fgslam.runs.config import ExperimentConfig, load_config, parse_config
-from fgslam.runs.homing_config import is_homing
+from fgslam.runs.config_reading import read_mapping
 from fgslam.worlds.lab.settings import RenderedLabSettings
 
 EXPERIMENTS = [
     path
     for path in sorted((Path(__file__).parents[3] / "experiments").glob("*.yaml"))
-    if not is_homing(path)
+    if "task" not in read_mapping(path)
 ]
 MINIMAL: dict[str, Any] = {"name": "x", "dataset": {"kind": "image_folder", "path": "there"}}
 LAB: dict[str, Any] = {"name": "x", "dataset": {"kind": "rendered_lab"}}

@@ -9,8 +9,7 @@ from types import ModuleType
 import pytest
 
 from fgslam.runs.config import ExperimentConfig
-from fgslam.runs.homing_config import TASKS
-from fgslam.runs.localisation_config import LocalisationConfig
+from fgslam.runs.config_models import HOMING_TASKS, TASKS, LocalisationConfig
 
 ROOT = Path(__file__).parents[3]
 
@@ -42,7 +41,7 @@ def test_every_key_and_kind_is_on_the_page(maker: ModuleType) -> None:
                 assert f"| `{name}` |" in page or f".{name}`" in page, name
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", HOMING_TASKS)
 def test_every_key_of_every_homing_task_is_on_the_page(maker: ModuleType, task: str) -> None:
     page = maker.configuration_page()
     assert f"### Task `{task}`" in page

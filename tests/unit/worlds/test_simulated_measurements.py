@@ -23,8 +23,7 @@ from fgslam.datasets.opening import open_measurements
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
-from fgslam.runs.config import ExperimentConfig, make_config
-from fgslam.runs.localisation_config import load_experiment
+from fgslam.runs.config import ExperimentConfig, load_experiment, make_config
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import replay_step
 from fgslam.worlds.simulated.identities import IdentityBook

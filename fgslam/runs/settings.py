@@ -1,4 +1,4 @@
-"""Settings of the task `localisation`: which frames are sought in a map, and what is right."""
+"""Settings of a run itself: what it writes, and what is asked of a saved map."""
 
 from __future__ import annotations
 
@@ -9,6 +9,39 @@ from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT
 from fgslam.slam.map_settings import FirstDriveSettings
+
+
+@dataclass(frozen=True, config=STRICT)
+class OutputSettings:
+    """Pictures, the page and checkpoints."""
+
+    pictures: Annotated[bool, Field(description="draw the pictures of the run folder")] = True
+    report: Annotated[bool, Field(description="write report.html")] = True
+    checkpoint_seconds: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="write all results so far this often, for --resume; 0: after each frame",
+        ),
+    ] = 2.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class HomingOutputSettings:
+    """Pictures, the page and bearing logs."""
+
+    pictures: Annotated[
+        int, Field(ge=0, description="at most so many pictures of pairs, links or frames")
+    ] = 8
+    report: Annotated[bool, Field(description="write report.html")] = True
+    logs: Annotated[
+        int,
+        Field(
+            ge=0,
+            description="bearing logs kept, of the first trials or runs, which `fgslam compare` "
+            "replays",
+        ),
+    ] = 4
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -1,0 +1,362 @@
+"""What an experiment's configuration may say: one strict model for each task.
+
+Each field has its unit and meaning. A file without the key `task` is one of SLAM.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+from fgslam.backend.filters.settings import LandmarkKalmanSettings
+from fgslam.backend.homing.settings import HomingEstimatorSettings, HomingGraphSettings
+from fgslam.backend.settings import EstimatorSettings
+from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
+from fgslam.datasets.omni.settings import (
+    OmniDatasetSettings,
+    OmniHouseSettings,
+    SimulatedBearingsSettings,
+)
+from fgslam.datasets.settings import DatasetSettings, MeasurementDatasetSettings
+from fgslam.frontend.features.omni_settings import OmniFeatureSettings
+from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
+from fgslam.homing.settings import (
+    HomingBehaviourSettings,
+    LocalisationSettings,
+    TopologicalMapSettings,
+)
+from fgslam.runs.config_reading import kind_as_settings, with_default_kind
+from fgslam.runs.settings import (
+    HomingOutputSettings,
+    KnownMapSettings,
+    OutputSettings,
+    QuerySettings,
+)
+from fgslam.slam.frontend_settings import FrontendSettings
+from fgslam.slam.map_settings import MapSettings
+
+LiveEstimator: TypeAlias = Annotated[
+    EstimatorSettings, BeforeValidator(with_default_kind(LandmarkKalmanSettings.kind))
+]
+ComparedEstimator: TypeAlias = Annotated[EstimatorSettings, BeforeValidator(kind_as_settings)]
+LiveHoming: TypeAlias = Annotated[
+    HomingEstimatorSettings, BeforeValidator(with_default_kind(HomingGraphSettings.kind))
+]
+ComparedHoming: TypeAlias = Annotated[HomingEstimatorSettings, BeforeValidator(kind_as_settings)]
+ComparedList: TypeAlias = Annotated[
+    tuple[ComparedHoming, ...],
+    Field(
+        description="estimators that are given the same bearings: kinds, or groups of keys as "
+        "under `estimator`"
+    ),
+]
+ViewName: TypeAlias = Annotated[
+    str, BeforeValidator(lambda value: str(value) if isinstance(value, int) else value)
+]
+
+
+class Experiment(BaseModel):
+    """What the experiments of all tasks have."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    taken_folders: ClassVar[tuple[str, ...]] = ("pictures", "compare", "trials", "first")
+    """Folders of a run that no estimator may be called."""
+
+    name: Annotated[
+        str, Field(pattern=r"^[\w.-]+$", description="short name; the default run folder's")
+    ]
+    seed: Annotated[int, Field(ge=0, description="of everything random in the run")] = 0
+    provenance: Annotated[
+        dict[str, Any] | None,
+        Field(description="written into a run's own config.yaml: versions and data; not read"),
+    ] = None
+
+    def as_values(self) -> dict[str, Any]:
+        """Plain values for YAML or JSON, every default filled in."""
+        return self.model_dump(mode="json", exclude={"provenance"})
+
+    @property
+    def estimators(self) -> tuple[Any, ...]:
+        """Settings of the live estimator, then of those of `compare`; each once."""
+        live, others = getattr(self, "estimator", None), getattr(self, "compare", ())
+        return tuple(dict.fromkeys((*([] if live is None else [live]), *others)))
+
+    @property
+    def task_name(self) -> str | None:
+        """Value of the key `task`; None for SLAM, which has no such key."""
+        return getattr(self, "task", None)
+
+    def problem(self) -> str:
+        """What is contradictory, with its fix; empty where nothing is."""
+        titles = [settings.title for settings in self.estimators]
+        for title in titles:
+            if title in self.taken_folders:
+                return (
+                    f"an estimator cannot be called {title}, a folder of the run; choose another "
+                    "label"
+                )
+            if titles.count(title) > 1:
+                return f"two different estimators are called {title}; give one of them a label"
+        return ""
+
+
+# --------------------------------------------------------------------------------------------
+# SLAM
+
+
+class ExperimentConfig(Experiment):
+    """One experiment."""
+
+    dataset: DatasetSettings
+    odometry: OdometrySettings = RecordedOdometrySettings()
+    frontend: FrontendSettings = FrontendSettings()
+    estimator: LiveEstimator = LandmarkKalmanSettings()
+    compare: Annotated[
+        tuple[ComparedEstimator, ...],
+        Field(
+            description="estimators that replay the run's own log beside the live one: kinds, or "
+            "groups of keys as under `estimator`"
+        ),
+    ] = ()
+    map: MapSettings = MapSettings()
+    output: OutputSettings = OutputSettings()
+
+    @property
+    def on_measurements(self) -> bool:
+        """Whether the data set holds measurements instead of images."""
+        return isinstance(self.dataset, MeasurementDatasetSettings)
+
+    def problem(self) -> str:
+        """Also contradictions about the map."""
+        return super().problem() or _map_problem(self)
+
+
+def _map_problem(config: ExperimentConfig) -> str:
+    """What is contradictory about the map, with its mend; empty where nothing is."""
+    given, first = config.map, config.map.made_from
+    datasets = (config.dataset, *(() if first is None else (first.dataset,)))
+    measurements = any(isinstance(one, MeasurementDatasetSettings) for one in datasets)
+    as_default = (given.start, given.extend) == ("relocalise", True)
+    goes_on = given.start == "continue"
+    problems = {
+        "map: measurements have no appearance to keep; give recordings of images": (
+            measurements and given != MapSettings()
+        ),
+        "map.load and map.made_from exclude each other; give one of them": (
+            first is not None and given.load is not None
+        ),
+        "map.start and map.extend mean nothing without a map; give map.load (--map-in)": (
+            not given.given and not as_default
+        ),
+        "map.extend is false, so there is no new map to save; leave map.save out": (
+            not given.extend and given.save is not None
+        ),
+        "map.load and map.save are one file; save to another name": (
+            given.load is not None
+            and given.save is not None
+            and Path(given.load).resolve() == Path(given.save).resolve()
+        ),
+        "map.start continue goes on with the run that was saved; it takes map.load alone": (
+            goes_on and (first is not None or not given.extend)
+        ),
+    }
+    return next((words for words, wrong in problems.items() if wrong), "")
+
+
+class LocalisationConfig(Experiment):
+    """Frames of a recording, sought in a map without any prior."""
+
+    task: Annotated[Literal["localisation"], Field(description="SLAM has no such key")]
+    map: KnownMapSettings
+    dataset: DatasetSettings
+    odometry: OdometrySettings = RecordedOdometrySettings()
+    frontend: FrontendSettings = FrontendSettings()
+    estimator: LiveEstimator = LandmarkKalmanSettings()
+    localisation: QuerySettings = QuerySettings()
+    output: OutputSettings = OutputSettings()
+
+    def as_experiment(self) -> ExperimentConfig:
+        """The run that would drive the queries' recording in the map: of its parts some are used.
+
+        The front-end looks for no loops and recovers from nothing: a submap is a few frames long.
+        """
+        return ExperimentConfig(
+            name=self.name,
+            seed=self.seed,
+            dataset=self.dataset,
+            odometry=self.odometry,
+            frontend=self.frontend,
+            estimator=self.estimator,
+            map=MapSettings(load=self.map.load, made_from=self.map.made_from),
+            output=self.output,
+        )
+
+    def problem(self) -> str:
+        """Also a map that is missing or given twice, and data without images."""
+        given = self.map
+        if (given.load is None) == (given.made_from is None):
+            return "map needs either load or made_from; give one of them"
+        first = () if given.made_from is None else (given.made_from.dataset,)
+        if any(isinstance(one, MeasurementDatasetSettings) for one in (self.dataset, *first)):
+            return "measurements have no appearance to be recognised by; give recordings of images"
+        return super().problem()
+
+
+# --------------------------------------------------------------------------------------------
+# Homing
+
+_TASK = Field(description="which kind of homing experiment; SLAM has no such key")
+
+
+class HomingExperiment(Experiment):
+    """What the experiments of all homing tasks have."""
+
+    taken_folders: ClassVar[tuple[str, ...]] = ("pictures", "compare", "logs", "runs")
+
+    task: Annotated[str, Field(description="which kind of homing experiment")]
+    output: HomingOutputSettings = HomingOutputSettings()
+    jobs: Annotated[
+        int | None,
+        Field(
+            ge=1, description="processes at a time; null: one a core. Results do not depend on it"
+        ),
+    ] = None
+
+
+class HomingPairsConfig(HomingExperiment):
+    """The homing vector between every two views of a recording."""
+
+    task: Annotated[Literal["homing_pairs"], _TASK]
+    dataset: OmniDatasetSettings
+    features: OmniFeatureSettings = OmniFeatureSettings()
+    homing_vector: HomingVectorSettings = HomingVectorSettings()
+    both_ways: Annotated[
+        bool, Field(description="each pair in both directions; else from the earlier view only")
+    ] = False
+    reference: Annotated[
+        bool, Field(description="plain SIFT and two-point RANSAC beside it, for comparison")
+    ] = True
+
+
+class TopologicalMapConfig(HomingExperiment):
+    """A topological map of a recording's views, routes on it, and localisation."""
+
+    task: Annotated[Literal["topological_map"], _TASK]
+    dataset: OmniDatasetSettings
+    features: OmniFeatureSettings = OmniFeatureSettings()
+    homing_vector: HomingVectorSettings = HomingVectorSettings()
+    map: TopologicalMapSettings = TopologicalMapSettings()
+    localisation: LocalisationSettings = LocalisationSettings()
+    ordered: Annotated[bool, Field(description="views follow each other on a way")] = False
+    routes: Annotated[
+        tuple[Annotated[tuple[ViewName, ...], Field(min_length=2)], ...],
+        Field(
+            description="ways to seek on the map, by the views' numbers: start and goal, or all "
+            "nodes of a chain whose links shall be there"
+        ),
+    ] = ()
+    held_out_every: Annotated[
+        int | None,
+        Field(
+            ge=2,
+            description="localisation is tried with every so many views, on a map of the others; "
+            "null: not tried",
+        ),
+    ] = None
+
+
+class OmniVideoConfig(HomingExperiment):
+    """Points tracked through a recording of a mirror camera."""
+
+    task: Annotated[Literal["omni_video"], _TASK]
+    dataset: OmniDatasetSettings
+    tracking: OmniTrackingSettings = OmniTrackingSettings()
+    least_points: Annotated[
+        int, Field(ge=1, description="with fewer points left, new ones are added")
+    ] = 110
+    most_points: Annotated[int, Field(ge=1, description="up to so many")] = 160
+
+
+class HomingTrialsConfig(HomingExperiment):
+    """Simulated homings of bearings alone: estimators against outliers."""
+
+    task: Annotated[Literal["homing_trials"], _TASK]
+    dataset: SimulatedBearingsSettings = SimulatedBearingsSettings()
+    outliers: Annotated[
+        tuple[Annotated[float, Field(ge=0.0, lt=1.0)], ...],
+        Field(
+            min_length=1,
+            description="shares of outliers, each with its own trials: of wrong matches, and half "
+            "each of jumping tracks and of gross bearings; they replace the dataset's own",
+        ),
+    ] = (0.0, 0.1, 0.2, 0.3)
+    trials: Annotated[int, Field(ge=1, description="homings for each share")] = 200
+    homing_vector: HomingVectorSettings = HomingVectorSettings()
+    estimator: LiveHoming = HomingGraphSettings()
+    compare: ComparedList = ()
+
+
+class DrivingConfig(HomingExperiment):
+    """Closed loop in a rendered house: what homing and path following share."""
+
+    dataset: OmniHouseSettings = OmniHouseSettings()
+    features: OmniFeatureSettings = OmniFeatureSettings()
+    homing_vector: HomingVectorSettings = HomingVectorSettings()
+    tracking: OmniTrackingSettings = OmniTrackingSettings()
+    behaviour: HomingBehaviourSettings = HomingBehaviourSettings()
+    estimator: LiveHoming = HomingGraphSettings()
+    compare: ComparedList = ()
+    trials: Annotated[
+        int, Field(ge=1, description="drives, each with a seed of its own: path, noise, people")
+    ] = 1
+    start_offset_m: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="the robot starts up to so far from the path's start, turned at random: "
+            "from where homing succeeds",
+        ),
+    ] = 0.0
+    wrong_matches: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            lt=0.9,
+            description="share of wrong matches mixed into those of start and target, to try how "
+            "much homing bears",
+        ),
+    ] = 0.0
+
+
+class HomingConfig(DrivingConfig):
+    """One homing in closed loop: the path's first leg alone."""
+
+    task: Annotated[Literal["homing"], _TASK]
+
+
+class PathFollowingConfig(DrivingConfig):
+    """A path of many target images, followed in closed loop."""
+
+    task: Annotated[Literal["path_following"], _TASK]
+
+
+TASKS: dict[str | None, type[Experiment]] = {
+    None: ExperimentConfig,
+    "localisation": LocalisationConfig,
+    "homing_pairs": HomingPairsConfig,
+    "topological_map": TopologicalMapConfig,
+    "omni_video": OmniVideoConfig,
+    "homing_trials": HomingTrialsConfig,
+    "homing": HomingConfig,
+    "path_following": PathFollowingConfig,
+}
+"""The model of each value of the key `task`; None where a file has no such key."""
+
+HOMING_TASKS = tuple(
+    task
+    for task, model in TASKS.items()
+    if task is not None and issubclass(model, HomingExperiment)
+)
