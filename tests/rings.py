@@ -60,13 +60,13 @@ class RingMotion(OdometryMotion):
         self._poses = poses
         self._wrong = g.so3_exp(np.array([0.0, np.deg2rad(drift_deg), 0.0]))
 
-    def between(self, i: int, timestamp: float) -> tuple[Odometry | None, bool]:
+    def between(self, i: int, timestamp: float) -> Odometry | None:
         if i == 0:
-            return None, False
+            return None
         step = g.inverse(self._poses[i - 1]) @ self._poses[i]
         if np.linalg.norm(step[:3, 3]) > 1.0:  # carried: the wheels know nothing of it
             step = np.eye(4)
-        return Odometry(step @ g.pose(self._wrong, np.zeros(3)), NOISE), True
+        return Odometry(step @ g.pose(self._wrong, np.zeros(3)), NOISE)
 
     def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
         pass

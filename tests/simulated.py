@@ -204,7 +204,7 @@ def play_directly(
         else:
             problem = PoseProblem.of(estimator.landmarks(), matched)
             tracking = solver.solve(prediction, problem)
-        stats.append(estimator.update(increment, tracking, increment.odometry))
+        stats.append(estimator.update(increment, tracking))
     return stats
 
 

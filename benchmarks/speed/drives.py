@@ -64,12 +64,10 @@ class Clocked:
         """The landmarks of the timed estimator."""
         return self.inner.landmarks()
 
-    def update(
-        self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
-    ) -> UpdateStats:
+    def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """The update of the timed estimator."""
         cpu, wall = time.process_time(), time.perf_counter()
-        stats = self.inner.update(increment, tracking, motion)
+        stats = self.inner.update(increment, tracking)
         self.wall.append(time.perf_counter() - wall)
         self.cpu.append(self._spent + time.process_time() - cpu)
         return stats

@@ -143,7 +143,7 @@ def worst_update(drive: MeasuredDrive) -> float:
         found = replay_frame(increment, closed, solver, motion, k)
         # The pose found by the one serves both: without a point to weight at, it is the tracking's.
         graph.predict(increment.odometry)
-        graph.update(increment, replace(found.tracking, weighted_at=None), increment.odometry)
+        graph.update(increment, replace(found.tracking, weighted_at=None))
         worst = max(worst, difference(graph.landmarks(), closed.landmarks()))
     return worst
 

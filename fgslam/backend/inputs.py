@@ -6,6 +6,7 @@ the landmarks had a say in it.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -19,13 +20,13 @@ from fgslam.core.measurements import Increment, Odometry
 from fgslam.core.sensors import Sensor
 
 
-def require_finite(increment: Increment, tracking: EgoMotion, motion: Odometry | None) -> None:
+def require_finite(increment: Increment, tracking: EgoMotion) -> None:
     """Refuses numbers that are not finite: in a solver one of them would spoil all others.
 
     Raises:
         EstimatorError: which kind of number, and in which frame.
     """
-    observed = increment.observations
+    observed, motion = increment.observations, increment.odometry
     given = {
         "measurement": [observed.measurement, observed.covariance],
         "motion": [] if motion is None else [motion.motion, motion.covariance],
@@ -45,27 +46,31 @@ class RecordedInputs:
 
     increments: list[Increment] = field(default_factory=list)
     trackings: list[EgoMotion] = field(default_factory=list)
-    motions: list[Odometry | None] = field(default_factory=list)
 
-    def append(self, increment: Increment, tracking: EgoMotion, motion: Odometry | None) -> None:
+    def append(self, increment: Increment, tracking: EgoMotion) -> None:
         """Keeps one update's arguments."""
         self.increments.append(increment)
         self.trackings.append(tracking)
-        self.motions.append(motion)
 
-    def __iter__(self) -> Iterator[tuple[Increment, EgoMotion, Odometry | None]]:
-        return zip(self.increments, self.trackings, self.motions, strict=True)
+    def __iter__(self) -> Iterator[tuple[Increment, EgoMotion]]:
+        return zip(self.increments, self.trackings, strict=True)
 
     def timestamps(self) -> FloatArray:
         """(n,) seconds."""
         return np.array([increment.timestamp for increment in self.increments])
 
+    def motions(self) -> list[Odometry | None]:
+        """The step to each frame, as it was used."""
+        return [increment.odometry for increment in self.increments]
+
     def to_arrays(self, sensor: Sensor) -> StateArrays:
         """All of it as plain arrays."""
-        log = MeasurementLog(sensor, {}, list(self.increments))
-        n = len(self.trackings)
-        known = np.array([motion is not None for motion in self.motions], np.bool_)
-        given = [motion for motion in self.motions if motion is not None]
+        log = MeasurementLog(sensor, {})
+        for increment in self.increments:
+            log.append(increment)
+        n, motions = len(self.trackings), self.motions()
+        known = np.array([motion is not None for motion in motions], np.bool_)
+        given = [motion for motion in motions if motion is not None]
         return {f"log/{name}": array for name, array in log.to_arrays().items()} | {
             "wTc": np.array([t.wTc for t in self.trackings]).reshape(n, 4, 4),
             "covariance": np.array([t.covariance for t in self.trackings]).reshape(n, 6, 6),
@@ -103,8 +108,9 @@ class RecordedInputs:
                 EgoMotionStatus.OK if state["measured"][k] else EgoMotionStatus.TOO_FEW_MATCHES,
                 0,
             )
-            motion = None
-            if state["motion_known"][k]:
-                motion = Odometry(state["motion"][row[k]], state["motion_covariance"][row[k]])
-            out.append(increment, tracking, motion)
+            if increment.odometry is None and state["motion_known"][k]:
+                motion, covariance = state["motion"][row[k]], state["motion_covariance"][row[k]]
+                stand_in = Odometry(motion, covariance, measured=False)
+                increment = dataclasses.replace(increment, odometry=stand_in)
+            out.append(increment, tracking)
         return out

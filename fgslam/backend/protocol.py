@@ -39,17 +39,14 @@ class Estimator(Protocol):
         """
         ...
 
-    def update(
-        self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
-    ) -> UpdateStats:
+    def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """Take in one frame.
 
         Args:
-            increment: the frame's measurements.
+            increment: the frame's measurements; its odometry is what the pose was predicted with,
+                None for the first frame alone.
             tracking: least-squares pose of the frame against this estimator's own landmarks. Its
                 ``inliers`` run over the increment's matched (not new) observations, in order.
-            motion: what the pose was predicted with: the increment's odometry, or the motion
-                model's stand-in where none was measured; None for the first frame.
 
         Returns:
             What it did, with a verdict on each of ``increment.loops``.

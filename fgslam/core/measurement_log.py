@@ -9,6 +9,7 @@ before there were any; one that has them is version 3. All three versions are re
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 import zipfile
@@ -90,12 +91,18 @@ class MeasurementLog:
         return iter(self.increments)
 
     def append(self, increment: Increment) -> None:
-        """Adds one frame; its time must come after the last one's."""
+        """Adds one frame without a motion model's stand-in: a replay derives its own.
+
+        Raises MeasurementLogError where its time does not come after the last one's.
+        """
         if self.increments and not increment.timestamp > self.increments[-1].timestamp:
             raise MeasurementLogError(
                 f"frame {increment.index}: time stamp {increment.timestamp:.9f} s does not come "
                 f"after {self.increments[-1].timestamp:.9f} s; sort the measurements by time"
             )
+        odometry = increment.odometry
+        if odometry is not None and not odometry.measured:
+            increment = dataclasses.replace(increment, odometry=None)
         self.increments.append(increment)
 
     def to_arrays(self) -> StateArrays:

@@ -26,10 +26,13 @@ class Odometry:
     Attributes:
         motion: (4, 4) ``pTn``: the pose at the new frame, in the frame of the previous one.
         covariance: (6, 6) of the tangent vector at the new pose, [rotation, translation].
+        measured: by wheels or another sensor; else a motion model's stand-in, such as constant
+            velocity, which belongs in no log.
     """
 
     motion: FloatArray
     covariance: FloatArray
+    measured: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +108,8 @@ class Increment:
     Attributes:
         index: the recording's frame number.
         timestamp: seconds.
-        odometry: camera motion since the previous increment; None for the first one.
+        odometry: camera motion since the previous increment, measured or a motion model's; None
+            for the first one, and in a log where none was measured.
         observations: matched (Type III) and new (Type IV) landmarks.
         rejected: (k,) matched observations that the live run's pose rejected as outliers.
         missed_ids: landmarks expected in view and not matched (Type II).

@@ -17,8 +17,8 @@ from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 class MotionModel(Protocol):
     """Gives the camera's motion from the previous frame to the next one."""
 
-    def between(self, i: int, timestamp: float) -> tuple[Odometry | None, bool]:
-        """Camera motion to frame ``i``, None for the first; and whether it was measured."""
+    def between(self, i: int, timestamp: float) -> Odometry | None:
+        """Camera motion to frame ``i``, measured or a stand-in; None for the first."""
         ...
 
     def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
@@ -58,14 +58,14 @@ class OdometryMotion:
         self._kind = kind
         self._stand_in = stand_in
 
-    def between(self, i: int, timestamp: float) -> tuple[Odometry | None, bool]:
+    def between(self, i: int, timestamp: float) -> Odometry | None:
         """Camera motion to frame ``i``; raises OdometryError for an unusable increment."""
         if i == 0:
-            return None, False
+            return None
         body = self._sequence.odometry(i)
         if body is None:
             return self._stand_in.between(i, timestamp)
-        return odometry_of_camera(body, self._bTc), True
+        return odometry_of_camera(body, self._bTc)
 
     def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
         """Keeps the stand-in's velocity fresh."""
@@ -109,7 +109,7 @@ class ConstantVelocityMotion:
         self._pose = np.eye(4)
         self._velocity: FloatArray | None = None
 
-    def between(self, i: int, timestamp: float) -> tuple[Odometry | None, bool]:
+    def between(self, i: int, timestamp: float) -> Odometry | None:
         """The last velocity over the new interval ``dt``.
 
         The velocity has wandered by ``sigma * T`` over the time T since it was last measured, so
@@ -117,12 +117,12 @@ class ConstantVelocityMotion:
         and growing while the camera is blind.
         """
         if self._timestamp is None:
-            return None, False
+            return None
         dt = timestamp - self._timestamp
         if self._velocity is None:
-            return Odometry(np.eye(4), np.diag((self._start_sigma * dt) ** 2)), False
+            return Odometry(np.eye(4), np.diag((self._start_sigma * dt) ** 2), measured=False)
         sigma = self._sigma * (timestamp - self._measured_at) * dt
-        return Odometry(se3_exp(self._velocity * dt), np.diag(sigma**2)), False
+        return Odometry(se3_exp(self._velocity * dt), np.diag(sigma**2), measured=False)
 
     def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
         """Updates the velocity from the last two measured poses.

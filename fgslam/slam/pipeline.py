@@ -83,7 +83,7 @@ class SlamPipeline:
     def process(self, found: FeatureFrame, index: int, timestamp: float) -> FrameReport:
         """One frame: Sections 2 to 4 of the paper in their order, then what 7 leaves to do."""
         watch = Stopwatch()
-        odometry, measured = self.motion.between(found.i, timestamp)
+        odometry = self.motion.between(found.i, timestamp)
         prediction = self.estimator.predict(odometry)
         watch.lap("predict")
         stereo = self._match_stereo(found)
@@ -93,8 +93,8 @@ class SlamPipeline:
         watch.lap("track")
         seen = self._recognise(seen, stereo, landmarks, ended)
         watch.lap("places")
-        increment = _increment(index, timestamp, odometry if measured else None, seen)
-        stats = self.estimator.update(increment, seen.tracking, odometry)
+        increment = _increment(index, timestamp, odometry, seen)
+        stats = self.estimator.update(increment, seen.tracking)
         _observe(self.motion, increment, seen.tracking, stats)
         self._remember(increment, seen, stats)
         watch.lap("update")
@@ -184,10 +184,10 @@ def replay_frame(
 ) -> ReplayedFrame:
     """As :func:`replay_step`, with the frame's tracking and times."""
     watch = Stopwatch()
-    odometry = increment.odometry
-    if odometry is None:
-        odometry, _ = motion.between(k, increment.timestamp)
-    prediction = estimator.predict(odometry)
+    if increment.odometry is None:
+        stand_in = motion.between(k, increment.timestamp)
+        increment = dataclasses.replace(increment, odometry=stand_in)
+    prediction = estimator.predict(increment.odometry)
     watch.lap("predict")
     matched = increment.observations.select(~increment.observations.is_new)
     if k == 0 and not len(estimator.landmarks()):
@@ -197,7 +197,7 @@ def replay_frame(
     else:
         tracking = _solve(estimator, partial(ego_motion.solve, prediction), matched)
     watch.lap("track")
-    stats = estimator.update(increment, tracking, odometry)
+    stats = estimator.update(increment, tracking)
     _observe(motion, increment, tracking, stats)
     watch.lap("update")
     return ReplayedFrame(tracking, stats, watch.ms)
@@ -245,7 +245,9 @@ def _observe(
 def _anchored(increment: Increment, tracking: EgoMotion, stats: UpdateStats) -> bool:
     """Whether odometry or the map had a say in the pose, or the frame founds the map."""
     founding = stats.landmarks > 0 and stats.landmarks == int(increment.observations.is_new.sum())
-    return increment.odometry is not None or tracking.status.measured or founding
+    odometry = increment.odometry
+    known = odometry is not None and odometry.measured
+    return known or tracking.status.measured or founding
 
 
 def _increment(index: int, timestamp: float, odometry: Odometry | None, seen: _Seen) -> Increment:

@@ -252,7 +252,7 @@ def test_from_exactly_known_poses_landmarks_are_independent(name: str) -> None:
         increment = dataclasses.replace(increment, odometry=motion)
         matches = int((~increment.observations.is_new).sum())
         here = Prediction(simulation.poses[k], exact)
-        estimator.update(increment, tracked_at(here, matches), motion)
+        estimator.update(increment, tracked_at(here, matches))
     found = estimator.estimate().landmarks
     position, covariance = by_information(simulation.increments, simulation.poses, found.ids)
     scale = np.linalg.norm(covariance, axis=(1, 2))

@@ -48,11 +48,10 @@ class DeadReckoning:
         """Landmarks as first seen; the arrays are read only by agreement."""
         return self._map
 
-    def update(
-        self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
-    ) -> UpdateStats:
+    def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """Moves on by the odometry, or the stand-in; tracking, matches and loops have no say."""
-        predicted = self.predict(self._past.motion_to(increment, motion))
+        self._past.require_step(increment)
+        predicted = self.predict(increment.odometry)
         self._current = Prediction(reorthonormalise(predicted.wTc), predicted.covariance)
         self._add(increment.observations.select(increment.observations.is_new))
         self._remove(increment.pruned_ids)

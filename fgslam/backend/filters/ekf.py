@@ -99,9 +99,7 @@ class FullEkf:
             self._map = LandmarkMap(self._ids[order], self._positions[order], covariances)
         return self._map
 
-    def update(
-        self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
-    ) -> UpdateStats:
+    def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """Predicts, corrects by all matches at once, drops the pruned, adds the new.
 
         ``tracking`` is used only of a frame that was found without a prior: it says where to
@@ -113,16 +111,16 @@ class FullEkf:
         if increment.relocalised:
             self._past.require_later(increment)
         else:
-            motion = self._past.motion_to(increment, motion)
+            self._past.require_step(increment)
         first = self._first_sights(increment)
         self._require_room(increment, len(first.points))
-        self._require_finite(increment, motion)
+        self._require_finite(increment)
         seen = increment.observations
         if increment.relocalised:
             wTc, front = self._set_down(tracking)
             seen = seen.select(np.flatnonzero(~seen.is_new)[tracking.inliers])
         else:
-            wTc, front = self._moved(motion)
+            wTc, front = self._moved(increment.odometry)
         found = self._correction(increment, seen, wTc, front)
         found = found.of_the_pose_alone() if self._fixed else found
         # Nothing below can fail.
@@ -219,8 +217,8 @@ class FullEkf:
                 "landmarks; lower max_landmarks, prune earlier, or use isam2"
             ) from None
 
-    def _require_finite(self, increment: Increment, motion: Odometry | None) -> None:
-        seen = increment.observations
+    def _require_finite(self, increment: Increment) -> None:
+        seen, motion = increment.observations, increment.odometry
         given = [seen.measurement, seen.covariance]
         if motion is not None:
             given += [motion.motion, motion.covariance]

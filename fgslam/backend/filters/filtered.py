@@ -39,19 +39,14 @@ class FilteredTrajectory:
                 f"after {self.timestamps[-1]:.9f} s; sort the measurements by time"
             )
 
-    def motion_to(self, increment: Increment, motion: Odometry | None) -> Odometry | None:
-        """The increment's odometry, or else the stand-in; None for the first frame alone.
-
-        Raises EstimatorError where time does not increase, or a later frame has no motion at all.
-        """
+    def require_step(self, increment: Increment) -> None:
+        """Raises EstimatorError where time does not increase, or a later frame has no odometry."""
         self.require_later(increment)
-        known = increment.odometry if increment.odometry is not None else motion
-        if known is None and self.timestamps:
+        if increment.odometry is None and self.timestamps:
             raise EstimatorError(
                 f"frame {increment.index}: neither odometry nor a stand-in says how the camera "
-                "moved; hand the motion model's step to the update"
+                "moved; put the motion model's step into the increment"
             )
-        return known
 
     def trajectory(self) -> Trajectory:
         """All poses."""

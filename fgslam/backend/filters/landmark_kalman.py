@@ -81,9 +81,7 @@ class LandmarkKalman:
         """Current landmarks, until the next update; the arrays are read only by agreement."""
         return self._rows.map()
 
-    def update(
-        self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
-    ) -> UpdateStats:
+    def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """Pose from the tracking; matched landmarks filtered, missed ones grown, new ones added.
 
         Then loops are closed: the pose told is the corrected one, with the covariance of the
@@ -96,7 +94,7 @@ class LandmarkKalman:
         nis, dof = self._update_matched(used)
         self._grow(increment.missed_ids)
         self._add(increment.observations.select(increment.observations.is_new))
-        self._book(increment, tracking, motion, before, used.ids)
+        self._book(increment, tracking, before, used.ids)
         self._rows.remove(increment.pruned_ids)
         self._past.append(increment.timestamp, self._current)
         closed = tuple(self._close(increment, loop) for loop in increment.loops)
@@ -171,17 +169,11 @@ class LandmarkKalman:
         return rows.ids, rows.positions, rows.covariances, rows.counts, rows.homes
 
     def _book(
-        self,
-        increment: Increment,
-        tracking: EgoMotion,
-        motion: Odometry | None,
-        before: Prediction,
-        used: IntArray,
+        self, increment: Increment, tracking: EgoMotion, before: Prediction, used: IntArray
     ) -> None:
         """The step to this frame, for loops to come; and which old landmarks placed it."""
-        known = increment.odometry if increment.odometry is not None else motion
         step = inverse(before.wTc) @ tracking.wTc if len(self._past) else tracking.wTc
-        self._drive.step(step, tracking, known, increment.relocalised)
+        self._drive.step(step, tracking, increment.odometry, increment.relocalised)
         homes = self._rows.homes[self._rows.rows(used)]
         self._drive.tie(homes, self._past.poses, tracking, increment.relocalised)
 

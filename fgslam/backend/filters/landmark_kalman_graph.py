@@ -22,7 +22,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction, UpdateStats
 from fgslam.core.geometry import transform_to_world, triangulate
-from fgslam.core.measurements import Increment, MeasurementType, Observations, Odometry
+from fgslam.core.measurements import Increment, MeasurementType, Observations
 from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.noise import Whitening
@@ -70,9 +70,7 @@ class LandmarkKalmanGraph(LandmarkKalman):
         self._pose_graph = FixedMapPose(rig, ego_motion)
         self._cameras = rig
 
-    def update(
-        self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
-    ) -> UpdateStats:
+    def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """As the closed form, with the frame's pose from its graph.
 
         Where the tracking found no minimum (first frame, too few matches, capped, no image), the
@@ -80,16 +78,15 @@ class LandmarkKalmanGraph(LandmarkKalman):
         """
         _require_depth(increment, tracking.inliers, self._settings.update == "world")
         if tracking.status is EgoMotionStatus.OK and tracking.weighted_at is not None:
-            known = increment.odometry if increment.odometry is not None else motion
             matched = increment.observations.select(~increment.observations.is_new)
             found = self._pose_graph.solve(
-                self.predict(known),
+                self.predict(increment.odometry),
                 tracking.weighted_at,
                 self.landmarks(),
                 matched.select(tracking.inliers),
             )
             tracking = dataclasses.replace(tracking, wTc=found.wTc, covariance=found.covariance)
-        return super().update(increment, tracking, motion)
+        return super().update(increment, tracking)
 
     # -- the landmarks' algebra, by elimination ------------------------------------------------
 

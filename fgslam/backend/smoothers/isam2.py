@@ -110,7 +110,7 @@ class Isam2Smoother(WholeGraphSmoother):
         frames = self._builder.frames
         solved = solution(refined, frames, self._floor)
         variable_of = {i: track.variable for i, track in self._builder.tracks.items()}
-        between, motions = self._segments.between, self._inputs.motions
+        between, motions = self._segments.between, self._inputs.motions()
         return fill_between(self._sensor, self._floor, solved, between, motions, variable_of)
 
     def _joint(self, variables: list[int]) -> FloatArray:

@@ -93,24 +93,21 @@ class Smoother(ABC):
         """Smoothed landmarks with what is known of them given the poses."""
         return self._tracker.landmarks()
 
-    def update(
-        self, increment: Increment, tracking: EgoMotion, motion: Odometry | None = None
-    ) -> UpdateStats:
+    def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """Tracks the frame, adds it to the graph, solves the graph if it is time to.
 
         Raises:
             EstimatorError: a number is not finite, or time does not increase; the state is then as
                 before. Or the solver failed beyond mending; the estimator is then at its end.
         """
-        motion = increment.odometry if increment.odometry is not None else motion
         if increment.relocalised and self._inputs.increments:
-            motion = self._unknown_step(tracking)
-        require_finite(increment, tracking, motion)
-        stats = self._tracker.update(dataclasses.replace(increment, loops=()), tracking, motion)
-        self._inputs.append(increment, tracking, motion)
+            increment = dataclasses.replace(increment, odometry=self._unknown_step(tracking))
+        require_finite(increment, tracking)
+        stats = self._tracker.update(dataclasses.replace(increment, loops=()), tracking)
+        self._inputs.append(increment, tracking)
         self._eras.append(self._takeovers)
         self._answer = self._refined = None
-        self._absorb(self._sorted_out(increment, tracking, motion))
+        self._absorb(self._sorted_out(increment, tracking))
         where = f"frame {increment.index}"
         closed = tuple(self._close(loop, where) for loop in increment.loops)
         current = self._current(tracking)
@@ -157,8 +154,8 @@ class Smoother(ABC):
         """Repeats all updates of :meth:`state`."""
         if self._inputs.increments:
             raise EstimatorError("only a new estimator can be restored")
-        for increment, tracking, motion in RecordedInputs.from_arrays(state):
-            self.update(increment, tracking, motion)
+        for increment, tracking in RecordedInputs.from_arrays(state):
+            self.update(increment, tracking)
 
     # -- what a smoother adds ----------------------------------------------------------------
 
@@ -201,9 +198,7 @@ class Smoother(ABC):
 
     # -- common steps ------------------------------------------------------------------------
 
-    def _sorted_out(
-        self, increment: Increment, tracking: EgoMotion, motion: Odometry | None
-    ) -> TrackedFrame:
+    def _sorted_out(self, increment: Increment, tracking: EgoMotion) -> TrackedFrame:
         """The frame with those observations that fit; landmarks that moved have started anew."""
         observed = increment.observations
         matched = observed.select(~observed.is_new)
@@ -215,7 +210,7 @@ class Smoother(ABC):
         used &= ~np.isin(matched.ids, moved.ids)
         accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
         frame = len(self._inputs.increments) - 1
-        return TrackedFrame(frame, tracking.wTc, motion, self._held(accepted))
+        return TrackedFrame(frame, tracking.wTc, increment.odometry, self._held(accepted))
 
     def _judged(self, tracking: EgoMotion) -> tuple[BoolArray, BoolArray]:
         """Which matched observations are used, and which speak against their landmark's place."""
@@ -239,7 +234,7 @@ class Smoother(ABC):
     def _unknown_step(self, tracking: EgoMotion) -> Odometry:
         """The step to a frame found without a prior: as found, and free to be any other."""
         before = self._tracker.predict(None).wTc
-        return Odometry(inverse(before) @ tracking.wTc, FREE)
+        return Odometry(inverse(before) @ tracking.wTc, FREE, measured=False)
 
     def _enter(self, tracked: TrackedFrame) -> NewFactors:
         """Enters a frame into the graph."""

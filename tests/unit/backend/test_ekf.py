@@ -50,7 +50,7 @@ def drawn(drive: Drive, seed: int) -> Simulation:
 def step(estimator: FullEkf, increment: Increment) -> UpdateStats:
     """One frame, without the front-end's least squares, which the filter does not need."""
     tracking = tracked_at(estimator.predict(increment.odometry), 0)
-    return estimator.update(increment, tracking, increment.odometry)
+    return estimator.update(increment, tracking)
 
 
 # --------------------------------------------------------------------------------------------

@@ -105,10 +105,10 @@ def test_memory_is_that_of_this_process() -> None:
 def test_a_fault_ends_the_replay_with_frame_and_reason(
     monkeypatch: pytest.MonkeyPatch, error: Exception, words: str
 ) -> None:
-    def update(self: Any, increment: Any, tracking: Any, motion: Any = None) -> UpdateStats:
+    def update(self: Any, increment: Any, tracking: Any) -> UpdateStats:
         if increment.index == 10:  # the sixth: the simulation counts by two
             raise error
-        return LandmarkKalman.update(self, increment, tracking, motion)
+        return LandmarkKalman.update(self, increment, tracking)
 
     faulty(monkeypatch, update=update)
     log = a_log()
@@ -132,8 +132,8 @@ def replay_of(log: MeasurementLog, frames: int) -> Replay:
 
 
 def test_a_pose_that_is_not_finite_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    def update(self: Any, increment: Any, tracking: Any, motion: Any = None) -> UpdateStats:
-        stats = LandmarkKalman.update(self, increment, tracking, motion)
+    def update(self: Any, increment: Any, tracking: Any) -> UpdateStats:
+        stats = LandmarkKalman.update(self, increment, tracking)
         bad = np.full((4, 4), np.nan) if increment.index == 6 else stats.wTc
         return UpdateStats(bad, stats.covariance, stats.landmarks, stats.nis, stats.nis_dof)
 
