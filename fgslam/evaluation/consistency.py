@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
-from scipy.stats import chi2
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.geometry import inverse, se3_log
+from fgslam.core.quantiles import chi_square_quantile
 
 Verdict: TypeAlias = Literal["consistent", "overconfident", "conservative"]
 
@@ -126,7 +126,7 @@ def landmark_nees(
 def chi_square_band(dof: float, probability: float = 0.95) -> tuple[float, float]:
     """Two-sided band of a chi-square variable per degree of freedom: its quantiles over ``dof``."""
     tail = 0.5 * (1.0 - probability)
-    lower, upper = chi2.ppf([tail, 1.0 - tail], dof) / dof
+    lower, upper = chi_square_quantile([tail, 1.0 - tail], dof) / dof
     return float(lower), float(upper)
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.geometry import inverse
+from fgslam.core.quantiles import chi_square_quantile
 from fgslam.evaluation.consistency import pose_nees
 from fgslam.evaluation.trajectory import rotation_angles
 
@@ -155,7 +155,7 @@ def score(answers: Answers, bounds: Bounds) -> LocalisationScore:
     right = judged & (errors.metres <= bounds.within_m) & (errors.radians <= bounds.within_rad)
     false = judged & ((errors.metres > bounds.wrong_m) | (errors.radians > bounds.wrong_rad))
     sure = judged & (errors.dof > 0)
-    held = errors.nees[sure] <= chi2.ppf(_HELD, errors.dof[sure])
+    held = errors.nees[sure] <= chi_square_quantile(_HELD, errors.dof[sure])
     return LocalisationScore(
         queries=len(answers),
         accepted=int(answers.accepted.sum()),

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from fgslam.core.arrays import FloatArray
+from fgslam.core.quantiles import student_quantile
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ def mean_interval(values: FloatArray, probability: float = 0.95) -> MeanInterval
     if n == 1:
         return MeanInterval(mean, None, None, 1, probability)
     error = float(known.std(ddof=1)) / np.sqrt(n)
-    half = float(stats.t.ppf(0.5 + 0.5 * probability, n - 1)) * error
+    half = float(student_quantile(0.5 + 0.5 * probability, n - 1)) * error
     return MeanInterval(mean, mean - half, mean + half, n, probability)
 
 
@@ -71,7 +71,9 @@ def paired_test(a: FloatArray, b: FloatArray, probability: float = 0.95) -> Pair
     difference = mean_interval(a - b, probability)
     if difference is None:
         return None
-    p_value = float(stats.wilcoxon(a, b).pvalue) if np.any(a != b) else None
+    from scipy.stats import wilcoxon  # a second, and only trials need it
+
+    p_value = float(wilcoxon(a, b).pvalue) if np.any(a != b) else None
     ratio = float(a.mean() / b.mean()) if b.mean() != 0.0 else None
     wins, losses = int(np.count_nonzero(a < b)), int(np.count_nonzero(a > b))
     return PairedTest(difference, wins, losses, p_value, ratio)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student_t
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.planar import wrap
+from fgslam.core.quantiles import student_quantile
 from fgslam.homing.drive_record import DriveRecord
 
 ARRIVED_M = 0.5
@@ -121,5 +121,5 @@ def slope_by_leg(legs: IntArray, values: FloatArray, known: FloatArray | None = 
     residuals = y - columns @ fitted
     spread = np.linalg.inv(columns.T @ columns)[1, 1]
     sigma = float(np.sqrt(residuals @ residuals / free * spread))
-    slope, reach = float(fitted[1]), float(student_t.ppf(0.975, free)) * sigma
+    slope, reach = float(fitted[1]), float(student_quantile(0.975, free)) * sigma
     return Slope(slope, slope - reach, slope + reach)

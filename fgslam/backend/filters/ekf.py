@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
-from scipy.stats import chi2
 
 from fgslam.backend.filters.ekf_update import (
     Correction,
@@ -40,6 +39,7 @@ from fgslam.core.geometry import (
     transform_to_world,
 )
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
+from fgslam.core.quantiles import chi_square_quantile
 from fgslam.core.sensors import Sensor
 
 _UNKNOWN = 100.0  # by which a pose found without a prior is less certain before its landmarks count
@@ -286,7 +286,7 @@ class FullEkf:
         if gate > 0.0 and not excess <= gate**2:
             self._remarks.append(f"{what} refused: the covariance does not admit it {said}")
             return False
-        admitted = found.nis <= chi2.ppf(_ADMITTED, found.nis_dof)
+        admitted = found.nis <= chi_square_quantile(_ADMITTED, found.nis_dof)
         though = "" if admitted else ", though the covariance does not admit it"
         self._remarks.append(f"{what} taken{though} {said}")
         self._apply(found, self._wTc, self._covariance.front())

@@ -9,11 +9,11 @@ from __future__ import annotations
 from typing import Any
 
 import gtsam
-from scipy.stats import chi2
 
+from fgslam.core.quantiles import chi_square_quantile
 from fgslam.factors.keys import is_pose, number
 
-_GATE = float(chi2.ppf(0.999, 3))  # 16.3, of a landmark observation's three numbers
+_GATE = float(chi_square_quantile(0.999, 3))  # 16.3, of a landmark observation's three numbers
 _KEPT = 0.5  # weights end at 0 or 1
 _ROUNDS = 10  # trims until the observations that fit do not change any more
 _QUICK_WIDTH = 3.0  # deviations, as the kernels' default

@@ -7,7 +7,6 @@ from abc import abstractmethod
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from fgslam.backend.filters.submaps import Constraint, constraint_factor
 from fgslam.backend.smoothers.graph_solution import poses_of_frame
@@ -18,9 +17,10 @@ from fgslam.core.arrays import IntArray, StateArrays
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.measurements import LoopClosure
+from fgslam.core.quantiles import chi_square_quantile
 from fgslam.core.sensors import Sensor
 
-_AGREES = float(chi2.ppf(0.99, 6))  # 16.8: a loop that the graph meets as it is
+_AGREES = float(chi_square_quantile(0.99, 6))  # 16.8: a loop that the graph meets as it is
 
 
 class WholeGraphSmoother(Smoother):

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import chi2
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.homing import HomingVector, Refusal, RefusalReason
 from fgslam.core.planar import wrap
+from fgslam.core.quantiles import chi_square_quantile
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.tables import Cell, write_csv
 
@@ -172,7 +172,7 @@ def _row(pair: PairAnswer, names: Sequence[str]) -> list[Cell]:
 def _numbers(errors: PairErrors) -> dict[str, JsonValue]:
     if not len(errors):
         return {"answered": 0}
-    limit = chi2.ppf(_JOINT_PROBABILITY, 2)
+    limit = chi_square_quantile(_JOINT_PROBABILITY, 2)
     direction, rotation = np.abs(errors.direction), np.abs(errors.rotation)
     return {
         "answered": len(errors),
