@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray
-from fgslam.core.homing import HomingStart, HomingTruth, HomingVector, TrackedBearings
+from fgslam.core.homing import HomingStart, HomingTruth, TrackedBearings, TwoViewVector
 from fgslam.frontend.homing.local_map import make_local_map
 from fgslam.frontend.homing.ransac import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
@@ -34,7 +34,7 @@ def trial(seed: int, settings: SimulatedBearingsSettings | None = None) -> Trial
         settings or SimulatedBearingsSettings(), np.random.default_rng([seed, 1])
     )
     vector = estimate_homing_vector(simulated.matches, LEVEL, np.random.default_rng([seed, 2]))
-    assert isinstance(vector, HomingVector), vector
+    assert isinstance(vector, TwoViewVector), vector
     distance = make_local_map(vector, simulated.matches).distance
     rows = np.flatnonzero(vector.inliers & np.isfinite(distance) & (distance > 0.0))
     matches = simulated.matches.taken(rows)

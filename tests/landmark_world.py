@@ -32,7 +32,7 @@ from fgslam.homing.bearing_consistency import parallax
 from fgslam.homing.closed_loop import Driver, follow
 from fgslam.homing.drive_record import DriveRecord
 from fgslam.homing.front_end import Sighting
-from fgslam.homing.path_following import PathFollower
+from fgslam.homing.path_following import HomingChain
 from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import Steering
 from fgslam.runs.tasks.homing_start import start_from_matches
@@ -280,10 +280,10 @@ def make_follower(
     setting: Setting,
     settings: HomingBehaviourSettings,
     estimator: HomingEstimatorSettings | None = None,
-) -> PathFollower:
+) -> HomingChain:
     """Over the whole path."""
     kind = HomingEkfSettings() if estimator is None else estimator
-    return PathFollower(
+    return HomingChain(
         setting.front_end,
         setting.path(),
         lambda start: make_homing_estimator(start, kind),

@@ -26,9 +26,7 @@ from fgslam.core.arrays import Image
 from fgslam.core.homing import OmniFeatures, TrackedBearings
 from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
-from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
-from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
+from fgslam.frontend.features.omni_settings import OmniFeatureSettings
 from fgslam.homing.controller import HomingController
 from fgslam.homing.front_end import HomingFrontEnd
 from fgslam.homing.image_front_end import FrontEndSettings, ImageFrontEnd
@@ -80,14 +78,8 @@ class NotedFrontEnd:
     """FrontEnd that keep where the tracked points were seen in the camera's own images."""
 
     def __init__(self, world: OmniWorld) -> None:
-        settings = FrontEndSettings(
-            OmniFeatureSettings(),
-            OmniMatchingSettings(),
-            HomingVectorSettings(),
-            OmniTrackingSettings(),
-        )
         self._camera = world.camera
-        self.inner = ImageFrontEnd(world.camera, settings, np.random.default_rng(1))
+        self.inner = ImageFrontEnd(world.camera, FrontEndSettings(), np.random.default_rng(1))
         self.seen: list[TrackedBearings] = []
 
     def describe(self, image: Image) -> OmniFeatures:

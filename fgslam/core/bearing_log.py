@@ -21,9 +21,9 @@ from fgslam.core.homing import (
     BearingMatches,
     HomingStart,
     HomingTruth,
-    HomingVector,
     LocalMap,
     TrackedBearings,
+    TwoViewVector,
 )
 from fgslam.core.measurement_log import load_arrays
 
@@ -88,7 +88,7 @@ class BearingLog:
             "vector": np.array([vector.direction, vector.rotation]),
             "vector_covariance": vector.covariance,
             "vector_inliers": vector.inliers,
-            "vector_rival_support": np.array(vector.rival_support, np.int64),
+            "vector_rival_support": np.array(vector.competing_support, np.int64),
             "image_time": np.array([image.time for image in self.images], np.float64),
             "image_start": np.cumsum(sizes),
         }
@@ -111,12 +111,12 @@ class BearingLog:
         """
         provenance = _read_header(arrays, where)
         _require_consistent(arrays, where)
-        vector = HomingVector(
+        vector = TwoViewVector(
             direction=float(arrays["vector"][0]),
             rotation=float(arrays["vector"][1]),
             covariance=arrays["vector_covariance"],
             inliers=arrays["vector_inliers"],
-            rival_support=int(arrays["vector_rival_support"]),
+            competing_support=int(arrays["vector_rival_support"]),
         )
         chart = LocalMap(*(arrays[f"map_{name}"] for name in _names(LocalMap)))
         matches = BearingMatches(*(arrays[f"match_{name}"] for name in _names(BearingMatches)))

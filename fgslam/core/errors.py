@@ -51,5 +51,9 @@ class EstimatorError(FgslamError):
     """An estimator was given input that it cannot accept (time running backwards, unknown type)."""
 
 
+class SessionError(FgslamError):
+    """A session of SLAM or a path follower was used after it was closed, or after it had failed."""
+
+
 class MissingDependencyError(FgslamError):
     """A library of the system or an optional package is absent."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Literal
 
 import numpy as np
 
@@ -139,27 +140,32 @@ class BearingMatches:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HomingVector:
+class TwoViewVector:
     """(R, theta, psi) with R = 1: where the target lies and how it is turned (III-B).
+
+    It is true where a :class:`Refusal` is false, so that ``if answer:`` tells them apart.
 
     Attributes:
         direction: theta, of the target as seen from the present pose, radians.
         rotation: psi, heading of the target minus the present one, radians.
         covariance: (2, 2) of (direction, rotation).
         inliers: (n,) of the matches that were given.
-        rival_support: inliers of the best *different* solution; 0 for none.
+        competing_support: inliers of the best *different* solution; 0 for none.
     """
 
     direction: float
     rotation: float
     covariance: FloatArray
     inliers: BoolArray
-    rival_support: int
+    competing_support: int
 
     @property
     def support(self) -> int:
         """Number of inliers."""
         return int(np.count_nonzero(self.inliers))
+
+    def __bool__(self) -> Literal[True]:
+        return True
 
 
 class RefusalReason(str, Enum):
@@ -179,7 +185,7 @@ class RefusalReason(str, Enum):
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """No homing vector, and why; ``details`` is one clear clause with the numbers.
+    """No homing vector, and why; ``details`` is one clear clause with the numbers. It is false.
 
     ``AT_TARGET`` is an answer of its own: both views are from one place, ``rotation`` holds
     the turn (radians); it is None for all other reasons.
@@ -188,6 +194,9 @@ class Refusal:
     reason: RefusalReason
     details: str
     rotation: float | None = None
+
+    def __bool__(self) -> Literal[False]:
+        return False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,7 +236,7 @@ class HomingStart:
     """
 
     time: float
-    vector: HomingVector
+    vector: TwoViewVector
     local_map: LocalMap
     matches: BearingMatches
 

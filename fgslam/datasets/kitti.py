@@ -15,6 +15,7 @@ from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, right_from_left_camera
 from fgslam.core.sensors import CameraRig
+from fgslam.core.text_files import read_lines
 from fgslam.datasets.images import list_numbered_images
 from fgslam.datasets.recording import Recording, recording_identity
 from fgslam.datasets.selection import select_frames
@@ -26,7 +27,7 @@ from fgslam.datasets.stereo_files import (
     require_folder,
     size,
 )
-from fgslam.datasets.tables import read_lines, read_table, require_increasing
+from fgslam.datasets.tables import read_table, require_increasing
 
 _POSE_COLUMNS = tuple(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
+from fgslam.core.text_files import read_lines
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,17 +26,6 @@ class Table:
     def column(self, k: int) -> FloatArray:
         """Column ``k`` (n,)."""
         return np.asarray(self.values[:, k])
-
-
-def read_lines(path: Path, error: type[DatasetError] = DatasetError) -> list[tuple[int, str]]:
-    """Numbered lines, without blank ones and comments (``#``). Raises ``error`` if unreadable."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as cause:
-        reason = "it is not text" if isinstance(cause, UnicodeDecodeError) else cause.strerror
-        raise error(f"cannot read {path}: {reason}; restore the file") from cause
-    stripped = ((k, line.strip()) for k, line in enumerate(text.splitlines(), 1))
-    return [(k, line) for k, line in stripped if line and not line.startswith("#")]
 
 
 def read_table(

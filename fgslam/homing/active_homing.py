@@ -11,7 +11,7 @@ import numpy as np
 from fgslam.backend.homing.protocol import HomingEstimator
 from fgslam.core.arrays import BoolArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing import HomeVector, HomingStart, HomingVector, TrackedBearings
+from fgslam.core.homing import HomeVector, HomingStart, TrackedBearings, TwoViewVector
 from fgslam.core.planar import wrap
 from fgslam.homing.bearing_consistency import common_turn, parallax, target_misfit, tracked_misfit
 from fgslam.homing.settings import HomingControlSettings
@@ -149,15 +149,15 @@ class ActiveHoming:
         before = parallax(self.start.matches, self.start.vector.rotation)
         return min(1.0, self.unit * seen / before) if before > 0.0 else 1.0
 
-    def contradicts(self, vector: HomingVector) -> bool:
+    def contradicts(self, vector: TwoViewVector) -> bool:
         """Whether a new homing vector from the present place cannot be true if the estimate is."""
         return bool(self._contradictions(vector).any())
 
-    def turned_otherwise(self, vector: HomingVector) -> bool:
+    def turned_otherwise(self, vector: TwoViewVector) -> bool:
         """Whether that is so of its rotation."""
         return bool(self._contradictions(vector)[1])
 
-    def _contradictions(self, vector: HomingVector) -> BoolArray:
+    def _contradictions(self, vector: TwoViewVector) -> BoolArray:
         """(2,) of direction and rotation."""
         home = self.home
         turns = [vector.direction - home.direction, vector.rotation - home.rotation]

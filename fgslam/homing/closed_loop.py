@@ -15,7 +15,7 @@ from fgslam.homing.active_homing import ActiveHoming
 from fgslam.homing.avoidance import ObstacleAvoider, RangeScan
 from fgslam.homing.command import Command, Drive
 from fgslam.homing.drive_record import STAGES, DriveRecord, HomingLog
-from fgslam.homing.path_following import PathFollower
+from fgslam.homing.path_following import HomingChain
 from fgslam.homing.settings import ClosedLoopSettings
 from fgslam.homing.steering import Steering
 
@@ -64,7 +64,7 @@ class Driver:
 
 def follow(
     world: World,
-    follower: PathFollower,
+    follower: HomingChain,
     driver: Driver,
     settings: ClosedLoopSettings,
     targets: FloatArray | None = None,
@@ -169,7 +169,7 @@ class _Recorder:
         )
 
     def record(
-        self, end: FloatArray, follower: PathFollower, targets: FloatArray | None
+        self, end: FloatArray, follower: HomingChain, targets: FloatArray | None
     ) -> DriveRecord:
         """All of it."""
         commands, drives, known = self._commands, self._drives, self._estimates

@@ -66,3 +66,48 @@ class Drive:
     speed: float
     turn_rate: float
     overridden: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveCommand:
+    """What the wheels are to do after one image.
+
+    Attributes:
+        v: speed, m/s, forward.
+        omega: turning rate, rad/s, counter-clockwise.
+        homing: where home is and how sure that is; the properties below are of it.
+    """
+
+    v: float
+    omega: float
+    homing: Command
+
+    @property
+    def time(self) -> float:
+        """Of the image, seconds."""
+        return self.homing.time
+
+    @property
+    def state(self) -> HomingState:
+        """Of the homing."""
+        return self.homing.state
+
+    @property
+    def reason(self) -> str:
+        """One clause: why the state is what it is."""
+        return self.homing.reason
+
+    @property
+    def target(self) -> int:
+        """Number of the target image that is aimed at, from 0."""
+        return self.homing.target
+
+    @property
+    def heading(self) -> float:
+        """Direction of home from the robot's heading, radians, counter-clockwise."""
+        return self.homing.heading
+
+    @property
+    def remaining(self) -> float:
+        """Part of the leg that is left: 1 where it began."""
+        return self.homing.remaining

@@ -14,7 +14,7 @@ import numpy as np
 
 from fgslam.core.arrays import ByteArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing import HomingVector, OmniFeatures, Refusal, RefusalReason
+from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
 from fgslam.homing.active_homing import ActiveHoming, EstimatorMaker, Fault
 from fgslam.homing.command import Command, HomingState
@@ -59,7 +59,7 @@ class HomingController:
         self._next_look = -np.inf
         self._ambiguous = False
         self._standing_since: float | None = None
-        self._pending: HomingVector | None = None
+        self._pending: TwoViewVector | None = None
         self._obstacle = ""  # the last refusal's words, while there is nothing newer to say
 
     def step(self, image: ByteArray, time: float) -> Command:
@@ -171,7 +171,7 @@ class HomingController:
         return self._doubt(time, "near the target it is seen elsewhere", seen.vector, left)
 
     def _doubt(
-        self, time: float, why: str, vector: HomingVector | None = None, left: float = 1.0
+        self, time: float, why: str, vector: TwoViewVector | None = None, left: float = 1.0
     ) -> Command:
         """The estimate is given up, and homing begins anew where the robot stands.
 
@@ -248,7 +248,7 @@ class HomingController:
         except EstimatorError as error:
             return Refusal(RefusalReason.UNCERTAIN, str(error))
 
-    def _confirmed(self, vector: HomingVector) -> bool:
+    def _confirmed(self, vector: TwoViewVector) -> bool:
         """Whether a new vector is to be believed: nothing was in doubt, or two images agree."""
         if self._pending is None:
             return not self._ambiguous

@@ -8,10 +8,10 @@ from typing import Protocol
 from fgslam.core.arrays import ByteArray
 from fgslam.core.homing import (
     HomingStart,
-    HomingVector,
     OmniFeatures,
     Refusal,
     TrackedBearings,
+    TwoViewVector,
 )
 
 
@@ -25,7 +25,7 @@ class Sighting:
             :func:`fgslam.homing.bearing_consistency.parallax`.
     """
 
-    vector: HomingVector
+    vector: TwoViewVector
     parallax: float
 
 

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray
 from fgslam.core.homing import (
     BearingMatches,
     HomingStart,
-    HomingVector,
     OmniFeatures,
     Refusal,
     RefusalReason,
     TrackedBearings,
+    TwoViewVector,
 )
+from fgslam.core.settings import STRICT
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.frontend.homing.bearing_tracking import BearingTracker
@@ -29,24 +33,44 @@ from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from fgslam.homing.bearing_consistency import parallax
 from fgslam.homing.front_end import Sighting
 
+_STREAM = 8  # of the seed's random numbers; the simulated worlds have others
 _SECTORS = 8  # of 45 degrees
 _DARK = 8.0  # mean grey value of what the camera sees
 _MAX_RELATIVE_SIGMA = 1.0  # of a distance; whoever knows less of a feature waits for parallax
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, config=STRICT)
 class FrontEndSettings:
-    """What every stage of the front-end is set to.
+    """What every stage of the front-end is set to."""
 
-    ``wrong_matches`` is the share of wrong ones that is mixed into all matches, to try how much the
-    rest bears; 0 in earnest.
-    """
+    features: OmniFeatureSettings = OmniFeatureSettings()
+    homing_vector: HomingVectorSettings = HomingVectorSettings()
+    tracking: OmniTrackingSettings = OmniTrackingSettings()
+    wrong_matches: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            lt=0.9,
+            description="share of wrong matches mixed into those of start and target, to test "
+            "robustness; 0 on a robot",
+        ),
+    ] = 0.0
 
-    features: OmniFeatureSettings
-    matching: OmniMatchingSettings
-    homing_vector: HomingVectorSettings
-    tracking: OmniTrackingSettings
-    wrong_matches: float = 0.0
+
+DRIVING = FrontEndSettings(
+    OmniFeatureSettings(matching=OmniMatchingSettings(ratio=0.9)),
+    HomingVectorSettings(
+        samples=600,
+        confidence=0.999999,
+        rival_angle_deg=40.0,
+        rival_log_odds=8.0,
+        max_direction_sigma_deg=12.0,
+    ),
+)
+"""For driving: a start that is 10 degrees off does no harm, the estimator corrects it on the way.
+
+Between images that are only compared the defaults are stricter.
+"""
 
 
 class ImageFrontEnd:
@@ -97,13 +121,13 @@ class ImageFrontEnd:
 
     def _matched(
         self, image: ByteArray, target: OmniFeatures
-    ) -> tuple[OmniFeatures, BearingMatches, HomingVector] | Refusal:
+    ) -> tuple[OmniFeatures, BearingMatches, TwoViewVector] | Refusal:
         """The image's features, their matches with the target's, and what these say."""
         present = self.describe(image)
-        refusal = _unusable(image, present)
+        refusal = unusable(image, present)
         if refusal is not None:
             return refusal
-        matches = match_features(present, target, self._settings.matching)
+        matches = match_features(present, target, self._settings.features.matching)
         if self._settings.wrong_matches > 0.0:
             matches = mixed_with_wrong(matches, self._settings.wrong_matches, self._rng)
         vector = estimate_homing_vector(matches, self._settings.homing_vector, self._rng)
@@ -113,7 +137,7 @@ class ImageFrontEnd:
         self,
         image: ByteArray,
         time: float,
-        vector: HomingVector,
+        vector: TwoViewVector,
         matches: BearingMatches,
         features: tuple[OmniFeatures, OmniFeatures],
     ) -> HomingStart | Refusal:
@@ -139,6 +163,11 @@ class ImageFrontEnd:
         local_map = make_local_map(vector, points)
         self._tracker.start(image, time, local_map.ids, pixels)
         return HomingStart(time, vector, local_map, points)
+
+
+def make_front_end(camera: OmniCamera, settings: FrontEndSettings, seed: int) -> ImageFrontEnd:
+    """The front-end of one drive, with a random generator of its own."""
+    return ImageFrontEnd(camera, settings, np.random.default_rng((seed, _STREAM)))
 
 
 def surest_all_around(matches: BearingMatches, most: int) -> IntArray:
@@ -180,7 +209,8 @@ def mixed_with_wrong(
     return joined(matches, wrong)
 
 
-def _unusable(image: ByteArray, present: OmniFeatures) -> Refusal | None:
+def unusable(image: ByteArray, present: OmniFeatures) -> Refusal | None:
+    """Why nothing can be recognised in an image (h, w, 3) with these features; None if it can."""
     # What is black is not seen, and adds nothing to the sum.
     lit = int(np.count_nonzero(image[..., 0] | image[..., 1] | image[..., 2]))
     brightness = float(np.sum(image)) / (3.0 * max(lit, 1))

@@ -9,11 +9,11 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.homing import HomingVector, OmniFeatures, Refusal, RefusalReason
+from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
 from fgslam.homing.settings import TopologicalMapSettings
 
-Answer: TypeAlias = HomingVector | Refusal
+Answer: TypeAlias = TwoViewVector | Refusal
 Linker: TypeAlias = Callable[[OmniFeatures, OmniFeatures], Answer]
 """The homing vector from the first image's place to the second's."""
 Pair: TypeAlias = tuple[int, int]
@@ -113,13 +113,15 @@ def _one_way(
     )  # fmt: skip
 
 
-def _opposite(vector: HomingVector) -> HomingVector:
+def _opposite(vector: TwoViewVector) -> TwoViewVector:
     """The way back, of the same motion."""
     back = float(wrap(np.array(vector.direction + np.pi - vector.rotation)))
     # (theta + pi - psi, -psi) of (theta, psi)
     jacobian = np.array([[1.0, -1.0], [0.0, -1.0]])
     covariance = jacobian @ vector.covariance @ jacobian.T
-    return HomingVector(back, -vector.rotation, covariance, vector.inliers, vector.rival_support)
+    return TwoViewVector(
+        back, -vector.rotation, covariance, vector.inliers, vector.competing_support
+    )
 
 
 def _same_place(

@@ -40,7 +40,7 @@ class LegOutcome:
     reason: str
 
 
-class PathFollower:
+class HomingChain:
     """Homes to the targets in their order.
 
     A target that is reached hands over to the next one with the same image, so that the robot

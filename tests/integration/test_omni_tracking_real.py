@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fgslam.cameras.omni.camera_files import make_camera
 from fgslam.cameras.omni.ring_calibration import find_mirror_circle
 from fgslam.cameras.omni.settings import HyperbolicMirrorSettings
-from fgslam.core.homing import FeatureKind, HomingVector
+from fgslam.core.homing import FeatureKind, TwoViewVector
 from fgslam.datasets.images import read_colour_image
-from fgslam.datasets.omni.camera_files import make_camera
 from fgslam.datasets.omni.opening import open_omni
 from fgslam.datasets.omni.settings import OmniVideoSettings
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
@@ -63,7 +63,7 @@ def test_the_wide_baseline_pair_is_matched_with_both_kinds(shared_data: Path) ->
     extractor = OmniFeatureExtractor(make_camera(settings, (1400, 1400)), OmniFeatureSettings())
     matches = match_features(*map(extractor.extract, images), OmniMatchingSettings())
     vector = estimate_homing_vector(matches, HomingVectorSettings(), np.random.default_rng(0))
-    assert isinstance(vector, HomingVector)
+    assert isinstance(vector, TwoViewVector)
     kinds = matches.kind[vector.inliers]
     assert np.count_nonzero(kinds == FeatureKind.SIFT) >= 150
     assert np.count_nonzero(kinds == FeatureKind.COLUMN) >= 5

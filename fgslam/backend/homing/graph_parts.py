@@ -14,7 +14,7 @@ import numpy as np
 
 from fgslam.backend.homing.settings import GraphMotionSettings
 from fgslam.core.arrays import FloatArray
-from fgslam.core.homing import HomingVector
+from fgslam.core.homing import TwoViewVector
 from fgslam.factors.bearing import (
     BearingFactors,
     leg_factor,
@@ -59,7 +59,7 @@ class Beginning(NamedTuple):
     """
 
     target: FloatArray
-    vector: HomingVector
+    vector: TwoViewVector
     covariance: FloatArray
 
 

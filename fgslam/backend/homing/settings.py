@@ -228,7 +228,7 @@ class SnapshotSettings(NamedSettings):
     kind: Literal["snapshot"] = "snapshot"
 
 
-HomingEstimatorSettings: TypeAlias = Annotated[
-    HomingEkfSettings | HomingGraphSettings | AverageLandmarkVectorSettings | SnapshotSettings,
-    Field(discriminator="kind"),
-]
+HomingEstimatorKind: TypeAlias = (
+    HomingEkfSettings | HomingGraphSettings | AverageLandmarkVectorSettings | SnapshotSettings
+)
+HomingEstimatorSettings: TypeAlias = Annotated[HomingEstimatorKind, Field(discriminator="kind")]

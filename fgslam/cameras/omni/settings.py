@@ -31,6 +31,19 @@ class EquirectangularSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
+class CylinderSettings:
+    """A panorama whose rows are proportional to the tangent of elevation."""
+
+    kind: Literal["cylinder"] = "cylinder"
+    top_elevation_deg: Annotated[
+        float, Field(gt=-90.0, lt=90.0, description="of the first row, degrees up")
+    ] = 45.0
+    bottom_elevation_deg: Annotated[
+        float, Field(gt=-90.0, lt=90.0, description="of the last row, degrees up")
+    ] = -45.0
+
+
+@dataclass(frozen=True, config=STRICT)
 class MirrorMountSettings:
     """How a mirror lies in its picture."""
 
@@ -160,6 +173,7 @@ class BloggieSettings:
 
 OmniCameraSettings: TypeAlias = Annotated[
     EquirectangularSettings
+    | CylinderSettings
     | HyperbolicMirrorSettings
     | OCamCalibSettings
     | RadialPolynomialSettings

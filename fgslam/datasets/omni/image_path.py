@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from fgslam.cameras.omni.camera_files import make_camera
 from fgslam.datasets.images import read_colour_image
-from fgslam.datasets.omni.camera_files import make_camera
 from fgslam.datasets.omni.recording import OmniRecording, ids_of, no_times, pictures_in
 from fgslam.datasets.omni.settings import OmniPathSettings
 from fgslam.datasets.recording import recording_identity

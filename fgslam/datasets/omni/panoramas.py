@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.cameras.omni.camera_files import make_camera
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.planar import wrap
 from fgslam.datasets.images import IMAGE_SUFFIXES, read_colour_image
-from fgslam.datasets.omni.camera_files import make_camera
 from fgslam.datasets.omni.panorama_reduction import PanoramaReduction
 from fgslam.datasets.omni.recording import (
     ColourLoader,

@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from fgslam.cameras.omni.camera_files import make_camera
 from fgslam.core.arrays import Image
 from fgslam.core.errors import DatasetError, FrameError
-from fgslam.datasets.omni.camera_files import make_camera
 from fgslam.datasets.omni.recording import OmniRecording
 from fgslam.datasets.omni.settings import OmniVideoSettings
 from fgslam.datasets.recording import recording_identity

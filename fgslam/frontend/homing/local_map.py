@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray
-from fgslam.core.homing import BearingMatches, HomingVector, LocalMap
+from fgslam.core.homing import BearingMatches, LocalMap, TwoViewVector
 
 
 def triangulate(matches: BearingMatches, direction: float, rotation: float) -> FloatArray:
@@ -16,7 +16,7 @@ def triangulate(matches: BearingMatches, direction: float, rotation: float) -> F
     return np.asarray(distance, dtype=np.float64)
 
 
-def make_local_map(vector: HomingVector, matches: BearingMatches) -> LocalMap:
+def make_local_map(vector: TwoViewVector, matches: BearingMatches) -> LocalMap:
     """Triangulates all matches with their covariance, first order.
 
     The distance's uncertainty has two sources: both bearings' noise and the homing vector's own

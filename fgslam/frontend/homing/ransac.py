@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.homing import BearingMatches, HomingVector, Refusal, RefusalReason
+from fgslam.core.homing import BearingMatches, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import unit, wrap
 from fgslam.frontend.homing.epipolar import EpipolarTest
 from fgslam.frontend.homing.match_probability import (
@@ -40,7 +40,7 @@ _LEAST_SPREAD = 0.25  # of directions; half a turn has 0.31, all around 0.71
 
 def estimate_homing_vector(
     matches: BearingMatches, settings: HomingVectorSettings, rng: np.random.Generator
-) -> HomingVector | Refusal:
+) -> TwoViewVector | Refusal:
     """The homing vector that the matches support best, or why there is none.
 
     Args:
@@ -72,7 +72,7 @@ def estimate_homing_vector(
     theta, psi = (float(v) for v in best.parameters[:2])
     support = max((search.witnesses(r.inliers) for r in rivals), default=0)
     floor = np.deg2rad([settings.direction_floor_deg, settings.rotation_floor_deg])
-    return HomingVector(theta, psi, covariance + np.diag(floor**2), best.inliers, support)
+    return TwoViewVector(theta, psi, covariance + np.diag(floor**2), best.inliers, support)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

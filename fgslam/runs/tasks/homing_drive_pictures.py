@@ -14,8 +14,8 @@ from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.homing import TrackedBearings
 from fgslam.homing.active_homing import ActiveHoming
 from fgslam.homing.command import Command
-from fgslam.homing.path_following import PathFollower
-from fgslam.report.content import Picture
+from fgslam.homing.path_following import HomingChain
+from fgslam.report.page.data import Picture
 from fgslam.report.pictures.view_tracks import draw_view_tracks
 
 FOLDER = "pictures"
@@ -55,7 +55,7 @@ class LegView:
 class DriveWatcher:
     """Looks over the robot's shoulder; see :data:`fgslam.homing.closed_loop.Watcher`."""
 
-    def __init__(self, front_end: Unwrapping, follower: PathFollower) -> None:
+    def __init__(self, front_end: Unwrapping, follower: HomingChain) -> None:
         self._front_end, self._follower = front_end, follower
         self._homing: ActiveHoming | None = None
         self._trails: dict[int, FloatArray] = {}

@@ -16,7 +16,7 @@ from fgslam.core.errors import OutputError
 from fgslam.homing.avoidance import make_avoider
 from fgslam.homing.closed_loop import Driver, World, follow
 from fgslam.homing.front_end import HomingFrontEnd
-from fgslam.homing.path_following import PathFollower
+from fgslam.homing.path_following import HomingChain
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.steering import Steering
 from fgslam.runs.config_models import DrivingConfig
@@ -105,7 +105,7 @@ def perform_drive(task: DriveTask) -> DrivenSeed:
     if config.start_offset_m > 0.0:
         world.put(_displaced(world, config.start_offset_m, np.random.default_rng((task.seed, 7))))
     memory = PathMemory.of([front_end.describe(image) for image in world.targets])
-    follower = PathFollower(
+    follower = HomingChain(
         front_end,
         memory.images,
         lambda start: make_homing_estimator(start, config.estimator),

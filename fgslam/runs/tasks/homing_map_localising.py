@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.core.homing import HomingVector, OmniFeatures, Refusal
+from fgslam.core.homing import OmniFeatures, Refusal, TwoViewVector
 from fgslam.evaluation.metrics import JsonValue
-from fgslam.frontend.homing.matching import match_features
-from fgslam.frontend.homing.ransac import estimate_homing_vector
+from fgslam.frontend.homing.two_views import vector_between
 from fgslam.homing.links import Answer, Pair
 from fgslam.homing.localisation import Localiser
 from fgslam.homing.retrieval import VisualWords
@@ -87,9 +86,8 @@ def localise(
     )
     rng = np.random.default_rng((config.seed, 1))
 
-    def linker(image: OmniFeatures, node: OmniFeatures) -> HomingVector | Refusal:
-        matches = match_features(image, node, config.features.matching)
-        return estimate_homing_vector(matches, config.homing_vector, rng)
+    def linker(image: OmniFeatures, node: OmniFeatures) -> TwoViewVector | Refusal:
+        return vector_between(image, node, config.features.matching, config.homing_vector, rng)[0]
 
     words = VisualWords(nodes, config.map.retrieval, rng)
     localiser = Localiser(topology, words, linker, config.localisation)

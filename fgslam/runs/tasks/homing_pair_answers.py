@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.homing import HomingVector, Refusal, RefusalReason
+from fgslam.core.homing import Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
 from fgslam.core.quantiles import chi_square_quantile
 from fgslam.evaluation.metrics import JsonValue
@@ -46,19 +46,19 @@ class PairAnswer:
 
     a: int
     b: int
-    found: HomingVector | Refusal
+    found: TwoViewVector | Refusal
     matches: int
     rows: IntArray | None = None
 
     @property
     def answered(self) -> bool:
         """Whether there is a homing vector."""
-        return isinstance(self.found, HomingVector)
+        return isinstance(self.found, TwoViewVector)
 
     @property
     def inliers(self) -> int:
         """Of the answer; 0 where there is none."""
-        return self.found.support if isinstance(self.found, HomingVector) else 0
+        return self.found.support if isinstance(self.found, TwoViewVector) else 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +113,7 @@ def pair_errors(
         poses: (m, 3) true planar poses of all views, metres and radians.
         rooms: of all views; None where they are not known.
     """
-    found = [(p, p.found) for p in answers if isinstance(p.found, HomingVector)]
+    found = [(p, p.found) for p in answers if isinstance(p.found, TwoViewVector)]
     errors = np.zeros((len(found), 2))
     covariances = np.zeros((len(found), 2, 2))
     for k, (pair, vector) in enumerate(found):
@@ -161,7 +161,7 @@ def write_pairs(path: Path, answers: Sequence[PairAnswer], names: Sequence[str])
 def _row(pair: PairAnswer, names: Sequence[str]) -> list[Cell]:
     start: list[Cell] = [names[pair.a], names[pair.b], pair.answered]
     found = pair.found
-    if isinstance(found, HomingVector):
+    if isinstance(found, TwoViewVector):
         sigma = np.rad2deg(np.sqrt(np.diagonal(found.covariance)))
         direction, rotation = np.rad2deg([found.direction, found.rotation])
         return [*start, direction, sigma[0], rotation, sigma[1], found.support, ""]

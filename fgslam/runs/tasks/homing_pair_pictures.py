@@ -10,8 +10,8 @@ import numpy as np
 from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.atomic_files import make_subfolder
-from fgslam.core.homing import BearingMatches, FeatureKind, HomingVector
-from fgslam.report.content import Picture
+from fgslam.core.homing import BearingMatches, FeatureKind, TwoViewVector
+from fgslam.report.page.data import Picture
 from fgslam.report.pictures.view_matches import MatchedPixels, draw_view_matches
 from fgslam.runs.tasks.homing_pair_answers import PairAnswer, PairErrors
 from fgslam.runs.tasks.homing_pair_search import PairSearch, answer_pair
@@ -52,7 +52,7 @@ def draw_pair(folder: Path, views: Views, search: PairSearch, answer: PairAnswer
     vector = found.found
     kept = (
         matches.taken(vector.inliers)
-        if isinstance(vector, HomingVector)
+        if isinstance(vector, TwoViewVector)
         else matches.taken(np.zeros(len(matches), np.bool_))
     )
     camera = views.recording.camera
@@ -61,14 +61,14 @@ def draw_pair(folder: Path, views: Views, search: PairSearch, answer: PairAnswer
         _pixels(camera, kept.bearing_b, kept.elevation_b),
         kept.kind == FeatureKind.COLUMN,
     )
-    told = _told(vector, matches) if isinstance(vector, HomingVector) else "refused"
+    told = _told(vector, matches) if isinstance(vector, TwoViewVector) else "refused"
     path = make_subfolder(folder, FOLDER) / f"matches_{a}_{b}.png"
     images = views.recording.image(answer.a), views.recording.image(answer.b)
     draw_view_matches(path, images, pixels, (f"view {a}: {told}", f"view {b}"))
     return Picture(f"Matches of views {a} and {b}: {told}", path.read_bytes())
 
 
-def _told(vector: HomingVector, matches: BearingMatches) -> str:
+def _told(vector: TwoViewVector, matches: BearingMatches) -> str:
     direction, rotation = np.rad2deg([vector.direction, vector.rotation])
     return (
         f"{vector.support} of {len(matches)} matches, direction {direction:.1f}, "

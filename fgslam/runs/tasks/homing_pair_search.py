@@ -12,14 +12,13 @@ from fgslam.core.arrays import IntArray
 from fgslam.core.homing import (
     BearingMatches,
     FeatureKind,
-    HomingVector,
     OmniFeatures,
     Refusal,
+    TwoViewVector,
 )
 from fgslam.frontend.features.omni_settings import OmniMatchingSettings
-from fgslam.frontend.homing.matching import match_features
-from fgslam.frontend.homing.ransac import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.two_views import pair_generator, vector_between
 from fgslam.runs.homing_results import Progress, Stopped
 from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.runs.tasks.homing_pair_answers import PairAnswer
@@ -69,16 +68,10 @@ def pairs_of(count: int, *, both_ways: bool) -> list[tuple[int, int]]:
     return [(a, b) for a in range(count) for b in range(count) if a < b or (both_ways and a != b)]
 
 
-def pair_generator(seed: int, a: int, b: int) -> np.random.Generator:
-    """What RANSAC draws from for one pair, whichever process and order."""
-    return np.random.default_rng((seed, a, b))
-
-
 def answer_pair(search: PairSearch, a: int, b: int) -> tuple[PairAnswer, BearingMatches]:
     """One pair's answer and its tentative matches."""
-    matches = match_features(search.features[a], search.features[b], search.matching)
-    rng = pair_generator(search.seed, a, b)
-    found = estimate_homing_vector(matches, search.vector, rng)
+    views, rng = (search.features[a], search.features[b]), pair_generator(search.seed, a, b)
+    found, matches = vector_between(*views, search.matching, search.vector, rng)
     return PairAnswer(a, b, found, len(matches), _inlier_rows(found, matches)), matches
 
 
@@ -111,7 +104,7 @@ def search_of(search: PairSearch, pairs: Sequence[tuple[int, int]]) -> PairSearc
     return PairSearch(search.features, tuple(pairs), search.matching, search.vector, search.seed)
 
 
-def _inlier_rows(found: HomingVector | Refusal, matches: BearingMatches) -> IntArray | None:
+def _inlier_rows(found: TwoViewVector | Refusal, matches: BearingMatches) -> IntArray | None:
     if isinstance(found, Refusal):
         return None
     kept = matches.taken(found.inliers & (matches.kind == FeatureKind.SIFT))

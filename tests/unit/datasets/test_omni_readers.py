@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from fgslam.cameras.omni.bearing_measurement import angles_of
+from fgslam.cameras.omni.camera_files import make_camera
 from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
 from fgslam.cameras.omni.ocamcalib import OCamCamera
 from fgslam.cameras.omni.panoramas import Equirectangular
@@ -23,7 +24,6 @@ from fgslam.cameras.omni.settings import (
 )
 from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
-from fgslam.datasets.omni.camera_files import make_camera
 from fgslam.datasets.omni.opening import open_omni
 from fgslam.datasets.omni.panorama_reduction import PanoramaReduction
 from fgslam.datasets.omni.recording import OmniRecording, ids_of

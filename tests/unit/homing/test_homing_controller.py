@@ -21,12 +21,12 @@ from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import (
     HomingEstimate,
     HomingStart,
-    HomingVector,
     LocalMap,
     OmniFeatures,
     Refusal,
     RefusalReason,
     TrackedBearings,
+    TwoViewVector,
 )
 from fgslam.core.planar import bearings, between, unit, wrap
 from fgslam.homing.active_homing import ActiveHoming
@@ -43,13 +43,13 @@ POINTS = 3.0 * unit(np.linspace(-3.0, 3.0, 20)) * np.linspace(0.6, 1.4, 20)[:, N
 """(20, 2) landmarks around start and target, legs."""
 
 
-def vector_to(direction: float, rotation: float = 0.0) -> HomingVector:
+def vector_to(direction: float, rotation: float = 0.0) -> TwoViewVector:
     """A homing vector of 20 inliers and a degree."""
     covariance = np.eye(2) * np.deg2rad(1.0) ** 2
-    return HomingVector(direction, rotation, covariance, np.ones(20, dtype=np.bool_), 0)
+    return TwoViewVector(direction, rotation, covariance, np.ones(20, dtype=np.bool_), 0)
 
 
-def start_at(time: float, vector: HomingVector) -> HomingStart:
+def start_at(time: float, vector: TwoViewVector) -> HomingStart:
     """A start whose local map is exact."""
     target = np.array([*unit(np.array(vector.direction)), vector.rotation])
     angles = np.zeros((20, 4))
@@ -89,7 +89,7 @@ class OracleEstimator:
 class ScriptedFrontEnd:
     """Answers to ``begin`` from a list, the last one repeated; tracks of a robot that one sets."""
 
-    answers: list[HomingVector | Refusal]
+    answers: list[TwoViewVector | Refusal]
     robot: FloatArray = field(default_factory=lambda: np.zeros(3))
     tracks: int = 20
     turned: float = 0.0
@@ -156,7 +156,7 @@ class Bench:
         return self.controller.step(DARK, self.time)
 
 
-def bench(*answers: HomingVector | Refusal, **changes: float) -> Bench:
+def bench(*answers: TwoViewVector | Refusal, **changes: float) -> Bench:
     """With these answers to ``begin``."""
     return Bench(ScriptedFrontEnd(list(answers)), replace(SETTINGS, **changes))  # type: ignore[arg-type]
 
@@ -536,7 +536,7 @@ def test_target_seen_elsewhere_begins_the_leg_anew() -> None:
     ],
 )
 def test_how_near_the_target_is_seen_decides(
-    vector: HomingVector, part: float, state: HomingState
+    vector: TwoViewVector, part: float, state: HomingState
 ) -> None:
     """Seen elsewhere than expected: at the target itself that is an arrival, else an error."""
     b = bench(vector_to(0.0))

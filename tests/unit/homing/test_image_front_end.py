@@ -9,9 +9,6 @@ import pytest
 
 from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.homing import FeatureKind, Refusal, RefusalReason
-from fgslam.frontend.features.omni_settings import OmniFeatureSettings
-from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from fgslam.homing.image_front_end import (
     FrontEndSettings,
     ImageFrontEnd,
@@ -22,11 +19,7 @@ from tests.homing import two_views
 
 
 def front_end() -> ImageFrontEnd:
-    features = OmniFeatureSettings()
-    settings = FrontEndSettings(
-        features, features.matching, HomingVectorSettings(), OmniTrackingSettings()
-    )
-    return ImageFrontEnd(Equirectangular(256, 128), settings, np.random.default_rng(0))
+    return ImageFrontEnd(Equirectangular(256, 128), FrontEndSettings(), np.random.default_rng(0))
 
 
 def test_share_of_wrong_matches_is_as_asked_and_none_is_right() -> None:

@@ -15,7 +15,7 @@ from fgslam.homing.avoidance import RangeScan
 from fgslam.homing.command import Drive, HomingState
 from fgslam.homing.drive_record import STAGES, DriveRecord
 from fgslam.homing.drive_scores import corners, cross_track, pass_distances, slope_by_leg
-from fgslam.homing.path_following import PathFollower
+from fgslam.homing.path_following import HomingChain
 from fgslam.homing.settings import (
     ClosedLoopSettings,
     HomingBehaviourSettings,
@@ -103,14 +103,14 @@ def test_graph_drives_as_well() -> None:
     assert pass_distances(record).max() < 0.2
 
 
-def follower_with_unknown(count: int, path: PathFollowingSettings) -> PathFollower:
+def follower_with_unknown(count: int, path: PathFollowingSettings) -> HomingChain:
     """Two targets on a path, the first ``count`` replaced by images from elsewhere."""
     setting = winding_path(9, count + 1, 1.0)
     elsewhere = setting.front_end.features_at(np.array([80.0, 80.0, 0.0]))
     images = [elsewhere] * count + setting.path()[count:]
     kind = HomingEkfSettings()
     control = replace(HomingControlSettings(), give_up_s=0.5, farther_tries=0)
-    return PathFollower(
+    return HomingChain(
         setting.front_end, images, lambda start: make_homing_estimator(start, kind), control, path
     )
 
@@ -186,7 +186,7 @@ def test_bad_input_is_told() -> None:
     """No target; time that runs backwards, also right after a switch."""
     setting = winding_path(7, 1, 2.0)
     with pytest.raises(ConfigError, match="no target image"):
-        PathFollower(
+        HomingChain(
             setting.front_end, [], lambda _: pytest.fail("no start"), HomingControlSettings(),
             PathFollowingSettings(),
         )  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import IntArray
-from fgslam.core.homing import HomingVector, OmniFeatures
+from fgslam.core.homing import OmniFeatures, TwoViewVector
 from fgslam.homing.links import Answer, Link, Pair
 from fgslam.homing.settings import TopologicalMapSettings
 from fgslam.homing.third_view_consistency import ThirdViewConsistency
@@ -105,7 +105,7 @@ def test_map_of_a_walk_has_confirmed_far_links_only() -> None:
         there = [*walk, *NEIGHBOURS]
         pairs = [q for a, b in there for q in ((a, b), (b, a))]
         answers: dict[Pair, Answer] = {
-            (a, b): HomingVector(
+            (a, b): TwoViewVector(
                 0.0 if a < b else np.pi, 0.0, np.eye(2) * 1e-4, np.ones(THINGS, np.bool_), 0
             )
             for a, b in pairs

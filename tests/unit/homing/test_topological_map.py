@@ -11,7 +11,7 @@ import pytest
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import StoredMapError
-from fgslam.core.homing import HomingVector, OmniFeatures, Refusal, RefusalReason
+from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import between, wrap
 from fgslam.frontend.homing.ransac import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
@@ -27,13 +27,13 @@ SETTINGS = TopologicalMapSettings()
 NONE = Refusal(RefusalReason.TOO_FEW_MATCHES, "3 matches, of 8 needed")
 
 
-def vector(direction: float, rotation: float, support: int = 60) -> HomingVector:
+def vector(direction: float, rotation: float, support: int = 60) -> TwoViewVector:
     """With a deviation of a degree."""
     covariance = np.eye(2) * np.deg2rad(1.0) ** 2
-    return HomingVector(direction, rotation, covariance, np.ones(support, dtype=np.bool_), 0)
+    return TwoViewVector(direction, rotation, covariance, np.ones(support, dtype=np.bool_), 0)
 
 
-def true_vector(one: FloatArray, other: FloatArray, support: int = 60) -> HomingVector:
+def true_vector(one: FloatArray, other: FloatArray, support: int = 60) -> TwoViewVector:
     """From one pose to another."""
     way = between(one, other)
     return vector(float(np.arctan2(way[1], way[0])), float(way[2]), support)

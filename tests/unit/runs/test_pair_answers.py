@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.homing import HomingVector, Refusal, RefusalReason
+from fgslam.core.homing import Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import compose, wrap
 from fgslam.runs.tasks.homing_pair_answers import (
     PairAnswer,
@@ -23,9 +23,9 @@ from fgslam.runs.tasks.homing_pair_answers import (
 SIGMA = np.deg2rad(1.0)
 
 
-def vector(direction: float, rotation: float, sigma: float = SIGMA) -> HomingVector:
+def vector(direction: float, rotation: float, sigma: float = SIGMA) -> TwoViewVector:
     inliers = np.array([True, True, False])
-    return HomingVector(direction, rotation, sigma**2 * np.eye(2), inliers, 0)
+    return TwoViewVector(direction, rotation, sigma**2 * np.eye(2), inliers, 0)
 
 
 def test_the_true_pair_is_counter_clockwise_from_the_heading_of_the_first() -> None:

@@ -14,7 +14,7 @@ from fgslam.backend.homing.ekf import HomingEkf
 from fgslam.backend.homing.ekf_model import FilterState, initial_state, motion
 from fgslam.backend.homing.settings import PAPER, FilterMotionSettings, HomingEkfSettings
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing import HomingStart, HomingVector, LocalMap, TrackedBearings
+from fgslam.core.homing import HomingStart, LocalMap, TrackedBearings, TwoViewVector
 from fgslam.core.planar import bearings, wrap
 from fgslam.worlds.simulated.bearing_settings import SimulatedBearingsSettings
 
@@ -132,7 +132,7 @@ def round_start(
         bearing_b=bearings(target, points),
     )
     chart = LocalMap(np.arange(n), angle, np.full(n, 20.0), np.tile(np.eye(2), (n, 1, 1)))
-    vector = HomingVector(0.0, 0.0, np.eye(2), np.ones(n, np.bool_), 0)
+    vector = TwoViewVector(0.0, 0.0, np.eye(2), np.ones(n, np.bool_), 0)
     none, sigma = np.full(n, np.nan), np.full(n, 0.01)
     image = TrackedBearings(1.0, np.arange(n), bearings(robot, points), sigma, none, none)
     return HomingStart(0.0, vector, chart, matches), image

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.homing import BearingMatches, HomingVector, LocalMap, Refusal, RefusalReason
+from fgslam.core.homing import BearingMatches, LocalMap, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
 from fgslam.frontend.homing.epipolar import EpipolarTest
 from fgslam.frontend.homing.local_map import make_local_map, triangulable, triangulate
@@ -22,11 +22,11 @@ HALF_DEGREE = np.deg2rad(0.5)
 SETTINGS = HomingVectorSettings()
 
 
-def answer(views: TwoViews, settings: HomingVectorSettings = SETTINGS) -> HomingVector | Refusal:
+def answer(views: TwoViews, settings: HomingVectorSettings = SETTINGS) -> TwoViewVector | Refusal:
     return estimate_homing_vector(views.matches, settings, np.random.default_rng(7))
 
 
-def error(views: TwoViews, vector: HomingVector) -> FloatArray:
+def error(views: TwoViews, vector: TwoViewVector) -> FloatArray:
     """(2,) radians: direction and rotation."""
     return wrap(np.array([vector.direction - views.direction, vector.rotation - views.rotation]))
 
@@ -37,7 +37,7 @@ def test_median_error_at_half_a_degree(count: int, wrong: float) -> None:
     for seed in range(100):
         views = two_views(seed, count, HALF_DEGREE, wrong)
         vector = answer(views)
-        if isinstance(vector, HomingVector):
+        if isinstance(vector, TwoViewVector):
             off = error(views, vector)
             errors.append(np.abs(off))
             nees.append(off @ np.linalg.solve(vector.covariance, off))
@@ -54,7 +54,7 @@ def test_most_right_matches_are_inliers() -> None:
     for seed in range(50):
         views = two_views(seed, 40, HALF_DEGREE, 0.3)
         vector = answer(views)
-        if isinstance(vector, HomingVector):
+        if isinstance(vector, TwoViewVector):
             recalls.append(np.mean(vector.inliers[views.right]))
     assert np.mean(recalls) >= 0.99
 
@@ -63,8 +63,8 @@ def test_equal_from_equal_seeds_and_arguments_untouched() -> None:
     views = two_views(3, 40, HALF_DEGREE, 0.3)
     before = dataclasses.astuple(views.matches)
     first, second = answer(views), answer(views)
-    assert isinstance(first, HomingVector)
-    assert isinstance(second, HomingVector)
+    assert isinstance(first, TwoViewVector)
+    assert isinstance(second, TwoViewVector)
     assert (first.direction, first.rotation) == (second.direction, second.rotation)
     for old, new in zip(before, dataclasses.astuple(views.matches), strict=True):
         np.testing.assert_array_equal(old, new)
@@ -235,13 +235,13 @@ def _map(views: TwoViews, sigma: float, covariance: FloatArray) -> LocalMap:
     matches: BearingMatches = dataclasses.replace(views.matches, sigma=noise)
     inliers = np.ones(len(matches), dtype=np.bool_)
     return make_local_map(
-        HomingVector(views.direction, views.rotation, covariance, inliers, 0), matches
+        TwoViewVector(views.direction, views.rotation, covariance, inliers, 0), matches
     )
 
 
 def test_rays_that_diverge_are_not_triangulable() -> None:
     views = two_views(2, 30)
-    backwards = HomingVector(
+    backwards = TwoViewVector(
         views.direction + np.pi, views.rotation, np.eye(2) * 1e-8, np.ones(30, dtype=np.bool_), 0
     )
     made = make_local_map(backwards, views.matches)

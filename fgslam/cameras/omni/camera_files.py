@@ -1,41 +1,79 @@
-"""Cameras from settings: models, calibration files, and what a recording keeps beside itself."""
+"""Omnidirectional cameras from calibration files and from settings."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
+import yaml
 
 from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
 from fgslam.cameras.omni.ocamcalib import read_ocamcalib
-from fgslam.cameras.omni.panoramas import Equirectangular
+from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
 from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.cameras.omni.radial import MirrorFrame
 from fgslam.cameras.omni.radial_polynomial import RadialPolynomial, fit_radial_polynomial
 from fgslam.cameras.omni.settings import (
     BloggieSettings,
+    CylinderSettings,
     EquirectangularSettings,
     HyperbolicMirrorSettings,
     MirrorMountSettings,
     OCamCalibSettings,
-    OmniCameraSettings,
     RadialPolynomialSettings,
 )
 from fgslam.core.errors import CalibrationError
-from fgslam.datasets.tables import read_lines
+from fgslam.core.settings import make_settings
+from fgslam.core.text_files import read_lines
 
 Size = tuple[int, int]
 
 
-def make_camera(
-    settings: OmniCameraSettings, image_size: Size, folder: Path | None = None
+OmniCameraKind: TypeAlias = (
+    EquirectangularSettings
+    | CylinderSettings
+    | HyperbolicMirrorSettings
+    | OCamCalibSettings
+    | RadialPolynomialSettings
+    | BloggieSettings
+)
+
+
+def load_camera(
+    source: str | Path | Mapping[str, Any] | OmniCameraKind,
+    size: tuple[int, int] | None = None,
 ) -> OmniCamera:
-    """The camera that the settings describe, for pictures of a size (width, height).
+    """An omnidirectional camera from a calibration file, or from the keys of its model.
+
+    Args:
+        source: the path of an OCamCalib result file (``calib_results.txt``), of BloggieUnwarp's
+            ``settings.txt`` or of a YAML file of keys; or the keys themselves, as under
+            ``dataset.camera`` of an experiment: ``{"kind": "mirror", "xi": 0.92}``; or the kind
+            alone: ``"equirectangular"``, ``"cylinder"``, ``"mirror"``, ``"radial_polynomial"``.
+        size: width and height of the images, pixels; None where the calibration states it.
+
+    Raises:
+        CalibrationError: the file is missing or malformed, its values are impossible, or it is for
+            images of another size; no size is given and the calibration has none.
+        ConfigError: a key or its value is wrong.
+    """
+    if isinstance(source, str | Path):
+        source, folder = _read(source)
+        return make_camera(source, size, folder)
+    return make_camera(_settings_of(source), size)
+
+
+def make_camera(
+    settings: OmniCameraKind, image_size: Size | None, folder: Path | None = None
+) -> OmniCamera:
+    """The camera that the settings describe, for images of a size (width, height).
 
     Args:
         settings: one kind of camera.
-        image_size: width and height of the pictures.
+        image_size: width and height of the images; None where the calibration states it.
         folder: of the recording; calibration files are looked for there first.
 
     Raises:
@@ -45,20 +83,76 @@ def make_camera(
     match settings:
         case EquirectangularSettings():
             limits = np.deg2rad([settings.top_elevation_deg, settings.bottom_elevation_deg])
-            return Equirectangular(*image_size, float(limits[0]), float(limits[1]))
+            size = _stated_size(settings.kind, None, image_size)
+            return Equirectangular(*size, float(limits[0]), float(limits[1]))
+        case CylinderSettings():
+            tangents = np.tan(
+                np.deg2rad([settings.bottom_elevation_deg, settings.top_elevation_deg])
+            )
+            size = _stated_size(settings.kind, None, image_size)
+            return Cylinder(*size, float(tangents[0]), float(tangents[1]))
         case HyperbolicMirrorSettings():
-            return _hyperbolic(settings, image_size)
+            return _hyperbolic(settings, _stated_size("mirror", settings.size, image_size))
         case OCamCalibSettings():
             calibration = read_ocamcalib(_find(settings.file, folder))
             ahead = math.radians(settings.ahead_deg)
             return calibration.camera(image_size, settings.ring_px, ahead, settings.clockwise)
         case RadialPolynomialSettings():
-            _require_size("radial_polynomial", settings.size, image_size)
-            frame = _frame(settings, image_size, settings.centre)
+            size = _stated_size(settings.kind, settings.size, image_size)
+            frame = _frame(settings, size, settings.centre)
             coefficients = tuple(np.deg2rad(settings.coefficients_deg).tolist())
             return RadialPolynomial(frame, *settings.ring_px, coefficients=coefficients)
         case BloggieSettings():
             return _bloggie(settings, _find(settings.file, folder), image_size)
+
+
+def _read(source: str | Path) -> tuple[OmniCameraKind, Path | None]:
+    """Settings in or for a file, and its folder; of a bare kind its defaults."""
+    path = Path(source)
+    if str(source) in _KINDS and not path.is_file():
+        return _KINDS[str(source)](), None
+    if not path.is_file():
+        raise CalibrationError(
+            f"camera: there is no file {path}, and no such kind of camera; give a calibration "
+            f"file, or one of {', '.join(_KINDS)}"
+        )
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return _settings_of(_read_keys(path)), path.parent
+    if any(line.startswith("INPUT_WIDTH") for _, line in read_lines(path, CalibrationError)):
+        return BloggieSettings(file=path.name), path.parent
+    return OCamCalibSettings(file=path.name), path.parent
+
+
+def _read_keys(path: Path) -> Any:
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise CalibrationError(f"cannot read {path} ({error}); give a YAML text file") from None
+    except yaml.YAMLError as error:
+        message = " ".join(str(error).split())
+        raise CalibrationError(f"{path}: not valid YAML ({message}); correct it") from None
+
+
+def _settings_of(source: object) -> OmniCameraKind:
+    if isinstance(source, OmniCameraKind):
+        return source
+    if not isinstance(source, Mapping) or source.get("kind") not in _KINDS:
+        raise CalibrationError(
+            f"camera: {source!r} describes none; give a calibration file, or keys with a kind, one "
+            f"of {', '.join(_KINDS)}"
+        )
+    kind = _KINDS[source["kind"]]
+    return make_settings(kind, {str(key): value for key, value in source.items()}, "camera")
+
+
+_KINDS: dict[str, type[OmniCameraKind]] = {
+    "equirectangular": EquirectangularSettings,
+    "cylinder": CylinderSettings,
+    "mirror": HyperbolicMirrorSettings,
+    "ocamcalib": OCamCalibSettings,
+    "radial_polynomial": RadialPolynomialSettings,
+    "bloggie": BloggieSettings,
+}
 
 
 def _frame(
@@ -69,7 +163,6 @@ def _frame(
 
 
 def _hyperbolic(settings: HyperbolicMirrorSettings, size: Size) -> HyperbolicMirror:
-    _require_size("mirror", settings.size, size)
     frame = _frame(settings, size, settings.centre)
     lowest = math.radians(settings.inner_elevation_deg)
     highest = math.radians(settings.outer_elevation_deg)
@@ -91,12 +184,18 @@ def _hyperbolic(settings: HyperbolicMirrorSettings, size: Size) -> HyperbolicMir
     return HyperbolicMirror(frame, inner, outer, xi=settings.xi, focal_px=focal)
 
 
-def _require_size(kind: str, calibrated: Size | None, size: Size) -> None:
-    if calibrated is not None and calibrated != size:
+def _stated_size(kind: str, calibrated: Size | None, size: Size | None) -> Size:
+    stated = size or calibrated
+    if stated is None:
+        raise CalibrationError(
+            f"camera ({kind}) states no size; give that of its images, size=(width, height)"
+        )
+    if calibrated not in (None, stated):
         raise CalibrationError(
             f"camera ({kind}) is calibrated for {calibrated[0]}x{calibrated[1]} pixels, but the "
-            f"pictures have {size[0]}x{size[1]}; give the calibration at this size"
+            f"pictures have {stated[0]}x{stated[1]}; give the calibration at this size"
         )
+    return stated
 
 
 def _find(file: str, folder: Path | None) -> Path:
@@ -129,10 +228,11 @@ _BLOGGIE_KEYS = (
 )
 
 
-def _bloggie(settings: BloggieSettings, path: Path, size: Size) -> RadialPolynomial:
+def _bloggie(settings: BloggieSettings, path: Path, size: Size | None) -> RadialPolynomial:
     """The camera of a settings file of BloggieUnwarp: the panorama's middle is ahead."""
     values = _bloggie_values(path)
     width, height = values["INPUT_WIDTH"], values["INPUT_HEIGHT"]
+    size = size or (int(width), int(height))
     if (width, height) != size:
         raise CalibrationError(
             f"{path} is for pictures of {width:g}x{height:g} pixels, but these have "

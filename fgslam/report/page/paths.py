@@ -13,7 +13,8 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import congruence
-from fgslam.report.figures.traces import (
+from fgslam.report.page.data import EstimatorReport, ReportData
+from fgslam.report.page.traces import (
     Figure,
     Owner,
     Paint,
@@ -25,7 +26,6 @@ from fgslam.report.figures.traces import (
     trace,
 )
 from fgslam.report.pictures.birds_eye import exaggeration, world_position_covariances
-from fgslam.report.run_results import EstimatorReport, ReportData
 
 MAX_POSES = 1_500
 MAX_DOTS_ABOVE = 3_000
@@ -84,8 +84,7 @@ def drive_from_above(data: ReportData) -> Figure:
             Switch("landmarks", "landmarks"),
             *([Switch("returns", "loops closed")] if data.closures else []),
         ),
-        choices=_with_landmarks(data),
-        chosen=data.best,
+        selects=True,
         note=_thinning_note(data, MAX_DOTS_ABOVE),
     )
 
@@ -110,8 +109,7 @@ def map_to_turn(data: ReportData) -> Figure:
     return Figure(
         "map",
         "The map in three dimensions",
-        "Drag to turn, pinch or scroll to come closer, drag with the right button to shift; or use "
-        "arrow keys, plus and minus. "
+        "Drag to turn, pinch or scroll to come closer, drag with the right button to shift. "
         "Dots: landmarks of the estimator chosen, coloured by height. Lines as above.",
         (*_dots_in_space(data, level, limits), *_paths(data, level)),
         {"scene": scene},
@@ -121,17 +119,11 @@ def map_to_turn(data: ReportData) -> Figure:
             Switch("online", "path as first estimated", on=False),
             Switch("landmarks", "landmarks"),
         ),
-        choices=_with_landmarks(data),
-        chosen=data.best,
+        selects=True,
         note=" ".join(
             filter(None, [_thinning_note(data, MAX_DOTS_MAP), _outside(data, level, limits)])
         ),
     )
-
-
-def _with_landmarks(data: ReportData) -> tuple[int, ...]:
-    """Numbers of the estimators that have a map."""
-    return tuple(i for i, e in enumerate(data.estimators) if len(e.landmarks))
 
 
 def _thinning_note(data: ReportData, dots: int) -> str:

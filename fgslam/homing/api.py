@@ -1,0 +1,274 @@
+"""Homing as a library: the vector between two images, teaching a path, following it.
+
+The tasks ``homing_pairs`` and ``path_following`` run the same parts; nothing is estimated here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fgslam.backend.homing.factory import homing_settings_of, make_homing_estimator
+from fgslam.backend.homing.settings import HomingEstimatorKind
+from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.core.errors import CalibrationError, EstimatorError, SessionError, StoredMapError
+from fgslam.core.homing import Refusal, TwoViewVector
+from fgslam.core.settings import make_settings
+from fgslam.frontend.features.colour_image import colour_image
+from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni_settings import OmniFeatureSettings
+from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.two_views import pair_generator, vector_between
+from fgslam.homing.command import Drive, DriveCommand
+from fgslam.homing.image_front_end import DRIVING, FrontEndSettings, make_front_end, unusable
+from fgslam.homing.path_following import HomingChain, LegOutcome
+from fgslam.homing.path_memory import PathMemory
+from fgslam.homing.settings import HomingBehaviourSettings
+from fgslam.homing.steering import Steering
+
+
+class HomingVector:
+    """Where one image was taken as seen from another, by Goedemé et al. (2005), section III."""
+
+    def __init__(
+        self,
+        camera: OmniCamera,
+        *,
+        features: OmniFeatureSettings | None = None,
+        seed: int = 0,
+        **settings: Any,
+    ) -> None:
+        """Prepares the features' views for one camera.
+
+        Args:
+            camera: of all images, see :func:`fgslam.load_camera`.
+            features: extraction and matching; None: the defaults.
+            seed: of RANSAC's samples; the same images then give the same answer.
+            settings: of :class:`fgslam.frontend.homing.settings.HomingVectorSettings`, as under
+                ``homing_vector`` of an experiment: ``samples=1000``.
+
+        Raises:
+            CalibrationError: ``camera`` is none.
+            ConfigError: a setting is unknown or out of its bounds.
+        """
+        self._camera = _require_camera(camera, "HomingVector")
+        self._features = features or OmniFeatureSettings()
+        self._settings = make_settings(HomingVectorSettings, settings, "HomingVector")
+        self._seed = seed
+        self._extractor = OmniFeatureExtractor(camera, self._features)
+
+    def between(self, image_a: npt.ArrayLike, image_b: npt.ArrayLike) -> TwoViewVector | Refusal:
+        """Direction and rotation from the place of image a to that of image b.
+
+        Bearings are counter-clockwise from the heading of a. The distance is not known: the scale
+        of images is not. Both kinds of answer can be asked: ``if answer:`` is true of a vector,
+        with ``direction``, ``rotation`` (radians), ``covariance`` (2, 2) of both and ``inliers``,
+        and false of a refusal, with ``reason`` and ``details``. Its reason ``AT_TARGET`` says that
+        both images are from one place, and ``rotation`` how they are turned.
+
+        Args:
+            image_a: (height, width, 3) RGB or (height, width) grey uint8; the present image.
+            image_b: likewise; the target.
+
+        Raises:
+            FrameError: an image is not this camera's.
+        """
+        size = (self._camera.width, self._camera.height)
+        images = colour_image(image_a, size, "image_a"), colour_image(image_b, size, "image_b")
+        a, b = map(self._extractor.extract, images)
+        for image, found in zip(images, (a, b), strict=True):
+            refusal = unusable(image, found)
+            if refusal is not None:
+                return refusal
+        rng = pair_generator(self._seed, 0, 1)
+        return vector_between(a, b, self._features.matching, self._settings, rng)[0]
+
+
+def teach(
+    images: Iterable[npt.ArrayLike],
+    camera: OmniCamera,
+    *,
+    names: Sequence[str] | None = None,
+    features: OmniFeatureSettings | None = None,
+) -> PathMemory:
+    """The path along target images: their features in order, to be followed or saved.
+
+    Args:
+        images: (height, width, 3) RGB or (height, width) grey uint8, in the order in which they
+            are to be reached; about 2 m apart in rooms.
+        camera: that took them.
+        names: one an image, for people; None numbers them.
+        features: extraction; None: the defaults.
+
+    Raises:
+        CalibrationError: ``camera`` is none.
+        FrameError: an image is not this camera's.
+        StoredMapError: there is no image, or not one name an image.
+    """
+    size = (_require_camera(camera, "teach").width, camera.height)
+    extractor = OmniFeatureExtractor(camera, features or DRIVING.features)
+    found = tuple(
+        extractor.extract(colour_image(image, size, f"image {k}")) for k, image in enumerate(images)
+    )
+    if not found:
+        raise StoredMapError("path: no target image; give at least one")
+    return PathMemory.of(found, names)
+
+
+class PathFollower:
+    """Drives along a taught path: an image in, speed and turning rate out.
+
+    Followers share nothing: any number of them work side by side. Used as a context manager it is
+    closed at the end.
+    """
+
+    def __init__(
+        self,
+        camera: OmniCamera,
+        path: PathMemory,
+        estimator: str | HomingEstimatorKind = "homing_graph",
+        *,
+        behaviour: HomingBehaviourSettings | None = None,
+        front_end: FrontEndSettings = DRIVING,
+        seed: int = 0,
+    ) -> None:
+        """Begins before the first target.
+
+        Args:
+            camera: of the robot; the path may have been taught with another one.
+            path: of :func:`fgslam.teach`, or loaded.
+            estimator: its kind, ``homing_graph``, ``homing_ekf``, ``alv`` or ``snapshot``, or its
+                settings.
+            behaviour: control, steering (largest speed), skipping of targets; None: the defaults.
+            front_end: features, matching, tracking.
+            seed: of RANSAC's samples; the same images then give the same commands.
+
+        Raises:
+            CalibrationError: ``camera`` is none.
+            ConfigError: there is no such estimator.
+            StoredMapError: ``path`` is none.
+        """
+        if not isinstance(path, PathMemory):
+            raise StoredMapError(
+                f"PathFollower: the path is a {type(path).__name__}; make it by "
+                "fgslam.teach(images, camera), or load it by fgslam.PathMemory.load(file)"
+            )
+        self._camera = _require_camera(camera, "PathFollower")
+        settings = homing_settings_of(estimator)
+        behaviour = behaviour or HomingBehaviourSettings()
+        self._homing = HomingChain(
+            make_front_end(camera, front_end, seed),
+            path.images,
+            lambda start: make_homing_estimator(start, settings),
+            behaviour.control,
+            behaviour.path,
+        )
+        self._steering = Steering(behaviour.steering)
+        self._longest_step = 1.0 / behaviour.loop.images_per_s
+        self._time: float | None = None
+        self._closed = False
+
+    def step(self, image: npt.ArrayLike, time: float) -> DriveCommand:
+        """The command after one more image; it holds until the next one.
+
+        Args:
+            image: (height, width, 3) RGB or (height, width) grey uint8 from where the robot is.
+            time: seconds, later than that of the image before.
+
+        Raises:
+            SessionError: the follower is closed.
+            EstimatorError: the time is not finite, or not later. Nothing has changed then, nor by:
+            FrameError: the image is not this camera's.
+        """
+        self._require_open()
+        seconds = self._elapsed(time)
+        size = (self._camera.width, self._camera.height)
+        command = self._homing.step(colour_image(image, size), float(time))
+        drive = self._steering.step(command, seconds)
+        self._time = float(time)
+        return DriveCommand(drive.speed, drive.turn_rate, command)
+
+    def driven(self, v: float, omega: float, seconds: float) -> None:
+        """Reports that the robot drove otherwise than commanded, as obstacle avoidance makes it.
+
+        The time does not count as lack of progress, and the steering starts from this speed.
+
+        Args:
+            v: speed, m/s.
+            omega: turning rate, rad/s, counter-clockwise.
+            seconds: since the last command.
+
+        Raises:
+            SessionError: the follower is closed.
+            EstimatorError: a number is not finite.
+        """
+        self._require_open()
+        if not all(map(_is_finite, (v, omega, seconds))):
+            raise EstimatorError(
+                f"PathFollower: driven({v!r}, {omega!r}, {seconds!r}); give finite numbers"
+            )
+        self._steering.driven(Drive(v, omega, overridden=True))
+        self._homing.held_up(seconds)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the last target is reached, or the path given up."""
+        return self._homing.finished
+
+    @property
+    def legs(self) -> tuple[LegOutcome, ...]:
+        """How each leg that is over ended, in order."""
+        return tuple(self._homing.outcomes)
+
+    def close(self) -> None:
+        """Ends it; the present leg, if any, ends unfinished."""
+        if not self._closed and self._time is not None:
+            self._homing.interrupt(self._time, "closed")
+        self._closed = True
+
+    def __enter__(self) -> PathFollower:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise SessionError("PathFollower: it is closed; make a new one with the same path")
+
+    def _elapsed(self, time: float) -> float:
+        """Seconds since the last image, as far as steering may rely on the next one being near."""
+        if not _is_finite(time):
+            raise EstimatorError(f"PathFollower: the time is {time!r}; give finite seconds")
+        if self._time is None:
+            return self._longest_step
+        if time <= self._time:
+            raise EstimatorError(
+                f"PathFollower: an image at {time:.9f} s does not come after {self._time:.9f} s; "
+                "give images in the order of their times"
+            )
+        return min(time - self._time, self._longest_step)
+
+
+def _is_finite(value: object) -> bool:
+    number = isinstance(value, int | float | np.integer | np.floating)
+    return number and math.isfinite(float(value))  # type: ignore[arg-type]  # a number
+
+
+def _require_camera(camera: OmniCamera, who: str) -> OmniCamera:
+    if not all(hasattr(camera, name) for name in ("width", "height", "rays", "pixels")):
+        raise CalibrationError(
+            f"{who}: the camera is a {type(camera).__name__}; load one by "
+            "fgslam.load_camera(file), or give keys of one to it"
+        )
+    return camera
