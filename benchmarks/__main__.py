@@ -12,11 +12,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from benchmarks.bounds import BOUNDS
 from benchmarks.catalogue import EVIDENCE
-from benchmarks.pages import write_pages
+from benchmarks.pages import bounds, write_pages
+from benchmarks.rows import Section, section_as_json
 from benchmarks.runs import DATA, say
 from benchmarks.speed import long_drive, parts
-from benchmarks.tables import write_json
 from fgslam.core.errors import FgslamError
 
 
@@ -56,10 +57,13 @@ def _write_ratios(ratios: Mapping[str, float], path: str | Path) -> None:
 
 
 def _print_tables(name: str, data: Path, out: Path | None) -> None:
-    tables = list(EVIDENCE[name](data))
-    sys.stdout.write("\n".join(table.markdown() for table in tables))
+    tables = tuple(EVIDENCE[name](data))
+    rows = tuple(BOUNDS[name](tables)) if name in BOUNDS else ()
+    parts_shown = [table.markdown() for table in tables]
+    sys.stdout.write("\n".join([*parts_shown, *(bounds(rows) if rows else ())]) + "\n")
     if out is not None:
-        write_json(out, tables)
+        section = Section(name, (f"python -m benchmarks {name}",), rows=rows, tables=tables)
+        out.write_text(json.dumps(section_as_json(section), indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

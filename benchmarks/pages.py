@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from benchmarks.rows import RESULTS, Record, Section, load_record, shown_bound, shown_number
+from benchmarks.rows import RESULTS, Record, Row, Section, load_record, shown_bound, shown_number
 from benchmarks.tables import Cell, Table, shown
 
 PAGES = Path(__file__).parents[1] / "docs" / "results"
@@ -64,8 +64,24 @@ def overview(records: dict[str, Record]) -> str:
         lines += ["", f"## {group}"]
         for name in names:
             record = records[name]
-            lines += ["", f"### [{record.title}]({name}.md)", "", *_bounds(record.sections)]
+            lines += ["", f"### [{record.title}]({name}.md)", "", *_overview(record)]
     return _joined(lines)
+
+
+def _overview(record: Record) -> list[str]:
+    """Bounds of one page, each beside the experiment that it belongs to."""
+    rows = [
+        (section.title, row.name, shown_number(row), shown_bound(row), _WORDS[row.met])
+        for section in record.sections
+        for row in section.rows
+        if row.bound is not None
+    ]
+    titles = ["", *(row[0] for row in rows)]
+    once = [
+        ("" if row[0] == before else row[0], *row[1:])
+        for row, before in zip(rows, titles, strict=False)
+    ]
+    return grid(("experiment", "", "measured", "bound", ""), once) if rows else ["No bounds."]
 
 
 def page(record: Record) -> str:
@@ -85,7 +101,7 @@ def _section(section: Section) -> Iterator[str]:
     if section.commands:
         yield from ("```sh", *_continued(section.commands), "```", "")
     if section.rows:
-        yield from (*_bounds([section]), "")
+        yield from (*bounds(section.rows), "")
     for table in section.tables:
         if table.title:
             yield from (f"**{table.title}**", "")
@@ -94,15 +110,10 @@ def _section(section: Section) -> Iterator[str]:
             yield from (*_wrapped(note), "")
 
 
-def _bounds(sections: Iterable[Section]) -> list[str]:
-    rows: list[Sequence[str]] = [
-        (row.name, shown_number(row), shown_bound(row), _WORDS[row.met])
-        for section in sections
-        for row in section.rows
-    ]
-    if not rows:
-        return ["No bound; see the page."]
-    return grid(("", "measured", "bound", ""), rows)
+def bounds(rows: Iterable[Row]) -> list[str]:
+    """Numbers beside their bounds, met or missed, as a Markdown table."""
+    cells = [(r.name, shown_number(r), shown_bound(r), _WORDS[r.met]) for r in rows]
+    return grid(("", "measured", "bound", ""), cells)
 
 
 def fitted(table: Table, width: int = WIDTH) -> list[str]:
@@ -161,7 +172,9 @@ def _wrapped(paragraph: str) -> list[str]:
 def _continued(commands: Iterable[str]) -> Iterator[str]:
     """Commands as a shell reads them, long ones on several lines."""
     for command in commands:
-        lines = textwrap.wrap(command, WIDTH - 4, break_long_words=False, break_on_hyphens=False)
+        whole = command.replace("--set ", "--set\0")  # an option stays with its value
+        cut = textwrap.wrap(whole, WIDTH - 6, break_long_words=False, break_on_hyphens=False)
+        lines = [line.replace("\0", " ") for line in cut]
         yield from (f"{'    ' if k else ''}{line} \\" for k, line in enumerate(lines[:-1]))
         yield f"{'    ' if len(lines) > 1 else ''}{lines[-1]}"
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
-
-import yaml
 
 from benchmarks.tables import Table, shown
 
@@ -37,6 +36,11 @@ class Row:
     unit: str = ""
     relation: Relation = "<="
     bound: float | None = None
+
+    def __post_init__(self) -> None:
+        """Raises TypeError where the measured value is not a number."""
+        if not isinstance(self.measured, (int, float)):
+            raise TypeError(f"row '{self.name}': {self.measured!r} is not a number")
 
     @property
     def met(self) -> bool | None:
@@ -104,11 +108,11 @@ def load_record(path: Path) -> Record:
         RecordError: a key is missing or unknown, or a table's row has the wrong length.
     """
     try:
-        given = yaml.safe_load(path.read_text(encoding="utf-8"))  # JSON is YAML
+        given = json.loads(path.read_text(encoding="utf-8"))
         sections = tuple(_section(part) for part in given.pop("sections"))
         given["text"] = tuple(given.get("text", ()))
         return Record(path.stem, sections=sections, **given)
-    except (KeyError, TypeError, ValueError, yaml.YAMLError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise RecordError(f"{path}: {error}; see benchmarks/rows.py for the form") from error
 
 
@@ -125,6 +129,17 @@ def _section(given: dict[str, Any]) -> Section:
     )
     lists: dict[str, Any] = {key: tuple(given.pop(key, ())) for key in ("commands", "text")}
     return Section(rows=rows, tables=tables, **lists, **given)
+
+
+def section_as_json(section: Section) -> dict[str, Any]:
+    """The form in which :func:`load_record` reads a section."""
+    rows = [{k: v for k, v in vars(row).items() if v not in ("", None)} for row in section.rows]
+    return {
+        "title": section.title,
+        "commands": list(section.commands),
+        "rows": rows,
+        "tables": [table.as_json() for table in section.tables],
+    }
 
 
 def shown_bound(row: Row) -> str:

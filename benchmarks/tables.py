@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypeAlias
 
 Cell: TypeAlias = str | int | float | None
@@ -63,12 +61,6 @@ def shown(cell: Cell) -> str:
         text = f"{cell:.{max(0, min(decimals, 4))}f}"
         return text if text.strip("-0.") else text.removeprefix("-")
     return str(cell)
-
-
-def write_json(path: Path, tables: Iterable[Table]) -> None:
-    """All tables into one JSON file."""
-    text = json.dumps([table.as_json() for table in tables], indent=2)
-    path.write_text(text + "\n", encoding="utf-8")
 
 
 def _line(cells: Iterable[str]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
@@ -21,14 +20,14 @@ from benchmarks.runs import (
     run_whole,
     trajectory_error,
 )
-from benchmarks.tables import Table, shown, write_json
+from benchmarks.tables import Table, shown
 from fgslam.evaluation.trajectory import Alignment
 
 # ----------------------------------------------------------------------------------------------
 # The instruments themselves: fast
 
 
-def test_table_as_markdown_and_json(tmp_path: Path) -> None:
+def test_table_as_markdown_and_json() -> None:
     table = Table("T", ("what", "value"), [("a", 0.01234), ("b", None), ("c", 7)], ("why",))
     assert table.markdown().splitlines() == [
         "### T", "", "| what | value |", "| --- | --- |", "| a | 0.0123 |", "| b | - |",
@@ -36,10 +35,8 @@ def test_table_as_markdown_and_json(tmp_path: Path) -> None:
     ]  # fmt: skip
     assert table.column("value") == [0.01234, None, 7]
     nan = Table("N", ("value",), [(float("nan"),)])
-    write_json(tmp_path / "t.json", [table, nan])
-    read = json.loads((tmp_path / "t.json").read_text(encoding="utf-8"))
-    assert read[0]["rows"] == [["a", 0.01234], ["b", None], ["c", 7]]
-    assert read[1]["rows"] == [[None]]
+    assert table.as_json()["rows"] == [["a", 0.01234], ["b", None], ["c", 7]]
+    assert nan.as_json()["rows"] == [[None]]
 
 
 def test_table_refuses_a_row_of_another_length() -> None:

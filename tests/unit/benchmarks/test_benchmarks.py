@@ -8,9 +8,18 @@ from pathlib import Path
 import pytest
 
 import benchmarks.__main__ as runner
+from benchmarks.bounds import BOUNDS
 from benchmarks.catalogue import EVIDENCE
-from benchmarks.pages import WIDTH, fitted
-from benchmarks.rows import RecordError, Relation, Row, load_record, shown_bound, shown_number
+from benchmarks.pages import PAGES, WIDTH, all_pages, fitted
+from benchmarks.rows import (
+    RESULTS,
+    RecordError,
+    Relation,
+    Row,
+    load_record,
+    shown_bound,
+    shown_number,
+)
 from benchmarks.speed import parts
 from benchmarks.tables import Table
 
@@ -78,11 +87,14 @@ def test_every_name_prints_its_tables_and_writes_them(
         return [Table("T", ("what", "value"), [("a", 0.5)])]
 
     monkeypatch.setitem(EVIDENCE, name, measured)
+    monkeypatch.delitem(runner.BOUNDS, name, raising=False)
     out = tmp_path / "t.json"
     assert runner.main([name, "--data", str(tmp_path), "--out", str(out)]) == 0
     assert given == [tmp_path]
     assert "| a | 0.500 |" in capsys.readouterr().out
-    assert json.loads(out.read_text())[0]["rows"] == [["a", 0.5]]
+    written = json.loads(out.read_text())
+    assert written["commands"] == [f"python -m benchmarks {name}"]
+    assert written["tables"][0]["rows"] == [["a", 0.5]]
 
 
 def test_a_missing_recording_is_one_line_and_status_2(
@@ -92,3 +104,41 @@ def test_a_missing_recording_is_one_line_and_status_2(
     told = capsys.readouterr().err.strip().splitlines()[-1]
     assert told.startswith("error: ")
     assert str(tmp_path) in told
+
+
+def test_pages_of_results_are_those_of_the_committed_measurements() -> None:
+    for name, text in all_pages().items():
+        page = (PAGES / f"{name}.md").read_text(encoding="utf-8")
+        assert page == text, f"stale page {name}: run python -m benchmarks pages"
+    assert {path.stem for path in RESULTS.glob("*.json")} | {"index"} == set(all_pages())
+    assert {path.stem for path in PAGES.glob("*.md")} == set(all_pages())
+
+
+def test_lines_of_result_pages_fit() -> None:
+    for name, text in all_pages().items():
+        assert max(map(len, text.splitlines())) <= 120, name
+
+
+def test_overview_counts_what_is_missed() -> None:
+    rows = [row for path in RESULTS.glob("*.json") for row in load_record(path).rows]
+    missed = sum(not row.met for row in rows)
+    assert f"{len(rows)} bounds, {len(rows) - missed} met, {missed} missed" in " ".join(
+        all_pages()["index"].split()
+    )
+
+
+def test_bounds_of_the_paper_s_drive_are_read_from_its_tables() -> None:
+    ends = Table("End pose", ("distance cm", "yaw deg", "ATE cm"), [(4.4, 0.3, None), (6, -0.6, 1)])
+    columns = ("landmarks", "matched to the map: 5 %", "stereo precision")
+    landmarks = Table("Landmarks and matches", columns, [(3590, "40", None), (2001, 39, 0.97)])
+    rows = BOUNDS["paper_tables"]([ends, landmarks])
+    assert [row.met for row in rows] == [False, False, True, False, True, True]
+
+
+def test_bounds_of_the_seeds_take_the_worst() -> None:
+    columns = ("seed", "ATE cm", "end cm", "yaw deg", "matched, 5 %", "landmarks", "precision")
+    table = Table("seeds", columns, [
+        (1, 0.1, 0.1, 0.1, 90, 9000, 1.0), ("worst", 2.0, 5.0, 0.6, 40, 2000, 0.97),
+        ("bound", "a", "b", "c", "d", "e", "f"),
+    ])  # fmt: skip
+    assert [row.met for row in BOUNDS["seeds"]([table])] == [False, True, False, True, False, True]
