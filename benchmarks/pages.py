@@ -76,10 +76,10 @@ def _overview(record: Record) -> list[str]:
         for row in section.rows
         if row.bound is not None
     ]
-    titles = ["", *(row[0] for row in rows)]
+    before = ["", *(row[0] for row in rows)]
     once = [
-        ("" if row[0] == before else row[0], *row[1:])
-        for row, before in zip(rows, titles, strict=False)
+        ("" if row[0] == last else row[0], *row[1:])
+        for row, last in zip(rows, before, strict=False)
     ]
     return grid(("experiment", "", "measured", "bound", ""), once) if rows else ["No bounds."]
 
