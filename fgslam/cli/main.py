@@ -57,8 +57,12 @@ def run(
     Ctrl-C ends it early with all files valid; --resume goes on from there.
     """
     from fgslam.core.errors import ConfigError
-    from fgslam.runs.config import load_experiment
-    from fgslam.runs.config_models import HomingExperiment, LocalisationConfig
+    from fgslam.runs.config import (
+        ExperimentConfig,
+        HomingExperiment,
+        LocalisationConfig,
+        load_experiment,
+    )
 
     if overwrite and resume:
         raise ConfigError("--overwrite and --resume exclude each other; give one of them")
