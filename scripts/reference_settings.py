@@ -1,38 +1,48 @@
-"""Writes docs/reference/settings.md from the schema: every key, its default, range and meaning.
-
-``python scripts/make_configuration_docs.py`` rewrites the page; a test fails while it is stale.
-"""
+"""The page of settings, made from the schema: every key, its default, range and meaning."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, TypeAlias
 
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.config_models import HOMING_TASKS, TASKS, LocalisationConfig
+from scripts.markdown import item, paragraph
 
 Node: TypeAlias = dict[str, Any]
 
-PAGE = Path(__file__).parents[1] / "docs" / "reference" / "settings.md"
 _UNWRITTEN = ("kind", "task", "provenance")
 _TOLD_ELSEWHERE = ("map.made_from.dataset", "map.made_from.odometry")
-_INTRODUCTION = """# Configuration
+FIRST = {
+    "dataset.kind, dataset.path": "the recording: its layout and its folder",
+    "odometry.kind": "`recorded`, `constant_velocity`, or `synthetic` (truth plus stated noise)",
+    "estimator.kind": "the estimator that steers the run",
+    "compare": "estimators that replay the measurements of the run",
+    "seed": "of everything random in the run",
+    "frontend.ego_motion.dof": "3 on a flat floor, 5 at a fixed height, 6 for a flying or hand-held rig",
+    "frontend.stereo.pixel_sigma": "standard deviation of a feature's place in the image",
+    "frontend.stereo.max_disparity_px": "what is nearer than this disparity is not matched",
+    "estimator.noise_factor": "above 1 on images, whose errors persist from frame to frame",
+    "frontend.loops": "`{}` switches loop closing on",
+    "map.load, map.save": "saved maps: begin in one, write one",
+}
+"""What a user sets first, by key."""
 
-<!-- Made by scripts/make_configuration_docs.py: edit the settings' descriptions, not this page. -->
+_INTRODUCTION = """# Settings
+
+<!-- Made by `python -m scripts.make_reference`: edit the settings' descriptions, not this page. -->
 
 An experiment is one YAML file; `experiments/` has examples. Any key can be set from the command
-line, too: `fgslam run CONFIG.yaml --set frontend.sift.octave_layers=3 --set dataset.stop=null`.
-Values are YAML; the last one wins. An override that chooses another `kind` drops the file's keys of
-the old one. Unknown keys, keys given twice, NaN and infinity are refused. A run writes the resolved
+line, too: `fgslam run CONFIG.yaml --set frontend.sift.octave_layers=3 --set dataset.stop=null`. The
+last value of a key wins. An override that chooses another `kind` drops the file's keys of the old
+one. Unknown keys, keys given twice, NaN and infinity are refused. A run writes the resolved
 configuration, every default filled in, to `RUN/config.yaml`; that file is itself a configuration
 and repeats the run.
 
-Experiments of homing have a key `task`; theirs is the [second part](#homing-experiments).
-
 Keys without a default must be given. Units are metres, seconds and pixels, angles in degrees,
-unless the key's name or meaning says otherwise.
+unless the key's name or meaning says otherwise. Experiments of homing have a key `task`: see
+[homing experiments](#homing-experiments).
 """
 
 _LOCALISATION = """## Task `localisation`
@@ -49,10 +59,12 @@ them.
 """
 
 
-def configuration_page() -> str:
+def settings_page() -> str:
     """The whole page, in Markdown."""
     schema = ExperimentConfig.model_json_schema()
-    sections = [_INTRODUCTION, "## The experiment\n\n" + "\n".join(_table(schema, schema))]
+    first = [line for key, told in FIRST.items() for line in item(f"`{key}`: {told}")]
+    sections = [_INTRODUCTION, "## The keys that matter first\n\n" + "\n".join(first)]
+    sections += ["## The experiment\n\n" + "\n".join(_keys(schema, schema))]
     for name, node in schema["properties"].items():
         if name not in _UNWRITTEN:
             sections += _sections(schema, node, name, 2)
@@ -65,7 +77,11 @@ def _localisation() -> Iterator[str]:
     """The keys that only this task has; the others are those of the experiments above."""
     schema = LocalisationConfig.model_json_schema()
     told = " ".join(schema.get("description", "").split())
-    yield _LOCALISATION.format(told=told) + "\n" + "\n".join(_table(schema, schema))
+    yield (
+        _LOCALISATION.format(told="\n".join(paragraph(told)))
+        + "\n"
+        + "\n".join(_keys(schema, schema))
+    )
     for name in ("map", "localisation"):
         for section in _sections(schema, schema["properties"][name], name, 3):
             yield section.replace("`map`", "`map` of the task `localisation`", 1)
@@ -78,7 +94,7 @@ def _homing() -> Iterator[str]:
     for task in HOMING_TASKS:
         schema = TASKS[task].model_json_schema()
         told = " ".join(schema.get("description", "").split())
-        yield "\n".join([f"### Task `{task}`", "", told, "", *_table(schema, schema)])
+        yield "\n".join([f"### Task `{task}`", "", *paragraph(told), "", *_keys(schema, schema)])
         for name, node in schema["properties"].items():
             if name not in _UNWRITTEN:
                 groups |= dict.fromkeys(_sections(schema, node, name, 3))
@@ -92,27 +108,26 @@ def _sections(schema: Node, node: Node, dotted: str, level: int) -> Iterator[str
         kind = group["properties"].get("kind", {}).get("const")
         title = f"`{dotted}`" + (f", kind `{kind}`" if kind else "")
         told = " ".join(group.get("description", "").split())
-        lines = [f"{'#' * level} {title}", "", *([told, ""] if told else [])]
-        table = _table(schema, group)
-        yield "\n".join([*lines, *(table or ["Groups of keys:"])])
+        lines = [f"{'#' * level} {title}", "", *([*paragraph(told), ""] if told else [])]
+        keys = _keys(schema, group)
+        yield "\n".join([*lines, *(keys or ["Groups of keys:"])])
         for name, inner in group["properties"].items():
             below = f"{dotted}.{name}"
             if name not in _UNWRITTEN and below not in _TOLD_ELSEWHERE:
                 yield from _sections(schema, inner, below, min(level + 1, 4))
 
 
-def _table(schema: Node, group: Node) -> list[str]:
-    """Rows of the keys that hold a value or may be switched on; nothing where there are none."""
-    rows = []
+def _keys(schema: Node, group: Node) -> list[str]:
+    """Items of the keys that hold a value or may be switched on; nothing where there are none."""
+    lines: list[str] = []
     for name, node in group["properties"].items():
         if name in _UNWRITTEN or _is_plain_group(schema, node):
             continue
         required = name in group.get("required", ())
-        default = "" if required else f"`{_default(node)}`"
-        meaning = _meaning(schema, node).replace("|", "\\|")
-        rows.append(f"| `{name}` | {_kind(schema, node)} | {default} | {meaning} |")
-    header = ["| key | value | default | meaning |", "|---|---|---|---|"]
-    return [*header, *rows] if rows else []
+        default = "must be given" if required else f"default `{_default(node)}`"
+        kind, meaning = _kind(schema, node), _meaning(schema, node)
+        lines += item(f"`{name}` ({kind}; {default}): {meaning}")
+    return lines
 
 
 def _alternatives(node: Node) -> list[Node]:
@@ -142,7 +157,7 @@ def _meaning(schema: Node, node: Node) -> str:
     ]
     if kinds:
         return f"`kind`: {', '.join(f'`{kind}`' for kind in kinds)}; its keys are below"
-    return "null is off; a group, `{}` for its defaults, switches it on: its keys are below"
+    return "null is off; a group, `{}` for its defaults, switches it on"
 
 
 def _default(node: Node) -> str:
@@ -185,7 +200,3 @@ def _type(node: Node) -> str:
     return " ".join(
         [name.get(kind, "text" if kind == "string" else kind), ", ".join(limits)]
     ).strip()
-
-
-if __name__ == "__main__":
-    PAGE.write_text(configuration_page(), encoding="utf-8")

@@ -1,0 +1,1 @@
+"""Programs of the checkout: setting up, the vocabulary, the reference pages."""

@@ -1,0 +1,96 @@
+"""The generated reference pages say what the code says."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import typer
+
+from fgslam.cli.main import app
+from fgslam.runs.config import ExperimentConfig
+from fgslam.runs.config_models import HOMING_TASKS, TASKS, LocalisationConfig
+from scripts import reference_settings
+from scripts.make_reference import PAGES, REFERENCE
+from scripts.markdown import WIDTH, item
+from scripts.reference_commands import commands_page
+from scripts.reference_settings import settings_page
+
+
+@pytest.fixture(scope="module")
+def page() -> str:
+    return settings_page()
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_committed_page_is_current(name: str) -> None:
+    text = (REFERENCE / f"{name}.md").read_text(encoding="utf-8")
+    assert text == PAGES[name](), "stale: run python -m scripts.make_reference"
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_lines_fit(name: str) -> None:
+    assert max(map(len, PAGES[name]().splitlines())) <= WIDTH
+
+
+def test_every_key_and_kind_is_on_the_page(page: str) -> None:
+    schema = ExperimentConfig.model_json_schema()
+    for group in schema["$defs"].values():
+        for name, node in group.get("properties", {}).items():
+            if name == "kind":
+                assert f"kind `{node['const']}`" in page
+            else:
+                assert f"- `{name}` (" in page or f".{name}`" in page, name
+
+
+@pytest.mark.parametrize("task", HOMING_TASKS)
+def test_every_key_of_every_homing_task_is_on_the_page(page: str, task: str) -> None:
+    assert f"### Task `{task}`" in page
+    schema = TASKS[task].model_json_schema()
+    for group in (schema, *schema["$defs"].values()):
+        for name, node in group.get("properties", {}).items():
+            if name == "kind":
+                assert f"kind `{node['const']}`" in page
+            elif name not in ("task", "provenance"):
+                assert f"- `{name}` (" in page or f"{name}`" in page, name
+
+
+def test_every_key_of_localisation_is_on_the_page(page: str) -> None:
+    assert "## Task `localisation`" in page
+    schema = LocalisationConfig.model_json_schema()
+    for group in ("KnownMapSettings", "QuerySettings"):
+        for name in schema["$defs"][group]["properties"]:
+            assert f"- `{name}` (" in page, name
+
+
+def test_item_holds_range_default_and_meaning(page: str) -> None:
+    assert "- `seed` (whole number >= 0; default `0`): of everything random in the run" in page
+    assert "- `path` (text; must be given): folder of the recording" in page
+    assert '- `mode` (`descriptor` or `paper`; default `"descriptor"`):' in page
+
+
+def test_keys_that_matter_first_exist(page: str) -> None:
+    keys = [key for names in reference_settings.FIRST for key in names.split(", ")]
+    assert 10 <= len(keys) <= 15
+    for key in keys:
+        group, _, name = key.rpartition(".")
+        assert not group or f"`{group}`" in page, key
+        assert f"- `{name}` (" in page or f"`{key}`, kind" in page or name == "kind", key
+
+
+def test_every_command_and_option_is_on_the_page() -> None:
+    page = commands_page()
+    group = typer.main.get_command(app)
+    assert isinstance(group, typer.core.TyperGroup)
+    for name, command in group.commands.items():
+        section = re.split(r"\n## ", page.split(f"## `fgslam {name}`\n", 1)[1])[0]
+        for parameter in command.params:
+            if parameter.param_type_name == "option" and parameter.name != "help":
+                assert f"`{parameter.opts[0]}" in section, (name, parameter.opts)
+
+
+def test_items_break_between_words_but_not_in_code() -> None:
+    lines = item("`a key with a long name`: " + "word " * 40)
+    assert max(map(len, lines)) <= WIDTH
+    assert lines[0].startswith("- `a key with a long name`: word")
+    assert lines[1].startswith("  word")
