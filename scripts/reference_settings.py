@@ -20,7 +20,7 @@ FIRST = {
     "estimator.kind": "the estimator that steers the run",
     "compare": "estimators that replay the measurements of the run",
     "seed": "of everything random in the run",
-    "frontend.ego_motion.dof": "3 on a flat floor, 5 at a fixed height, 6 for a flying or hand-held rig",
+    "frontend.ego_motion.dof": "3 on a flat floor, 5 at a fixed height, 6 for a rig in the hand",
     "frontend.stereo.pixel_sigma": "standard deviation of a feature's place in the image",
     "frontend.stereo.max_disparity_px": "what is nearer than this disparity is not matched",
     "estimator.noise_factor": "above 1 on images, whose errors persist from frame to frame",
