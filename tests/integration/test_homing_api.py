@@ -1,0 +1,122 @@
+"""The public functions of homing give the numbers of the engine's tasks, on the rendered house."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+import fgslam as fg
+from fgslam.cli.main import app
+from fgslam.datasets.omni.house import open_house
+from fgslam.homing.image_front_end import DRIVING
+from fgslam.homing.settings import AvoidanceSettings, HomingBehaviourSettings
+from fgslam.worlds.house.settings import HousePanoramaSettings, HousePathSettings, OmniHouseSettings
+from fgslam.worlds.house.world import OmniWorld
+
+STEPS, DT, SEED = 10, 0.1, 0
+QUIET = {"pictures": 0, "report": False}
+HOUSE = OmniHouseSettings(path=HousePathSettings(legs=1, spacing_m=2.0))
+
+
+def run(folder: Path, values: dict[str, Any]) -> Path:
+    """Runs an experiment as a user would; its folder."""
+    config = folder / "experiment.yaml"
+    config.write_text(yaml.safe_dump(values), encoding="utf-8")
+    app(["run", str(config), "--out", str(folder / "run")], standalone_mode=False)
+    return folder / "run"
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def world() -> OmniWorld:
+    return open_house(HOUSE, SEED)
+
+
+def test_between_gives_the_numbers_of_the_task_homing_pairs(tmp_path: Path) -> None:
+    settings = OmniHouseSettings(
+        path=HousePathSettings(legs=2, spacing_m=1.0),
+        camera=HousePanoramaSettings(width=512, height=256),
+    )
+    world = open_house(settings, SEED)
+    images = [world.picture(pose, k) for k, pose in enumerate(world.reference_poses[:2])]
+    (tmp_path / "panoramas").mkdir()
+    for k, image in enumerate(images):
+        cv2.imwrite(str(tmp_path / "panoramas" / f"{k}.png"), image[..., ::-1])
+    dataset = {"kind": "panoramas", "path": str(tmp_path / "panoramas")}
+    values = {
+        "task": "homing_pairs",
+        "name": "pair",
+        "jobs": 1,
+        "dataset": dataset,
+        "reference": False,
+    }
+    (row,) = rows(run(tmp_path, values | {"homing_vector": {"samples": 500}}) / "pairs.csv")
+    answer = fg.HomingVector(world.camera, samples=500).between(*images)
+    assert isinstance(answer, fg.TwoViewVector), answer
+    sigma = np.sqrt(np.diag(answer.covariance))
+    found = np.degrees([answer.direction, sigma[0], answer.rotation, sigma[1]])
+    names = ("direction_deg", "sigma_direction_deg", "rotation_deg", "sigma_rotation_deg")
+    written = [float(row[name]) for name in names]
+    np.testing.assert_allclose(found, written, rtol=1e-9, atol=0)  # the file's ten digits
+    assert answer.support == int(row["inliers"])
+
+
+def test_a_follower_commands_what_the_closed_loop_does(tmp_path: Path, world: OmniWorld) -> None:
+    values = yaml.safe_load(Path("experiments/homing_lab.yaml").read_text(encoding="utf-8"))
+    values["behaviour"] = {"loop": {"longest_s": STEPS * DT}, "avoidance": {"method": "none"}}
+    values["output"] = QUIET
+    written = rows(run(tmp_path, values) / "commands.csv")
+    assert len(written) == STEPS
+    world.put(world.reference_poses[0])
+    behaviour = HomingBehaviourSettings(avoidance=AvoidanceSettings(method="none"))
+    path = fg.teach(world.targets, world.camera)
+    follower = fg.PathFollower(world.camera, path, behaviour=behaviour, seed=SEED)
+    for k, row in enumerate(written):
+        command = follower.step(world.image(k * DT), k * DT)
+        world.drive(command.v, command.omega, DT)
+        assert (row["state"], row["reason"]) == (command.state.value, command.reason)
+        told = [command.v, *np.degrees([command.omega, command.heading]), command.remaining]
+        names = ("speed_mps", "turn_deg_s", "heading_deg", "remaining")
+        # Times are sums in the one and products in the other.
+        np.testing.assert_allclose(told, [float(row[name]) for name in names], rtol=1e-7, atol=1e-7)
+
+
+def test_followers_side_by_side_do_not_disturb_each_other(world: OmniWorld) -> None:
+    start, target = world.reference_poses
+    camera, path = world.camera, fg.teach(world.targets, world.camera)
+    back = fg.teach([world.picture(start, 7)], camera)
+    there = [world.picture(start + 0.05 * k * (target - start), k) for k in range(4)]
+    here = [world.picture(target + 0.05 * k * (start - target), k) for k in range(4)]
+
+    def alone(images: list[Any], which: fg.PathMemory) -> list[tuple[float, float, str]]:
+        follower = fg.PathFollower(camera, which, estimator="homing_ekf")
+        commands = [follower.step(image, DT * k) for k, image in enumerate(images)]
+        return [(c.v, c.omega, c.reason) for c in commands]
+
+    first = fg.PathFollower(camera, path, estimator="homing_ekf")
+    second = fg.PathFollower(camera, back, estimator="homing_ekf")
+    both: tuple[list[Any], list[Any]] = ([], [])
+    for k in range(4):
+        for follower, images, out in ((first, there, both[0]), (second, here, both[1])):
+            command = follower.step(images[k], DT * k)
+            out.append((command.v, command.omega, command.reason))
+    assert list(both) == [alone(there, path), alone(here, back)]
+    assert both[0][-1][0] > 0.0
+
+
+def test_a_follower_by_default_has_the_settings_of_the_driving_experiments() -> None:
+    for name in ("homing_lab", "path_following"):
+        values = yaml.safe_load(Path(f"experiments/{name}.yaml").read_text(encoding="utf-8"))
+        assert DRIVING.features.matching.ratio == values["features"]["matching"]["ratio"]
+        for key, value in values["homing_vector"].items():
+            assert getattr(DRIVING.homing_vector, key) == value
