@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core.homing import HomingEstimate, HomingTruth
-from fgslam.report.homing import Column, HomingPage, TextTable
-from fgslam.report.homing.curves import Line, claimed_against_true, curve_figure
-from fgslam.report.homing.local_map import local_map_figure
-from fgslam.report.homing.plan import Drive, catchment_figure, drive_figure
+from fgslam.report.content import Column, Page, TextTable
+from fgslam.report.figures.curves import Line, claimed_against_true, curve_figure
+from fgslam.report.figures.local_map import local_map_figure
+from fgslam.report.figures.plan import Drive, catchment_figure, drive_figure
 
 FEATURES = np.array([[0.5, 0.8], [1.2, -0.6], [-0.3, 0.9], [0.7, -1.1]])
 LEG_M = 2.0
@@ -54,7 +54,7 @@ def drive() -> Drive:
     )
 
 
-def page(title: str = "homing_lab") -> HomingPage:
+def page(title: str = "homing_lab") -> Page:
     """One of everything."""
     time = np.linspace(0.0, 4.0, 30)
     curve = curve_figure(
@@ -66,10 +66,10 @@ def page(title: str = "homing_lab") -> HomingPage:
     error = {"direction": np.linspace(-1.0, 3.0, 20)}
     angle = np.linspace(0.0, 6.0, 12)
     offsets = np.column_stack([np.cos(angle), np.sin(angle)]) * (1.0 + angle[:, None])
-    return HomingPage(
+    return Page(
         title=title,
         subtitle="task homing",
-        verdict=("2 of 2 targets were reached.",),
+        headline=("2 of 2 targets were reached.",),
         tables=(
             TextTable(
                 "estimators",

@@ -11,7 +11,8 @@ from PIL import Image
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap, Trajectory
 from fgslam.core.geometry import pose, so3_exp
-from fgslam.report.page import Column, Comparison, EstimatorReport, Picture, ReportData
+from fgslam.report.content import Column, Picture, TextTable
+from fgslam.report.run_results import EstimatorReport, ReportData
 
 HOSTILE = "<script>alert('%{x}')</script> & \"quotes\" </style>"
 
@@ -95,7 +96,7 @@ def full_report(frames: int = 60, landmarks: int = 300) -> ReportData:
         estimators=estimators,
         truth=truth,
         notes=("a note on the recording",),
-        comparison=Comparison(columns, rows),
+        tables=(TextTable("comparison", "Comparison", "estimator", columns, rows),),
         pictures=(Picture("flow in frame 60", picture(rng)),),
         config_yaml="name: loop\n",
         versions={"fgslam": "0.1", "open3d": None},

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 from rich.table import Table
 
-from fgslam.report.homing import TextTable
+from fgslam.report.content import TextTable
 from fgslam.runs.homing_results import METRICS_FILE, REPORT_FILE, HomingResult
 
 _REMARKS_SHOWN = 8

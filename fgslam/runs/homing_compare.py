@@ -14,10 +14,10 @@ from fgslam.core.bearing_log import BearingLog
 from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.evaluation.homing import HomingErrors, homing_errors, summarise_homings
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
-from fgslam.report.homing import TextTable
-from fgslam.report.homing.curves import Line, curve_figure
-from fgslam.report.homing.local_map import local_map_figure
-from fgslam.report.page.traces import Figure
+from fgslam.report.content import TextTable
+from fgslam.report.figures.curves import Line, curve_figure
+from fgslam.report.figures.local_map import local_map_figure
+from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.choosing import EVERY, Choice, choose
 from fgslam.runs.config import is_homing, load_homing

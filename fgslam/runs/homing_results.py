@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from fgslam.evaluation.metrics import JsonValue
-from fgslam.report.homing import HomingPage, TextTable, write_homing_report
+from fgslam.report.content import Page, TextTable
+from fgslam.report.page import write_html
 from fgslam.report.tables import write_json
 from fgslam.runs.config_models import HomingExperiment
 from fgslam.runs.folder import ExistingFolder, create_run_folder
@@ -78,17 +79,17 @@ def write_document(
 
 
 def write_page(result: HomingResult, subtitle: str, **parts: Any) -> None:
-    """report.html, unless the configuration does without; ``parts`` as of HomingPage."""
+    """report.html, unless the configuration does without; ``parts`` as of Page."""
     if not result.config.output.report:
         return
-    page = HomingPage(
+    page = Page(
         title=result.config.name,
         subtitle=subtitle,
-        verdict=result.verdict,
+        headline=result.verdict,
         tables=result.tables,
         notes=result.remarks,
         config_yaml=(result.folder / "config.yaml").read_text(encoding="utf-8"),
         versions=versions(),
         **parts,
     )
-    write_homing_report(result.folder / REPORT_FILE, page)
+    write_html(result.folder / REPORT_FILE, page)

@@ -22,8 +22,9 @@ from fgslam.evaluation.trajectory import (
     to_estimate_world,
 )
 from fgslam.report.metrics import read_metrics
-from fgslam.report.page import Comparison, EstimatorReport, ReportData, write_report
 from fgslam.report.point_cloud import MapPoints, read_ply
+from fgslam.report.run_results import EstimatorReport, ReportData
+from fgslam.report.slam_page import write_report
 from fgslam.report.trajectories import read_covariances, read_tum
 from fgslam.runs.folder import RUN_MARKER
 from fgslam.runs.report_parts import comparison_table, sample_pictures
@@ -75,15 +76,15 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
     )
     pictures = next((p for p in folders if (p / "pictures").is_dir()), folder) / "pictures"
     loops = _find(folders, LOOPS_FILE)
-    places, closures = (Comparison(), []) if loops is None else read_closures(loops)
+    places, closures = (None, []) if loops is None else read_closures(loops)
+    comparison = comparison_table(metrics["estimators"])
     return ReportData(
         title=str(metrics.get("name") or config.get("name") or folder.name),
         subtitle=_subtitle(metrics, config),
         estimators=estimators,
         truth=_truth_in_their_world(estimators, truth),
         notes=_notes(metrics),
-        comparison=comparison_table(metrics["estimators"]),
-        places=places,
+        tables=(comparison, *([places] if places and places.rows else [])),
         closures=tuple(closures),
         pictures=tuple(sample_pictures(pictures)),
         config_yaml=config_text,

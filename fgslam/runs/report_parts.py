@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fgslam.core.errors import DatasetError
-from fgslam.report.page import Column, Comparison, Picture
+from fgslam.report.content import Column, Picture, TextTable
 
 UNKNOWN = "-"
 _FIGURES_OF_A_FRAME = {
@@ -138,7 +138,7 @@ _METRICS = (
 )
 
 
-def comparison_table(estimators: Mapping[str, Any]) -> Comparison:
+def comparison_table(estimators: Mapping[str, Any]) -> TextTable:
     """The table of a metrics.json's estimators; values that are not known read `-`."""
     found = {
         title: [_value(values or {}, metric.path) for metric in _METRICS]
@@ -153,7 +153,7 @@ def comparison_table(estimators: Mapping[str, Any]) -> Comparison:
         (title, tuple(_text(_METRICS[k], row[k]) for k in kept)) for title, row in found.items()
     )
     columns = tuple(Column(_METRICS[k].heading, _METRICS[k].meaning) for k in kept)
-    return Comparison(columns, rows)
+    return TextTable("comparison", "Comparison", "estimator", columns, rows)
 
 
 def sample_pictures(folder: Path) -> Iterator[Picture]:

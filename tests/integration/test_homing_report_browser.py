@@ -11,7 +11,7 @@ from homing_pages import page
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
-from fgslam.report.homing import write_homing_report
+from fgslam.report.page import write_html
 
 FIGURES = ("local-map", "drive", "direction", "claimed", "catchment")
 DRAWN = "document.getElementById('plot-{}')._fullData"
@@ -20,7 +20,7 @@ DRAWN = "document.getElementById('plot-{}')._fullData"
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     folder: Path = tmp_path_factory.mktemp("homing")
-    write_homing_report(folder / "report.html", page())
+    write_html(folder / "report.html", page())
     with browsing(folder) as found:
         found.open(folder / "report.html")
         yield found

@@ -14,7 +14,7 @@ from fgslam.core.planar import between, wrap
 from fgslam.homing.command import HomingState
 from fgslam.homing.drive_record import DriveRecord, HomingLog
 from fgslam.homing.drive_scores import cross_track, pass_distances
-from fgslam.report.homing.plan import Drive
+from fgslam.report.figures.plan import Drive
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.homing_logs import save_bearing_logs
 

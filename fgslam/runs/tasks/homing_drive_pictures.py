@@ -15,7 +15,7 @@ from fgslam.core.homing import TrackedBearings
 from fgslam.homing.active_homing import ActiveHoming
 from fgslam.homing.command import Command
 from fgslam.homing.path_following import HomingChain
-from fgslam.report.page.data import Picture
+from fgslam.report.content import Picture
 from fgslam.report.pictures.view_tracks import draw_view_tracks
 
 FOLDER = "pictures"

@@ -22,11 +22,11 @@ from fgslam.homing.drive_scores import (
     slope_by_leg,
     truly_arrived,
 )
-from fgslam.report.homing import Column, TextTable
-from fgslam.report.homing.curves import Line, curve_figure
-from fgslam.report.homing.local_map import local_map_figure
-from fgslam.report.homing.plan import PASS_RADIUS_M, catchment_figure, drive_figure
-from fgslam.report.page.traces import Figure
+from fgslam.report.content import Column, TextTable
+from fgslam.report.figures.curves import Line, curve_figure
+from fgslam.report.figures.local_map import local_map_figure
+from fgslam.report.figures.plan import PASS_RADIUS_M, catchment_figure, drive_figure
+from fgslam.report.figures.traces import Figure
 from fgslam.runs.config_models import DrivingConfig
 from fgslam.runs.homing_replay import replay_homing
 from fgslam.runs.homing_results import HomingResult, Status, write_document, write_page

@@ -15,10 +15,9 @@ from fgslam.evaluation.metrics import JsonValue
 from fgslam.homing.links import Answer, Link, Pair
 from fgslam.homing.third_view_consistency import InlierRows
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
-from fgslam.report.homing import Column, TextTable
-from fgslam.report.homing.network import Links, network_figure, unfolded
-from fgslam.report.page.data import Picture
-from fgslam.report.page.traces import Figure
+from fgslam.report.content import Column, Picture, TextTable
+from fgslam.report.figures.network import Links, network_figure, unfolded
+from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.config_models import TopologicalMapConfig
 from fgslam.runs.folder import ExistingFolder

@@ -11,7 +11,7 @@ from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.homing import BearingMatches, FeatureKind, TwoViewVector
-from fgslam.report.page.data import Picture
+from fgslam.report.content import Picture
 from fgslam.report.pictures.view_matches import MatchedPixels, draw_view_matches
 from fgslam.runs.tasks.homing_pair_answers import PairAnswer, PairErrors
 from fgslam.runs.tasks.homing_pair_search import PairSearch, answer_pair

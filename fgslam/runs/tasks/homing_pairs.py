@@ -9,10 +9,10 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.evaluation.metrics import JsonValue
-from fgslam.report.homing import Column, TextTable
-from fgslam.report.homing.curves import claimed_against_true, sorted_errors
-from fgslam.report.homing.network import Links, network_figure
-from fgslam.report.page.traces import Figure
+from fgslam.report.content import Column, TextTable
+from fgslam.report.figures.curves import claimed_against_true, sorted_errors
+from fgslam.report.figures.network import Links, network_figure
+from fgslam.report.figures.traces import Figure
 from fgslam.runs.config_models import HomingPairsConfig
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.homing_results import (

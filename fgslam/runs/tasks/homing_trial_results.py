@@ -11,9 +11,9 @@ import numpy as np
 from fgslam.evaluation.consistency import Consistency, Nees
 from fgslam.evaluation.homing import HomingErrors, HomingSummary, summarise_homings
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
-from fgslam.report.homing import Column, TextTable
-from fgslam.report.homing.curves import sorted_errors
-from fgslam.report.page.traces import Figure
+from fgslam.report.content import Column, TextTable
+from fgslam.report.figures.curves import sorted_errors
+from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.config_models import HomingTrialsConfig
 from fgslam.runs.homing_results import HomingResult, Status, write_document, write_page

@@ -14,9 +14,8 @@ from fgslam.core.atomic_files import make_subfolder
 from fgslam.datasets.omni.recording import OmniRecording
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
 from fgslam.frontend.homing.video_tracking import ReplenishedTracker, TrackedImage
-from fgslam.report.homing import Column, TextTable
-from fgslam.report.homing.curves import Line, curve_figure
-from fgslam.report.page.data import Picture
+from fgslam.report.content import Column, Picture, TextTable
+from fgslam.report.figures.curves import Line, curve_figure
 from fgslam.report.pictures.view_tracks import draw_view_tracks
 from fgslam.report.tables import write_csv
 from fgslam.runs.config_models import OmniVideoConfig

@@ -12,8 +12,8 @@ from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.geometry import yaw_pitch_roll
 from fgslam.evaluation.localisation import Bounds, LocalisationScore, Spread
 from fgslam.evaluation.metrics import JsonValue
-from fgslam.report.homing import HomingPage, write_homing_report
-from fgslam.report.page.data import Picture
+from fgslam.report.content import Page, Picture
+from fgslam.report.page import write_html
 from fgslam.report.pictures.located import LocatedDrawing, draw_located
 from fgslam.report.tables import Cell, write_csv, write_json
 from fgslam.runs.tasks.localisation_results import (
@@ -77,17 +77,17 @@ def write_results(result: LocalisationResult, given: GivenMap, subtitle: str) ->
         bounds = bounds_of(result.config)
         pictures = tuple(_draw(folder, given, one, bounds) for one in judged)
     if output.report:
-        page = HomingPage(
+        page = Page(
             title=result.config.name,
             subtitle=subtitle,
-            verdict=result.verdict,
+            headline=result.verdict,
             tables=result.tables,
             pictures=pictures,
             notes=result.notes,
             config_yaml=(folder / "config.yaml").read_text(encoding="utf-8"),
             versions=versions(),
         )
-        write_homing_report(folder / REPORT_FILE, page)
+        write_html(folder / REPORT_FILE, page)
 
 
 def _rows(judged: Scored) -> Iterator[tuple[Cell, ...]]:

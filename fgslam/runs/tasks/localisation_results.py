@@ -23,7 +23,7 @@ from fgslam.evaluation.localisation import (
     localisation_errors,
     score,
 )
-from fgslam.report.homing import Column, TextTable
+from fgslam.report.content import Column, TextTable
 from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.tasks.localisation_queries import Asked, Attempt
 

@@ -14,7 +14,7 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory
 from fgslam.evaluation.closures import JudgedClosure, judge_closures
 from fgslam.evaluation.metrics import JsonValue
-from fgslam.report.page import Column, Comparison
+from fgslam.report.content import Column, TextTable
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.tasks.slam_recorder import RunRecorder
 
@@ -77,7 +77,7 @@ def write_closures(folder: Path, recorder: RunRecorder, closures: list[JudgedClo
     write_csv(folder / LOOPS_FILE, _NAMES, rows)
 
 
-def read_closures(path: Path) -> tuple[Comparison, list[tuple[int, int]]]:
+def read_closures(path: Path) -> tuple[TextTable, list[tuple[int, int]]]:
     """The report's table of a loops.csv, and (closing, returned to) of the loops closed.
 
     A file of an older run does not tell which were refused: there all count as taken.
@@ -87,7 +87,7 @@ def read_closures(path: Path) -> tuple[Comparison, list[tuple[int, int]]]:
         rows = list(csv.DictReader(io.StringIO(text)))
         lines = tuple((_title(row), _values(row)) for row in rows)
         closed = [(int(row["at"]), int(row["to"])) for row in rows if _taken(row) != "no"]
-        return Comparison(_COLUMNS, lines), closed
+        return TextTable("places", "Places recognised", "closed at", _COLUMNS, lines), closed
     except (OSError, UnicodeDecodeError, KeyError, ValueError, TypeError) as error:
         raise DatasetError(
             f"{path}: not a table of closed loops ({error}); run the experiment again"

@@ -13,8 +13,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import congruence
-from fgslam.report.page.data import EstimatorReport, ReportData
-from fgslam.report.page.traces import (
+from fgslam.report.figures.traces import (
     Figure,
     Owner,
     Paint,
@@ -26,6 +25,7 @@ from fgslam.report.page.traces import (
     trace,
 )
 from fgslam.report.pictures.birds_eye import exaggeration, world_position_covariances
+from fgslam.report.run_results import EstimatorReport, ReportData
 
 MAX_POSES = 1_500
 MAX_DOTS_ABOVE = 3_000
@@ -84,7 +84,8 @@ def drive_from_above(data: ReportData) -> Figure:
             Switch("landmarks", "landmarks"),
             *([Switch("returns", "loops closed")] if data.closures else []),
         ),
-        selects=True,
+        choices=_with_landmarks(data),
+        chosen=data.best,
         note=_thinning_note(data, MAX_DOTS_ABOVE),
     )
 
@@ -109,7 +110,8 @@ def map_to_turn(data: ReportData) -> Figure:
     return Figure(
         "map",
         "The map in three dimensions",
-        "Drag to turn, pinch or scroll to come closer, drag with the right button to shift. "
+        "Drag to turn, pinch or scroll to come closer, drag with the right button to shift; or use "
+        "arrow keys, plus and minus. "
         "Dots: landmarks of the estimator chosen, coloured by height. Lines as above.",
         (*_dots_in_space(data, level, limits), *_paths(data, level)),
         {"scene": scene},
@@ -119,11 +121,17 @@ def map_to_turn(data: ReportData) -> Figure:
             Switch("online", "path as first estimated", on=False),
             Switch("landmarks", "landmarks"),
         ),
-        selects=True,
+        choices=_with_landmarks(data),
+        chosen=data.best,
         note=" ".join(
             filter(None, [_thinning_note(data, MAX_DOTS_MAP), _outside(data, level, limits)])
         ),
     )
+
+
+def _with_landmarks(data: ReportData) -> tuple[int, ...]:
+    """Numbers of the estimators that have a map."""
+    return tuple(i for i, e in enumerate(data.estimators) if len(e.landmarks))
 
 
 def _thinning_note(data: ReportData, dots: int) -> str:

@@ -79,9 +79,12 @@ class Figure:
         traces: what is drawn.
         layout: Plotly's, without colours.
         switches: checkboxes above it.
-        selects: whether one estimator at a time is chosen for part of it.
+        choices: numbers of the series of which one at a time is chosen for part of it (none where
+            no series has that part); None where all are shown together.
+        chosen: which of them at first.
         note: what is not drawn, in words.
         steps: names of its moments, shown one at a time by a slider; none where it has no time.
+        missing: why it has no numbers, should it have none.
     """
 
     key: str
@@ -90,9 +93,26 @@ class Figure:
     traces: tuple[Trace, ...]
     layout: Mapping[str, Any]
     switches: tuple[Switch, ...] = ()
-    selects: bool = False
+    choices: tuple[int, ...] | None = None
+    chosen: int = 0
     note: str = ""
     steps: tuple[str, ...] = ()
+    missing: str = "nothing was recorded"
+
+    @property
+    def has_numbers(self) -> bool:
+        """Whether anything but bands is drawn in it."""
+        return any(trace["meta"]["paint"] != "band" for trace in self.traces)
+
+    @property
+    def turns(self) -> bool:
+        """Whether it is drawn in space, and turned by the reader."""
+        return "scene" in self.layout
+
+    @property
+    def tall(self) -> bool:
+        """Whether it needs height: a plane of equal axes, or space."""
+        return self.turns or "scaleanchor" in self.layout.get("yaxis", {})
 
 
 def trace(owner: Owner, axes: Mapping[str, FloatArray], **more: Any) -> Trace:

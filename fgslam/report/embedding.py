@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from PIL import Image, UnidentifiedImageError
 
-from fgslam.report.page.data import Picture
+from fgslam.report.content import Picture
 
 MAX_WIDTH = 1400
 BUDGET_BYTES = 2_800_000

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.report.page.traces import Figure, Owner, Switch, Trace, peaks, trace
+from fgslam.report.figures.traces import Figure, Owner, Switch, Trace, peaks, trace
 
 MAX_POINTS = 2_500
 

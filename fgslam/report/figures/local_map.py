@@ -9,7 +9,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import HomingEstimate, HomingTruth
-from fgslam.report.page.traces import Figure, Owner, Switch, Trace, thinned, trace
+from fgslam.report.figures.traces import Figure, Owner, Switch, Trace, thinned, trace
 
 MAX_MOMENTS = 60
 SIGMAS = 3.0

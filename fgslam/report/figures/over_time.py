@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.report.page.data import EstimatorReport, ReportData
-from fgslam.report.page.traces import Figure, Owner, Switch, Trace, peaks, trace
+from fgslam.report.figures.traces import Figure, Owner, Switch, Trace, peaks, trace
+from fgslam.report.run_results import EstimatorReport, ReportData
 
 MAX_POINTS = 2500
 SIGMAS = 3.0

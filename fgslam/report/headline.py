@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from fgslam.report.page.data import EstimatorReport, ReportData
+from fgslam.report.run_results import EstimatorReport, ReportData
 
 _ABOUT_EQUAL = 1.05
 _ROUND_FROM = 1000.0
@@ -15,28 +15,13 @@ _JUDGED = {
 }
 
 
-def headline(data: ReportData) -> list[str]:
+def headline(data: ReportData) -> tuple[str, ...]:
     """Sentences about accuracy, consistency and failures, most important first."""
     working = [e for e in data.estimators if not e.failure]
     lines = [_accuracy(data, working)] if working else ["No estimator gave a result."]
     lines += _consistency(working)
     lines += [f"{e.title} failed: {e.failure}" for e in data.estimators if e.failure]
-    return lines
-
-
-def best(data: ReportData) -> int:
-    """Number of the most accurate estimator with a map; of the first one where that is not known.
-
-    One that ended early has its error over part of the way only, and is no match for the others.
-    """
-    errors = [
-        (e.ate_m, i)
-        for i, e in enumerate(data.estimators)
-        if e.ate_m is not None and len(e.landmarks) and not e.failure
-    ]
-    if errors:
-        return min(errors)[1]
-    return next((i for i, e in enumerate(data.estimators) if len(e.landmarks)), 0)
+    return tuple(lines)
 
 
 def metres(value: float) -> str:

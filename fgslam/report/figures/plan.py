@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.report.page.traces import (
+from fgslam.report.figures.traces import (
     Figure,
     Owner,
     Switch,

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
 from fgslam.core.arrays import FloatArray
-from fgslam.report.page.traces import Figure, Owner, Switch, Trace, joined, plain_texts, trace
+from fgslam.report.figures.traces import Figure, Owner, Switch, Trace, joined, plain_texts, trace
 
 _TOLD = "%{text}<extra></extra>"
 

@@ -1,4 +1,4 @@
-"""What a report page shows: plain values and arrays, whoever computed them.
+"""Results of the estimators of one run, as figures and the page show them: plain arrays.
 
 All poses and points of one report are in one world: that of the estimates, the reference camera's
 first frame. What cannot be known is None or NaN, never a guess; the page then says so.
@@ -13,6 +13,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap, Trajectory
+from fgslam.report.content import Picture, TextTable
 
 
 def _no_landmarks() -> LandmarkMap:
@@ -100,42 +101,6 @@ class EstimatorReport:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Column:
-    """A column of the comparison table: heading with unit, and what it means."""
-
-    name: str
-    meaning: str
-
-
-@dataclass(frozen=True, slots=True)
-class Comparison:
-    """The comparison table as it is read: values as text with their units in the headings.
-
-    Attributes:
-        columns: m headings.
-        rows: title of the estimator and its m values; `-` where a value is not known.
-    """
-
-    columns: tuple[Column, ...] = ()
-    rows: tuple[tuple[str, tuple[str, ...]], ...] = ()
-
-    def __post_init__(self) -> None:
-        for title, values in self.rows:
-            if len(values) != len(self.columns):
-                raise ValueError(
-                    f"{title}: {len(values)} values in a table of {len(self.columns)} columns"
-                )
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """A picture beside the plots: PNG or JPEG, with a caption that says what it shows."""
-
-    caption: str
-    content: bytes = field(repr=False)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class ReportData:
     """All that one page shows.
@@ -145,8 +110,7 @@ class ReportData:
         notes: what was tolerated in the recording, warnings, in words.
         truth: true poses in the estimates' world; None where there are none.
         estimators: one or more, in the order of the table; their colours follow it.
-        comparison: the table.
-        places: closures, taken or refused, a row each; without columns where none were looked for.
+        tables: the estimators side by side, closures taken and refused.
         closures: pairs of frames (closing, returned to) of the loops closed, counted in the first
             estimator's poses.
         pictures: of the run.
@@ -161,8 +125,7 @@ class ReportData:
     estimators: tuple[EstimatorReport, ...]
     truth: Trajectory | None = None
     notes: tuple[str, ...] = ()
-    comparison: Comparison = field(default_factory=Comparison)
-    places: Comparison = field(default_factory=Comparison)
+    tables: tuple[TextTable, ...] = ()
     closures: tuple[tuple[int, int], ...] = ()
     pictures: tuple[Picture, ...] = ()
     config_yaml: str = ""
@@ -180,3 +143,19 @@ class ReportData:
         """Seconds of the first frame: times in the plots count from it."""
         known = [e.timestamps[0] for e in self.estimators if len(e)]
         return float(min(known, default=0.0))
+
+    @property
+    def best(self) -> int:
+        """Number of the most accurate estimator with a map; the first one where that is not known.
+
+        One that ended early has its error over part of the way only, and is no match for the
+        others.
+        """
+        errors = [
+            (e.ate_m, i)
+            for i, e in enumerate(self.estimators)
+            if e.ate_m is not None and len(e.landmarks) and not e.failure
+        ]
+        if errors:
+            return min(errors)[1]
+        return next((i for i, e in enumerate(self.estimators) if len(e.landmarks)), 0)

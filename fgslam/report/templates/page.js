@@ -1,8 +1,24 @@
 "use strict";
 // Draws the figures of a report and keeps them in step with the page's switches and colours.
 // The switches themselves are the only state: a figure is always drawn from what they say.
-(() => {
-  const report = JSON.parse(document.getElementById("report-data").textContent);
+(async () => {
+  // Compressed text of an element of this page.
+  async function unpacked(id) {
+    const bytes = Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+    return new Response(stream).text();
+  }
+
+  if (typeof DecompressionStream === "undefined") {
+    document.getElementById("undrawn").hidden = false;
+    return;
+  }
+  const figures = JSON.parse(await unpacked("report-data"));
+  const colours = Number(document.getElementById("report-data").dataset.colours);
+  const plotly = document.createElement("script");
+  plotly.textContent = await unpacked("plotly"); // runs at once: the page's policy names its digest
+  document.head.append(plotly);
+
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const touch = matchMedia("(pointer: coarse)");
   const narrow = matchMedia("(max-width: 600px)");
@@ -30,7 +46,7 @@
   function colourOf(owner) {
     if (owner.paint === "truth") return css("--ink");
     if (owner.paint === "grey") return css("--dots");
-    return css(`--e${(owner.colour ?? owner.estimator) % report.colours}`);
+    return css(`--e${(owner.colour ?? owner.estimator) % colours}`);
   }
 
   function dressedTrace(figure, trace) {
@@ -82,7 +98,7 @@
   }
 
   function draw(key) {
-    const { traces, layout } = report.figures[key];
+    const { traces, layout } = figures[key];
     const config = {
       responsive: true,
       displaylogo: false,
@@ -98,7 +114,7 @@
     return Plotly.react(`plot-${key}`, dressed, dressedLayout(key, layout), config);
   }
 
-  const drawAll = () => Promise.all(Object.keys(report.figures).map(draw));
+  const drawAll = () => Promise.all(Object.keys(figures).map(draw));
 
   document.addEventListener("change", (event) => {
     const { figure, estimator } = event.target.dataset;
@@ -136,6 +152,25 @@
     });
   }
 
+  // Maps turn by arrow keys, too, and come closer by plus and minus.
+  const TURN = { ArrowLeft: [0.1, 1], ArrowRight: [-0.1, 1], "+": [0, 0.9], "-": [0, 1.1] };
+  const RAISE = { ArrowUp: 0.15, ArrowDown: -0.15 };
+  for (const plot of document.querySelectorAll(".plot[tabindex]")) {
+    plot.addEventListener("keydown", (event) => {
+      if (!(event.key in TURN) && !(event.key in RAISE)) return;
+      event.preventDefault();
+      const camera = plot._fullLayout.scene._scene.getCamera();
+      const [angle, nearer] = TURN[event.key] ?? [0, 1];
+      const { x, y, z } = camera.eye;
+      const eye = {
+        x: nearer * (x * Math.cos(angle) - y * Math.sin(angle)),
+        y: nearer * (x * Math.sin(angle) + y * Math.cos(angle)),
+        z: nearer * z + (RAISE[event.key] ?? 0),
+      };
+      Plotly.relayout(plot, { "scene.camera": { ...camera, eye } });
+    });
+  }
+
   const dialog = document.getElementById("closer");
   for (const button of document.querySelectorAll("button.enlarge")) {
     button.addEventListener("click", () => {
@@ -148,5 +183,6 @@
   }
   dialog.querySelector("button").addEventListener("click", () => dialog.close());
 
-  drawAll().then(() => document.documentElement.setAttribute("data-drawn", "yes"));
+  await drawAll();
+  document.documentElement.setAttribute("data-drawn", "yes");
 })();

@@ -1,0 +1,105 @@
+"""The page of any task: one HTML file that needs nothing else, neither beside it nor the network.
+
+A jinja2 template with automatic escaping; the page's own policy lets only the two scripts run whose
+digests it names, so that not even a mistake here would run what a configuration or a file name
+says. Plotly and the numbers of the figures are compressed: the browser unpacks them.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import json
+from functools import lru_cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from fgslam.core.atomic_files import write_text
+from fgslam.report.content import Page
+from fgslam.report.embedding import embed
+from fgslam.report.figures import palette
+
+NOT_KNOWN = "not known"
+
+
+def write_html(path: Path, page: Page) -> None:
+    """Writes the page atomically; the same values give the same bytes.
+
+    Args:
+        path: the .html file.
+        page: all that it shows.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_text(path, render(page))
+
+
+def render(page: Page) -> str:
+    """The page as text."""
+    shown, left_out = embed(page.pictures)
+    script = _asset("page.js")
+    return _template().render(
+        page=page,
+        pictures=shown,
+        left_out=left_out,
+        not_known=NOT_KNOWN,
+        style=palette.style_sheet() + _asset("page.css"),
+        colours=palette.COUNT,
+        script=script,
+        script_digest=_digest(script),
+        plotly=_packed_plotly()[0],
+        plotly_digest=_packed_plotly()[1],
+        figures=_packed(_numbers(page)),
+    )
+
+
+def _template() -> jinja2.Template:
+    environment = jinja2.Environment(
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters["json"] = json.dumps  # into attributes: escaped like any text
+    return environment.from_string(_asset("page.html"))
+
+
+def _numbers(page: Page) -> str:
+    """Traces and layouts of the figures that show something, by key, as JSON."""
+    values: dict[str, Any] = {
+        figure.key: {"traces": figure.traces, "layout": figure.layout}
+        for figure in page.figures
+        if figure.has_numbers
+    }
+    return json.dumps(values, allow_nan=False, sort_keys=True)
+
+
+@lru_cache(maxsize=1)
+def _packed_plotly() -> tuple[str, str]:
+    """Plotly's script as :func:`_packed`, and the digest under which the page lets it run."""
+    from plotly.offline import get_plotlyjs  # most of the file, needed by nothing else
+
+    # As the browser's parser hands a script on, so that its digest is the same there.
+    script = str(get_plotlyjs()).replace("\r\n", "\n").replace("\r", "\n")
+    return _packed(script), _digest(script)
+
+
+def _packed(text: str) -> str:
+    """Text as gzip in base64, without a date, so that equal texts give equal bytes."""
+    content = gzip.compress(text.encode("utf-8"), compresslevel=9, mtime=0)
+    return base64.b64encode(content).decode("ascii")
+
+
+def _digest(script: str) -> str:
+    return base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
+
+
+def _asset(name: str) -> str:
+    folder = resources.files(__package__) / "templates"
+    return (folder / name).read_text(encoding="utf-8")
