@@ -7,12 +7,19 @@ first frame. What cannot be known is None or NaN, never a guess; the page then s
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import LandmarkMap, Trajectory
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
+from fgslam.evaluation.consistency import chi_square_band, judge, pose_nees
+from fgslam.evaluation.trajectory import (
+    Alignment,
+    evaluate_trajectory,
+    position_errors,
+    to_estimate_world,
+)
 from fgslam.report.content import Picture, TextTable
 
 
@@ -80,6 +87,11 @@ class EstimatorReport:
 
     def __len__(self) -> int:
         return len(self.timestamps)
+
+    @property
+    def final(self) -> Trajectory:
+        """The path as estimated at the end."""
+        return Trajectory(self.timestamps, self.final_poses)
 
     @staticmethod
     def failed(title: str, kind: str, why: str) -> EstimatorReport:
@@ -159,3 +171,92 @@ class ReportData:
         if errors:
             return min(errors)[1]
         return next((i for i, e in enumerate(self.estimators) if len(e.landmarks)), 0)
+
+
+def judged_report(
+    title: str,
+    kind: str,
+    estimate: Estimate,
+    online: Trajectory | None,
+    truth: Trajectory | None,
+) -> EstimatorReport:
+    """An estimate with its errors, by the same functions as the numbers of metrics.json.
+
+    Args:
+        title: its name in the run.
+        kind: which estimator it is.
+        estimate: as known at the end.
+        online: each pose as first estimated, where that is known.
+        truth: true poses in any world, where there are some.
+    """
+    final, covariances = estimate.trajectory, estimate.covariances
+    poses = np.full((len(final), 4, 4), np.nan)
+    if online is not None:
+        rows, of = same_times(final.timestamps, online.timestamps)
+        poses[rows] = online.poses[of]
+    unknown = np.full(len(final), np.nan)
+    report = EstimatorReport(
+        title=title,
+        kind=kind,
+        timestamps=final.timestamps,
+        final_poses=final.poses,
+        online_poses=poses,
+        covariances=covariances,
+        landmarks=estimate.landmarks,
+        final_error_m=unknown,
+        online_error_m=unknown,
+        nees=unknown,
+        update_ms=unknown,
+        remarks=estimate.remarks,
+    )
+    found = None if truth is None else to_estimate_world(final, truth)
+    return report if found is None else _against_truth(report, *found, truth)
+
+
+def _against_truth(
+    report: EstimatorReport, rows: IntArray, true_poses: FloatArray, truth: Trajectory | None
+) -> EstimatorReport:
+    """The report with its errors; ``rows`` (k,) have the true poses (k, 4, 4) in its world."""
+    errors, online_errors, values = (np.full(len(report), np.nan) for _ in range(3))
+    errors[rows] = position_errors(report.final_poses[rows], true_poses)
+    online_errors[rows] = position_errors(report.online_poses[rows], true_poses)
+    found = pose_nees(report.final_poses[rows], report.covariances[rows], true_poses)
+    per_dof = np.full(len(rows), np.nan)
+    values[rows] = np.divide(found.values, found.dof, out=per_dof, where=found.dof > 0)
+    usual = np.bincount(found.dof[found.dof > 0])
+    later = rows[1:]  # the first pose is the gauge
+    judged = judge(
+        [pose_nees(report.final_poses[later], report.covariances[later], true_poses[1:])]
+    )
+    aligned = evaluate_trajectory(report.final, truth, Alignment.SE3)
+    return replace(
+        report,
+        final_error_m=errors,
+        online_error_m=online_errors,
+        nees=values,
+        nees_band=chi_square_band(float(usual.argmax())) if len(usual) else None,
+        ate_m=aligned.ate_rmse_m,
+        nees_per_dof=None if judged is None else judged.per_dof,
+        verdict=None if judged is None else judged.verdict,
+    )
+
+
+def truth_in_their_world(
+    estimators: tuple[EstimatorReport, ...], truth: Trajectory | None
+) -> Trajectory | None:
+    """True poses of the frames, the first one aligned; of the estimator that has most of them."""
+    best: Trajectory | None = None
+    for estimator in estimators:
+        if truth is None:
+            break
+        final = estimator.final
+        found = to_estimate_world(final, truth)
+        if found is not None and (best is None or len(found[0]) > len(best)):
+            best = Trajectory(final.timestamps[found[0]], found[1])
+    return best
+
+
+def same_times(a: FloatArray, b: FloatArray) -> tuple[IntArray, IntArray]:
+    """Rows of both that have the very same time stamp, as files of one estimator do."""
+    _, rows, of = np.intersect1d(a, b, return_indices=True)
+    return rows, of

@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError, FgslamError
-from fgslam.core.estimates import LandmarkMap, Trajectory
+from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.evaluation.consistency import chi_square_band, judge, pose_nees
-from fgslam.evaluation.trajectory import (
-    Alignment,
-    evaluate_trajectory,
-    position_errors,
-    to_estimate_world,
-)
 from fgslam.report.metrics import read_metrics
 from fgslam.report.point_cloud import MapPoints, read_ply
-from fgslam.report.run_results import EstimatorReport, ReportData
+from fgslam.report.run_results import (
+    EstimatorReport,
+    ReportData,
+    judged_report,
+    same_times,
+    truth_in_their_world,
+)
 from fgslam.report.slam_page import write_report
 from fgslam.report.trajectories import read_covariances, read_tum
 from fgslam.runs.folder import RUN_MARKER
@@ -82,7 +82,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
         title=str(metrics.get("name") or config.get("name") or folder.name),
         subtitle=_subtitle(metrics, config),
         estimators=estimators,
-        truth=_truth_in_their_world(estimators, truth),
+        truth=truth_in_their_world(estimators, truth),
         notes=_notes(metrics),
         tables=(comparison, *([places] if places and places.rows else [])),
         closures=tuple(closures),
@@ -185,25 +185,16 @@ def _estimator(
     if not (folder / "final.tum").is_file():
         return EstimatorReport.failed(title, kind, failure or "it left no trajectory")
     final = read_tum(folder / "final.tum")
-    covariances = _covariances(folder / "covariance.csv", final)
-    online = _online(folder / "online.tum", final)
-    errors, online_errors, nees, band = _against_truth(final, online, covariances, truth)
-    return EstimatorReport(
-        title=title,
-        kind=kind,
-        timestamps=final.timestamps,
-        final_poses=final.poses,
-        online_poses=online,
-        covariances=covariances,
+    estimate = Estimate(
+        trajectory=final,
+        covariances=_covariances(folder / "covariance.csv", final),
         landmarks=_landmarks(folder / "map.ply"),
-        final_error_m=errors,
-        online_error_m=online_errors,
-        nees=nees,
-        nees_band=band,
-        update_ms=_update_ms(folder / "frames.csv", final, live_ms),
         remarks=tuple(str(line) for line in values.get("remarks") or ()),
+    )
+    return replace(
+        judged_report(title, kind, estimate, _online(folder / "online.tum"), truth),
+        update_ms=_update_ms(folder / "frames.csv", final, live_ms),
         failure=failure,
-        **_judged(final, covariances, truth),
     )
 
 
@@ -212,24 +203,13 @@ def _covariances(path: Path, final: Trajectory) -> FloatArray:
     out = np.full((len(final), 6, 6), np.nan)
     if path.is_file():
         stamps, found = read_covariances(path)
-        rows, of = _same_times(final.timestamps, stamps)
+        rows, of = same_times(final.timestamps, stamps)
         out[rows] = found[of]
     return out
 
 
-def _online(path: Path, final: Trajectory) -> FloatArray:
-    out = np.full((len(final), 4, 4), np.nan)
-    if path.is_file():
-        online = read_tum(path)
-        rows, of = _same_times(final.timestamps, online.timestamps)
-        out[rows] = online.poses[of]
-    return out
-
-
-def _same_times(a: FloatArray, b: FloatArray) -> tuple[IntArray, IntArray]:
-    """Rows of both that have the very same time stamp, as files of one estimator do."""
-    _, rows, of = np.intersect1d(a, b, return_indices=True)
-    return rows, of
+def _online(path: Path) -> Trajectory | None:
+    return read_tum(path) if path.is_file() else None
 
 
 def _landmarks(path: Path) -> LandmarkMap:
@@ -239,43 +219,6 @@ def _landmarks(path: Path) -> LandmarkMap:
     points: MapPoints = read_ply(path)
     shown = points.select(points.valid) if points.valid.any() else points
     return LandmarkMap(shown.ids, shown.positions, shown.covariances)
-
-
-def _against_truth(
-    final: Trajectory, online: FloatArray, covariances: FloatArray, truth: Trajectory | None
-) -> tuple[FloatArray, FloatArray, FloatArray, tuple[float, float] | None]:
-    """Errors final and online (n,), NEES per degree of freedom (n,) and its band."""
-    errors, online_errors, nees = (np.full(len(final), np.nan) for _ in range(3))
-    found = None if truth is None else to_estimate_world(final, truth)
-    if found is None:
-        return errors, online_errors, nees, None
-    rows, true_poses = found
-    errors[rows] = position_errors(final.poses[rows], true_poses)
-    online_errors[rows] = position_errors(online[rows], true_poses)
-    judged = pose_nees(final.poses[rows], covariances[rows], true_poses)
-    nees[rows] = np.divide(
-        judged.values, judged.dof, out=np.full(len(rows), np.nan), where=judged.dof > 0
-    )
-    usual = np.bincount(judged.dof[judged.dof > 0])
-    band = chi_square_band(float(usual.argmax())) if len(usual) else None
-    return errors, online_errors, nees, band
-
-
-def _judged(final: Trajectory, covariances: FloatArray, truth: Trajectory | None) -> dict[str, Any]:
-    """ATE, NEES of the run and verdict, by the same functions as metrics.json's."""
-    error = evaluate_trajectory(final, truth, Alignment.SE3)
-    found = None if truth is None else to_estimate_world(final, truth)
-    if found is None:
-        return {"ate_m": None}
-    rows, true_poses = found[0][1:], found[1][1:]  # the first pose is the gauge
-    result = judge([pose_nees(final.poses[rows], covariances[rows], true_poses)])
-    if result is None:
-        return {"ate_m": error.ate_rmse_m}
-    return {
-        "ate_m": error.ate_rmse_m,
-        "nees_per_dof": result.per_dof,
-        "verdict": result.verdict,
-    }
 
 
 def _update_ms(path: Path, final: Trajectory, live_ms: dict[float, float]) -> FloatArray:
@@ -306,18 +249,3 @@ def _number_pairs(path: Path, rows: Any, name: str) -> list[tuple[float, float]]
         raise DatasetError(
             f"{path}: not a table of timestamp and {name} ({error}); run the experiment again"
         ) from error
-
-
-def _truth_in_their_world(
-    estimators: tuple[EstimatorReport, ...], truth: Trajectory | None
-) -> Trajectory | None:
-    """True poses of the frames, the first one aligned; of the estimator that has most of them."""
-    best: Trajectory | None = None
-    for estimator in estimators:
-        if truth is None:
-            break
-        final = Trajectory(estimator.timestamps, estimator.final_poses)
-        found = to_estimate_world(final, truth)
-        if found is not None and (best is None or len(found[0]) > len(best)):
-            best = Trajectory(final.timestamps[found[0]], found[1])
-    return best

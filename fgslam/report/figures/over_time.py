@@ -17,6 +17,7 @@ _FINAL = {"dash": "solid", "width": 2}
 _ONLINE = {"dash": "dot", "width": 2}
 _CLAIMED = {"dash": "dash", "width": 1.2}
 _WIDELY = 8.0
+_LEAST_NEES = 1e-9
 _SECONDS = {"title": {"text": "time since the start (s)"}}
 
 
@@ -67,8 +68,9 @@ def nees_over_time(data: ReportData) -> Figure:
     end = max((float(e.timestamps[-1]) - data.start for e in data.estimators if len(e)), default=1)
     traces = [_band(band, end) for band in bands]
     for i, estimator in enumerate(data.estimators):
-        # A logarithmic axis has no place for zero, the NEES of a pose that is exactly known.
-        values = np.where(estimator.nees > 0.0, estimator.nees, np.nan)
+        # The first pose is known exactly, or as good as: its NEES of 0 or 1e-20 has no place on a
+        # logarithmic axis.
+        values = np.where(estimator.nees > _LEAST_NEES, estimator.nees, np.nan)
         owner = Owner(estimator.title, i)
         traces += _curve(owner, data, estimator, values, {"width": 1.6}, "%{y:.3g}")
     told = " and ".join(f"{low:.2f} to {high:.2f}" for low, high in bands) or "not known"

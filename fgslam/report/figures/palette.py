@@ -30,6 +30,17 @@ ON_DARK = (
     "#b9c84a",
     "#b4bcc6",
 )
+INK = "#1b1f24"
+"""Of the truth and of text on light pages; the page's ``--ink``."""
+
+GREY = "#a3abb4"
+"""Of walls and landmarks on light pages; the page's ``--dots``."""
+
+BAND = "rgba(90, 100, 110, 0.18)"
+"""Of bands on light pages; the page's ``--band``."""
+
+GRID = "#e4e7ea"
+
 COUNT = len(ON_LIGHT)
 """How many estimators have a colour of their own; more share them."""
 

@@ -138,6 +138,11 @@ def packed(values: FloatArray) -> dict[str, str]:
     return {"dtype": "f4", "bdata": base64.b64encode(content).decode("ascii")}
 
 
+def unpacked(values: Mapping[str, str]) -> FloatArray:
+    """The numbers (n,) of :func:`packed`."""
+    return np.frombuffer(base64.b64decode(values["bdata"]), "<f4").astype(np.float64)
+
+
 def thinned(count: int, limit: int) -> IntArray:
     """At most ``limit`` of ``count`` rows, evenly spread, with the first and the last."""
     if count <= limit:

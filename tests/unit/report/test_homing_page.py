@@ -19,16 +19,12 @@ from fgslam.report.figures.curves import claimed_against_true, sorted_errors
 from fgslam.report.figures.local_map import MAX_MOMENTS, SIGMAS, ellipse, local_map_figure, upwards
 from fgslam.report.figures.network import Links, network_figure, unfolded
 from fgslam.report.figures.plan import catchment_figure, drive_figure
-from fgslam.report.figures.traces import Figure, Trace
+from fgslam.report.figures.traces import Figure, Trace, unpacked
 from fgslam.report.page import render, write_html
 
 
-def numbers(packed: dict[str, str]) -> FloatArray:
-    return np.frombuffer(base64.b64decode(packed["bdata"]), "<f4").astype(np.float64)
-
-
 def points(found: Trace) -> FloatArray:
-    return np.column_stack([numbers(found["x"]), numbers(found["y"])])
+    return np.column_stack([unpacked(found["x"]), unpacked(found["y"])])
 
 
 def at_step(figure: Figure, name: str, step: int) -> list[Trace]:

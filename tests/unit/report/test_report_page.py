@@ -18,7 +18,6 @@ import pytest
 from PIL import Image
 from reports import HOSTILE, estimator_report, full_report, loop, picture, without_truth
 
-from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import OutputError
 from fgslam.core.geometry import so3_exp
 from fgslam.report.content import Column, Picture, TextTable
@@ -26,7 +25,7 @@ from fgslam.report.embedding import BUDGET_BYTES, MAX_WIDTH, embed
 from fgslam.report.figures import palette
 from fgslam.report.figures import trajectory as drawn
 from fgslam.report.figures.over_time import error_over_time, nees_over_time, position_sigma
-from fgslam.report.figures.traces import Figure, Trace, peaks, thinned
+from fgslam.report.figures.traces import Figure, Trace, peaks, thinned, unpacked
 from fgslam.report.figures.trajectory import drive_from_above, level_axes, map_to_turn
 from fgslam.report.headline import headline
 from fgslam.report.page import render as render_page
@@ -65,13 +64,9 @@ def render(data: ReportData) -> str:
     return render_page(slam_page(data))
 
 
-def unpacked(script: str) -> str:
+def text_of(script: str) -> str:
     """Text of a compressed element."""
     return gzip.decompress(base64.b64decode(script)).decode("utf-8")
-
-
-def numbers(packed: dict[str, str]) -> FloatArray:
-    return np.frombuffer(base64.b64decode(packed["bdata"]), "<f4").astype(np.float64)
 
 
 def named(figure: Figure, name: str) -> Trace:
@@ -166,8 +161,8 @@ def test_ellipses_hold_three_sigma_of_the_covariance_turned_into_the_world() -> 
     data = with_values(
         data, final_poses=np.stack([pose, pose]), covariances=np.stack([covariance, covariance])
     )
-    x = numbers(named(drive_from_above(data), "isam2, 3 sigma")["x"])
-    y = numbers(named(drive_from_above(data), "isam2, 3 sigma")["y"])
+    x = unpacked(named(drive_from_above(data), "isam2, 3 sigma")["x"])
+    y = unpacked(named(drive_from_above(data), "isam2, 3 sigma")["y"])
     assert np.nanmax(x) == pytest.approx(3 * 0.5, rel=0.01)
     assert np.nanmax(y) == pytest.approx(3 * 0.01, rel=0.01)
 
@@ -207,7 +202,7 @@ def test_ellipses_that_would_hide_the_view_wait_until_asked_for() -> None:
 
 def test_covariances_that_are_not_known_have_no_ellipse() -> None:
     data = with_values(full_report(), covariances=np.full((60, 6, 6), np.nan))
-    assert not len(numbers(named(drive_from_above(data), "isam2, 3 sigma")["x"]))
+    assert not len(unpacked(named(drive_from_above(data), "isam2, 3 sigma")["x"]))
     assert np.isnan(position_sigma(data.estimators[0])).all()
 
 
@@ -218,8 +213,8 @@ def test_large_maps_and_long_runs_are_thinned_and_it_is_said(monkeypatch: Any) -
     monkeypatch.setattr(drawn, "MAX_DOTS_ABOVE", 500)
     above = drive_from_above(data)
     assert "100 of up to 300 poses and 500 of up to 900 landmarks" in above.note
-    assert len(numbers(named(above, "isam2, final")["x"])) == 100
-    assert len(numbers(named(above, "landmark of isam2")["x"])) == 500
+    assert len(unpacked(named(above, "isam2, final")["x"])) == 100
+    assert len(unpacked(named(above, "landmark of isam2")["x"])) == 500
 
 
 def test_far_landmarks_do_not_shrink_the_map() -> None:
@@ -231,7 +226,7 @@ def test_far_landmarks_do_not_shrink_the_map() -> None:
     low, high = drive_from_above(far).layout["xaxis"]["range"]
     assert high - low < 15.0
     solid = map_to_turn(far)
-    assert numbers(named(solid, "landmark of isam2")["x"]).max() < 15.0
+    assert unpacked(named(solid, "landmark of isam2")["x"]).max() < 15.0
     assert re.search(r"Far landmarks outside the box, not drawn: up to \d+\.", solid.note)
 
 
@@ -253,7 +248,7 @@ def test_nees_of_exact_poses_is_left_out_of_a_logarithmic_axis() -> None:
     nees = data.estimators[0].nees.copy()
     nees[:4] = 0.0
     figure = nees_over_time(with_values(data, nees=nees))
-    assert np.isnan(numbers(named(figure, "isam2")["y"])[:4]).all()
+    assert np.isnan(unpacked(named(figure, "isam2")["y"])[:4]).all()
     assert "0.07 to 3.12" in figure.description
 
 
@@ -278,11 +273,11 @@ def test_only_the_two_scripts_may_run() -> None:
     assert policy is not None
     data, plotly, script = reader.scripts
     assert "default-src 'none'" in policy
-    run = (unpacked(plotly), script)
+    run = (text_of(plotly), script)
     digests = [base64.b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in run]
     assert re.findall(r"'sha256-([^']+)'", policy) == digests
     assert "unsafe-inline'" not in policy.split("style-src")[0]
-    assert set(json.loads(unpacked(data))) == {"above", "map", "error", "nees", "time"}
+    assert set(json.loads(text_of(data))) == {"above", "map", "error", "nees", "time"}
     (element,) = [a for a in reader.all("script") if a.get("id") == "report-data"]
     assert element["data-colours"] == str(palette.COUNT) == str(len(palette.ON_DARK))
 
