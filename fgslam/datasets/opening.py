@@ -1,16 +1,11 @@
-"""Functions that open any recording by its settings: of images, or of measurements."""
+"""Functions that open any recording by its settings: of images, or of measurements.
+
+A reader is imported when its kind is opened: what one needs takes others a second to load.
+"""
 
 from __future__ import annotations
 
 from fgslam.core.recordings import MeasurementRecording
-from fgslam.datasets.euroc import open_euroc
-from fgslam.datasets.image_folder import open_image_folder
-from fgslam.datasets.kitti import open_kitti
-from fgslam.datasets.light_field import open_light_field
-from fgslam.datasets.measurements.simulated import open_simulated_measurements
-from fgslam.datasets.measurements.stereo_tracks import open_stereo_tracks
-from fgslam.datasets.measurements.utias_range_bearing import open_lost_in_the_woods
-from fgslam.datasets.measurements.utias_stereo import open_starry_night
 from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import (
@@ -42,12 +37,20 @@ def open_recording(
     """
     match settings:
         case ImageFolderSettings():
+            from fgslam.datasets.image_folder import open_image_folder
+
             return open_image_folder(settings, odometry or RecordedOdometrySettings())
         case KittiSettings():
+            from fgslam.datasets.kitti import open_kitti
+
             return open_kitti(settings)
         case EurocSettings():
+            from fgslam.datasets.euroc import open_euroc
+
             return open_euroc(settings)
         case LightFieldSettings():
+            from fgslam.datasets.light_field import open_light_field
+
             return open_light_field(settings)
 
 
@@ -69,10 +72,18 @@ def open_measurements(
     odometry = odometry or RecordedOdometrySettings()
     match settings:
         case SimulatedMeasurementsSettings():
+            from fgslam.datasets.measurements.simulated import open_simulated_measurements
+
             return open_simulated_measurements(settings, seed, odometry)
         case StereoTracksSettings():
+            from fgslam.datasets.measurements.stereo_tracks import open_stereo_tracks
+
             return open_stereo_tracks(settings, odometry)
         case UtiasStereoSettings():
+            from fgslam.datasets.measurements.utias_stereo import open_starry_night
+
             return open_starry_night(settings, odometry)
         case UtiasRangeBearingSettings():
+            from fgslam.datasets.measurements.utias_range_bearing import open_lost_in_the_woods
+
             return open_lost_in_the_woods(settings, odometry)

@@ -12,7 +12,6 @@ from fgslam.datasets.odometry_settings import (
     SyntheticOdometrySettings,
 )
 from fgslam.datasets.opening import open_recording
-from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
 from fgslam.datasets.synthetic_odometry import SyntheticOdometry
 from fgslam.runs.config import ExperimentConfig
@@ -27,6 +26,8 @@ def open_sequence(
     """
     dataset = config.dataset
     if isinstance(dataset, RenderedLabSettings):
+        from fgslam.datasets.rendered_lab import RenderedLabSequence  # the world and its textures
+
         _require_own_noise(config.odometry)
         sequence: Sequence = RenderedLabSequence(
             dataset, config.seed, dataset.start, dataset.stop, dataset.stride, progress

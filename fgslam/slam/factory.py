@@ -1,16 +1,16 @@
-"""Builds the parts of a run from its configuration; the only place where kinds are told apart."""
+"""Builds the parts of a run from its configuration; the only place where kinds are told apart.
+
+An estimator is imported when its kind is made: a filter needs no solver of graphs.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fgslam.backend.common_settings import FloorSettings
-from fgslam.backend.filters.dead_reckoning import DeadReckoning
-from fgslam.backend.filters.ekf import FullEkf
-from fgslam.backend.filters.landmark_kalman import LandmarkKalman
-from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
 from fgslam.backend.filters.settings import (
     DeadReckoningSettings,
     EkfSettings,
@@ -19,9 +19,6 @@ from fgslam.backend.filters.settings import (
 )
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
-from fgslam.backend.smoothers.batch import BatchSmoother
-from fgslam.backend.smoothers.fixed_lag import FixedLagSmoother
-from fgslam.backend.smoothers.isam2 import Isam2Smoother
 from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Prediction
@@ -35,8 +32,6 @@ from fgslam.datasets.odometry_settings import (
     RecordedOdometrySettings,
 )
 from fgslam.frontend.features.sift import SiftExtractor
-from fgslam.frontend.places.loops.recognition import PlaceRecognition, RecognitionParts
-from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
@@ -48,6 +43,10 @@ from fgslam.slam.feature_stream import FeatureStream
 from fgslam.slam.frontend_settings import FrontendSettings
 from fgslam.slam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
 from fgslam.slam.pipeline import SlamPipeline
+
+if TYPE_CHECKING:
+    from fgslam.frontend.places.loops.recognition import PlaceRecognition
+    from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 
 
 def make_stream(sequence: Sequence, settings: FrontendSettings) -> FeatureStream:
@@ -93,12 +92,20 @@ def make_estimator(
     ego_motion = ego_motion or EgoMotionSettings()
     match settings:
         case DeadReckoningSettings():
+            from fgslam.backend.filters.dead_reckoning import DeadReckoning
+
             return DeadReckoning(rig, prior)
         case LandmarkKalmanSettings():
+            from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+
             return LandmarkKalman(rig, settings, prior)
         case LandmarkKalmanGraphSettings():
+            from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
+
             return LandmarkKalmanGraph(rig, settings, prior, ego_motion)
         case EkfSettings():
+            from fgslam.backend.filters.ekf import FullEkf
+
             floor = make_floor(rig, settings.floor, ego_motion.dof)
             return FullEkf(rig, settings, floor, prior)
         case _:
@@ -114,10 +121,16 @@ def _make_smoother(
 ) -> Estimator:
     match settings:
         case FixedLagSettings():
+            from fgslam.backend.smoothers.fixed_lag import FixedLagSmoother
+
             return FixedLagSmoother(rig, settings, floor, prior)
         case Isam2Settings():
+            from fgslam.backend.smoothers.isam2 import Isam2Smoother
+
             return Isam2Smoother(rig, settings, floor, prior)
         case BatchSettings():
+            from fgslam.backend.smoothers.batch import BatchSmoother
+
             return BatchSmoother(rig, settings, floor, prior)
 
 
@@ -178,6 +191,8 @@ def make_places(
     """What looks for returns and finds the lost camera; None where neither is wanted."""
     if settings.loops is None and settings.lost is None:
         return None
+    from fgslam.frontend.places.loops.recognition import PlaceRecognition, RecognitionParts
+
     parts = RecognitionParts(
         loops=settings.loops,
         lost=settings.lost,
@@ -190,6 +205,8 @@ def make_places(
 
 def make_relocaliser(rig: CameraRig, settings: FrontendSettings) -> Relocaliser:
     """What finds a frame in a map without a prior, for the poses that the ego-motion allows."""
+    from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
+
     floor = Floor.under(rig, settings.ego_motion.dof)
     return Relocaliser(rig, floor, settings.relocalisation)
 
