@@ -284,7 +284,7 @@ def _check_baseline(expected: dict[str, Any], results: Results) -> bool:
 
 @app.command()
 def localize(
-    map_file: Annotated[Path, typer.Argument(metavar="MAP", help="a saved map")],
+    map_file: options.SavedMap,
     recording: options.Recording,
     frame: Annotated[
         int | None,
@@ -321,9 +321,7 @@ def localize(
 
 @app.command()
 def export(
-    run_folder: Annotated[
-        Path, typer.Argument(metavar="RUN|MAP", help="a run folder, or a saved map")
-    ],
+    run_folder: options.RunOrMap,
     map_file: Annotated[
         Path | None, typer.Option("--map", help="landmarks as .ply, .pcd or .off (Geomview)")
     ] = None,
@@ -351,8 +349,8 @@ def export(
 
 @app.command()
 def merge(
-    first: Annotated[Path, typer.Argument(metavar="MAP", help="the map whose world it will be")],
-    second: Annotated[Path, typer.Argument(metavar="MAP", help="the map to lay onto it")],
+    first: options.FirstMap,
+    second: options.SecondMap,
     out: Annotated[Path, typer.Option(metavar="MAP", help="where to write both as one")],
     overwrite: options.Overwrite = False,
 ) -> None:
@@ -365,7 +363,7 @@ def merge(
 
 @app.command()
 def view(
-    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="a run folder")],
+    run_folder: options.RunToView,
     save: Annotated[
         Path | None, typer.Option(help="write an .rrd file for the viewer instead of a window")
     ] = None,

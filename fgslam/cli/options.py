@@ -7,17 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fgslam.runs.named_experiments import experiment_names, find_experiment
-
-
-def _beginning_with(incomplete: str) -> list[str]:
-    """For shell completion: experiments of the package; files the shell completes by itself."""
-    return [name for name in experiment_names() if name.startswith(incomplete)]
-
-
-def _folder_or_experiment(given: str) -> Path:
-    """A folder of that name goes before the experiment of that name."""
-    return Path(given) if Path(given).exists() else find_experiment(Path(given))
+from fgslam.cli import given_paths
 
 
 def _version(wanted: bool) -> None:
@@ -49,8 +39,8 @@ Experiment = Annotated[
     Path,
     typer.Argument(
         metavar="EXPERIMENT",
-        parser=lambda given: find_experiment(Path(given)),
-        autocompletion=_beginning_with,
+        parser=given_paths.experiment,
+        autocompletion=given_paths.names_beginning_with,
         help="a .yaml file, or the name of one that comes with fgslam, e.g. lab_loop",
     ),
 ]
@@ -74,10 +64,38 @@ Recording = Annotated[
     Path,
     typer.Argument(
         metavar="RECORDING",
-        parser=_folder_or_experiment,
-        autocompletion=_beginning_with,
+        parser=given_paths.recording,
+        autocompletion=given_paths.names_beginning_with,
         help="a recording's folder; or an experiment, .yaml or name, for its data set",
     ),
+]
+
+# --------------------------------------------------------------------------------------------
+# Runs and maps
+
+RunToView = Annotated[
+    Path, typer.Argument(metavar="RUN", parser=given_paths.run_folder, help="a run folder")
+]
+RunOrMap = Annotated[
+    Path,
+    typer.Argument(
+        metavar="RUN|MAP",
+        parser=given_paths.run_folder_or_map,
+        help="a run folder, or a saved map",
+    ),
+]
+SavedMap = Annotated[
+    Path, typer.Argument(metavar="MAP", parser=given_paths.saved_map, help="a saved map")
+]
+FirstMap = Annotated[
+    Path,
+    typer.Argument(
+        metavar="MAP", parser=given_paths.saved_map, help="the map whose world it will be"
+    ),
+]
+SecondMap = Annotated[
+    Path,
+    typer.Argument(metavar="MAP", parser=given_paths.saved_map, help="the map to lay onto it"),
 ]
 
 # --------------------------------------------------------------------------------------------
@@ -87,7 +105,7 @@ Runs = Annotated[
     list[Path],
     typer.Argument(
         metavar="RUN...",
-        parser=_folder_or_experiment,
+        parser=given_paths.run_folder_or_experiment,
         help="run folders; with --trials one run or experiment",
     ),
 ]

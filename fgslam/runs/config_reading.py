@@ -112,16 +112,22 @@ def read_mapping(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read ({error}); give a YAML text file") from None
     except yaml.YAMLError as error:
-        message = " ".join(str(error).split())
-        raise ConfigError(f"{path}: not valid YAML ({message}); mend that line") from None
+        raise ConfigError(f"{path}{_problem(error)}; correct that line") from None
     except RecursionError:
-        raise ConfigError(f"{path}: not valid YAML (nested too deeply); mend it") from None
+        raise ConfigError(f"{path}: not valid YAML (nested too deeply); correct it") from None
     if repeated is not None:
         line = repeated.start_mark.line + 1
         raise ConfigError(f"{path}, line {line}: key {repeated.value} is given twice; remove one")
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: holds no `key: value` pairs; see experiments/ for examples")
     return values
+
+
+def _problem(error: yaml.YAMLError) -> str:
+    """Where and why a text is no YAML, in a few words."""
+    if not isinstance(error, yaml.MarkedYAMLError) or error.problem_mark is None:
+        return f": not valid YAML ({' '.join(str(error).split())})"
+    return f", line {error.problem_mark.line + 1}: not valid YAML ({error.problem})"
 
 
 def _repeated_key(node: Any) -> Any:

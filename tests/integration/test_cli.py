@@ -109,7 +109,7 @@ def test_demo_is_the_loop_of_the_paper(monkeypatch: Patch, tmp_path: Path) -> No
         (("rum",), "fgslam: No such command 'rum'"),
         (("--version-please",), "fgslam: No such option: --version-please"),
         (("inspect", "x", "--frames", "many"), "fgslam inspect: Invalid value for '--frames'"),
-        (("run", "c.yaml", "--resume", "--overwrite"), "exclude each other; give one of them"),
+        (("run", "lab_loop", "--resume", "--overwrite"), "exclude each other; give one of them"),
         (("run", "absent.yaml"), "absent.yaml: no such file"),
         (("run", "lab_lop"), "lab_lop: no such file; the experiment lab_loop comes with fgslam"),
     ],

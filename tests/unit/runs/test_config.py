@@ -158,9 +158,9 @@ def test_a_wrong_item_of_a_vector_is_named_by_its_place(tmp_path: Path) -> None:
         (b"# only a remark\n", "holds no `key: value` pairs"),
         (b"- 1\n- 2\n", "holds no `key: value` pairs"),
         (b"just words\n", "holds no `key: value` pairs"),
-        (b"name: [1, 2\n", "not valid YAML"),
-        (b"name: x\n  seed: 1\n", "not valid YAML"),
-        (b"name: !!python/object/apply:os.system ['true']\n", "not valid YAML"),
+        (b"name: [1, 2\n", ", line 2: not valid YAML"),
+        (b"name: x\n  seed: 1\n", ", line 2: not valid YAML"),
+        (b"name: !!python/object/apply:os.system ['true']\n", ", line 1: not valid YAML"),
         (b"\x89PNG\r\n\x1a\n\x00\xff\xfe", "cannot be read"),
         (b"name: a\x00b\n", "not valid YAML"),
         (b"[" * 5000, "not valid YAML"),
@@ -171,7 +171,8 @@ def test_files_that_are_no_configuration(content: bytes, expected: str, tmp_path
     path.write_bytes(content)
     with pytest.raises(ConfigError) as caught:
         load_config(path)
-    assert str(caught.value).startswith(f"{path}: {expected}")
+    separator = "" if expected.startswith(",") else ": "
+    assert str(caught.value).startswith(f"{path}{separator}{expected}")
     assert "\n" not in str(caught.value)
 
 
