@@ -65,7 +65,9 @@ FORBIDDEN_LIBRARIES = frozenset(
     {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "random"}
 )
 FORBIDDEN_CALLS = frozenset({"eval", "exec", "compile", "__import__"})
-SAFE_YAML = frozenset({"safe_load", "safe_dump", "SafeLoader", "SafeDumper", "YAMLError"})
+SAFE_YAML = frozenset(
+    {"safe_load", "safe_dump", "SafeLoader", "SafeDumper", "YAMLError", "MarkedYAMLError"}
+)
 MAX_MODULE_LINES = 450
 MAX_FUNCTION_LINES = 50
 
