@@ -58,12 +58,8 @@ class LabViews:
 
     def look(self, wTc: FloatArray, number: int) -> View:
         """Renders and finds features; ``number`` selects the image noise."""
-        layers = self._world.layers(None)
         clean = np.array(
-            [
-                self._world.renderer.image(layers, wTc @ offset)
-                for offset in camera_offsets(self.rig)
-            ]
+            [self._world.image(wTc @ offset, []) for offset in camera_offsets(self.rig)]
         )
         rounded = np.clip(np.rint(clean), 0, 255).astype(np.uint8)
         images = apply_effects(rounded, self.settings.effects, number, self.seed)

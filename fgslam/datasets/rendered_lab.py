@@ -29,7 +29,7 @@ from fgslam.worlds.lab.settings import LabSettings, RenderedLabSettings
 from fgslam.worlds.lab.world import World, camera_offsets, make_rig, open_room
 from fgslam.worlds.rendering.cache import RenderCache, content_hash
 from fgslam.worlds.rendering.image_effects import apply_effects, is_blocked
-from fgslam.worlds.rendering.pinhole import Layer
+from fgslam.worlds.rendering.scene import Body
 
 RENDER_VERSION = 7
 """Part of the cache's key: raised whenever the same settings give other pixels."""
@@ -192,7 +192,7 @@ class RenderedLabSequence:
         if is_blocked(self._settings.effects, index):
             return np.full((self._rig.height, self._rig.width), np.nan)
         world = self._open_world()
-        return world.renderer.depth(self._layers(world, index), self._body[index] @ self._rig.bTc)
+        return world.depth(self._body[index] @ self._rig.bTc, self._bodies(world, index))
 
     def object_ids(self, i: int) -> IntArray:
         """(height, width) index into ``object_names`` of the reference camera's pixels.
@@ -203,7 +203,7 @@ class RenderedLabSequence:
         if is_blocked(self._settings.effects, index):
             return np.full((self._rig.height, self._rig.width), -1, dtype=np.int64)
         world = self._open_world()
-        return world.renderer.things(self._layers(world, index), self._body[index] @ self._rig.bTc)
+        return world.object_ids(self._body[index] @ self._rig.bTc, self._bodies(world, index))
 
     # ---------------------------------------------------------------- rendering
 
@@ -255,13 +255,13 @@ class RenderedLabSequence:
         instants = self._instants(index)
         total = np.zeros((self._rig.cameras, self._rig.height, self._rig.width))
         for seconds, pose in zip(instants, self.room_from_camera(instants), strict=True):
-            layers = world.layers(self._stance(seconds))
+            bodies = world.bodies(self._stance(seconds))
             for k, offset in enumerate(camera_offsets(self._rig)):
-                total[k] += world.renderer.image(layers, pose @ offset)
+                total[k] += world.image(pose @ offset, bodies)
         return np.clip(np.rint(total / len(instants)), 0, 255).astype(np.uint8)
 
-    def _layers(self, world: World, index: int) -> list[Layer]:
-        return world.layers(self._stance(float(self._drive.timestamps[index])))
+    def _bodies(self, world: World, index: int) -> list[Body]:
+        return world.bodies(self._stance(float(self._drive.timestamps[index])))
 
     def _stance(self, seconds: float) -> Stance | None:
         return None if self._walk is None else self._walk.stance(seconds)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import numpy.typing as npt
 
@@ -13,17 +11,15 @@ from fgslam.worlds.house.settings import (
     HouseLightSettings,
     HouseTiltSettings,
 )
-from fgslam.worlds.rendering.pinhole import Layer
+from fgslam.worlds.rendering.scene import Layer
 
 Float32 = npt.NDArray[np.float32]
 
 
 def lit(layer: Layer, evening: Float32, settings: HouseLightSettings) -> Layer:
     """The same layer in another light: a mix of its own with the evening's, at some level."""
-    out = copy.copy(layer)
     mixed = (1.0 - settings.evening) * layer.light + settings.evening * evening
-    out.light = np.asarray(settings.level * mixed, dtype=np.float32)
-    return out
+    return layer.lit(np.asarray(settings.level * mixed, dtype=np.float32))
 
 
 def white_balance(settings: HouseLightSettings) -> Float32:

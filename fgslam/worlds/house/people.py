@@ -10,13 +10,12 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.planar import unit
 from fgslam.worlds.lab.person import Stance, person
-from fgslam.worlds.rendering.colour_bank import ColourBank
 from fgslam.worlds.rendering.colour_textures import SHIRTS
 from fgslam.worlds.rendering.lighting import flat_light
-from fgslam.worlds.rendering.omnidirectional import Body
 from fgslam.worlds.rendering.patches import Patch, Surface, Thing, stack
-from fgslam.worlds.rendering.pinhole import Layer
 from fgslam.worlds.rendering.raycaster import RayCaster
+from fgslam.worlds.rendering.scene import Body, Layer
+from fgslam.worlds.rendering.texture_bank import ColourBank
 
 PERSON_RADIUS = 0.3
 _BODY_RADIUS = 0.6

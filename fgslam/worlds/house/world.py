@@ -22,16 +22,20 @@ from fgslam.worlds.house import disturbances
 from fgslam.worlds.house.camera import make_house_camera
 from fgslam.worlds.house.people import PERSON_RADIUS, People
 from fgslam.worlds.house.settings import OmniHouseSettings
-from fgslam.worlds.rendering.colour_bank import ColourBank
 from fgslam.worlds.rendering.colour_textures import build_colour_library
 from fgslam.worlds.rendering.lighting import bake
-from fgslam.worlds.rendering.omnidirectional import MirrorRenderer, surface_points, visible
 from fgslam.worlds.rendering.patches import stack
-from fgslam.worlds.rendering.pinhole import Layer
 from fgslam.worlds.rendering.raycaster import RayCaster
+from fgslam.worlds.rendering.renderer import Renderer, surface_points, visible
+from fgslam.worlds.rendering.scene import Layer
+from fgslam.worlds.rendering.texture_bank import ColourBank
+from fgslam.worlds.rendering.views import OmniView
 
 # Coarser than in the lab: the mirror's pixels are wider.
 _LIGHT_SPACING_M = 0.2
+# Smoothing a border costs four rays a pixel: weaker contrast, summed over the three channels, is
+# not worth it.
+_EDGE_CONTRAST = 24.0
 _PEOPLE_STEPS, _PEOPLE_STEP_M, _PEOPLE_CLEARANCE_M = 16, 0.7, 0.45
 # Nearer than this to an obstacle's coarse distance, contact is decided exactly; metres.
 _CONTACT_M = 0.06
@@ -89,7 +93,7 @@ class OmniWorld:
         self.settings, self._seed = settings, seed
         self.model = open_house(settings.house_seed, settings.door_width_m)
         self.camera: OmniCamera = make_house_camera(settings.camera)
-        self._renderer = MirrorRenderer(self.camera, self.model.bank)
+        self._renderer = Renderer(OmniView(self.camera), self.model.bank, _EDGE_CONTRAST)
         planner = PathPlanner(self.model.space, settings.path.clearance_m)
         within = None if settings.path.rooms == "house" else settings.path.rooms
         self.reference_poses = planner.reference_path(
@@ -203,7 +207,7 @@ class OmniWorld:
 
     def ranges(self, pose: FloatArray) -> FloatArray:
         """(h, w) distance from the viewpoint in metres, from an untilted pose (3,)."""
-        return self._renderer.ranges(self.model.layer, self._untilted(pose))
+        return self._renderer.distances(self.model.layer, self._untilted(pose))
 
     def _untilted(self, pose: FloatArray) -> FloatArray:
         return disturbances.camera_pose(pose, self.settings.camera_height_m, np.zeros(2))

@@ -5,18 +5,23 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
 from fgslam.core import geometry
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.sensors import CameraRig
 from fgslam.worlds.lab.person import Stance, person
 from fgslam.worlds.lab.places import PlaceChoice, build_place, build_textures
 from fgslam.worlds.lab.settings import LabRigSettings
 from fgslam.worlds.rendering.lighting import bake, flat_light
-from fgslam.worlds.rendering.mipmap import TextureBank
 from fgslam.worlds.rendering.patches import stack
-from fgslam.worlds.rendering.pinhole import Layer, Pinhole, Renderer
 from fgslam.worlds.rendering.raycaster import RayCaster
+from fgslam.worlds.rendering.renderer import Renderer
+from fgslam.worlds.rendering.scene import Body, Layer
+from fgslam.worlds.rendering.texture_bank import GreyBank
+from fgslam.worlds.rendering.views import PinholeView
+
+Float32 = npt.NDArray[np.float32]
 
 
 def make_rig(settings: LabRigSettings) -> CameraRig:
@@ -71,7 +76,7 @@ class Room:
         self.low, self.high = place.low, place.high
         self.things = (*(thing.name for thing in place.things), "person")
         self.caster = RayCaster(patches)
-        self.bank = TextureBank(build_textures(choice))
+        self.bank = GreyBank(build_textures(choice))
         rng = np.random.default_rng([choice.seed, 3])
         spacing, reach = place.light_spacing_m, place.light_reach_m
         light = bake(patches, self.caster, place.lamps, rng, spacing, reach)
@@ -89,13 +94,26 @@ class World:
 
     def __init__(self, rig: CameraRig, room: Room) -> None:
         self.room = room
-        camera = Pinhole(rig.width, rig.height, rig.fx, rig.cx, rig.cy)
-        self.renderer = Renderer(camera, room.bank)
+        view = PinholeView((rig.height, rig.width), rig.fx, rig.cx, rig.cy)
+        self._renderer = Renderer(view, room.bank)
 
-    def layers(self, stance: Stance | None) -> list[Layer]:
-        """The room, and the person standing in it where there is one."""
+    def bodies(self, stance: Stance | None) -> list[Body]:
+        """The person standing in the room where there is one."""
         if stance is None:
-            return [self.room.layer]
+            return []
         patches = stack([person(stance)], first_thing=len(self.room.things) - 1)
         light = flat_light(patches, np.array([0.3, -0.2, 1.0]))
-        return [self.room.layer, Layer(patches, RayCaster(patches), light, self.room.bank)]
+        layer = Layer(patches, RayCaster(patches), light, self.room.bank)
+        return [Body(layer, np.eye(4), np.inf)]
+
+    def image(self, pose: FloatArray, bodies: list[Body]) -> Float32:
+        """(h, w) grey levels, not yet rounded, from a camera's pose (4, 4) in the room."""
+        return self._renderer.image(self.room.layer, pose, bodies)[..., 0]
+
+    def depth(self, pose: FloatArray, bodies: list[Body]) -> FloatArray:
+        """(h, w) exact depth Z in metres at pixel centres; infinite for nothing."""
+        return self._renderer.distances(self.room.layer, pose, bodies)
+
+    def object_ids(self, pose: FloatArray, bodies: list[Body]) -> IntArray:
+        """(h, w) index into ``room.things`` at pixel centres; -1 for nothing."""
+        return self._renderer.things(self.room.layer, pose, bodies)

@@ -6,13 +6,13 @@ import pytest
 from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
 from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.worlds.house.disturbances import camera_pose
-from fgslam.worlds.rendering.colour_bank import ColourBank
 from fgslam.worlds.rendering.lighting import flat_light
-from fgslam.worlds.rendering.mipmap import TextureBank
-from fgslam.worlds.rendering.omnidirectional import Body, MirrorRenderer, surface_points, visible
 from fgslam.worlds.rendering.patches import Surface, Thing, box, stack
-from fgslam.worlds.rendering.pinhole import Layer
 from fgslam.worlds.rendering.raycaster import RayCaster
+from fgslam.worlds.rendering.renderer import Renderer, surface_points, visible
+from fgslam.worlds.rendering.scene import Body, Layer
+from fgslam.worlds.rendering.texture_bank import ColourBank, GreyBank
+from fgslam.worlds.rendering.views import OmniView
 from tests.omni_house import PANORAMA, plain, room
 
 GREY, RED = (100, 100, 100), (250, 20, 30)
@@ -34,8 +34,8 @@ def scene(bank: ColourBank) -> Layer:
 @pytest.mark.parametrize("camera", [PANORAMA, MIRROR], ids=["panorama", "mirror"])
 def test_mark_is_drawn_where_truth_says(camera: OmniCamera, scene: Layer, bank: ColourBank) -> None:
     """Each mark's centre of redness lies on the pixel of its centre, to a fifth of a pixel."""
-    image = MirrorRenderer(camera, bank).levels(scene, POSE)
-    renderer = MirrorRenderer(camera, bank)
+    image = Renderer(OmniView(camera), bank, 24.0).levels(scene, POSE)
+    renderer = Renderer(OmniView(camera), bank, 24.0)
     red = np.zeros(renderer.valid.shape)
     red[renderer.valid] = (image[0] - GREY[0]) / (RED[0] - GREY[0])
     pixels, shows = visible(scene, camera, POSE, MARKS - [0.0, 0.002, 0.0])
@@ -52,7 +52,7 @@ def test_mark_is_drawn_where_truth_says(camera: OmniCamera, scene: Layer, bank: 
 def test_pictures_have_red_first_and_are_black_outside_the_mirror(
     scene: Layer, bank: ColourBank
 ) -> None:
-    renderer = MirrorRenderer(MIRROR, bank)
+    renderer = Renderer(OmniView(MIRROR), bank, 24.0)
     image = renderer.assemble(renderer.levels(scene, POSE))
     assert image.shape == (240, 320, 3)
     assert image.dtype == np.uint8
@@ -77,7 +77,7 @@ def test_points_and_ranges_are_exact(scene: Layer, bank: ColourBank) -> None:
     again, seen = visible(scene, MIRROR, POSE, points[shown])
     assert seen.all()
     np.testing.assert_allclose(again, pixels[shown], atol=1e-9)
-    ranges = MirrorRenderer(MIRROR, bank).ranges(scene, POSE)
+    ranges = Renderer(OmniView(MIRROR), bank, 24.0).distances(scene, POSE)
     assert np.isnan(ranges[0, 0])
     centres = np.array([[150.0, 60.0], [200.0, 130.0]])
     far = np.linalg.norm(surface_points(scene, MIRROR, POSE, centres) - POSE[:3, 3], axis=1)
@@ -93,7 +93,7 @@ def test_edge_pixels_are_mixed(bank: ColourBank) -> None:
     """Over a mark's border redness goes through intermediate levels in proportion to coverage."""
     layer = room(bank, np.array([[0.0, 3.0, 1.2]]), side=1.0)
     upright = camera_pose(np.array([0.0, 0.5, np.pi / 2]), 1.2, np.zeros(2))
-    levels = MirrorRenderer(PANORAMA, bank).levels(layer, upright).reshape(3, 256, 512)
+    levels = Renderer(OmniView(PANORAMA), bank, 24.0).levels(layer, upright).reshape(3, 256, 512)
     share = (levels[0] - GREY[0]) / (RED[0] - GREY[0])
     # On the horizon's row the mark spans +-atan(0.5 / 2.498): its width in pixels is known.
     width = 2.0 * np.arctan(0.5 / 2.498) * 511 / (2 * np.pi)
@@ -107,7 +107,7 @@ def test_body_hides_what_is_behind_it_and_nothing_before_it(bank: ColourBank) ->
     light = flat_light(things, np.array([0.0, 0.0, 1.0]))
     light.values[:] = 1.0
     mover = Layer(things, RayCaster(things), light, bank)
-    renderer = MirrorRenderer(PANORAMA, bank)
+    renderer = Renderer(OmniView(PANORAMA), bank, 24.0)
     clean = renderer.levels(layer, POSE)
     for place, hidden in (([1.5, 1.5, 0.0], True), ([0.4, 9.0, 0.0], False)):
         wTo = np.eye(4)
@@ -133,9 +133,9 @@ def test_each_channel_is_filtered_as_a_grey_texture() -> None:
     footprint = np.exp(rng.uniform(-3.0, 6.0, n)).astype(np.float32)
     seen = colour.sample(texture, u, v, footprint)
     for k in range(3):
-        grey = TextureBank({f"t{i}": t[..., k] for i, t in enumerate(textures)})
+        grey = GreyBank({f"t{i}": t[..., k] for i, t in enumerate(textures)})
         # Coarser levels are rounded to whole levels in colour, hence half a level.
-        np.testing.assert_allclose(seen[k], grey.sample(texture, u, v, footprint), atol=0.75)
+        np.testing.assert_allclose(seen[k], grey.sample(texture, u, v, footprint)[0], atol=0.75)
 
 
 def test_white_stays_white_and_black_black() -> None:

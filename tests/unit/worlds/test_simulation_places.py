@@ -29,10 +29,12 @@ from fgslam.worlds.lab.settings import (
 )
 from fgslam.worlds.lab.world import make_rig
 from fgslam.worlds.rendering.lighting import bake
-from fgslam.worlds.rendering.mipmap import TextureBank
 from fgslam.worlds.rendering.patches import Surface, Thing, box, rectangle, stack
-from fgslam.worlds.rendering.pinhole import Layer, Pinhole, Renderer
 from fgslam.worlds.rendering.raycaster import RayCaster
+from fgslam.worlds.rendering.renderer import Renderer
+from fgslam.worlds.rendering.scene import Layer
+from fgslam.worlds.rendering.texture_bank import GreyBank
+from fgslam.worlds.rendering.views import PinholeView
 
 RIG = make_rig(LabRigSettings(width=80, height=60))
 ROOMS = PlaceChoice("rooms", 0, 1, identical_posters=False)
@@ -172,22 +174,22 @@ def test_legs_look_alike_in_the_images() -> None:
     place = build_place(CORRIDORS)
     patches = stack(place.things)
     names = {surface.texture for surface in patches.surfaces}
-    bank = TextureBank(
+    bank = GreyBank(
         {name: rng.uniform(60, 200, (64, 64)).astype(np.float32) for name in sorted(names)}
     )
     caster = RayCaster(patches)
     light = bake(patches, caster, place.lamps, rng, 0.5, place.light_reach_m)
     layer = Layer(patches, caster, light, bank)
-    renderer = Renderer(Pinhole(RIG.width, RIG.height, RIG.fx, RIG.cx, RIG.cy), bank)
+    renderer = Renderer(PinholeView((RIG.height, RIG.width), RIG.fx, RIG.cx, RIG.cy), bank)
     turn = np.eye(4)
     turn[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     turn[:2, 3] = [alike.SIDE, 0.0]
     body = np.eye(4)
     body[:2, 3] = [9.0, 0.1]
-    here, there = (renderer.image([layer], pose @ RIG.bTc) for pose in (body, turn @ body))
+    here, there = (renderer.image(layer, pose @ RIG.bTc) for pose in (body, turn @ body))
     alike_by = np.abs(here - there).mean()
     body[0, 3] += 2.0
-    elsewhere = renderer.image([layer], body @ RIG.bTc)
+    elsewhere = renderer.image(layer, body @ RIG.bTc)
     assert alike_by < 0.1 * np.abs(here - elsewhere).mean()
 
 

@@ -4,15 +4,18 @@ from scipy import ndimage
 
 from fgslam.core import geometry
 from fgslam.worlds.rendering.lighting import flat_light
-from fgslam.worlds.rendering.mipmap import TextureBank
 from fgslam.worlds.rendering.patches import Surface, Thing, box, placed, prism, rectangle, stack
-from fgslam.worlds.rendering.pinhole import Layer, Pinhole, Renderer
 from fgslam.worlds.rendering.raycaster import RayCaster
+from fgslam.worlds.rendering.renderer import Renderer
+from fgslam.worlds.rendering.scene import Body, Layer
+from fgslam.worlds.rendering.texture_bank import GreyBank
+from fgslam.worlds.rendering.views import PinholeView
 
-CAMERA = Pinhole(64, 48, 60.0, 31.5, 23.5)
+HEIGHT, WIDTH = 48, 64
+CAMERA = PinholeView((HEIGHT, WIDTH), 60.0, 31.5, 23.5)
 
 
-def make_layer(things: list[Thing], bank: TextureBank) -> Layer:
+def make_layer(things: list[Thing], bank: GreyBank) -> Layer:
     patches = stack(things)
     # Lit from the camera's side, straight on: an albedo is seen as it is.
     light = flat_light(patches, np.array([0.0, 0.0, -1.0]))
@@ -25,9 +28,9 @@ def wall(texture: str, depth: float, tile_m: float | None = None) -> Thing:
     return Thing("wall", (patch,))
 
 
-def ramps(side: int) -> TextureBank:
+def ramps(side: int) -> GreyBank:
     across = np.tile(np.linspace(10, 240, side, dtype=np.float32), (side, 1))
-    return TextureBank({"across": across, "down": across.T.copy()})
+    return GreyBank({"across": across, "down": across.T.copy()})
 
 
 @pytest.mark.parametrize("texture", ["across", "down"])
@@ -35,12 +38,12 @@ def test_patch_is_seen_upright_and_in_place(texture: str) -> None:
     """Left is left, top is top, and every pixel shows the point that its centre's ray hits."""
     side = 256
     bank = ramps(side)
-    image = Renderer(CAMERA, bank).image([make_layer([wall(texture, 5.0)], bank)], np.eye(4))
-    centre, size = (CAMERA.cx, CAMERA.width) if texture == "across" else (CAMERA.cy, CAMERA.height)
+    image = Renderer(CAMERA, bank).image(make_layer([wall(texture, 5.0)], bank), np.eye(4))[..., 0]
+    centre, size = (CAMERA.cx, WIDTH) if texture == "across" else (CAMERA.cy, HEIGHT)
     metres = (np.arange(size) - centre) / CAMERA.focal * 5.0
     texels = (metres + 4.0) / 8.0 * side - 0.5
     expected = 10 + 230 * texels / (side - 1)
-    seen = image[CAMERA.height // 2] if texture == "across" else image[:, CAMERA.width // 2]
+    seen = image[HEIGHT // 2] if texture == "across" else image[:, WIDTH // 2]
     np.testing.assert_allclose(seen, expected, atol=0.02)
 
 
@@ -48,8 +51,8 @@ def test_depth_is_exact_on_a_slanted_wall() -> None:
     bank = ramps(16)
     layer = make_layer([wall("across", 5.0)], bank)
     pose = geometry.pose(geometry.so3_exp(np.array([0.2, -0.5, 0.1])), np.array([0.3, 0.1, 1.0]))
-    depth = Renderer(CAMERA, bank).depth([layer], pose)
-    rows, columns = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width]
+    depth = Renderer(CAMERA, bank).distances(layer, pose)
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH]
     rays = np.stack(
         [
             (columns - CAMERA.cx) / CAMERA.focal,
@@ -69,18 +72,18 @@ def test_nothing_is_black_infinite_and_nobody() -> None:
     layer = make_layer([wall("across", 5.0)], bank)
     away = geometry.pose(geometry.so3_exp(np.array([0.0, np.pi, 0.0])), np.zeros(3))
     renderer = Renderer(CAMERA, bank)
-    assert renderer.image([layer], away).max() == 0.0
-    assert np.isinf(renderer.depth([layer], away)).all()
-    assert (renderer.things([layer], away) == -1).all()
+    assert renderer.image(layer, away)[..., 0].max() == 0.0
+    assert np.isinf(renderer.distances(layer, away)).all()
+    assert (renderer.things(layer, away) == -1).all()
 
 
 def test_fine_texture_fades_to_its_mean_instead_of_aliasing() -> None:
     checks = np.indices((256, 256)).sum(axis=0) % 2 * 200.0 + 20.0
-    bank = TextureBank({"checks": checks.astype(np.float32)})
+    bank = GreyBank({"checks": checks.astype(np.float32)})
     renderer = Renderer(CAMERA, bank)
-    far = renderer.image([make_layer([wall("checks", 5.0, tile_m=1.0)], bank)], np.eye(4))
+    far = renderer.image(make_layer([wall("checks", 5.0, tile_m=1.0)], bank), np.eye(4))[..., 0]
     np.testing.assert_allclose(far, 120.0, atol=1.0)
-    near = renderer.image([make_layer([wall("checks", 0.05, tile_m=1.0)], bank)], np.eye(4))
+    near = renderer.image(make_layer([wall("checks", 0.05, tile_m=1.0)], bank), np.eye(4))[..., 0]
     assert near.std() > 25.0
 
 
@@ -89,11 +92,11 @@ def test_shift_of_a_tenth_of_a_pixel_shows_as_such() -> None:
     rng = np.random.default_rng(0)
     smooth = ndimage.gaussian_filter(rng.standard_normal((256, 256)), 8.0)
     smooth = 128 + 40 * (smooth - smooth.mean()) / smooth.std()
-    bank = TextureBank({"smooth": smooth.astype(np.float32)})
+    bank = GreyBank({"smooth": smooth.astype(np.float32)})
     renderer, layer = Renderer(CAMERA, bank), make_layer([wall("smooth", 4.0)], bank)
-    here = renderer.image([layer], np.eye(4)).astype(float)
+    here = renderer.image(layer, np.eye(4)).astype(float)[..., 0]
     moved = geometry.pose(np.eye(3), np.array([0.1 * 4.0 / CAMERA.focal, 0.0, 0.0]))
-    there = renderer.image([layer], moved).astype(float)
+    there = renderer.image(layer, moved).astype(float)[..., 0]
     gradient = np.gradient(here, axis=1)
     shift = np.sum((there - here) * gradient) / np.sum(gradient**2)
     assert shift == pytest.approx(0.1, abs=0.005)
@@ -101,18 +104,18 @@ def test_shift_of_a_tenth_of_a_pixel_shows_as_such() -> None:
 
 def test_nearer_layer_hides_the_farther_one_and_edges_are_mixed() -> None:
     flat = {n: np.full((4, 4), v, dtype=np.float32) for n, v in (("dark", 20.0), ("light", 220.0))}
-    bank = TextureBank(flat)
+    bank = GreyBank(flat)
     behind = make_layer([wall("light", 5.0)], bank)
     half = rectangle((-4, -4, 3.0), (4.01, 0, 0), (0, 8, 0), Surface("dark"))
     patches = stack([Thing("half", (half,))], first_thing=5)
     light = flat_light(patches, np.array([0.0, 0.0, -1.0]))
     before = Layer(patches, RayCaster(patches), light, bank)
     renderer = Renderer(CAMERA, bank)
-    things = renderer.things([behind, before], np.eye(4))
+    things = renderer.things(behind, np.eye(4), [Body(before, np.eye(4), np.inf)])
     assert set(np.unique(things)) == {0, 5}
     assert (things[:, :31] == 5).all()
     assert (things[:, 33:] == 0).all()
-    row = renderer.image([behind, before], np.eye(4))[24]
+    row = renderer.image(behind, np.eye(4), [Body(before, np.eye(4), np.inf)])[24, :, 0]
     np.testing.assert_allclose(row[:30], 20.0, atol=0.1)
     np.testing.assert_allclose(row[34:], 220.0, atol=0.1)
     # The border lies at column 31.7: that pixel, and it alone, is part dark and part light.
@@ -142,7 +145,7 @@ def test_mirrored_text_would_be_seen() -> None:
         layer = make_layer([Thing("box", tuple(placed(solid, 0, 0, 0, yaw)))], bank)
         # Camera 4 m to the south of the box, level, looking north.
         level = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
-        row = renderer.image([layer], geometry.pose(level, np.array([0, -4.0, 0])))[24]
+        row = renderer.image(layer, geometry.pose(level, np.array([0, -4.0, 0])))[24, :, 0]
         face = row[row > 0.0]
         assert len(face) > 20
         assert (np.diff(face[1:-1]) > 0).all()
@@ -151,4 +154,4 @@ def test_mirrored_text_would_be_seen() -> None:
 
 def test_textures_must_have_sides_that_are_powers_of_two() -> None:
     with pytest.raises(ValueError, match="powers of two"):
-        TextureBank({"odd": np.zeros((48, 64), dtype=np.float32)})
+        GreyBank({"odd": np.zeros((48, 64), dtype=np.float32)})
