@@ -25,10 +25,11 @@ from fgslam.backend.common_settings import KernelSettings
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
 from fgslam.backend.filters.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
-from fgslam.backend.smoothers.batch import BatchSmoother
+from fgslam.backend.smoothers.batch import BatchSolver
 from fgslam.backend.smoothers.marginals import marginals_of
 from fgslam.backend.smoothers.outliers import solver_parameters
 from fgslam.backend.smoothers.settings import BatchSettings, Isam2Settings
+from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.measurement_log import MeasurementLog
@@ -101,8 +102,9 @@ def batch_solve_s(drive: MeasuredDrive) -> float:
 def problem(drive: MeasuredDrive) -> tuple[Any, Any]:
     """Batch's factors and initial values of a whole drive."""
     estimator = play(drive, LEAST_SQUARES).estimator
-    assert isinstance(estimator, BatchSmoother)
-    return estimator._builder.kept_factors(), estimator._values
+    assert isinstance(estimator, Smoother)
+    assert isinstance(estimator._solver, BatchSolver)
+    return estimator._builder.kept_factors(), estimator._solver._values
 
 
 def minimum(graph: Any, values: Any) -> Any:

@@ -21,7 +21,11 @@ class Estimator(Protocol):
     the state as it was. Arguments are never mutated. Returned arrays must not be written to.
     """
 
-    kind: ClassVar[str]
+    @property
+    def kind(self) -> str:
+        """Names the estimator in configurations, tables and messages."""
+        ...
+
     supports: ClassVar[frozenset[MeasurementType]]
 
     def predict(self, odometry: Odometry | None) -> Prediction:

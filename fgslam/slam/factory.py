@@ -121,17 +121,17 @@ def _make_smoother(
 ) -> Estimator:
     match settings:
         case FixedLagSettings():
-            from fgslam.backend.smoothers.fixed_lag import FixedLagSmoother
+            from fgslam.backend.smoothers.fixed_lag import fixed_lag_smoother
 
-            return FixedLagSmoother(rig, settings, floor, prior)
+            return fixed_lag_smoother(rig, settings, floor, prior)
         case Isam2Settings():
-            from fgslam.backend.smoothers.isam2 import Isam2Smoother
+            from fgslam.backend.smoothers.isam2 import isam2_smoother
 
-            return Isam2Smoother(rig, settings, floor, prior)
+            return isam2_smoother(rig, settings, floor, prior)
         case BatchSettings():
-            from fgslam.backend.smoothers.batch import BatchSmoother
+            from fgslam.backend.smoothers.batch import batch_smoother
 
-            return BatchSmoother(rig, settings, floor, prior)
+            return batch_smoother(rig, settings, floor, prior)
 
 
 def make_floor(rig: Sensor, settings: FloorSettings, dof: DegreesOfFreedom) -> Floor:

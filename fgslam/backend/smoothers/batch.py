@@ -10,19 +10,16 @@ import numpy as np
 
 from fgslam.backend.common_settings import KernelSettings
 from fgslam.backend.filters.submaps import Constraint
-from fgslam.backend.smoothers.graph_solution import (
-    Solution,
-    allowed_parts,
-    poses_of_frame,
-    solution,
-)
-from fgslam.backend.smoothers.loop_closing import solved
+from fgslam.backend.smoothers.graph_builder import NewFactors
+from fgslam.backend.smoothers.graph_solution import Solution, allowed_parts, poses_of_frame
+from fgslam.backend.smoothers.loop_closing import GraphLoops, solved
 from fgslam.backend.smoothers.outliers import graduated, solver_parameters, trimmed, with_kernel
-from fgslam.backend.smoothers.refinement import Refined, refine
-from fgslam.backend.smoothers.segments import TrackedFrame
+from fgslam.backend.smoothers.refinement import Refined, WholeGraphAnswer, refine
 from fgslam.backend.smoothers.settings import BatchSettings
-from fgslam.backend.smoothers.whole_graph import WholeGraphSmoother
-from fgslam.core.estimates import Prediction
+from fgslam.backend.smoothers.smoother import GraphProblem, MapSmoother
+from fgslam.backend.smoothers.solver import ClosedLoop, Drive, Smoothed, solver_failed
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import reorthonormalise
 from fgslam.core.sensors import Sensor
@@ -31,57 +28,84 @@ from fgslam.factors.keys import pose_key
 _RELATIVE_TOLERANCE = 1e-9  # of the cost; the estimate then moves by less than a micrometre
 
 
-class BatchSmoother(WholeGraphSmoother):
-    """Estimator of kind ``batch``, on :class:`fgslam.backend.protocol.Estimator`."""
+def batch_smoother(
+    sensor: Sensor, settings: BatchSettings, floor: Floor, prior: Prediction
+) -> MapSmoother:
+    """Estimator of kind ``batch``, at the prior pose with an empty map."""
+    if settings.method == "gnc":
+        # GNC is its own kernel; the graph's factors must be plain.
+        settings = dataclasses.replace(settings, kernel=KernelSettings("none"))
+    problem = GraphProblem.of(sensor, settings, floor, prior)
+    return MapSmoother(problem, BatchSolver(problem, settings))
+
+
+class BatchSolver:
+    """Solves the whole graph by Levenberg-Marquardt or graduated non-convexity, when asked to."""
 
     kind: ClassVar[str] = "batch"
 
-    def __init__(
-        self, sensor: Sensor, settings: BatchSettings, floor: Floor, prior: Prediction
-    ) -> None:
-        """Starts at the prior pose with an empty map."""
-        if settings.method == "gnc":
-            # GNC is its own kernel; the graph's factors must be plain.
-            settings = dataclasses.replace(settings, kernel=KernelSettings("none"))
-        super().__init__(sensor, settings, floor, prior)
+    def __init__(self, problem: GraphProblem, settings: BatchSettings) -> None:
+        """Nothing to solve yet."""
+        self._builder, self._floor = problem.builder, problem.floor
         self._settings = settings
+        self._loops = GraphLoops(problem.builder, settings.loops)
+        self._answer = WholeGraphAnswer(problem.builder, problem.floor, self._refined)
         self._values = gtsam.Values()
+        self.remarks: list[str] = []
 
-    def _absorb(self, tracked: TrackedFrame) -> None:
-        new = self._enter(tracked)
+    def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
+        """Takes in a frame's initial values; the builder keeps its factors."""
         self._values.insert(new.values)
-        every = self._settings.solve_every
-        if every and (new.frame + 1) % every == 0:
-            answer = self._solve()
-            self._values.update(self._refined_graph().values)
-            last = Prediction(answer.poses[-1], answer.pose_covariances[-1])
-            self._take_over(self._values, last)
+        self._answer.changed()
 
-    def _loop_graph(self) -> Any:
-        graph = super()._loop_graph()
+    def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
+        """The minimum after every `solve_every` frames."""
+        every = self._settings.solve_every
+        if not every or (frame + 1) % every:
+            return None
+        answer = self._answer.solution()
+        self._values.update(self._answer.refined().values)
+        return Smoothed(self._values, Prediction(answer.poses[-1], answer.pose_covariances[-1]))
+
+    def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
+        """Tracks on from the solution; where nothing moves, the next one takes the loop in."""
+        self._answer.changed()
+        try:
+            found = self._loops.judge(
+                loop,
+                drive,
+                self._values,
+                self._factors,
+                lambda graph: solved(graph, self._values),
+                what,
+            )
+        except RuntimeError as error:
+            raise self._failed(error) from None
+        self.remarks.append(found.remark)
+        if found.values is None:
+            return ClosedLoop() if found.closed else None
+        self._values = found.values
+        last = self._builder.frames[-1]
+        here = reorthonormalise(poses_of_frame(self._values, last))
+        marginals = gtsam.Marginals(self._factors(), self._values)
+        covariance = np.asarray(marginals.marginalCovariance(pose_key(last)))
+        covariance = allowed_parts(self._floor, here[None], covariance[None])[0]
+        return ClosedLoop(Smoothed(self._values, Prediction(here, covariance), bent=True))
+
+    def solution(self) -> Solution:
+        """The minimum over all that was measured."""
+        return self._answer.solution()
+
+    def joint(self, variables: list[int]) -> FloatArray:
+        """Joint covariance of the last pose and landmark variables."""
+        return self._answer.joint(variables)
+
+    def _factors(self) -> Any:
+        """The graph as it is solved when a loop is judged."""
+        graph = self._builder.kept_factors()
         return with_kernel(graph) if self._settings.method == "gnc" else graph
 
-    def _values_now(self) -> Any:
-        return self._values
-
-    def _solved_before(self, graph: Any) -> Any:
-        return solved(graph, self._values)
-
-    def _join(self, known: Constraint, found: Any | None) -> None:
-        """Tracks on from the solution; where nothing moves, the next one takes the loop in."""
-        if found is None:
-            return
-        self._values = found
-        last, graph = self._builder.frames[-1], self._loop_graph()
-        here = reorthonormalise(poses_of_frame(found, last))
-        covariance = np.asarray(gtsam.Marginals(graph, found).marginalCovariance(pose_key(last)))
-        covariance = allowed_parts(self._floor, here[None], covariance[None])[0]
-        self._take_over(found, Prediction(here, covariance), whole=True)
-
-    def _solve(self) -> Solution:
-        return solution(self._refined_graph(), self._builder.frames, self._floor)
-
-    def _refine(self) -> Refined:
+    def _refined(self) -> Refined:
         try:
             return refine(self._builder, self._values, self._minimise)
         except RuntimeError as error:
@@ -95,3 +119,6 @@ class BatchSmoother(WholeGraphSmoother):
         if self._settings.trim:
             return trimmed(graph, values, params, self._settings.noise_factor)
         return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize(), graph
+
+    def _failed(self, error: Exception, when: str = "at") -> Exception:
+        return solver_failed(self.kind, error, self._builder.frames[-1], when)

@@ -26,12 +26,12 @@ from fgslam.backend.smoothers.graph_solution import (
 )
 from fgslam.backend.smoothers.loop_closing import misfit
 from fgslam.backend.smoothers.marginals import DenseMarginals, UndeterminedError
-from fgslam.backend.smoothers.segments import TrackedFrame
 from fgslam.backend.smoothers.settings import FixedLagSettings
-from fgslam.backend.smoothers.smoother import Smoother
+from fgslam.backend.smoothers.smoother import GraphProblem, Smoother
+from fgslam.backend.smoothers.solver import ClosedLoop, Drive, Smoothed, solver_failed
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import Prediction
+from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     adjoint,
@@ -44,7 +44,6 @@ from fgslam.core.geometry import (
     transform_to_camera,
     transform_to_world,
 )
-from fgslam.core.measurements import LoopClosure
 from fgslam.core.sensors import Sensor
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 from fgslam.factors.motion import pose_prior
@@ -52,22 +51,28 @@ from fgslam.factors.motion import pose_prior
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
 
 
-class FixedLagSmoother(Smoother):
-    """Estimator of kind ``fixed_lag``, on :class:`fgslam.backend.protocol.Estimator`."""
+def fixed_lag_smoother(
+    sensor: Sensor, settings: FixedLagSettings, floor: Floor, prior: Prediction
+) -> Smoother:
+    """Estimator of kind ``fixed_lag``, at the prior pose with an empty map.
+
+    Raises:
+        EstimatorError: neither lag is given.
+    """
+    if settings.lag_frames is None and settings.lag_s is None:
+        raise EstimatorError("fixed_lag: no lag; set estimator.lag_frames or estimator.lag_s")
+    problem = GraphProblem.of(sensor, settings, floor, prior, remember=False)
+    return Smoother(problem, FixedLagSolver(problem, settings))
+
+
+class FixedLagSolver:
+    """Solves a window of the last frames by GTSAM's incremental fixed-lag smoother."""
 
     kind: ClassVar[str] = "fixed_lag"
 
-    def __init__(
-        self, sensor: Sensor, settings: FixedLagSettings, floor: Floor, prior: Prediction
-    ) -> None:
-        """Starts at the prior pose with an empty map.
-
-        Raises:
-            EstimatorError: neither lag is given.
-        """
-        if settings.lag_frames is None and settings.lag_s is None:
-            raise EstimatorError("fixed_lag: no lag; set estimator.lag_frames or estimator.lag_s")
-        super().__init__(sensor, settings, floor, prior, remember=False)
+    def __init__(self, problem: GraphProblem, settings: FixedLagSettings) -> None:
+        """An empty window."""
+        self._builder, self._floor = problem.builder, problem.floor
         self._in_seconds = settings.lag_frames is None
         self._lag = float(settings.lag_frames or settings.lag_s or 0.0)
         self._loop_gate = settings.loops.gate_sigmas
@@ -79,58 +84,60 @@ class FixedLagSmoother(Smoother):
         self._covariances: list[FloatArray] = []
         self._clock: list[float] = []
         self._recent: deque[NewFactors] = deque()
+        self.remarks: list[str] = []
 
-    def _absorb(self, tracked: TrackedFrame) -> None:
-        new = self._enter(tracked)
-        self._clock.append(float(self._inputs.increments[-1].timestamp))
+    def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
+        """Takes in a frame, and lets go what is older than the lag."""
+        self._clock.append(timestamp)
         self._poses.append(np.eye(4))
         self._covariances.append(np.full((6, 6), np.nan))
         self._recent.append(new)
         self._update(new)
-        self._move_window()
-        for frame in range(self._oldest, new.frame + 1):
+        self._move_window(landmarks)
+
+    def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
+        """The window's solution, in every frame."""
+        return self._smoothed({self._oldest, frame})  # the one that leaves next, and the last one
+
+    def _smoothed(self, frames: set[int]) -> Smoothed:
+        """Keeps the window's poses, and the covariances of some frames of it."""
+        last = len(self._poses) - 1
+        for frame in range(self._oldest, last + 1):
             self._poses[frame] = poses_of_frame(self._values, frame)
         marginals = self._marginals()
-        for frame in {self._oldest, new.frame}:  # the one that leaves next, and the last one
+        for frame in frames:
             self._covariances[frame] = self._covariance(marginals, frame)
-        self._take_over(self._values, Prediction(self._poses[-1], self._covariances[-1]))
+        return Smoothed(self._values, Prediction(self._poses[last], self._covariances[last]))
 
-    def _close(self, loop: LoopClosure, where: str) -> bool:
+    def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
         """Moves the window as a whole to where the loop has the last pose; the past stays.
 
         The earlier frame's pose is known as it was when it left. What the last pose is less certain
         by than that one is drift, and the loop measures the drift: a Kalman correction of one pose,
         after which the window is solved anew from there.
         """
-        known = self._between(loop)
-        what = f"{where}: loop closure to frame {loop.frame} of the log"
-        if known.before >= self._oldest:  # both poses are variables
-            if not self._taken_in(known, what):
-                return False
+        if loop.before >= self._oldest:  # both poses are variables
+            if not self._taken_in(loop, what):
+                return None
         else:
-            moved = self._drift_undone(known, what)
+            moved = self._drift_undone(loop, what)
             if moved is None:
-                return False
+                return None
             self._move_all(moved)
-        last, marginals = known.after, self._marginals()
-        for frame in range(self._oldest, last + 1):
-            self._poses[frame] = poses_of_frame(self._values, frame)
-        self._covariances[last] = self._covariance(marginals, last)
-        self._take_over(self._values, Prediction(self._poses[last], self._covariances[last]))
-        return True
+        return ClosedLoop(self._smoothed({loop.after}))
 
     def _taken_in(self, known: Constraint, what: str) -> bool:
         """Adds a loop within the lag, where hardly anything drifts, as a factor; or refuses it."""
         factor, gate = constraint_factor(known), self._loop_gate
         off = misfit(factor, self._values)
         if gate > 0.0 and not off <= gate**2:
-            self._remarks.append(
+            self.remarks.append(
                 f"{what} refused: {np.sqrt(off):.1f} standard deviations off, {gate:g} allowed"
             )
             return False
         self._recent[-1].graph.add(factor)
         self._rebuild(gtsam.Values(self._values))
-        self._remarks.append(f"{what}: within the lag, a factor more")
+        self.remarks.append(f"{what}: within the lag, a factor more")
         return True
 
     def _drift_undone(self, known: Constraint, what: str) -> Prediction | None:
@@ -147,7 +154,7 @@ class FixedLagSmoother(Smoother):
         gain = np.linalg.solve(innovation, drift).T
         squared, gate = float(off @ np.linalg.solve(innovation, off)), self._loop_gate
         if gate > 0.0 and not squared <= gate**2:
-            self._remarks.append(
+            self.remarks.append(
                 f"{what} refused: {np.sqrt(squared):.1f} standard deviations off, {gate:g} allowed"
             )
             return None
@@ -155,7 +162,7 @@ class FixedLagSmoother(Smoother):
         target = self._floor.constrain(target) if self._floor.rigid_dof < 6 else target
         covariance = shared + congruence(basis, nearest_positive(drift - gain @ drift))
         shift = float(np.linalg.norm(target[:3, 3] - wTc[:3, 3]))
-        self._remarks.append(
+        self.remarks.append(
             f"{what}: the camera moved by {shift:.2f} m, and what lies within the lag"
         )
         return Prediction(target, self._floor.allowed_part(target, covariance))
@@ -174,14 +181,15 @@ class FixedLagSmoother(Smoother):
         self._covariances[self._oldest] = congruence(to_oldest, last.covariance)
         self._rebuild(values)
 
-    def _solve(self) -> Solution:
+    def solution(self) -> Solution:
+        """Poses as they left the window, and those inside with their marginals."""
         marginals = self._marginals()
         covariances = np.array(self._covariances)  # our own stay as the updates left them
         for frame in range(self._oldest, len(self._poses)):
             covariances[frame] = self._covariance(marginals, frame)
         inside = [
             track.variable
-            for track in self._builder.tracks.values()
+            for track in self._builder.admission.tracks.values()
             if track.variable >= 0 and self._values.exists(landmark_key(track.variable))
         ]
         found = marginals.landmarks([landmark_key(v) for v in inside])
@@ -192,7 +200,8 @@ class FixedLagSmoother(Smoother):
             dict(zip(inside, found, strict=True)),
         )
 
-    def _joint(self, variables: list[int]) -> FloatArray:
+    def joint(self, variables: list[int]) -> FloatArray:
+        """Joint covariance of the last pose and landmark variables of the window."""
         last = len(self._poses) - 1
         joint = self._marginals().joint(pose_key(last), [landmark_key(v) for v in variables])
         return allowed_joint(self._floor, self._poses[-1], joint)
@@ -224,7 +233,7 @@ class FixedLagSmoother(Smoother):
             together.insert(new.values)
             self._repair(together, error)
 
-    def _move_window(self) -> None:
+    def _move_window(self, known: LandmarkMap) -> None:
         """Notes which poses and landmarks have left; landmarks keep their last place."""
         last = len(self._poses) - 1
         while self._time(self._oldest) < self._time(last) - self._lag:
@@ -232,14 +241,10 @@ class FixedLagSmoother(Smoother):
         while self._recent and self._recent[0].frame < self._oldest:
             self._recent.popleft()
         left = self._builder.forget_before(self._oldest)
-        known = self._tracker.landmarks()
-        rows = known.rows(np.array(left, np.int64))
-        for identity, row in zip(left, rows.tolist(), strict=True):
-            frame = self._builder.tracks[identity].last.frame
-            self._frozen[identity] = (
-                known.positions[row].copy(),
-                self._with_pose(frame, known.positions[row], known.covariances[row]),
-            )
+        rows = known.rows(np.array([identity for identity, _ in left], np.int64))
+        for (_, track), row in zip(left, rows.tolist(), strict=True):
+            position, covariance = known.positions[row].copy(), known.covariances[row]
+            track.left_at = position, self._with_pose(track.last.frame, position, covariance)
 
     def _with_pose(self, frame: int, position: FloatArray, given_poses: FloatArray) -> FloatArray:
         """Covariance of a landmark that left: what was known given the poses, and of the pose."""
@@ -267,7 +272,7 @@ class FixedLagSmoother(Smoother):
             key = suspect(error)
             if key is None or is_pose(key) or not self._builder.in_graph(number(key)):
                 break
-            self._remarks.append(
+            self.remarks.append(
                 f"{self._builder.take_out(number(key))} left the system indeterminate at frame "
                 f"{self._recent[-1].frame}: taken out, solver built anew over the lag"
             )
@@ -276,7 +281,7 @@ class FixedLagSmoother(Smoother):
                 return
             except RuntimeError as another:
                 error = another
-        raise self._failed(error)
+        raise solver_failed(self.kind, error, self._builder.frames[-1])
 
     def _rebuild(self, values: Any) -> None:
         oldest = self._oldest

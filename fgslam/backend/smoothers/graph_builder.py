@@ -1,32 +1,20 @@
-"""Turns a run's measurements into a factor graph, frame by frame; every smoother starts from it.
-
-A doctor stands in front of the solver: a landmark enters the graph only once it is constrained,
-starts anew when it is contradicted, and can be taken out again. Nothing is lost by waiting: a
-landmark's first observation has as many numbers as the landmark, so it says nothing about poses.
-"""
+"""Turns a run's measurements into a factor graph, frame by frame; every smoother starts from it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import gtsam
 import numpy as np
 
 from fgslam.backend.graphs import without_gaps
+from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting, Track
 from fgslam.backend.smoothers.segments import TrackedFrame
 from fgslam.backend.smoothers.settings import GraphSettings
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
-from fgslam.core.geometry import (
-    congruence,
-    transform_to_world,
-    triangulate,
-    triangulation_covariance,
-)
-from fgslam.core.measurements import Observations
 from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.motion import (
@@ -39,8 +27,6 @@ from fgslam.factors.motion import (
 from fgslam.factors.noise import Whitening
 from fgslam.factors.range_bearing import RangeBearingFactors
 from fgslam.factors.stereo import StereoFactors
-
-_SAME_PLACE = 16.3  # 99.9 % quantile of chi-square with three degrees of freedom
 
 
 class LandmarkFactors(Protocol):
@@ -58,37 +44,6 @@ def landmark_factors(sensor: Sensor, whitening: Whitening) -> LandmarkFactors:
     if isinstance(sensor, CameraRig):
         return StereoFactors(sensor, whitening)
     return RangeBearingFactors(whitening)
-
-
-@dataclass(slots=True, eq=False)
-class Sighting:
-    """One observation of a landmark."""
-
-    frame: int
-    measurement: FloatArray
-    covariance: FloatArray
-
-
-@dataclass(slots=True, eq=False)
-class Track:
-    """What the graph knows of a landmark.
-
-    Attributes:
-        variable: number of its variable, -1 while it waits outside.
-        waiting: its sightings while it waits.
-        last: its latest sighting.
-        sightings: in how many frames it was seen.
-        elsewhere: world positions and covariances of its rejected sightings since the last one
-            that fitted.
-        least_parallax: below this it waits; raised when a solver failed on it.
-    """
-
-    least_parallax: float
-    last: Sighting
-    variable: int = -1
-    waiting: list[Sighting] = field(default_factory=list)
-    sightings: int = 0
-    elsewhere: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
 
 
 @dataclass(slots=True, eq=False)
@@ -113,9 +68,8 @@ class GraphBuilder:
 
     Attributes:
         graph: all factors; one taken out leaves an empty slot.
-        tracks: by the landmark's identity.
+        admission: the landmarks, and which of them the graph holds.
         frames: those whose poses are in the graph, in time order.
-        remarks: what was left out or started anew, in words.
     """
 
     def __init__(
@@ -140,14 +94,11 @@ class GraphBuilder:
         whitening = Whitening(kernel.name, kernel.width / settings.noise_factor)
         self._factors = landmark_factors(sensor, whitening)
         self._rows: dict[int, list[int]] = {}
-        self._known: dict[int, tuple[FloatArray, FloatArray]] = {}
         self._id_of: list[int] = []
-        self._first_frame = 0
         self._seen_frame: list[int] = []
         self._seen_variable: list[int] = []
         self.graph = gtsam.NonlinearFactorGraph()
-        self.tracks: dict[int, Track] = {}
-        self.remarks: list[str] = []
+        self.admission = LandmarkAdmission(sensor, settings)
         self.frames: list[int] = []
 
     @property
@@ -173,107 +124,31 @@ class GraphBuilder:
         """Replaces the prior of the first pose, which is not there yet."""
         self._prior = prior
 
-    def know(self, landmarks: LandmarkMap) -> None:
-        """Landmarks of a saved map: each enters with its first sighting, on its own prior.
-
-        The priors are independent of one another. One that turns out to have moved, or to lie
-        elsewhere, becomes a landmark like any other.
-        """
-        places = zip(landmarks.positions, landmarks.covariances, strict=True)
-        self._known = dict(zip(landmarks.ids.tolist(), places, strict=True))
-
-    def note(self, pruned: IntArray) -> None:
-        """Books landmarks that the front-end dropped.
-
-        What they said stays in the graph, but they are no longer told.
-        """
-        for identity in pruned.tolist():
-            self.tracks.pop(identity, None)
-            self._known.pop(identity, None)
-
-    def confirmed(self, identities: IntArray) -> None:
-        """Books that landmarks were seen where they should be: nothing was said against them."""
-        for identity in identities.tolist():
-            track = self.tracks.get(identity)
-            if track is not None:
-                track.elsewhere.clear()
-
-    def contradicted(self, rejected: Observations, wTc: FloatArray) -> Observations:
-        """Those rejected observations whose landmark must have moved: they start it anew.
-
-        It has when it was rejected in several frames in a row, and they agree on where it is: wrong
-        matches do not.
-
-        Args:
-            rejected: a frame's matched observations that do not fit.
-            wTc: (4, 4) the frame's pose.
-        """
-        after = self._settings.contradicted_after
-        if after == 0 or not len(rejected):
-            return rejected.select(np.zeros(len(rejected), np.bool_))
-        local = triangulate(self._sensor, rejected.measurement)
-        spread = triangulation_covariance(self._sensor, rejected.measurement, rejected.covariance)
-        places = transform_to_world(wTc, local)
-        covariances = congruence(wTc[:3, :3], spread)
-        moved = np.zeros(len(rejected), np.bool_)
-        for i, identity in enumerate(rejected.ids.tolist()):
-            track = self.tracks.get(identity)
-            if track is not None:
-                track.elsewhere.append((places[i], covariances[i]))
-                moved[i] = len(track.elsewhere) >= after and _agree(track.elsewhere[-after:])
-        return rejected.select(moved)
-
-    def start_anew(self, identities: Iterable[int], why: str) -> None:
-        """Closes the variables of landmarks; their next sighting begins new ones."""
-        for identity in identities:
-            self._known.pop(identity, None)
-            track = self.tracks.pop(identity, None)
-            if track is not None and why:
-                self.remarks.append(
-                    f"landmark {identity} (seen {track.sightings} times, last in frame "
-                    f"{track.last.frame}) {why}"
-                )
-
     def take_out(self, variable: int) -> str:
         """Removes a landmark from the graph; it waits until it is known twice as well.
 
         Returns:
             Its identity and sightings, in words.
         """
-        identity = self._id_of[variable]
         for row in self._rows.pop(variable, []):
             if self._remember:
                 self.graph.remove(row)
-        self._known.pop(identity, None)
         words = self.describe(variable)
-        track = self.tracks.get(identity)
-        if track is not None and track.variable == variable:
-            track.variable = -1
-            track.waiting = []
-            track.least_parallax = 2.0 * max(track.least_parallax, 1.0)
+        self.admission.taken_out(self._id_of[variable], variable)
         return words
 
     def describe(self, variable: int) -> str:
         """A landmark variable's identity and sightings, in words."""
-        identity = self._id_of[variable]
-        track = self.tracks.get(identity)
-        if track is None or track.variable != variable:
-            return f"landmark {identity} (no longer in use)"
-        return (
-            f"landmark {identity} (seen {track.sightings} times, last from frame "
-            f"{track.last.frame})"
-        )
+        return self.admission.describe(self._id_of[variable], variable)
 
-    def forget_before(self, frame: int) -> list[int]:
+    def forget_before(self, frame: int) -> list[tuple[int, Track]]:
         """For a bounded lag: earlier frames, and landmarks last seen in them, have left the graph.
 
         Returns:
-            Identities of those landmarks; their next sighting begins a new variable.
+            Identity and track of those landmarks; their next sighting begins a new variable.
         """
-        self._first_frame = frame
-        left = [i for i, t in self.tracks.items() if t.variable >= 0 and t.last.frame < frame]
-        for identity in left:
-            track = self.tracks[identity]
+        left = self.admission.leave_before(frame)
+        for _, track in left:
             self._rows.pop(track.variable, None)
             track.variable = -1
         return left
@@ -314,10 +189,6 @@ class GraphBuilder:
         """The graph without its empty slots."""
         return without_gaps(self.graph)
 
-    def waiting(self) -> Iterator[tuple[int, Track]]:
-        """Landmarks that are not in the graph."""
-        return ((i, track) for i, track in self.tracks.items() if track.variable < 0)
-
     # ----------------------------------------------------------------------------------------
 
     def _add_pose(self, new: NewFactors, tracked: TrackedFrame) -> None:
@@ -341,18 +212,15 @@ class GraphBuilder:
         parallax = _parallax(positions - wTc[:3, 3], landmarks.covariances[rows])
         for i, identity in enumerate(accepted.ids.tolist()):
             sighting = Sighting(new.frame, accepted.measurement[i], accepted.covariance[i])
-            track = self.tracks.get(identity)
-            if track is None:
-                track = self.tracks[identity] = Track(self._settings.least_parallax, sighting)
-            track.last = sighting
-            track.sightings += 1
+            track = self.admission.sighted(identity, sighting)
             if track.variable >= 0:
                 self._observe(new, track, sighting)
             else:
                 track.waiting.append(sighting)
-                self._admit(new, identity, positions[i], wTc, float(parallax[i]))
+                if self.admission.admits(identity, float(parallax[i])):
+                    self._enter(new, identity, positions[i], wTc, float(parallax[i]))
 
-    def _admit(
+    def _enter(
         self,
         new: NewFactors,
         identity: int,
@@ -360,20 +228,16 @@ class GraphBuilder:
         wTc: FloatArray,
         parallax: float,
     ) -> None:
-        """Lets a waiting landmark into the graph once it is constrained."""
-        track = self.tracks[identity]
-        track.waiting = [s for s in track.waiting if s.frame >= self._first_frame]
-        known = self._known.get(identity)
-        seldom = len(track.waiting) < self._settings.least_sightings
-        if known is None and (seldom or parallax < track.least_parallax):
-            return
+        """A landmark's variable, its prior if it needs one, and all its sightings so far."""
+        track = self.admission.tracks[identity]
         track.variable = len(self._id_of)
         self._id_of.append(identity)
         self._rows[track.variable] = []
         key = landmark_key(track.variable)
         new.values.insert(key, position)
-        if known is not None:
-            self._rows[track.variable].append(self._push(new, point_prior(key, *known)))
+        saved = self.admission.saved(identity)
+        if saved is not None:
+            self._rows[track.variable].append(self._push(new, point_prior(key, *saved)))
         elif parallax < self._settings.weak_parallax:
             distance = float(np.linalg.norm(position - wTc[:3, 3]))
             sigma = self._settings.weak_prior_ranges * distance
@@ -403,16 +267,6 @@ class GraphBuilder:
         if self._remember:
             self.graph.add(factor)
         return int(self.graph.size()) - 1
-
-
-def _agree(places: list[tuple[FloatArray, FloatArray]]) -> bool:
-    """Whether positions (3,) with covariances (3, 3) may be one place, each beside the last."""
-    last, uncertainty = places[-1]
-    for place, covariance in places[:-1]:
-        offset = place - last
-        if offset @ np.linalg.solve(covariance + uncertainty, offset) > _SAME_PLACE:
-            return False
-    return True
 
 
 def _parallax(rays: FloatArray, covariances: FloatArray) -> FloatArray:

@@ -7,25 +7,25 @@ from typing import Any, ClassVar
 import gtsam
 import numpy as np
 
-from fgslam.backend.filters.submaps import Constraint, constraint_factor
-from fgslam.backend.smoothers.between import fill_between
+from fgslam.backend.filters.submaps import Constraint
+from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.backend.smoothers.graph_solution import (
     Solution,
     allowed_parts,
     poses_of_frame,
-    solution,
     suspect,
 )
+from fgslam.backend.smoothers.loop_closing import GraphLoops
 from fgslam.backend.smoothers.outliers import solver_parameters, trimmed
-from fgslam.backend.smoothers.refinement import Refined, refine
-from fgslam.backend.smoothers.segments import Segments, TrackedFrame
+from fgslam.backend.smoothers.refinement import Refined, WholeGraphAnswer, refine
+from fgslam.backend.smoothers.segments import Segments
 from fgslam.backend.smoothers.settings import Isam2Settings
-from fgslam.backend.smoothers.whole_graph import WholeGraphSmoother
+from fgslam.backend.smoothers.smoother import GraphProblem, MapSmoother
+from fgslam.backend.smoothers.solver import ClosedLoop, Drive, Smoothed, solver_failed
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import Prediction
+from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
-from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise
-from fgslam.core.measurements import Observations
+from fgslam.core.geometry import reorthonormalise
 from fgslam.core.sensors import Sensor
 from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 
@@ -33,100 +33,87 @@ _RELATIVE_TOLERANCE = 1e-9  # of the cost
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
 
 
-class Isam2Smoother(WholeGraphSmoother):
-    """Estimator of kind ``isam2``, on :class:`fgslam.backend.protocol.Estimator`.
+def isam2_smoother(
+    sensor: Sensor, settings: Isam2Settings, floor: Floor, prior: Prediction
+) -> MapSmoother:
+    """Estimator of kind ``isam2``, at the prior pose with an empty map."""
+    problem = GraphProblem.of(sensor, settings, floor, prior)
+    segments = Segments(sensor, settings.keyframe_every)
+    return MapSmoother(problem, Isam2Solver(problem, settings), segments)
 
-    Updates come every few frames; in between the tracker answers. The last poses are kept at the
-    root of the Bayes tree, which is three times faster than GTSAM's own choice (all landmarks of
-    the update), with the same estimate.
+
+class Isam2Solver:
+    """Updates GTSAM's Bayes tree every few frames; in between the tracker answers.
+
+    The last poses are kept at the root of the tree, which is three times faster than GTSAM's own
+    choice (all landmarks of the update), with the same estimate.
     """
 
     kind: ClassVar[str] = "isam2"
 
-    def __init__(
-        self, sensor: Sensor, settings: Isam2Settings, floor: Floor, prior: Prediction
-    ) -> None:
-        """Starts at the prior pose with an empty map."""
-        super().__init__(sensor, settings, floor, prior)
+    def __init__(self, problem: GraphProblem, settings: Isam2Settings) -> None:
+        """An empty tree."""
+        self._builder, self._floor = problem.builder, problem.floor
         self._settings = settings
+        self._loops = GraphLoops(problem.builder, settings.loops)
+        self._answer = WholeGraphAnswer(problem.builder, problem.floor, self._refined)
         self._careful = False
         self._isam = self._new_solver()
         self._graph = gtsam.NonlinearFactorGraph()
         self._new_values = gtsam.Values()
         self._values = gtsam.Values()
-        self._segments = Segments(sensor, settings.keyframe_every)
         self._updated = 0
+        self.remarks: list[str] = []
 
-    def _absorb(self, tracked: TrackedFrame) -> None:
-        if self._inputs.increments[-1].loops:  # they need the frame's own pose
-            for entering in self._segments.take_at_once(tracked, self._tracker.landmarks()):
-                self._bring_in(entering)
-            return
-        entering_now = self._segments.take(tracked, self._tracker.landmarks())
-        if entering_now is None:
-            return
-        self._bring_in(entering_now)
-        if tracked.frame == 0 or tracked.frame - self._updated >= self._settings.update_every:
-            self._updated = tracked.frame
-            self._flush()
-            self._take_over(self._values, self._moved_on(entering_now, tracked))
-
-    def _bring_in(self, entering: TrackedFrame) -> None:
-        new = self._enter(entering)
+    def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
+        """Keeps a frame's factors for the next update."""
         self._graph.push_back(new.graph)
         self._new_values.insert(new.values)
+        self._answer.changed()
 
-    def _values_now(self) -> Any:
+    def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
+        """Updates the tree where the last update lies `update_every` frames back."""
+        if closes_loop or (frame and frame - self._updated < self._settings.update_every):
+            return None
+        self._updated = frame
+        self._flush()
+        last = self._builder.frames[-1]
+        return Smoothed(
+            self._values, Prediction(poses_of_frame(self._values, last), self._covariance(last))
+        )
+
+    def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
+        """Updates the tree with the loop, or builds it anew where the loop moves the map."""
         self._updated = self._builder.frames[-1]
         self._flush()
-        return self._values
-
-    def _solved_before(self, graph: Any) -> Any:
-        return self._values
-
-    def _join(self, known: Constraint, found: Any | None) -> None:
-        if found is None:
-            graph = gtsam.NonlinearFactorGraph()
-            graph.add(constraint_factor(known))
-            self._update(graph, gtsam.Values())
-        else:
-            try:
-                self._rebuild(found)
-            except RuntimeError as error:
-                self._repair(found, error)
+        self._answer.changed()
+        values = self._values
+        try:
+            found = self._loops.judge(
+                loop, drive, values, self._builder.kept_factors, lambda graph: values, what
+            )
+        except RuntimeError as error:
+            raise self._failed(error) from None
+        if found.closed:
+            self._join(found.values)
+        self.remarks.append(found.remark)
+        if not found.closed:
+            return None
         last = self._builder.frames[-1]
         here = reorthonormalise(poses_of_frame(self._values, last))
-        self._take_over(self._values, Prediction(here, self._covariance(last)), whole=True)
+        return ClosedLoop(
+            Smoothed(self._values, Prediction(here, self._covariance(last)), bent=True)
+        )
 
-    def _moved_on(self, entered: TrackedFrame, tracked: TrackedFrame) -> Prediction:
-        """The last frame's pose, as far from the one that entered last as it was tracked."""
-        motion = inverse(entered.wTc) @ tracked.wTc
-        covariance = congruence(adjoint(inverse(motion)), self._covariance(entered.frame))
-        pose = poses_of_frame(self._values, entered.frame) @ motion
-        return Prediction(reorthonormalise(pose), covariance)
+    def solution(self) -> Solution:
+        """All poses and landmarks of the graph, refined."""
+        return self._answer.solution()
 
-    def _solve(self) -> Solution:
-        refined = self._refined_graph()
-        frames = self._builder.frames
-        solved = solution(refined, frames, self._floor)
-        variable_of = {i: track.variable for i, track in self._builder.tracks.items()}
-        between, motions = self._segments.between, self._inputs.motions()
-        return fill_between(self._sensor, self._floor, solved, between, motions, variable_of)
+    def joint(self, variables: list[int]) -> FloatArray:
+        """Joint covariance of the graph's last pose and landmark variables."""
+        return self._answer.joint(variables)
 
-    def _joint(self, variables: list[int]) -> FloatArray:
-        """As the base's; carried on to the last frame where that one has no pose in the graph."""
-        joint = super()._joint(variables)
-        entered, last = self._builder.frames[-1], len(self._inputs.increments) - 1
-        if entered == last:
-            return joint
-        answer = self._solved()
-        carry = np.eye(len(joint))
-        carry[:6, :6] = adjoint(inverse(answer.poses[last]) @ answer.poses[entered])
-        joint = congruence(carry, joint)
-        joint[:6, :6] = answer.pose_covariances[last]
-        return joint
-
-    def _refine(self) -> Refined:
+    def _refined(self) -> Refined:
         values = gtsam.Values(self._values)
         values.insert(self._new_values)
         iterations = self._settings.final_iterations
@@ -140,6 +127,18 @@ class Isam2Smoother(WholeGraphSmoother):
             )
         except RuntimeError as error:
             raise self._failed(error) from None
+
+    def _join(self, found: Any | None) -> None:
+        """Goes on with the graph that has the loop; from these values where they are given."""
+        if found is None:
+            graph = gtsam.NonlinearFactorGraph()
+            graph.add(self._loops.last_factor())
+            self._update(graph, gtsam.Values())
+            return
+        try:
+            self._rebuild(found)
+        except RuntimeError as error:
+            self._repair(found, error)
 
     # ----------------------------------------------------------------------------------------
 
@@ -187,7 +186,7 @@ class Isam2Smoother(WholeGraphSmoother):
             key = suspect(error)
             if key is not None and is_pose(key) and not self._careful:
                 self._careful = True
-                self._remarks.append(
+                self.remarks.append(
                     f"pose of frame {number(key)} known too unevenly for Cholesky at frame "
                     f"{self._builder.frames[-1]}: iSAM2 built anew, with QR from here on"
                 )
@@ -210,7 +209,7 @@ class Isam2Smoother(WholeGraphSmoother):
     def _take_out(self, variable: int, values: Any, why: str) -> None:
         what = self._builder.take_out(variable)
         values.erase(landmark_key(variable))
-        self._remarks.append(
+        self.remarks.append(
             f"{what} {why} at frame {self._builder.frames[-1]}: taken out of the graph, iSAM2 "
             "built anew from the last estimate"
         )
@@ -220,12 +219,11 @@ class Isam2Smoother(WholeGraphSmoother):
         self._isam.update(self._builder.kept_factors(), values, [], self._groups())
         self._values = self._isam.calculateEstimate()
 
-    def _restart(self, moved: Observations) -> None:
-        super()._restart(moved)
-        self._segments.forget(moved.ids.tolist())
-
     def _covariance(self, frame: int) -> FloatArray:
         """Marginal of a pose."""
         covariance = np.asarray(self._isam.marginalCovariance(pose_key(frame)))
         pose = poses_of_frame(self._values, frame)
         return np.asarray(allowed_parts(self._floor, pose[None], covariance[None])[0])
+
+    def _failed(self, error: Exception) -> Exception:
+        return solver_failed(self.kind, error, self._builder.frames[-1])

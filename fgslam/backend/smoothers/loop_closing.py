@@ -9,24 +9,110 @@ with the frame that saw it first. There every observation fits as before, and wh
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from fgslam.backend.filters.submaps import Chain, Constraint, changes, corrected
+from fgslam.backend.filters.settings import LoopCorrectionSettings
+from fgslam.backend.filters.submaps import Chain, Constraint, changes, constraint_factor, corrected
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.graph_solution import poses_of_frame
 from fgslam.backend.smoothers.outliers import solver_parameters
+from fgslam.backend.smoothers.solver import Drive
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion
 from fgslam.core.geometry import adjoint, congruence, inverse, transform_to_world
 from fgslam.core.measurements import LoopClosure
+from fgslam.core.quantiles import chi_square_quantile
 from fgslam.factors.keys import landmark_key, pose_key
 
+_AGREES = chi_square_quantile(0.99, 6)  # 16.8: a loop that the graph meets as it is
 _ITERATIONS = 20
 _ENOUGH = 2.0  # the last iteration's gain, half squared deviations: far below the gate's square
 _TOLERANCE = 1e-6  # of the cost, where that is small
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Acceptance:
+    """What became of a loop closure in a graph that keeps every pose.
+
+    Attributes:
+        closed: it was accepted, and its factor is in the builder's graph.
+        values: of all variables with the loop closed; None where nothing had to move.
+        remark: in words.
+    """
+
+    closed: bool
+    values: Any | None
+    remark: str
+
+
+class GraphLoops:
+    """The loops of a graph that keeps every pose: which were accepted, and at what cost."""
+
+    def __init__(self, builder: GraphBuilder, settings: LoopCorrectionSettings) -> None:
+        """No loop yet."""
+        self._builder = builder
+        self._settings = settings
+        self._accepted: list[Constraint] = []
+
+    def judge(
+        self,
+        known: Constraint,
+        drive: Drive,
+        values: Any,
+        graph: Callable[[], Any],
+        minimum: Callable[[Any], Any],
+        what: str,
+    ) -> Acceptance:
+        """Whether the measurements allow a loop closure, which is then a factor of the graph.
+
+        One that the graph meets anyway is a factor more. Otherwise the graph is solved with it, and
+        it is refused where that raises the cost by more than measurement noise explains: a true
+        loop's rise is chi-square with six degrees of freedom, whatever the drift.
+
+        Args:
+            known: the loop, between two frames of the graph.
+            drive: as tracked, without it.
+            values: of all variables, as they are now.
+            graph: gives the factors to solve with it.
+            minimum: gives the values at that graph's minimum, without the loop.
+            what: begins the remark.
+
+        Raises:
+            RuntimeError: GTSAM cannot solve the graph.
+        """
+        if misfit(constraint_factor(known), values) <= _AGREES:
+            self._accept(known)
+            return Acceptance(True, None, f"{what}: as expected, nothing moved")
+        factors = graph()
+        before = minimum(factors)
+        cost, loops = float(factors.error(before)), [*self._accepted, known]
+        every = self._settings.submap_frames
+        guess = first_guess(self._builder, before, drive.chain, loops, every)
+        factors.add(constraint_factor(known))
+        found = solved(factors, guess)
+        rise, gate = 2.0 * (float(factors.error(found)) - cost), self._settings.gate_sigmas
+        if gate > 0.0 and not rise <= gate**2:
+            off = f"{np.sqrt(max(rise, 0.0)):.1f} standard deviations off, {gate:g} allowed"
+            return Acceptance(False, None, f"{what} refused: {off}")
+        self._accept(known)
+        here = poses_of_frame(found, known.after)[:3, 3]
+        shift = float(np.linalg.norm(here - drive.wTc[:3, 3]))
+        remark = f"{what}: the camera moved by {shift:.2f} m, the graph with it"
+        return Acceptance(True, found, remark)
+
+    def _accept(self, known: Constraint) -> None:
+        """Believed now, it is doubted when later ones contradict it."""
+        known = dataclasses.replace(known, doubted=True)
+        self._builder.add_factor(constraint_factor(known))
+        self._accepted.append(known)
+
+    def last_factor(self) -> Any:
+        """The factor of the loop accepted last."""
+        return constraint_factor(self._accepted[-1])
 
 
 def misfit(factor: Any, values: Any) -> float:

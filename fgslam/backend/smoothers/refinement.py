@@ -13,8 +13,17 @@ from typing import Any, TypeAlias
 import gtsam
 
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
-from fgslam.backend.smoothers.graph_solution import points_of, poses_of
+from fgslam.backend.smoothers.graph_solution import (
+    Solution,
+    joint_of,
+    points_of,
+    poses_of,
+    solution,
+)
 from fgslam.backend.smoothers.outliers import observed_variables
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import EstimatorError
+from fgslam.core.floor import Floor
 from fgslam.factors.keys import is_pose, landmark_key, number
 
 _ROUNDS = 5  # solutions until no landmark lies behind a camera any more
@@ -61,6 +70,44 @@ def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
             values.erase(landmark_key(variable))
     found, kept = minimise(graph, values)
     return Refined(kept, found, tuple(remarks))
+
+
+class WholeGraphAnswer:
+    """Final answers of a graph that keeps every pose, refined once until it changes."""
+
+    def __init__(self, builder: GraphBuilder, floor: Floor, refined: Callable[[], Refined]) -> None:
+        """``refined`` gives the graph, solved anew."""
+        self._builder = builder
+        self._floor = floor
+        self._refine = refined
+        self._refined: Refined | None = None
+
+    def changed(self) -> None:
+        """Forgets the last answer."""
+        self._refined = None
+
+    def refined(self) -> Refined:
+        """The graph's last solution."""
+        if self._refined is None:
+            self._refined = self._refine()
+        return self._refined
+
+    def solution(self) -> Solution:
+        """All poses and landmarks with their marginals."""
+        return solution(self.refined(), self._builder.frames, self._floor)
+
+    def joint(self, variables: list[int]) -> FloatArray:
+        """Joint covariance of the graph's last pose and landmark variables.
+
+        Raises:
+            EstimatorError: a landmark was left out of the last solution.
+        """
+        refined = self.refined()
+        lost = set(variables) - set(refined.variables)
+        if lost:
+            raise EstimatorError(f"{self._builder.describe(min(lost))} was left out of the graph")
+        last = self._builder.frames[-1]
+        return joint_of(refined.graph, refined.values, self._floor, last, variables)
 
 
 def landmark_variables(values: Any) -> list[int]:

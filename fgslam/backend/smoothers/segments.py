@@ -133,29 +133,28 @@ class Segments:
         self.between: list[TrackedFrame] = []
         """Frames that have no pose in the graph."""
 
-    def take(self, tracked: TrackedFrame, landmarks: LandmarkMap) -> TrackedFrame | None:
+    def take(
+        self, tracked: TrackedFrame, landmarks: LandmarkMap, at_once: bool = False
+    ) -> list[TrackedFrame]:
         """Takes the next frame; gives what now enters the graph, if anything.
 
         Args:
             tracked: the frame.
             landmarks: the map after it.
+            at_once: it is a keyframe out of turn, as for a loop; what is open enters before it.
         """
         if tracked.motion is not None:
             self._motions.append(tracked.motion)
+        if at_once:
+            before = [self._block_entering(tracked.frame, landmarks)] if self._block else []
+            return [*before, self._entering(tracked, tracked.accepted, 0)]
         if tracked.frame % self._every == 0:
-            return self._entering(tracked, tracked.accepted, 0)
+            return [self._entering(tracked, tracked.accepted, 0)]
         self._block.append(tracked)
         self.between.append(tracked)
         if (tracked.frame + 1) % self._every:
-            return None
-        return self._block_entering(tracked.frame, landmarks)
-
-    def take_at_once(self, tracked: TrackedFrame, landmarks: LandmarkMap) -> list[TrackedFrame]:
-        """Takes the next frame as a keyframe out of turn; what is open enters before it."""
-        if tracked.motion is not None:
-            self._motions.append(tracked.motion)
-        before = [self._block_entering(tracked.frame, landmarks)] if self._block else []
-        return [*before, self._entering(tracked, tracked.accepted, 0)]
+            return []
+        return [self._block_entering(tracked.frame, landmarks)]
 
     def _block_entering(self, last: int, landmarks: LandmarkMap) -> TrackedFrame:
         """The open block as one frame; ``last`` is the frame to which motions are known."""

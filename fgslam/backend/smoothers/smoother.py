@@ -1,16 +1,20 @@
-"""What all smoothers share: a tracker in front, the graph behind, and one answer from both.
+"""A smoother: a tracker in front, the factor graph behind, and one answer from both.
 
 Between two solutions of the graph the paper's filter tracks on the smoothed map: it predicts, gives
 the landmarks to match against, and the initial values of what is new. After each solution it
 takes over the smoothed pose and positions. So the graph may be solved every frame, every tenth,
 or once, and the front-end never waits for it.
+
+The parts: a tracker (:class:`~fgslam.backend.filters.landmark_kalman.LandmarkKalman`), a
+:class:`~fgslam.backend.smoothers.graph_builder.GraphBuilder`, a
+:class:`~fgslam.backend.smoothers.solver.GraphSolver`, and, if not every frame is a variable,
+:class:`~fgslam.backend.smoothers.segments.Segments`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,13 +22,15 @@ from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.backend.filters.submaps import FREE, Constraint
 from fgslam.backend.inputs import RecordedInputs, require_finite
-from fgslam.backend.smoothers.graph_builder import GraphBuilder, NewFactors, Sighting
-from fgslam.backend.smoothers.graph_solution import Solution, joint_of, poses_of_frame
+from fgslam.backend.smoothers.between import fill_between
+from fgslam.backend.smoothers.graph_builder import GraphBuilder
+from fgslam.backend.smoothers.graph_solution import Solution
 from fgslam.backend.smoothers.loop_closing import carried_to
-from fgslam.backend.smoothers.refinement import Refined
-from fgslam.backend.smoothers.segments import TrackedFrame
+from fgslam.backend.smoothers.segments import Segments, TrackedFrame
 from fgslam.backend.smoothers.settings import GraphSettings
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
+from fgslam.backend.smoothers.solver import Drive, GraphSolver, Smoothed
+from fgslam.backend.smoothers.tracker_map import TrackerMap
+from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import (
     EgoMotion,
@@ -39,51 +45,78 @@ from fgslam.core.geometry import (
     adjoint,
     congruence,
     inverse,
-    point_pose_jacobian,
-    transform_to_world,
-    triangulate,
-    triangulation_covariance,
+    reorthonormalise,
 )
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
-from fgslam.core.sensors import CameraRig, Sensor
-from fgslam.factors.keys import landmark_key, pose_key
-
-_ASTRAY_PX = 12.0  # where nothing is left out: farther off, a match speaks against its landmark
+from fgslam.core.sensors import Sensor
 
 
-class Smoother(ABC):
-    """Base of the smoothers; they say when the graph is solved, and how."""
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class GraphProblem:
+    """Where a run takes place, what its graph is made by, and from where it starts.
 
-    kind: ClassVar[str]
-    supports: ClassVar[frozenset[MeasurementType]] = frozenset(MeasurementType)
+    Attributes:
+        sensor: the cameras, or the range-bearing sensor.
+        settings: of the graph.
+        floor: on which the robot stays.
+        prior: pose of the first frame and its covariance.
+        tracker: the filter in front.
+        builder: of the graph.
+    """
 
-    def __init__(
-        self,
+    sensor: Sensor
+    settings: GraphSettings
+    floor: Floor
+    prior: Prediction
+    tracker: LandmarkKalman
+    builder: GraphBuilder
+
+    @staticmethod
+    def of(
         sensor: Sensor,
         settings: GraphSettings,
         floor: Floor,
         prior: Prediction,
         remember: bool = True,
+    ) -> GraphProblem:
+        """A tracker and a builder at the prior, both empty; ``remember`` as GraphBuilder's."""
+        tracker = LandmarkKalman(sensor, LandmarkKalmanSettings(loops=settings.loops), prior)
+        builder = GraphBuilder(sensor, settings, floor, prior, remember)
+        return GraphProblem(sensor, settings, floor, prior, tracker, builder)
+
+
+class Smoother:
+    """A smoothing estimator, on :class:`fgslam.backend.protocol.Estimator`."""
+
+    supports: ClassVar[frozenset[MeasurementType]] = frozenset(MeasurementType)
+
+    def __init__(
+        self, problem: GraphProblem, solver: GraphSolver, segments: Segments | None = None
     ) -> None:
-        """Starts at the prior pose with an empty map; ``remember`` as GraphBuilder's."""
-        self._sensor = sensor
-        self._floor = floor
-        self._gate_px = settings.gate_px
-        self._tracker = LandmarkKalman(sensor, LandmarkKalmanSettings(loops=settings.loops), prior)
-        self._builder = GraphBuilder(sensor, settings, floor, prior, remember)
+        """Starts at the problem's prior pose with an empty map.
+
+        Args:
+            problem: the tracker, the builder, and what they share.
+            solver: of the builder's graph.
+            segments: chooses the keyframes; None: every frame is a variable.
+        """
+        self._sensor, self._floor = problem.sensor, problem.floor
+        self._tracker, self._builder = problem.tracker, problem.builder
+        self._solver, self._segments = solver, segments
+        self._map = TrackerMap(problem.sensor, problem.tracker, problem.builder.admission)
+        self._closure_factor = problem.settings.loops.closure_factor
         self._inputs = RecordedInputs()
-        self._smoothed = prior
-        self._remarks: list[str] = []
+        self._smoothed = problem.prior
         self._answer: Solution | None = None
-        self._refined: Refined | None = None
-        self._anchors: dict[int, FloatArray] = {}
-        self._frozen: dict[int, tuple[FloatArray, FloatArray]] = {}
-        self._loop_settings = settings.loops
-        self._loops: list[Constraint] = []
         self._takeovers = 0
         self._eras: list[int] = []
 
-    # -- the protocol ------------------------------------------------------------------------
+    # -- the method ----------------------------------------------------------------------------
+
+    @property
+    def kind(self) -> str:
+        """The solver's."""
+        return self._solver.kind
 
     def predict(self, odometry: Odometry | None) -> Prediction:
         """Pose after the camera moved by ``odometry``."""
@@ -98,21 +131,23 @@ class Smoother(ABC):
 
         Raises:
             EstimatorError: a number is not finite, or time does not increase; the state is then as
-                before. Or the solver failed beyond mending; the estimator is then at its end.
+                before. Or the solver failed beyond repair; the estimator is then at its end.
         """
         if increment.relocalised and self._inputs.increments:
             increment = dataclasses.replace(increment, odometry=self._unknown_step(tracking))
         require_finite(increment, tracking)
         stats = self._tracker.update(dataclasses.replace(increment, loops=()), tracking)
-        self._inputs.append(increment, tracking)
-        self._eras.append(self._takeovers)
-        self._answer = self._refined = None
-        self._absorb(self._sorted_out(increment, tracking))
-        where = f"frame {increment.index}"
-        closed = tuple(self._close(loop, where) for loop in increment.loops)
+        self._record(increment, tracking)
+        tracked = self._admitted(increment, tracking)
+        entering = self._entering(tracked, at_once=bool(increment.loops))
+        for frame in entering:
+            self._add(frame)
+        if entering:
+            self._solve(entering[-1], tracked, bool(increment.loops))
+        closed = tuple(self._close(loop, increment.index) for loop in increment.loops)
         current = self._current(tracking)
-        return UpdateStats(
-            current.wTc, current.covariance, stats.landmarks, stats.nis, stats.nis_dof, closed
+        return dataclasses.replace(
+            stats, wTc=current.wTc, covariance=current.covariance, closed=closed
         )
 
     def estimate(self) -> Estimate:
@@ -123,8 +158,8 @@ class Smoother(ABC):
         return Estimate(
             Trajectory(self._inputs.timestamps(), answer.poses),
             answer.pose_covariances,
-            self._map(answer),
-            (*self._remarks, *self._builder.remarks, *answer.remarks),
+            self._map.reported(answer),
+            (*self._solver.remarks, *self._builder.admission.remarks, *answer.remarks),
         )
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
@@ -136,7 +171,7 @@ class Smoother(ABC):
     def joint_covariance(self, ids: IntArray) -> FloatArray:
         """Joint covariance of the last pose and the named landmarks."""
         self._tracker.landmarks().rows(ids)
-        tracks = [self._builder.tracks.get(i) for i in ids.tolist()]
+        tracks = [self._builder.admission.tracks.get(i) for i in ids.tolist()]
         variables = [-1 if track is None else track.variable for track in tracks]
         outside = [i for i, v in zip(ids.tolist(), variables, strict=True) if v < 0]
         if outside:
@@ -144,7 +179,7 @@ class Smoother(ABC):
                 f"landmark {outside[0]} waits outside the graph until it is constrained; ask for "
                 "its marginal instead"
             )
-        return self._joint(variables)
+        return self._at_last_frame(self._solver.joint(variables))
 
     def state(self) -> StateArrays:
         """Everything that was put in: a solver's inside has no arrays, but repeats to the bit."""
@@ -157,67 +192,31 @@ class Smoother(ABC):
         for increment, tracking in RecordedInputs.from_arrays(state):
             self.update(increment, tracking)
 
-    # -- what a smoother adds ----------------------------------------------------------------
+    # -- its steps -----------------------------------------------------------------------------
 
-    @abstractmethod
-    def _absorb(self, tracked: TrackedFrame) -> None:
-        """Takes a frame in; solves when it is time to."""
+    def _unknown_step(self, tracking: EgoMotion) -> Odometry:
+        """The step to a frame found without a prior: as found, and free to be any other."""
+        before = self._tracker.predict(None).wTc
+        return Odometry(inverse(before) @ tracking.wTc, FREE, measured=False)
 
-    @abstractmethod
-    def _close(self, loop: LoopClosure, where: str) -> bool:
-        """Closes a loop of the frame just taken in, which ``where`` names; or refuses it."""
+    def _record(self, increment: Increment, tracking: EgoMotion) -> None:
+        self._inputs.append(increment, tracking)
+        self._eras.append(self._takeovers)
+        self._answer = None
 
-    @abstractmethod
-    def _solve(self) -> Solution:
-        """All poses and landmarks, with covariances."""
-
-    def _refine(self) -> Refined:
-        """The whole graph, solved; for smoothers that keep it."""
-        raise NotImplementedError
-
-    def _refined_graph(self) -> Refined:
-        if self._refined is None:
-            self._refined = self._refine()
-        return self._refined
-
-    def _joint(self, variables: list[int]) -> FloatArray:
-        """Joint covariance of the graph's last pose and landmark variables."""
-        refined = self._refined_graph()
-        lost = set(variables) - set(refined.variables)
-        if lost:
-            raise EstimatorError(f"{self._builder.describe(min(lost))} was left out of the graph")
-        last = self._builder.frames[-1]
-        return joint_of(refined.graph, refined.values, self._floor, last, variables)
-
-    def _failed(self, error: Exception, when: str = "at") -> EstimatorError:
-        """What to raise where a solver's failure is beyond mending."""
-        return EstimatorError(
-            f"{self.kind}: the solver failed {when} frame {self._builder.frames[-1]} "
-            f"({' '.join(str(error).split())}); look at that frame with fgslam inspect"
-        )
-
-    # -- common steps ------------------------------------------------------------------------
-
-    def _sorted_out(self, increment: Increment, tracking: EgoMotion) -> TrackedFrame:
+    def _admitted(self, increment: Increment, tracking: EgoMotion) -> TrackedFrame:
         """The frame with those observations that fit; landmarks that moved have started anew."""
-        observed = increment.observations
+        admission, observed = self._builder.admission, increment.observations
         matched = observed.select(~observed.is_new)
-        used, astray = self._judged(tracking)
-        self._builder.note(increment.pruned_ids)
-        self._builder.confirmed(matched.ids[~astray])
-        moved = self._builder.contradicted(self._held(matched.select(astray)), tracking.wTc)
+        used, astray = admission.judge(tracking)
+        admission.pruned(increment.pruned_ids)
+        admission.confirmed(matched.ids[~astray])
+        moved = admission.contradicted(self._held(matched.select(astray)), tracking.wTc)
         self._restart(moved)
         used &= ~np.isin(matched.ids, moved.ids)
         accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
         frame = len(self._inputs.increments) - 1
         return TrackedFrame(frame, tracking.wTc, increment.odometry, self._held(accepted))
-
-    def _judged(self, tracking: EgoMotion) -> tuple[BoolArray, BoolArray]:
-        """Which matched observations are used, and which speak against their landmark's place."""
-        astray = ~tracking.inliers
-        if isinstance(self._sensor, CameraRig):
-            astray = astray & ~(tracking.residuals <= (self._gate_px or _ASTRAY_PX))
-        return (~astray if self._gate_px else np.ones(len(astray), np.bool_)), astray
 
     def _held(self, observed: Observations) -> Observations:
         """Those of landmarks that are in the map, pruned ones no longer."""
@@ -225,43 +224,47 @@ class Smoother(ABC):
 
     def _restart(self, moved: Observations) -> None:
         """Landmarks that were contradicted too often begin anew where they are seen now."""
+        ids = moved.ids.tolist()
         why = "was seen elsewhere in frame after frame: moved, started anew"
-        self._builder.start_anew(moved.ids.tolist(), why)
+        self._builder.admission.start_anew(ids, why)
         self._tracker.restart(moved)
-        for identity in moved.ids.tolist():
-            self._frozen.pop(identity, None)
+        if self._segments is not None:
+            self._segments.forget(ids)
 
-    def _unknown_step(self, tracking: EgoMotion) -> Odometry:
-        """The step to a frame found without a prior: as found, and free to be any other."""
-        before = self._tracker.predict(None).wTc
-        return Odometry(inverse(before) @ tracking.wTc, FREE, measured=False)
+    def _entering(self, tracked: TrackedFrame, at_once: bool) -> list[TrackedFrame]:
+        """What now enters the graph: this frame, or a segment that it completes, or nothing."""
+        if self._segments is None:
+            return [tracked]
+        return self._segments.take(tracked, self._tracker.landmarks(), at_once)
 
-    def _enter(self, tracked: TrackedFrame) -> NewFactors:
-        """Enters a frame into the graph."""
-        self._anchors[tracked.frame] = tracked.wTc
-        return self._builder.add(tracked, self._tracker.landmarks())
+    def _add(self, frame: TrackedFrame) -> None:
+        landmarks = self._tracker.landmarks()
+        self._map.entered(frame.frame, frame.wTc)
+        timestamp = float(self._inputs.increments[frame.frame].timestamp)
+        self._solver.add(self._builder.add(frame, landmarks), landmarks, timestamp)
 
-    def _take_over(self, values: Any, current: Prediction, whole: bool = False) -> None:
-        """Lets the tracker go on from smoothed values.
+    def _solve(self, entered: TrackedFrame, tracked: TrackedFrame, closes_loop: bool) -> None:
+        smoothed = self._solver.solve_if_due(tracked.frame, closes_loop)
+        if smoothed is not None:
+            last = smoothed.last
+            if self._segments is not None:
+                last = _moved_on(last, inverse(entered.wTc) @ tracked.wTc)
+            self._take_over(smoothed, last)
 
-        Landmarks that the graph knows nothing of stay; after a loop (``whole``) they move along
-        with the last pose, near which they are, unless they are a saved map's.
-        """
-        ids, positions = self._positions(values)
-        waiting_ids, waiting_positions = self._waiting(values)
-        ids = np.concatenate([ids, waiting_ids])
-        positions = np.concatenate([positions, waiting_positions])
-        if whole:
-            known, moved = self._tracker.landmarks(), self._tracker.predict(None).wTc
-            rest = np.flatnonzero(~np.isin(known.ids, ids) & (self._tracker.homes >= 0))
-            moved = current.wTc @ inverse(moved)
-            ids = np.concatenate([ids, known.ids[rest]])
-            positions = np.concatenate(
-                [positions, transform_to_world(moved, known.positions[rest])]
-            )
+    def _take_over(self, smoothed: Smoothed, current: Prediction) -> None:
         self._smoothed = current
         self._takeovers += 1
-        self._tracker.correct(current, ids, positions)
+        self._map.take_over(smoothed, current)
+
+    def _close(self, loop: LoopClosure, index: int) -> bool:
+        """Closes a loop of the frame just taken in, or refuses it."""
+        known = self._between(loop)
+        drive = Drive(self._tracker.chain, self._tracker.predict(None).wTc)
+        what = f"frame {index}: loop closure to frame {loop.frame} of the log"
+        closed = self._solver.close(known, drive, what)
+        if closed is not None and closed.smoothed is not None:
+            self._take_over(closed.smoothed, closed.smoothed.last)
+        return closed is not None
 
     def _between(self, loop: LoopClosure) -> Constraint:
         """A loop between poses of the graph, the last of which is the present frame's.
@@ -273,45 +276,14 @@ class Smoother(ABC):
         if not 0 <= loop.frame < last:
             raise EstimatorError(
                 f"{self.kind}: a loop closure of frame {last} of the log leads to frame "
-                f"{loop.frame}, which does not come before it; mend the log"
+                f"{loop.frame}, which does not come before it; correct the log"
             )
         era, frames = self._eras[loop.frame], self._builder.frames
         fellows = [frame for frame in frames if self._eras[frame] == era] or frames
         near = min(fellows, key=lambda frame: abs(frame - loop.frame))
-        covariance = self._loop_settings.closure_factor**2 * loop.covariance
+        covariance = self._closure_factor**2 * loop.covariance
         loop = dataclasses.replace(loop, covariance=covariance)
         return carried_to(near, loop, self._inputs.trackings, last)
-
-    def _waiting(self, values: Any) -> tuple[IntArray, FloatArray]:
-        """Landmarks outside the graph, moved along with the pose that saw them last."""
-        last_seen: dict[int, list[int]] = {}
-        for identity, track in self._builder.waiting():
-            last_seen.setdefault(track.last.frame, []).append(identity)
-        known = self._tracker.landmarks()
-        ids, positions = [np.empty(0, np.int64)], [np.empty((0, 3))]
-        anchors = {}
-        for frame, identities in last_seen.items():
-            if values.exists(pose_key(frame)):
-                anchors[frame] = poses_of_frame(values, frame)
-                # One just taken out of the graph is where the graph had it, and follows from here.
-                moved = anchors[frame] @ inverse(self._anchors.get(frame, anchors[frame]))
-                ids.append(np.array(identities, np.int64))
-                before = known.positions[known.rows(ids[-1])]
-                positions.append(transform_to_world(moved, before))
-        self._anchors = anchors
-        return np.concatenate(ids), np.concatenate(positions)
-
-    def _positions(self, values: Any) -> tuple[IntArray, FloatArray]:
-        """Identities and positions of the tracker's landmarks that ``values`` hold."""
-        tracks, ids, positions = self._builder.tracks, [], []
-        for identity in self._tracker.landmarks().ids.tolist():
-            track = tracks.get(identity)
-            if track is not None and track.variable >= 0:
-                key = landmark_key(track.variable)
-                if values.exists(key):
-                    ids.append(identity)
-                    positions.append(values.atPoint3(key))
-        return np.array(ids, np.int64), np.array(positions, np.float64).reshape(-1, 3)
 
     def _current(self, tracking: EgoMotion) -> Prediction:
         """The last pose: the tracker's, whose map is as uncertain as the pose last smoothed."""
@@ -323,34 +295,80 @@ class Smoother(ABC):
         return Prediction(now.wTc, self._floor.allowed_part(now.wTc, drift + tracking.covariance))
 
     def _solved(self) -> Solution:
+        """The graph's answer, with the poses of frames between keyframes."""
         if self._answer is None:
-            self._answer = self._solve()
+            self._answer = self._solver.solution()
+            if self._segments is not None:
+                tracks = self._builder.admission.tracks
+                variable_of = {i: track.variable for i, track in tracks.items()}
+                between, motions = self._segments.between, self._inputs.motions()
+                self._answer = fill_between(
+                    self._sensor, self._floor, self._answer, between, motions, variable_of
+                )
         return self._answer
 
-    def _map(self, answer: Solution) -> LandmarkMap:
-        """The tracker's landmarks where the graph has them; those that wait, from their pose."""
-        ids = self._tracker.landmarks().ids
-        positions, covariances = np.empty((len(ids), 3)), np.empty((len(ids), 3, 3))
-        known = self._tracker.landmarks()
-        for row, identity in enumerate(ids.tolist()):
-            track = self._builder.tracks.get(identity)
-            if track is None:  # seen since the last keyframe only
-                positions[row], covariances[row] = known.positions[row], known.covariances[row]
-            elif track.variable in answer.points:
-                positions[row] = answer.points[track.variable]
-                covariances[row] = answer.point_covariances[track.variable]
-            elif identity in self._frozen:
-                positions[row], covariances[row] = self._frozen[identity]
-            else:
-                positions[row], covariances[row] = self._seen_from(answer, track.last)
-        return LandmarkMap(ids, positions, covariances)
+    def _at_last_frame(self, joint: FloatArray) -> FloatArray:
+        """A joint covariance with the graph's last pose, carried on to the last frame's."""
+        entered, last = self._builder.frames[-1], len(self._inputs.increments) - 1
+        if entered == last:
+            return joint
+        answer = self._solved()
+        carry = np.eye(len(joint))
+        carry[:6, :6] = adjoint(inverse(answer.poses[last]) @ answer.poses[entered])
+        joint = congruence(carry, joint)
+        joint[:6, :6] = answer.pose_covariances[last]
+        return joint
 
-    def _seen_from(self, answer: Solution, sighting: Sighting) -> tuple[FloatArray, FloatArray]:
-        """Position and covariance of a landmark from a single sighting."""
-        wTc = answer.poses[sighting.frame]
-        measurement = sighting.measurement[None]
-        point = triangulate(self._sensor, measurement)
-        local = triangulation_covariance(self._sensor, measurement, sighting.covariance[None])
-        by_pose = congruence(point_pose_jacobian(point), answer.pose_covariances[sighting.frame])
-        world = congruence(wTc[:3, :3], local + by_pose)
-        return transform_to_world(wTc, point)[0], world[0]
+
+class MapSmoother(Smoother):
+    """A smoother that keeps its whole graph, and so can begin in a saved map (``MapUser``)."""
+
+    def __init__(
+        self, problem: GraphProblem, solver: GraphSolver, segments: Segments | None = None
+    ) -> None:
+        """As :class:`Smoother`."""
+        super().__init__(problem, solver, segments)
+        self._prior = problem.prior
+        self._begun_in: StateArrays = {}
+
+    @property
+    def keeps_maps(self) -> bool:
+        """False: a smoother's landmarks are what it estimates."""
+        return False
+
+    def begin_in(self, landmarks: LandmarkMap, hits: IntArray, fixed: bool) -> None:
+        """Takes a saved map over: a prior factor for each landmark that is seen again."""
+        self._tracker.begin_in(landmarks, hits, fixed=False)
+        self._builder.admission.know(landmarks)
+        self._begun_in = {
+            "map/ids": landmarks.ids,
+            "map/positions": landmarks.positions,
+            "map/covariances": landmarks.covariances,
+            "map/hits": hits,
+            "map/prior_pose": self._prior.wTc,
+            "map/prior_covariance": self._prior.covariance,
+        }
+
+    def state(self) -> StateArrays:
+        """The map that it began in, and where, and everything that was put in."""
+        return super().state() | self._begun_in
+
+    def restore(self, state: StateArrays) -> None:
+        """Repeats everything since the beginning."""
+        if "map/ids" in state:
+            self._start_at(Prediction(state["map/prior_pose"], state["map/prior_covariance"]))
+            known = (state[f"map/{name}"] for name in ("ids", "positions", "covariances"))
+            self.begin_in(LandmarkMap(*known), state["map/hits"], fixed=False)
+        super().restore(state)
+
+    def _start_at(self, prior: Prediction) -> None:
+        """Another prior pose: who goes on with a run in a map does not know where that began."""
+        self._prior = self._smoothed = prior
+        self._builder.start_at(prior)
+        self._tracker.correct(prior, np.empty(0, np.int64), np.empty((0, 3)))
+
+
+def _moved_on(last: Prediction, motion: FloatArray) -> Prediction:
+    """The present frame's pose, as far from the one that entered last as it was tracked."""
+    covariance = congruence(adjoint(inverse(motion)), last.covariance)
+    return Prediction(reorthonormalise(last.wTc @ motion), covariance)

@@ -22,8 +22,8 @@ from smoothing import (
 )
 
 from fgslam.backend.smoothers import refinement
-from fgslam.backend.smoothers.batch import BatchSmoother
 from fgslam.backend.smoothers.settings import BatchSettings
+from fgslam.backend.smoothers.smoother import MapSmoother
 from fgslam.core.errors import EstimatorError
 from fgslam.evaluation.consistency import judge
 
@@ -58,7 +58,7 @@ def test_the_end_is_the_minimum_of_what_fits() -> None:
     simulation = drawn(5)
     spoilt = wrong_matches(simulation.increments, 0.3, np.random.default_rng(5))
     estimator, _ = run(BatchSettings(), spoilt)
-    assert isinstance(estimator, BatchSmoother)
+    assert isinstance(estimator, MapSmoother)
     refined = estimator._refined_graph()
     graph, values = refined.graph, refined.values
     total = estimator._builder.kept_factors().size()
@@ -112,7 +112,7 @@ def test_a_landmark_of_which_nothing_fits_is_left_out_and_told(
 ) -> None:
     simulation = drawn(7)
     estimator, _ = run(BatchSettings(), simulation.increments)
-    variable = estimator._builder.tracks[3].variable
+    variable = estimator._builder.admission.tracks[3].variable
     told = [{variable: "has no observation that fits the others"}]
     monkeypatch.setattr(refinement, "_lost", lambda *given: told.pop() if told else {})
     found = estimator.estimate()

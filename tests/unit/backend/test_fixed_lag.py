@@ -23,8 +23,8 @@ from smoothing import (
     unseen,
 )
 
-from fgslam.backend.smoothers.fixed_lag import FixedLagSmoother
 from fgslam.backend.smoothers.settings import FixedLagSettings
+from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Prediction
 from fgslam.evaluation.consistency import judge
@@ -47,9 +47,14 @@ class Failing:
         raise RuntimeError(self._message)
 
 
-def smoother(settings: FixedLagSettings = LAG) -> FixedLagSmoother:
+def spoil(estimator: Any, message: str) -> None:
+    """The next update of the window's solver fails with this message."""
+    estimator._solver._solver = Failing(estimator._solver._solver, message)
+
+
+def smoother(settings: FixedLagSettings = LAG) -> Smoother:
     made = build(settings)
-    assert isinstance(made, FixedLagSmoother)
+    assert isinstance(made, Smoother)
     return made
 
 
@@ -97,11 +102,11 @@ def test_factors_and_variables_do_not_grow_with_the_run() -> None:
         play(estimator, [increment], FREE)
         counts.append(
             (
-                estimator._solver.getFactors().nrFactors(),
-                estimator._values.size(),
-                len(estimator._recent),
+                estimator._solver._solver.getFactors().nrFactors(),
+                estimator._solver._values.size(),
+                len(estimator._solver._recent),
                 estimator._builder.graph.size() + len(estimator._builder._seen_frame),
-                estimator._solver.getFactors().size(),
+                estimator._solver._solver.getFactors().size(),
             )
         )
     seen = np.array([len(x.observations) for x in simulation.increments])
@@ -125,7 +130,7 @@ def test_the_frozen_place_is_shown_until_the_landmark_is_seen_again() -> None:
         row = found.rows(np.array([28]))[0]
         places.append((found.positions[row], found.covariances[row]))
         if k in (12, 15):
-            assert estimator._builder.tracks[28].variable == -1
+            assert estimator._builder.admission.tracks[28].variable == -1
             with pytest.raises(EstimatorError, match="landmark 28 waits outside the graph"):
                 estimator.joint_covariance(np.array([28]))
     for k in range(11, 16):
@@ -165,9 +170,9 @@ def test_a_failure_at_a_landmark_is_mended_again_and_again() -> None:
     estimator = smoother()
     play(estimator, simulation.increments[:9], FREE)
     for k, identity in ((9, 28), (11, 5)):
-        variable = estimator._builder.tracks[identity].variable
+        variable = estimator._builder.admission.tracks[identity].variable
         message = f"\nIndeterminate near variable\n{landmark_key(variable)} (Symbol: l1).\n\nWhy."
-        estimator._solver = Failing(estimator._solver, message)
+        spoil(estimator, message)
         play(estimator, simulation.increments[k : k + 2], FREE)
         assert not estimator._builder.in_graph(variable)
     play(estimator, simulation.increments[13:], FREE)
@@ -186,8 +191,8 @@ def test_the_rebuilt_window_is_as_uncertain_as_the_one_that_failed() -> None:
     mended, whole = smoother(), smoother()
     for estimator in (mended, whole):
         play(estimator, simulation.increments[:12], FREE)
-    variable = mended._builder.tracks[28].variable
-    mended._solver = Failing(mended._solver, f"variable {landmark_key(variable)} (")
+    variable = mended._builder.admission.tracks[28].variable
+    spoil(mended, f"variable {landmark_key(variable)} (")
     for estimator in (mended, whole):
         play(estimator, simulation.increments[12:13], FREE)
     a, b = (position_sigma(e.estimate().covariances[-6:]) for e in (mended, whole))
@@ -201,9 +206,9 @@ def test_a_window_rebuilt_from_the_first_frame_on_has_one_prior() -> None:
     mended, whole = build(LAG, prior), build(LAG, prior)
     for estimator in (mended, whole):
         play(estimator, simulation.increments[:3], FREE)
-    assert isinstance(mended, FixedLagSmoother)
-    variable = mended._builder.tracks[28].variable
-    mended._solver = Failing(mended._solver, f"variable {landmark_key(variable)} (")
+    assert isinstance(mended, Smoother)
+    variable = mended._builder.admission.tracks[28].variable
+    spoil(mended, f"variable {landmark_key(variable)} (")
     for estimator in (mended, whole):
         play(estimator, simulation.increments[3:4], FREE)
     found = mended.estimate()
@@ -215,10 +220,12 @@ def test_a_window_rebuilt_from_the_first_frame_on_has_one_prior() -> None:
 def test_rebuilt_poses_leave_when_their_lag_is_over() -> None:
     simulation, estimator = drawn(8, frames=24), smoother()
     play(estimator, simulation.increments[:12], FREE)
-    variable = estimator._builder.tracks[28].variable
-    estimator._solver = Failing(estimator._solver, f"variable {landmark_key(variable)} (")
+    variable = estimator._builder.admission.tracks[28].variable
+    estimator._solver._solver = Failing(
+        estimator._solver._solver, f"variable {landmark_key(variable)} ("
+    )
     play(estimator, simulation.increments[12:15], FREE)
-    inside = sorted(number(key) for key in list(estimator._values.keys()) if is_pose(key))
+    inside = sorted(number(key) for key in list(estimator._solver._values.keys()) if is_pose(key))
     assert inside == list(range(9, 15))
 
 
@@ -242,7 +249,7 @@ def test_asking_changes_nothing_where_several_frames_leave_at_once() -> None:
 def test_what_cannot_be_mended_ends_in_one_clear_line(message: str) -> None:
     simulation, estimator = drawn(8, frames=12), smoother()
     play(estimator, simulation.increments[:9], FREE)
-    estimator._solver = Failing(estimator._solver, message)
+    spoil(estimator, message)
     with pytest.raises(EstimatorError, match=r"^fixed_lag: the solver failed at frame 9 \(") as e:
         play(estimator, simulation.increments[9:10], FREE)
     assert "\n" not in str(e.value)
@@ -258,6 +265,6 @@ def test_restored_it_continues_to_the_bit(at: int) -> None:
     second.restore({name: np.array(array) for name, array in first.state().items()})
     play(second, increments[at:], FREE)
     assert_same_bits(second.estimate(), straight.estimate())
-    held = [i for i, track in second._builder.tracks.items() if track.variable >= 0][:2]
+    held = [i for i, track in second._builder.admission.tracks.items() if track.variable >= 0][:2]
     ids = np.array(held)
     assert_same_bits(second.joint_covariance(ids), straight.joint_covariance(ids))

@@ -78,12 +78,12 @@ def test_a_landmark_waits_for_its_second_sighting_and_loses_none() -> None:
     made = builder()
     first = made.add(frame(0, points, True), known(points))
     assert landmarks_of(first.graph) == []
-    assert [identity for identity, _ in made.waiting()] == [4]
+    assert [identity for identity, _ in made.admission.waiting()] == [4]
     second = made.add(frame(1, points), known(points))
     key = landmark_key(0)
     assert landmarks_of(second.graph) == [(pose_key(0), key), (pose_key(1), key)]
     assert second.seen == [0]
-    assert list(made.waiting()) == []
+    assert list(made.admission.waiting()) == []
     np.testing.assert_array_equal(second.values.atPoint3(key), points[4])
 
 
@@ -179,7 +179,9 @@ def test_points_without_parallax_wait_and_are_in_the_map(name: str) -> None:
     far = found.landmarks.ids[found.landmarks.ids >= SHIFT]
     assert len(far) > 20
     assert ate(found, near) < 0.02
-    waiting = [identity for identity, _ in estimator._builder.waiting() if identity >= SHIFT]
+    waiting = [
+        identity for identity, _ in estimator._builder.admission.waiting() if identity >= SHIFT
+    ]
     assert len(waiting) > 5
     asked = np.array(waiting[:1])
     assert np.linalg.eigvalsh(estimator.landmark_covariances(asked)[0])[0] > 0.0
@@ -255,16 +257,16 @@ def test_contradictions_count_in_a_row_and_not_at_all_where_switched_off() -> No
         for k in range(1, 7):
             here = frame(k, elsewhere)
             if k == 4:
-                made.confirmed(np.array([1]))
-            gone = made.contradicted(here.accepted, here.wTc)
+                made.admission.confirmed(np.array([1]))
+            gone = made.admission.contradicted(here.accepted, here.wTc)
             found.append(len(gone) == 1)
             if len(gone):
-                made.start_anew([1], "moved")
+                made.admission.start_anew([1], "moved")
                 made.add(frame(k, points, True), known(points))
             elif k == 4:
-                made.confirmed(np.array([1]))
+                made.admission.confirmed(np.array([1]))
         assert found == expected, after
-        assert len(made.remarks) == sum(expected)
+        assert len(made.admission.remarks) == sum(expected)
 
 
 @GRAPHS
@@ -391,7 +393,7 @@ def test_what_came_out_behind_a_camera_is_taken_out(
     name: str, drive: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     estimator, _ = run(SMOOTHERS[name], drive.increments)
-    variable = estimator._builder.tracks[OFTEN].variable
+    variable = estimator._builder.admission.tracks[OFTEN].variable
     answers = [[variable]]
     monkeypatch.setattr(
         estimator._builder, "behind", lambda poses, points: answers.pop() if answers else []

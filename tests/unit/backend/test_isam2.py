@@ -22,8 +22,8 @@ from smoothing import (
     unseen,
 )
 
-from fgslam.backend.smoothers.isam2 import Isam2Smoother
 from fgslam.backend.smoothers.settings import Isam2Settings
+from fgslam.backend.smoothers.smoother import MapSmoother
 from fgslam.core.errors import EstimatorError
 from fgslam.evaluation.consistency import judge
 from fgslam.factors.keys import landmark_key, pose_key
@@ -51,14 +51,14 @@ class Failing:
         raise RuntimeError(self._message)
 
 
-def spoil(estimator: Isam2Smoother, key: int) -> None:
-    estimator._isam = Failing(estimator._isam, FAILED.format(key=key))
+def spoil(estimator: MapSmoother, key: int) -> None:
+    estimator._solver._isam = Failing(estimator._solver._isam, FAILED.format(key=key))
 
 
-def played(frames: int, settings: Isam2Settings = EVERY_FRAME) -> tuple[Any, Isam2Smoother]:
+def played(frames: int, settings: Isam2Settings = EVERY_FRAME) -> tuple[Any, MapSmoother]:
     simulation = drawn(8, frames=24)
     estimator = build(settings)
-    assert isinstance(estimator, Isam2Smoother)
+    assert isinstance(estimator, MapSmoother)
     play(estimator, simulation.increments[:frames], FREE)
     return simulation, estimator
 
@@ -74,8 +74,8 @@ def played(frames: int, settings: Isam2Settings = EVERY_FRAME) -> tuple[Any, Isa
 )
 def test_a_failure_at_a_landmark_is_mended_and_told(settings: Isam2Settings) -> None:
     simulation, estimator = played(13, settings)
-    variable = estimator._builder.tracks[5].variable
-    sightings = estimator._builder.tracks[5].sightings
+    variable = estimator._builder.admission.tracks[5].variable
+    sightings = estimator._builder.admission.tracks[5].sightings
     spoil(estimator, landmark_key(variable))
     play(estimator, simulation.increments[13:], FREE)
     found = estimator.estimate()
@@ -92,7 +92,7 @@ def test_a_failure_at_a_landmark_is_mended_and_told(settings: Isam2Settings) -> 
 def test_after_the_repair_it_is_as_if_the_landmark_had_never_been_in() -> None:
     settings = Isam2Settings(update_every=1, relinearize_threshold=1e-9)
     simulation, estimator = played(15, settings)
-    spoil(estimator, landmark_key(estimator._builder.tracks[5].variable))
+    spoil(estimator, landmark_key(estimator._builder.admission.tracks[5].variable))
     play(estimator, simulation.increments[15:16], FREE)
     without = answer(settings, unseen(simulation.increments[:16], 5, range(16)))
     found = estimator.estimate()
@@ -106,10 +106,10 @@ def test_after_the_repair_it_is_as_if_the_landmark_had_never_been_in() -> None:
 
 def test_one_taken_out_comes_back_when_it_is_known_twice_as_well() -> None:
     simulation, estimator = played(6)
-    before = estimator._builder.tracks[5].variable
+    before = estimator._builder.admission.tracks[5].variable
     spoil(estimator, landmark_key(before))
     play(estimator, simulation.increments[6:7], FREE)
-    track = estimator._builder.tracks[5]
+    track = estimator._builder.admission.tracks[5]
     assert track.least_parallax == 6.0
     play(estimator, simulation.increments[7:], FREE)
     assert track.variable > before
@@ -125,7 +125,7 @@ def test_one_taken_out_comes_back_when_it_is_known_twice_as_well() -> None:
 )
 def test_what_cannot_be_mended_ends_in_one_clear_line(message: str) -> None:
     simulation, estimator = played(10)
-    estimator._isam = Failing(estimator._isam, message)
+    estimator._solver._isam = Failing(estimator._solver._isam, message)
     with pytest.raises(EstimatorError, match=r"^isam2: the solver failed at frame 10 \(") as told:
         play(estimator, simulation.increments[10:11], FREE)
     assert "\n" not in str(told.value)
@@ -135,7 +135,7 @@ def test_what_cannot_be_mended_ends_in_one_clear_line(message: str) -> None:
 def test_a_pose_that_defeats_cholesky_is_solved_by_qr() -> None:
     simulation, estimator = played(10)
     straight = played(11)[1].estimate()
-    estimator._isam = Failing(estimator._isam, FAILED.format(key=pose_key(3)))
+    estimator._solver._isam = Failing(estimator._solver._isam, FAILED.format(key=pose_key(3)))
     play(estimator, simulation.increments[10:11], FREE)
     found = estimator.estimate()
     assert [words for words in found.remarks if "with QR" in words]
@@ -145,23 +145,23 @@ def test_a_pose_that_defeats_cholesky_is_solved_by_qr() -> None:
 
 def test_a_pose_that_defeats_qr_too_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation, estimator = played(10)
-    failing = Failing(estimator._isam, FAILED.format(key=pose_key(3)))
-    monkeypatch.setattr(estimator, "_new_solver", lambda: failing)
-    estimator._isam = failing
+    failing = Failing(estimator._solver._isam, FAILED.format(key=pose_key(3)))
+    monkeypatch.setattr(estimator._solver, "_new_solver", lambda: failing)
+    estimator._solver._isam = failing
     with pytest.raises(EstimatorError, match="isam2: the solver failed at frame 10"):
         play(estimator, simulation.increments[10:11], FREE)
 
 
 def test_a_solver_that_fails_again_and_again_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation, estimator = played(10)
-    solver = estimator._isam
+    solver = estimator._solver._isam
     variables = iter(range(10_000))
 
     def failing() -> Failing:
         return Failing(solver, FAILED.format(key=landmark_key(next(variables))))
 
-    monkeypatch.setattr(estimator, "_new_solver", failing)
-    estimator._isam = failing()
+    monkeypatch.setattr(estimator._solver, "_new_solver", failing)
+    estimator._solver._isam = failing()
     with pytest.raises(EstimatorError, match="isam2: the solver failed at frame 10"):
         play(estimator, simulation.increments[10:11], FREE)
     assert next(variables) <= 22
@@ -191,7 +191,7 @@ def test_updates_come_in_their_rhythm_and_the_tracker_answers_between() -> None:
     sizes = []
     for increment in simulation.increments[:12]:
         play(estimator, [increment], FREE)
-        sizes.append(estimator._values.size())
+        sizes.append(estimator._solver._values.size())
     grown = np.flatnonzero(np.diff(sizes, prepend=0))
     assert grown.tolist() == [0, 5, 10]
     assert len(estimator.estimate().trajectory) == 12
@@ -257,7 +257,7 @@ def test_restored_between_updates_and_keyframes_it_continues_to_the_bit(
 def test_with_keyframes_the_joint_covariance_is_of_the_last_frame(frames: int) -> None:
     _, estimator = played(frames, Isam2Settings(keyframe_every=4, update_every=4))
     found = estimator.estimate()
-    held = [i for i, track in estimator._builder.tracks.items() if track.variable >= 0]
+    held = [i for i, track in estimator._builder.admission.tracks.items() if track.variable >= 0]
     ids = np.intersect1d(held, found.landmarks.ids)[:5]
     joint = estimator.joint_covariance(ids)
     np.testing.assert_allclose(joint[:6, :6], found.covariances[-1], rtol=1e-9, atol=1e-18)
@@ -270,7 +270,7 @@ def test_with_keyframes_the_joint_covariance_is_of_the_last_frame(frames: int) -
 
 def test_a_landmark_seen_since_the_last_keyframe_only_is_told_to_wait() -> None:
     _, estimator = played(14, Isam2Settings(keyframe_every=4))
-    outside = set(estimator.landmarks().ids.tolist()) - set(estimator._builder.tracks)
+    outside = set(estimator.landmarks().ids.tolist()) - set(estimator._builder.admission.tracks)
     for identity in sorted(outside):
         with pytest.raises(EstimatorError, match=f"landmark {identity} waits outside"):
             estimator.joint_covariance(np.array([identity]))

@@ -55,7 +55,7 @@ def problem(kernel: KernelSettings, share: float) -> tuple[gtsam.NonlinearFactor
     )
     settings = dataclasses.replace(PLAIN, kernel=kernel)
     estimator, _ = run(settings, spoilt)
-    return estimator._builder.kept_factors(), estimator._values, wrong
+    return estimator._builder.kept_factors(), estimator._solver._values, wrong
 
 
 def residuals(graph: gtsam.NonlinearFactorGraph, values: object) -> FloatArray:

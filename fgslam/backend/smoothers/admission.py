@@ -1,0 +1,223 @@
+"""Which landmarks enter the graph, wait outside, start anew or leave it.
+
+A landmark enters only once it is constrained: seen in enough frames, with enough parallax.
+Nothing is lost by waiting: its first observation has as many numbers as the landmark, so it says
+nothing about poses. One that is contradicted frame after frame has moved, and starts anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fgslam.backend.smoothers.settings import GraphSettings
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.estimates import EgoMotion, LandmarkMap
+from fgslam.core.geometry import (
+    congruence,
+    transform_to_world,
+    triangulate,
+    triangulation_covariance,
+)
+from fgslam.core.measurements import Observations
+from fgslam.core.sensors import CameraRig, Sensor
+
+_SAME_PLACE = 16.3  # 99.9 % quantile of chi-square with three degrees of freedom
+_ASTRAY_PX = 12.0  # where nothing is left out: farther off, a match speaks against its landmark
+
+
+@dataclass(slots=True, eq=False)
+class Sighting:
+    """One observation of a landmark: frame, measurement (3,) and its covariance (3, 3)."""
+
+    frame: int
+    measurement: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(slots=True, eq=False)
+class Track:
+    """What the graph knows of a landmark.
+
+    Attributes:
+        least_parallax: below this it waits; raised when a solver failed on it.
+        last: its latest sighting.
+        variable: number of its variable, -1 while it waits outside.
+        waiting: its sightings while it waits.
+        sightings: in how many frames it was seen.
+        elsewhere: world positions and covariances of its rejected sightings since the last one
+            that fitted.
+        left_at: world position and covariance with which it last left a bounded lag.
+    """
+
+    least_parallax: float
+    last: Sighting
+    variable: int = -1
+    waiting: list[Sighting] = field(default_factory=list)
+    sightings: int = 0
+    elsewhere: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
+    left_at: tuple[FloatArray, FloatArray] | None = None
+
+
+class LandmarkAdmission:
+    """The landmarks of a run, by identity, and whether the graph holds them.
+
+    Attributes:
+        tracks: by the landmark's identity.
+        remarks: which landmarks started anew, in words.
+    """
+
+    def __init__(self, sensor: Sensor, settings: GraphSettings) -> None:
+        """No landmark yet."""
+        self._sensor = sensor
+        self._settings = settings
+        self._saved: dict[int, tuple[FloatArray, FloatArray]] = {}
+        self._first_frame = 0
+        self.tracks: dict[int, Track] = {}
+        self.remarks: list[str] = []
+
+    # -- what a frame's observations say of their landmarks --------------------------------------
+
+    def judge(self, tracking: EgoMotion) -> tuple[BoolArray, BoolArray]:
+        """Which matched observations are used, and which speak against their landmark's place.
+
+        Args:
+            tracking: the frame's least squares, over its (m,) matched observations.
+
+        Returns:
+            Two masks (m,).
+        """
+        gate_px = self._settings.gate_px
+        astray = ~tracking.inliers
+        if isinstance(self._sensor, CameraRig):
+            astray = astray & ~(tracking.residuals <= (gate_px or _ASTRAY_PX))
+        return (~astray if gate_px else np.ones(len(astray), np.bool_)), astray
+
+    def confirmed(self, identities: IntArray) -> None:
+        """Notes that landmarks were seen where they should be: nothing speaks against them."""
+        for identity in identities.tolist():
+            track = self.tracks.get(identity)
+            if track is not None:
+                track.elsewhere.clear()
+
+    def contradicted(self, rejected: Observations, wTc: FloatArray) -> Observations:
+        """Those rejected observations whose landmark must have moved: they start it anew.
+
+        It has when it was rejected in several frames in a row, and they agree on where it is: wrong
+        matches do not.
+
+        Args:
+            rejected: a frame's matched observations that do not fit.
+            wTc: (4, 4) the frame's pose.
+        """
+        after = self._settings.contradicted_after
+        if after == 0 or not len(rejected):
+            return rejected.select(np.zeros(len(rejected), np.bool_))
+        local = triangulate(self._sensor, rejected.measurement)
+        spread = triangulation_covariance(self._sensor, rejected.measurement, rejected.covariance)
+        places = transform_to_world(wTc, local)
+        covariances = congruence(wTc[:3, :3], spread)
+        moved = np.zeros(len(rejected), np.bool_)
+        for i, identity in enumerate(rejected.ids.tolist()):
+            track = self.tracks.get(identity)
+            if track is not None:
+                track.elsewhere.append((places[i], covariances[i]))
+                moved[i] = len(track.elsewhere) >= after and _agree(track.elsewhere[-after:])
+        return rejected.select(moved)
+
+    # -- coming and going ------------------------------------------------------------------------
+
+    def know(self, landmarks: LandmarkMap) -> None:
+        """Landmarks of a saved map: each enters with its first sighting, on its own prior.
+
+        The priors are independent of one another. One that turns out to have moved, or to lie
+        elsewhere, becomes a landmark like any other.
+        """
+        places = zip(landmarks.positions, landmarks.covariances, strict=True)
+        self._saved = dict(zip(landmarks.ids.tolist(), places, strict=True))
+
+    def saved(self, identity: int) -> tuple[FloatArray, FloatArray] | None:
+        """Position (3,) and covariance (3, 3) of a saved map's landmark, while they hold."""
+        return self._saved.get(identity)
+
+    def sighted(self, identity: int, sighting: Sighting) -> Track:
+        """The landmark's track with one sighting more."""
+        track = self.tracks.get(identity)
+        if track is None:
+            track = self.tracks[identity] = Track(self._settings.least_parallax, sighting)
+        track.last = sighting
+        track.sightings += 1
+        return track
+
+    def admits(self, identity: int, parallax: float) -> bool:
+        """True once a waiting landmark is constrained, or known from a saved map.
+
+        Args:
+            identity: of the landmark, which is in :attr:`tracks`.
+            parallax: its range over the range's standard deviation.
+        """
+        track = self.tracks[identity]
+        track.waiting = [s for s in track.waiting if s.frame >= self._first_frame]
+        seldom = len(track.waiting) < self._settings.least_sightings
+        return identity in self._saved or not (seldom or parallax < track.least_parallax)
+
+    def pruned(self, identities: IntArray) -> None:
+        """Drops landmarks as the front-end did: what they said stays in the graph, they do not."""
+        for identity in identities.tolist():
+            self.tracks.pop(identity, None)
+            self._saved.pop(identity, None)
+
+    def start_anew(self, identities: Iterable[int], why: str) -> None:
+        """Closes the variables of landmarks; their next sighting begins new ones."""
+        for identity in identities:
+            self._saved.pop(identity, None)
+            track = self.tracks.pop(identity, None)
+            if track is not None and why:
+                self.remarks.append(
+                    f"landmark {identity} (seen {track.sightings} times, last in frame "
+                    f"{track.last.frame}) {why}"
+                )
+
+    def taken_out(self, identity: int, variable: int) -> None:
+        """A landmark on which a solver failed waits until it is known twice as well."""
+        self._saved.pop(identity, None)
+        track = self.tracks.get(identity)
+        if track is not None and track.variable == variable:
+            track.variable = -1
+            track.waiting = []
+            track.least_parallax = 2.0 * max(track.least_parallax, 1.0)
+
+    def leave_before(self, frame: int) -> list[tuple[int, Track]]:
+        """Landmarks last seen before the frame at which a bounded lag begins.
+
+        Returns:
+            Identity and track of each; it keeps its variable until the caller closes it.
+        """
+        self._first_frame = frame
+        return [(i, t) for i, t in self.tracks.items() if t.variable >= 0 and t.last.frame < frame]
+
+    def waiting(self) -> Iterator[tuple[int, Track]]:
+        """Landmarks that are not in the graph."""
+        return ((i, track) for i, track in self.tracks.items() if track.variable < 0)
+
+    def describe(self, identity: int, variable: int) -> str:
+        """A landmark's identity and sightings, in words."""
+        track = self.tracks.get(identity)
+        if track is None or track.variable != variable:
+            return f"landmark {identity} (no longer in use)"
+        return (
+            f"landmark {identity} (seen {track.sightings} times, last from frame "
+            f"{track.last.frame})"
+        )
+
+
+def _agree(places: list[tuple[FloatArray, FloatArray]]) -> bool:
+    """True if positions (3,) with covariances (3, 3) may be one place, each beside the last."""
+    last, uncertainty = places[-1]
+    for place, covariance in places[:-1]:
+        offset = place - last
+        if offset @ np.linalg.solve(covariance + uncertainty, offset) > _SAME_PLACE:
+            return False
+    return True

@@ -1,0 +1,123 @@
+"""The tracker's map beside the graph's: what it takes over from a solution, and what is reported.
+
+The tracker holds every landmark that is matched against; the graph only those that are
+constrained. Those that wait outside move with the frame that saw them last.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting
+from fgslam.backend.smoothers.graph_solution import Solution, poses_of_frame
+from fgslam.backend.smoothers.solver import Smoothed
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import LandmarkMap, Prediction
+from fgslam.core.geometry import (
+    congruence,
+    inverse,
+    point_pose_jacobian,
+    transform_to_world,
+    triangulate,
+    triangulation_covariance,
+)
+from fgslam.core.sensors import Sensor
+from fgslam.factors.keys import landmark_key, pose_key
+
+
+class TrackerMap:
+    """Keeps the tracker's map in step with the graph's."""
+
+    def __init__(
+        self, sensor: Sensor, tracker: LandmarkKalman, admission: LandmarkAdmission
+    ) -> None:
+        """The two maps, both still empty."""
+        self._sensor = sensor
+        self._tracker = tracker
+        self._admission = admission
+        self._anchors: dict[int, FloatArray] = {}
+
+    def entered(self, frame: int, wTc: FloatArray) -> None:
+        """Notes the pose (4, 4) with which a frame entered the graph."""
+        self._anchors[frame] = wTc
+
+    def take_over(self, smoothed: Smoothed, current: Prediction) -> None:
+        """Lets the tracker go on from a solution, at its ``current`` pose.
+
+        Landmarks that the graph knows nothing of stay; where the solution is ``bent`` by a loop
+        they move along with the last pose, near which they are, unless they are a saved map's.
+        """
+        ids, positions = self._in_graph(smoothed.values)
+        waiting_ids, waiting_positions = self._waiting(smoothed.values)
+        ids = np.concatenate([ids, waiting_ids])
+        positions = np.concatenate([positions, waiting_positions])
+        if smoothed.bent:
+            known = self._tracker.landmarks()
+            rest = np.flatnonzero(~np.isin(known.ids, ids) & (self._tracker.homes >= 0))
+            moved = current.wTc @ inverse(self._tracker.predict(None).wTc)
+            ids = np.concatenate([ids, known.ids[rest]])
+            positions = np.concatenate(
+                [positions, transform_to_world(moved, known.positions[rest])]
+            )
+        self._tracker.correct(current, ids, positions)
+
+    def reported(self, answer: Solution) -> LandmarkMap:
+        """The tracker's landmarks where the graph has them; those that wait, from their pose."""
+        known = self._tracker.landmarks()
+        positions, covariances = np.empty((len(known), 3)), np.empty((len(known), 3, 3))
+        for row, identity in enumerate(known.ids.tolist()):
+            track = self._admission.tracks.get(identity)
+            if track is None:  # seen since the last keyframe only
+                positions[row], covariances[row] = known.positions[row], known.covariances[row]
+            elif track.variable in answer.points:
+                positions[row] = answer.points[track.variable]
+                covariances[row] = answer.point_covariances[track.variable]
+            elif track.left_at is not None:
+                positions[row], covariances[row] = track.left_at
+            else:
+                positions[row], covariances[row] = self._seen_from(answer, track.last)
+        return LandmarkMap(known.ids, positions, covariances)
+
+    def _in_graph(self, values: Any) -> tuple[IntArray, FloatArray]:
+        """Identities and positions of the tracker's landmarks that ``values`` hold."""
+        tracks, ids, positions = self._admission.tracks, [], []
+        for identity in self._tracker.landmarks().ids.tolist():
+            track = tracks.get(identity)
+            if track is not None and track.variable >= 0:
+                key = landmark_key(track.variable)
+                if values.exists(key):
+                    ids.append(identity)
+                    positions.append(values.atPoint3(key))
+        return np.array(ids, np.int64), np.array(positions, np.float64).reshape(-1, 3)
+
+    def _waiting(self, values: Any) -> tuple[IntArray, FloatArray]:
+        """Landmarks outside the graph, moved along with the pose that saw them last."""
+        last_seen: dict[int, list[int]] = {}
+        for identity, track in self._admission.waiting():
+            last_seen.setdefault(track.last.frame, []).append(identity)
+        known = self._tracker.landmarks()
+        ids, positions = [np.empty(0, np.int64)], [np.empty((0, 3))]
+        anchors = {}
+        for frame, identities in last_seen.items():
+            if values.exists(pose_key(frame)):
+                anchors[frame] = poses_of_frame(values, frame)
+                # One just taken out of the graph is where the graph had it, and follows from here.
+                moved = anchors[frame] @ inverse(self._anchors.get(frame, anchors[frame]))
+                ids.append(np.array(identities, np.int64))
+                before = known.positions[known.rows(ids[-1])]
+                positions.append(transform_to_world(moved, before))
+        self._anchors = anchors
+        return np.concatenate(ids), np.concatenate(positions)
+
+    def _seen_from(self, answer: Solution, sighting: Sighting) -> tuple[FloatArray, FloatArray]:
+        """Position and covariance of a landmark from a single sighting."""
+        wTc = answer.poses[sighting.frame]
+        measurement = sighting.measurement[None]
+        point = triangulate(self._sensor, measurement)
+        local = triangulation_covariance(self._sensor, measurement, sighting.covariance[None])
+        by_pose = congruence(point_pose_jacobian(point), answer.pose_covariances[sighting.frame])
+        world = congruence(wTc[:3, :3], local + by_pose)
+        return transform_to_world(wTc, point)[0], world[0]
