@@ -59,7 +59,7 @@ def test_the_end_is_the_minimum_of_what_fits() -> None:
     spoilt = wrong_matches(simulation.increments, 0.3, np.random.default_rng(5))
     estimator, _ = run(BatchSettings(), spoilt)
     assert isinstance(estimator, MapSmoother)
-    refined = estimator._refined_graph()
+    refined = estimator._solver._answer.refined()
     graph, values = refined.graph, refined.values
     total = estimator._builder.kept_factors().size()
     assert 0.7 * total < graph.size() < 0.85 * total

@@ -108,7 +108,7 @@ def test_what_is_behind_or_without_disparity_stays_out() -> None:
 def test_two_frames_of_a_segment_enter_and_the_motions_add_up() -> None:
     frames, landmarks = frames_of(1.0, 12)
     segments = Segments(RIG, 5)
-    entered = [f for f in (segments.take(frame, landmarks) for frame in frames) if f is not None]
+    entered = [f for frame in frames for f in segments.take(frame, landmarks)]
     assert [f.frame for f in entered] == [0, 3, 5, 8, 10]
     assert [f.frame for f in segments.between] == [1, 2, 4, 6, 7, 9, 11]
     assert entered[0].motion is None
@@ -132,8 +132,7 @@ def test_every_frame_enters_as_it_is_where_every_frame_is_a_keyframe() -> None:
     frames, landmarks = frames_of(1.0)
     segments = Segments(RIG, 1)
     for frame in frames:
-        entered = segments.take(frame, landmarks)
-        assert entered is not None
+        (entered,) = segments.take(frame, landmarks)
         assert entered.accepted is frame.accepted
     assert segments.between == []
 
@@ -149,11 +148,10 @@ def nothing(frame: TrackedFrame) -> TrackedFrame:
 def test_a_blind_frame_never_passes_for_one_that_saw(blind: list[int], middle: int) -> None:
     frames, landmarks = frames_of(1.0)
     segments = Segments(RIG, 5)
-    entered = None
     for frame in frames:
         frame = nothing(frame) if frame.frame in blind else frame
-        entered = segments.take(frame, landmarks)
-    assert entered is not None
+        last = segments.take(frame, landmarks)
+    (entered,) = last
     assert entered.frame == middle
     assert (len(entered.accepted) > 0) == (len(blind) < 4)
 
@@ -163,8 +161,8 @@ def test_observations_of_a_frame_that_saw_too_little_to_be_placed_are_not_fused(
     few = dataclasses.replace(frames[1], accepted=frames[1].accepted.select(np.arange(4)))
     segments = Segments(RIG, 5)
     for frame in (frames[0], few, *frames[2:]):
-        entered = segments.take(frame, landmarks)
-    assert entered is not None
+        last = segments.take(frame, landmarks)
+    (entered,) = last
     expected = summarise(RIG, frames[2:], frames[3], landmarks)
     np.testing.assert_array_equal(entered.accepted.measurement, expected.measurement)
 
@@ -178,8 +176,7 @@ def test_forgotten_and_pruned_landmarks_leave_the_open_block() -> None:
     segments.take(frames[0], landmarks)
     segments.take(frames[1], landmarks)
     segments.forget([gone])
-    entered = segments.take(frames[2], smaller)
-    assert entered is not None
+    (entered,) = segments.take(frames[2], smaller)
     assert pruned not in entered.accepted.ids
     row = np.flatnonzero(entered.accepted.ids == gone)
     own = frames[2].accepted
