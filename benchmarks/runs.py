@@ -17,6 +17,7 @@ from fgslam.runs.opening import open_sequence
 from fgslam.runs.tasks.slam import RunResult, run_experiment
 from fgslam.slam.factory import make_pipeline, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
@@ -93,14 +94,15 @@ def find_features(config: ExperimentConfig) -> FoundFeatures:
 
 def make_system(config: ExperimentConfig, sequence: Sequence) -> SlamPipeline:
     """A fresh system for the sequence."""
-    return make_pipeline(sequence, config.frontend, config.odometry, config.estimator)
+    return make_pipeline(sequence.rig, config.frontend, config.odometry, config.estimator)
 
 
 def process(found: FoundFeatures, pipeline: SlamPipeline) -> Iterator[FrameReport]:
     """The SLAM loop over features found before."""
     for frame in found.frames:
         timestamp = float(found.sequence.timestamps[frame.i])
-        yield pipeline.process(frame, frame.i, timestamp)
+        body = body_motion(found.sequence, frame.i, pipeline.motion)
+        yield pipeline.process(frame, frame.i, timestamp, body)
 
 
 def trajectory_error(

@@ -60,7 +60,8 @@ class RingMotion(OdometryMotion):
         self._poses = poses
         self._wrong = g.so3_exp(np.array([0.0, np.deg2rad(drift_deg), 0.0]))
 
-    def between(self, i: int, timestamp: float) -> Odometry | None:
+    def between(self, timestamp: float, body: Odometry | None) -> Odometry | None:
+        i = round(timestamp)  # a frame a second
         if i == 0:
             return None
         step = g.inverse(self._poses[i - 1]) @ self._poses[i]

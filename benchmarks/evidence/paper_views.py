@@ -18,6 +18,7 @@ from fgslam.frontend.stereo.settings import StereoSettings
 from fgslam.runs.config import ExperimentConfig
 from fgslam.slam.factory import make_pipeline
 from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import FrameReport
 
 STARTS = range(0, 250, 10)
@@ -238,9 +239,14 @@ def _moves(lab: LabViews, triples: list[Triple], options: tuple[str, ...]) -> Bo
 
 
 def _move(config: ExperimentConfig, pair: ViewPair) -> Move:
-    pipeline = make_pipeline(pair, config.frontend, config.odometry, config.estimator)
+    pipeline = make_pipeline(pair.rig, config.frontend, config.odometry, config.estimator)
     reports = [
-        pipeline.process(FeatureFrame(i, view.frame, view.features, "", 0.0, 0.0), i, float(i))
+        pipeline.process(
+            FeatureFrame(i, view.frame, view.features, "", 0.0, 0.0),
+            i,
+            float(i),
+            body_motion(pair, i, pipeline.motion),
+        )
         for i, view in enumerate(pair.views)
     ]
     return Move(pair, (reports[0], reports[1]))

@@ -30,10 +30,11 @@ from fgslam.core.recordings import Frame, Sequence
 from fgslam.core.sensors import CameraRig
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.opening import open_sequence
-from fgslam.runs.tasks.slam_recorder import RunRecorder
 from fgslam.slam.factory import make_pipeline, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import SlamPipeline
+from fgslam.slam.recorder import RunRecorder
 
 BLOCK = 40
 LIMITS = {
@@ -157,7 +158,7 @@ def run_blocks(
     config: ExperimentConfig, sequence: Sequence, tell: Callable[[int], None]
 ) -> tuple[Series, int]:
     """The whole drive, block by block; and how many landmarks the map had at its end."""
-    pipeline = make_pipeline(sequence, config.frontend, config.odometry, config.estimator)
+    pipeline = make_pipeline(sequence.rig, config.frontend, config.odometry, config.estimator)
     recorder = RunRecorder(MeasurementLog(sequence.rig, pipeline.motion.description()))
     ways = raw_sift(config)
     way, series = None, Series()
@@ -191,7 +192,8 @@ def through_system(
 
     def work() -> None:
         for frame in found:
-            report = pipeline.process(frame, frame.i, float(block.timestamps[frame.i]))
+            body = body_motion(block, frame.i, pipeline.motion)
+            report = pipeline.process(frame, frame.i, float(block.timestamps[frame.i]), body)
             recorder.add(report, 0.0, float("nan"))
 
     (series.whole if whole else series.rest).append(1e3 * timed(work) / len(block.frames))

@@ -36,6 +36,7 @@ from fgslam.runs.opening import open_sequence
 from fgslam.slam.factory import make_pipeline, make_places, make_stereo_matcher, make_tracker
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.frontend_settings import FrontendSettings
+from fgslam.slam.motion import body_motion
 
 SIZES = (1_000, 3_000, 10_000, 30_000, 100_000)
 FRAMES, EVERY = 120, 8
@@ -99,14 +100,17 @@ def drive() -> Driven:
     sequence, frontend = open_sequence(config), config.frontend
     extractor = SiftExtractor(frontend.sift, frontend.appearance.mode)
     stereo = make_stereo_matcher(sequence.rig, frontend)
-    pipeline = make_pipeline(sequence, frontend, config.odometry, config.estimator)
+    pipeline = make_pipeline(sequence.rig, frontend, config.odometry, config.estimator)
     queries, frontend_s = [], []
     for i in range(len(sequence)):
         frame = sequence.frame(i)
         start = time.process_time()
         found = tuple(extractor.extract(image) for image in frame.images)
         pipeline.process(
-            FeatureFrame(i, frame, found, "", 0.0, 0.0), i, float(sequence.timestamps[i])
+            FeatureFrame(i, frame, found, "", 0.0, 0.0),
+            i,
+            float(sequence.timestamps[i]),
+            body_motion(sequence, i, pipeline.motion),
         )
         frontend_s.append(time.process_time() - start)
         if i % EVERY == 0:

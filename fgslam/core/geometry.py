@@ -19,6 +19,7 @@ from fgslam.core.sensors import CameraRig, Sensor
 
 # Below this rotation angle the series of sin and cos are exact to double precision.
 _SMALL_ANGLE = 1e-4
+_RIGID_TOLERANCE = 1e-4  # of hand-written rotation matrices, four digits each
 
 BODY_FORWARD_LEFT_UP_FROM_CAMERA: FloatArray = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -205,6 +206,16 @@ def compose_odometry(steps: Iterable[Odometry]) -> Odometry:
         covariance = compose_covariance(step.motion, covariance, step.covariance)
         motion = motion @ step.motion
     return Odometry(motion, covariance)
+
+
+def is_rigid(matrix: FloatArray) -> bool:
+    """Whether the matrix is a finite rigid motion (4, 4)."""
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        return False
+    rotation = matrix[:3, :3]
+    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=_RIGID_TOLERANCE)
+    right_handed = np.linalg.det(rotation) > 0.0
+    return bool(orthonormal and right_handed and np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]))
 
 
 def odometry_of_camera(body: Odometry, bTc: FloatArray) -> Odometry:

@@ -7,6 +7,7 @@ machine; and matrices of a frame's size are too small to share: on a busy machin
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -14,11 +15,45 @@ import scipy.linalg  # noqa: F401  its BLAS is not NumPy's, and a limit reaches 
 from threadpoolctl import threadpool_limits
 
 
+class _Limits:
+    """Limits of the process, taken back in the reverse order in which they were set.
+
+    A limit belongs to the whole process. Of several threads at work the first to leave must not
+    take it from the others: what it set is undone only when all who came later have left, too.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._set: list[threadpool_limits] = []
+        self._left: set[int] = set()
+
+    def enter(self) -> threadpool_limits:
+        with self._lock:
+            limits = threadpool_limits(limits=1, user_api="blas")
+            self._set.append(limits)
+            return limits
+
+    def leave(self, limits: threadpool_limits) -> None:
+        with self._lock:
+            self._left.add(id(limits))
+            while self._set and id(self._set[-1]) in self._left:
+                last = self._set.pop()
+                self._left.remove(id(last))
+                last.restore_original_limits()
+
+
+_LIMITS = _Limits()
+
+
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
     """Every loaded BLAS works on one thread inside; usable as a decorator, too.
 
-    Whatever the environment says (``OPENBLAS_NUM_THREADS``); what was set before comes back.
+    Whatever the environment says (``OPENBLAS_NUM_THREADS``); what was set before comes back, once
+    all threads that are inside have left.
     """
-    with threadpool_limits(limits=1, user_api="blas"):
+    limits = _LIMITS.enter()
+    try:
         yield
+    finally:
+        _LIMITS.leave(limits)

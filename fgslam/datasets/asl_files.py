@@ -14,9 +14,8 @@ import yaml
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.estimates import Trajectory
-from fgslam.core.geometry import inverse
+from fgslam.core.geometry import inverse, is_rigid
 from fgslam.core.text_files import read_lines
-from fgslam.datasets.calibration import is_rigid
 from fgslam.datasets.tables import Table, read_table, require_increasing
 from fgslam.datasets.trajectories import (
     nearest_rows,

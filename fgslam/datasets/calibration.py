@@ -12,10 +12,8 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose, so3_exp
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, is_rigid, pose, so3_exp
 from fgslam.core.sensors import CameraRig
-
-_RIGID_TOLERANCE = 1e-4
 
 
 def read_calibration(path: Path, three_cameras: bool) -> CameraRig:
@@ -106,16 +104,6 @@ def _body_from_camera(path: Path, values: Mapping[str, Any]) -> FloatArray:
             "correct or remove it"
         )
     return bTc
-
-
-def is_rigid(matrix: FloatArray) -> bool:
-    """Whether the matrix is a finite rigid motion (4, 4)."""
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        return False
-    rotation = matrix[:3, :3]
-    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=_RIGID_TOLERANCE)
-    right_handed = np.linalg.det(rotation) > 0.0
-    return bool(orthonormal and right_handed and np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]))
 
 
 def level_mounting(camera_yaw_deg: float, lever_arm_m: tuple[float, float, float]) -> FloatArray:

@@ -176,13 +176,14 @@ def motions_from_poses(
     """Body motions between consecutive frame stamps (n,): n - 1 of them; None where not covered."""
     poses = interpolate_poses(log, frames)
     motions = inverse(poses[:-1]) @ poses[1:]
-    covariances = [_pose_noise(motion, settings) for motion in motions]
+    covariances = [pose_noise(motion, settings) for motion in motions]
     # Unlike a speed, a pose cannot be held beyond the log's ends: that would say "no motion".
     known = steps_covered(log.timestamps, frames, settings.max_gap_s, _POSE_HOLD_S)
     return _motions(poses, covariances, known)
 
 
-def _pose_noise(motion: FloatArray, settings: RecordedOdometrySettings) -> FloatArray:
+def pose_noise(motion: FloatArray, settings: RecordedOdometrySettings) -> FloatArray:
+    """Covariance (6, 6) of a body motion (4, 4): a fraction of its length and angle, no less."""
     length = float(np.linalg.norm(motion[:3, 3]))
     angle = rotation_angle(motion[:3, :3])
     rotation = max(

@@ -6,7 +6,7 @@ An estimator is imported when its kind is made: a filter needs no solver of grap
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -39,7 +39,8 @@ from fgslam.frontend.tracking.map_matching import MapMatcher
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.slam.arrival import Arrival, take_over
-from fgslam.slam.feature_stream import FeatureStream
+from fgslam.slam.choosing import is_settings
+from fgslam.slam.feature_stream import FeatureExtractor, FeatureStream
 from fgslam.slam.frontend_settings import FrontendSettings
 from fgslam.slam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
 from fgslam.slam.pipeline import SlamPipeline
@@ -51,8 +52,12 @@ if TYPE_CHECKING:
 
 def make_stream(sequence: Sequence, settings: FrontendSettings) -> FeatureStream:
     """Features of the sequence's frames, found ahead of the loop."""
-    extractor = SiftExtractor(settings.sift, settings.appearance.mode)
-    return FeatureStream(sequence, extractor.extract)
+    return FeatureStream(sequence, make_extractor(settings))
+
+
+def make_extractor(settings: FrontendSettings) -> FeatureExtractor:
+    """What finds the features of an image."""
+    return SiftExtractor(settings.sift, settings.appearance.mode).extract
 
 
 def make_stereo_matcher(rig: CameraRig, settings: FrontendSettings) -> StereoMatcher:
@@ -68,13 +73,13 @@ def make_tracker(rig: CameraRig, settings: FrontendSettings) -> LandmarkTracker:
     return LandmarkTracker(rig, database, matcher, solver)
 
 
-def make_motion(sequence: Sequence, settings: OdometrySettings) -> MotionModel:
+def make_motion(rig: CameraRig, settings: OdometrySettings) -> MotionModel:
     """What predicts the camera's motion."""
     if isinstance(settings, ConstantVelocitySettings):
         return ConstantVelocityMotion(settings)
     gap = settings.gap if isinstance(settings, RecordedOdometrySettings) else None
     stand_in = ConstantVelocityMotion(gap or ConstantVelocitySettings())
-    return OdometryMotion(sequence, settings.kind, stand_in)
+    return OdometryMotion(rig.bTc, settings.kind, stand_in)
 
 
 def make_estimator(
@@ -149,38 +154,42 @@ def make_floor(rig: Sensor, settings: FloorSettings, dof: DegreesOfFreedom) -> F
 
 
 def make_pipeline(
-    sequence: Sequence,
+    rig: CameraRig,
     frontend: FrontendSettings,
     odometry: OdometrySettings,
-    estimator_settings: EstimatorSettings,
+    estimator_settings: EstimatorSettings | Estimator,
     seed: int = 0,
     arrival: Arrival | None = None,
 ) -> SlamPipeline:
-    """The whole system for one sequence.
+    """The whole system for one rig.
 
     Args:
-        sequence: the recording.
-        frontend: the configuration's.
-        odometry: the configuration's.
-        estimator_settings: the configuration's.
+        rig: the rectified cameras.
+        frontend: settings of all that measures.
+        odometry: settings of what predicts the motion.
+        estimator_settings: which estimator to make; or one already made, at its prior pose.
         seed: of place recognition's samples.
         arrival: where the run begins in a saved map; None begins with an empty one.
     """
     prior = None if arrival is None else arrival.prior
-    estimator = make_estimator(sequence.rig, estimator_settings, frontend.ego_motion, prior)
+    estimator = (
+        make_estimator(rig, estimator_settings, frontend.ego_motion, prior)
+        if is_settings(estimator_settings)
+        else cast("Estimator", estimator_settings)
+    )
     measured_odometry = odometry.kind != "constant_velocity"
     require_support(estimator, measured_odometry, loops=frontend.loops is not None)
-    tracker = make_tracker(sequence.rig, frontend)
+    tracker = make_tracker(rig, frontend)
     if arrival is not None:
         take_over(estimator, arrival)
         tracker.database.load(arrival.saved)
         tracker.keeps_map = not arrival.extends
     return SlamPipeline(
-        stereo=make_stereo_matcher(sequence.rig, frontend),
+        stereo=make_stereo_matcher(rig, frontend),
         tracker=tracker,
-        motion=make_motion(sequence, odometry),
+        motion=make_motion(rig, odometry),
         estimator=estimator,
-        places=make_places(sequence.rig, frontend, tracker, seed),
+        places=make_places(rig, frontend, tracker, seed),
         located=prior if arrival is not None and arrival.relocalised else None,
     )
 

@@ -8,6 +8,8 @@ from collections import deque
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeAlias
 
 from fgslam.core.arrays import Image
 from fgslam.core.errors import FrameError
@@ -40,10 +42,38 @@ class FeatureFrame:
     sift_ms: float
 
 
+FeatureExtractor: TypeAlias = Callable[[Image], Features]
+"""Features of a grey image (height, width); called from several threads at once."""
+
+
+class FrameDescriber:
+    """Finds the features of single frames, the images of each in parallel threads."""
+
+    def __init__(self, extract: FeatureExtractor) -> None:
+        """Takes any extractor; threads start with the first frame."""
+        self._extract = extract
+        self._pool: ThreadPoolExecutor | None = None
+
+    def describe(self, i: int, frame: Frame | None) -> FeatureFrame:
+        """Frame ``i`` with its features; without images (None) it has none."""
+        if frame is None:
+            return FeatureFrame(i, None, (), "no images were given", 0.0, 0.0)
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(len(frame.images))
+        timed = partial(_timed, self._extract)
+        tasks = [self._pool.submit(timed, image) for image in frame.images]
+        return _Pending(i, frame, "", 0.0, tasks).finish()
+
+    def close(self) -> None:
+        """Ends the threads."""
+        if self._pool is not None:
+            self._pool.shutdown()
+
+
 class FeatureStream:
     """Iterates over a sequence's frames in order, features found in parallel ahead of time."""
 
-    def __init__(self, sequence: Sequence, extract: Callable[[Image], Features]) -> None:
+    def __init__(self, sequence: Sequence, extract: FeatureExtractor) -> None:
         """Takes any extractor; it must be safe to call from several threads."""
         self._sequence = sequence
         self._extract = extract
@@ -82,12 +112,14 @@ class FeatureStream:
     ) -> _Pending:
         if isinstance(frame, str):
             return _Pending(i, None, frame, load_ms, [])
-        tasks = [pool.submit(self._timed, image) for image in frame.images]
+        timed = partial(_timed, self._extract)
+        tasks = [pool.submit(timed, image) for image in frame.images]
         return _Pending(i, frame, "", load_ms, tasks)
 
-    def _timed(self, image: Image) -> tuple[Features, float]:
-        start = time.perf_counter()
-        return self._extract(image), 1e3 * (time.perf_counter() - start)
+
+def _timed(extract: FeatureExtractor, image: Image) -> tuple[Features, float]:
+    start = time.perf_counter()
+    return extract(image), 1e3 * (time.perf_counter() - start)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

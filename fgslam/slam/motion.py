@@ -17,8 +17,18 @@ from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 class MotionModel(Protocol):
     """Gives the camera's motion from the previous frame to the next one."""
 
-    def between(self, i: int, timestamp: float) -> Odometry | None:
-        """Camera motion to frame ``i``, measured or a stand-in; None for the first."""
+    @property
+    def uses_odometry(self) -> bool:
+        """Whether the body's odometry is of any use to it."""
+        ...
+
+    def between(self, timestamp: float, body: Odometry | None) -> Odometry | None:
+        """Camera motion since the last frame, measured or a stand-in; None for the first frame.
+
+        Args:
+            timestamp: of the new frame, seconds.
+            body: the robot's odometry since the last frame; None where none was measured.
+        """
         ...
 
     def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
@@ -46,25 +56,23 @@ class MotionModel(Protocol):
 
 
 class OdometryMotion:
-    """The recording's odometry, moved from the robot's body to the camera (Se et al. 5).
+    """The robot's odometry, moved from its body to the camera (Se et al. 5).
 
     Over a gap in it, constant velocity stands in.
     """
 
-    def __init__(self, sequence: Sequence, kind: str, stand_in: ConstantVelocityMotion) -> None:
-        """``kind`` is `recorded` or `synthetic`, for the log."""
-        self._sequence = sequence
-        self._bTc = sequence.rig.bTc
+    uses_odometry = True
+
+    def __init__(self, bTc: FloatArray, kind: str, stand_in: ConstantVelocityMotion) -> None:
+        """``bTc`` (4, 4) is the camera's lever arm; ``kind`` is `recorded` or `synthetic`."""
+        self._bTc = bTc
         self._kind = kind
         self._stand_in = stand_in
 
-    def between(self, i: int, timestamp: float) -> Odometry | None:
-        """Camera motion to frame ``i``; raises OdometryError for an unusable increment."""
-        if i == 0:
-            return None
-        body = self._sequence.odometry(i)
+    def between(self, timestamp: float, body: Odometry | None) -> Odometry | None:
+        """Camera motion by the odometry, or by the stand-in."""
         if body is None:
-            return self._stand_in.between(i, timestamp)
+            return self._stand_in.between(timestamp)
         return odometry_of_camera(body, self._bTc)
 
     def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
@@ -91,6 +99,8 @@ class OdometryMotion:
 class ConstantVelocityMotion:
     """The camera keeps its last velocity, up to a random acceleration; no sensor needed."""
 
+    uses_odometry = False
+
     def __init__(self, settings: ConstantVelocitySettings) -> None:
         """Knows nothing until two poses were observed; at first the camera is expected to rest."""
         self._settings = settings
@@ -109,8 +119,8 @@ class ConstantVelocityMotion:
         self._pose = np.eye(4)
         self._velocity: FloatArray | None = None
 
-    def between(self, i: int, timestamp: float) -> Odometry | None:
-        """The last velocity over the new interval ``dt``.
+    def between(self, timestamp: float, body: Odometry | None = None) -> Odometry | None:
+        """The last velocity over the new interval ``dt``; ``body`` has no say in it.
 
         The velocity has wandered by ``sigma * T`` over the time T since it was last measured, so
         the step's standard deviation is ``sigma * T * dt``: ``sigma * dt^2`` from frame to frame,
@@ -168,3 +178,12 @@ class ConstantVelocityMotion:
         self._founded = bool(state["founded"])
         self._pose = state["pose"]
         self._velocity = None if np.isnan(state["velocity"][0]) else state["velocity"]
+
+
+def body_motion(sequence: Sequence, i: int, motion: MotionModel) -> Odometry | None:
+    """The recording's odometry to frame ``i``; None for the first, and where it is of no use.
+
+    Raises:
+        OdometryError: the recording's odometry is malformed.
+    """
+    return sequence.odometry(i) if i and motion.uses_odometry else None

@@ -83,10 +83,19 @@ class SlamPipeline:
     places: PlaceRecognition | None = None
     located: Prediction | None = None
 
-    def process(self, found: FeatureFrame, index: int, timestamp: float) -> FrameReport:
-        """One frame: Sections 2 to 4 of the paper in their order, then what 7 leaves to do."""
+    def process(
+        self, found: FeatureFrame, index: int, timestamp: float, body: Odometry | None = None
+    ) -> FrameReport:
+        """One frame: Sections 2 to 4 of the paper in their order, then what 7 leaves to do.
+
+        Args:
+            found: the frame with its features.
+            index: its number in the recording, for the log.
+            timestamp: seconds.
+            body: the robot's motion since the last frame; None where none was measured.
+        """
         watch = Stopwatch()
-        odometry = self.motion.between(found.i, timestamp)
+        odometry = self.motion.between(timestamp, body)
         prediction = self.estimator.predict(odometry)
         watch.lap("predict")
         stereo = self._match_stereo(found)
@@ -188,7 +197,7 @@ def replay_frame(
     """As :func:`replay_step`, with the frame's tracking and times."""
     watch = Stopwatch()
     if increment.odometry is None:
-        stand_in = motion.between(k, increment.timestamp)
+        stand_in = motion.between(increment.timestamp, None)
         increment = dataclasses.replace(increment, odometry=stand_in)
     prediction = estimator.predict(increment.odometry)
     watch.lap("predict")

@@ -138,18 +138,6 @@ def test_a_replay_is_the_three_calls(settings: EstimatorSettings) -> None:
 # A live run, from ideal features on, against the replay of its log
 
 
-class Recorded:
-    """A recording's odometry, with a gap in it."""
-
-    rig = RIG
-
-    def __init__(self, steps: list[Odometry | None]) -> None:
-        self._steps = steps
-
-    def odometry(self, i: int) -> Odometry | None:
-        return self._steps[i]
-
-
 FRAMES = 14
 NO_IMAGE, NO_ODOMETRY = (5, 6), (4, 9)
 
@@ -174,10 +162,11 @@ def live_run(
         poses.append(poses[-1] @ g.se3_exp(np.array(TURN_AND_GO)))
     world = FeatureWorld(points_in_views(dataclasses.replace(DRIVE, points=250), poses, rng), rng)
     stand_in = ConstantVelocityMotion(ConstantVelocitySettings())
+    odometry = camera_odometry(rng)
     pipeline = SlamPipeline(
         stereo=StereoMatcher(RIG, frontend.stereo, frontend.appearance),
         tracker=make_tracker(RIG, frontend),
-        motion=OdometryMotion(Recorded(camera_odometry(rng)), "recorded", stand_in),
+        motion=OdometryMotion(RIG.bTc, "recorded", stand_in),
         estimator=at_origin(settings),
     )
     image = np.zeros((RIG.height, RIG.width), np.uint8)
@@ -188,7 +177,7 @@ def live_run(
         found = FeatureFrame(i, frame, features, "", 0.0, 0.0)
         if i in NO_IMAGE:
             found = FeatureFrame(i, None, (), "not there", 0.0, 0.0)
-        reports.append(pipeline.process(found, i, 0.5 * i))
+        reports.append(pipeline.process(found, i, 0.5 * i, odometry[i]))
     return pipeline.estimator, reports, np.array(poses)
 
 

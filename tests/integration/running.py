@@ -22,7 +22,7 @@ from fgslam.report.trajectories import read_covariances, read_tum
 from fgslam.runs.config import parse_config
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.tasks.slam import RunResult, run_experiment
-from fgslam.runs.tasks.slam_recorder import STAGES
+from fgslam.slam.recorder import STAGES
 
 KIND = "landmark_kalman"
 SAME_BYTES = (

@@ -15,14 +15,13 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.report.trajectories import write_tum
 from fgslam.runs.config import ExperimentConfig, parse_config
-from fgslam.runs.opening import open_sequence
 from fgslam.slam import factory
 from fgslam.slam.pipeline import replay_step
 
 
 def replay(config: ExperimentConfig, log: MeasurementLog) -> Estimate:
     estimator = factory.make_estimator(log.rig, config.estimator)
-    motion = factory.make_motion(open_sequence(config), config.odometry)
+    motion = factory.make_motion(log.rig, config.odometry)
     solver = EgoMotionSolver(log.rig, config.frontend.ego_motion)
     for k, increment in enumerate(log):
         replay_step(increment, estimator, solver, motion, k)

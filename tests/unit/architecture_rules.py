@@ -21,7 +21,7 @@ ROOMS: dict[str, frozenset[str] | None] = {
     "frontend": frozenset({"core", "cameras"}),
     "datasets": frozenset({"core", "cameras", "worlds"}),
     "backend": frozenset({"core", "frontend", "factors"}),
-    "slam": frozenset({"core", "frontend", "backend", "datasets"}),
+    "slam": frozenset({"core", "cameras", "frontend", "backend", "datasets"}),
     "homing": frozenset({"core", "cameras", "frontend", "backend"}),
     "runs": frozenset(
         {

@@ -26,6 +26,7 @@ from fgslam.datasets.odometry_settings import OdometrySettings
 from fgslam.slam.factory import make_pipeline
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.frontend_settings import FrontendSettings
+from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import SlamPipeline
 
 _NEAREST_M = 0.1  # of the last camera's plane: nearer ones have no size in its image
@@ -107,11 +108,12 @@ def submap_features(
         submap, which whoever is located by the submap has beside the map's.
     """
     plain = dataclasses.replace(frontend, loops=None, lost=None)
-    pipeline = make_pipeline(window, plain, odometry, LandmarkKalmanSettings())
+    pipeline = make_pipeline(window.rig, plain, odometry, LandmarkKalmanSettings())
     stats = None
     for i, one in enumerate(found):
         timestamp = float(window.timestamps[i])
-        stats = pipeline.process(dataclasses.replace(one, i=i), i, timestamp).stats
+        body = body_motion(window, i, pipeline.motion)
+        stats = pipeline.process(dataclasses.replace(one, i=i), i, timestamp, body).stats
     if stats is None:
         raise ValueError("a submap needs at least one frame")
     return _as_features(pipeline, window.rig, stats.wTc), stats.covariance

@@ -30,6 +30,7 @@ from fgslam.runs.tasks.slam_outputs import RunOutputs
 from fgslam.runs.tasks.slam_pictures import draw_frame, draw_run, figures_of, frames_to_show
 from fgslam.slam.factory import make_stream
 from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import FrameReport
 
 _SAVING_SHARE = 10.0  # the loop runs at least this many times as long as it saves
@@ -109,8 +110,7 @@ def _loop(
     try:
         for found in stream:
             wait_ms = 1e3 * (time.perf_counter() - waiting)
-            report = _process(outputs, found)
-            recorder.add(report, wait_ms, _stereo_precision(sequence, found.i, report.stereo))
+            report = _advance(outputs, found, wait_ms)
             if found.i in shown:
                 draw_frame(outputs, found.i, report)
             progress("tracking", len(recorder), len(sequence))
@@ -146,11 +146,19 @@ def save_progress(outputs: RunOutputs) -> EstimatorMetrics:
     return metrics
 
 
-def _process(outputs: RunOutputs, found: FeatureFrame) -> FrameReport:
-    timestamp = float(outputs.sequence.timestamps[found.i])
+def _advance(outputs: RunOutputs, found: FeatureFrame, wait_ms: float) -> FrameReport:
+    """Pushes one frame with its odometry into the session."""
+    sequence, session = outputs.sequence, outputs.session
     # A frame without images has a number, too: the one that the selection gives it.
     index = outputs.first_frame + found.i * outputs.config.dataset.stride
-    return outputs.pipeline.process(found, index, timestamp)
+    return session.advance(
+        found,
+        float(sequence.timestamps[found.i]),
+        body_motion(sequence, found.i, session.pipeline.motion),
+        index,
+        wait_ms,
+        lambda report: _stereo_precision(sequence, found.i, report.stereo),
+    )
 
 
 def _finish(begun: BegunRun, progress: Progress, stopped: Callable[[], bool]) -> RunResult:

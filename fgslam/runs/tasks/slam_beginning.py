@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from fgslam.core.errors import ConfigError, DatasetError
-from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import Sequence
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.folder import RUN_MARKER, ExistingFolder, create_run_folder
@@ -20,9 +19,9 @@ from fgslam.runs.tasks import slam_map_entry as map_entry
 from fgslam.runs.tasks import slam_mapping as mapping
 from fgslam.runs.tasks.slam_map_entry import Entry, GivenMap
 from fgslam.runs.tasks.slam_outputs import RunOutputs, versions, write_config
-from fgslam.runs.tasks.slam_recorder import RunRecorder
 from fgslam.slam.arrival import require_map_user
-from fgslam.slam.factory import make_estimator, make_pipeline
+from fgslam.slam.factory import make_estimator
+from fgslam.slam.session import Session
 
 Progress = Callable[[str, int, int], None]
 """Called with what is under way, how much is done, and of how much."""
@@ -117,16 +116,20 @@ def begin(run: OpenedRun, progress: Progress) -> BegunRun:
     arrival, notes = None, tuple[str, ...]()
     if entry is not None and given is not None:
         arrival, notes = entry.arrival(given, config.map), entry.notes(given, config.map)
-    pipeline = make_pipeline(
-        sequence, config.frontend, config.odometry, config.estimator, config.seed, arrival
+    session = Session(
+        sequence.rig,
+        config.estimator,
+        frontend=config.frontend,
+        odometry=config.odometry,
+        seed=config.seed,
+        arrival=arrival,
     )
-    recorder = RunRecorder(MeasurementLog(sequence.rig, pipeline.motion.description()))
     first_frame = opened.dataset.start
-    outputs = RunOutputs(run.folder, config, sequence, pipeline, recorder, first_frame, notes)
+    outputs = RunOutputs(run.folder, config, sequence, session, first_frame, notes)
     if run.resumed:
-        checkpoint.load(run.folder, pipeline, recorder)
+        checkpoint.load(run.folder, session.pipeline, session.recorder)
     elif given is not None and run.goes_on:
-        mapping.go_on(given, pipeline, recorder)
+        mapping.go_on(given, session.pipeline, session.recorder)
     return BegunRun(outputs, given)
 
 

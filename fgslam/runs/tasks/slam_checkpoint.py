@@ -11,8 +11,8 @@ from fgslam.core.arrays import StateArrays
 from fgslam.core.atomic_files import write_bytes
 from fgslam.core.errors import OutputError
 from fgslam.core.measurement_log import MeasurementLog, load_arrays
-from fgslam.runs.tasks.slam_recorder import RunRecorder
 from fgslam.slam.pipeline import SlamPipeline
+from fgslam.slam.recorder import RunRecorder
 
 STATE_FILE = "checkpoint.npz"
 LOG_FILE = "measurements.npz"

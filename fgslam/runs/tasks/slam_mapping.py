@@ -20,9 +20,9 @@ from fgslam.runs.config import ExperimentConfig, parse_config
 from fgslam.runs.tasks import slam_checkpoint as checkpoint
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, entry_of
 from fgslam.runs.tasks.slam_outputs import RunOutputs
-from fgslam.runs.tasks.slam_recorder import RunRecorder
 from fgslam.slam.map_settings import MapSettings
 from fgslam.slam.pipeline import SlamPipeline
+from fgslam.slam.recorder import RunRecorder
 
 _LOG = "log/"
 _TIMES = "recorder/stage_ms"

@@ -33,9 +33,10 @@ from fgslam.runs.folder import RUN_MARKER
 from fgslam.runs.tasks.rendered_truth import rendered_landmark_truth
 from fgslam.runs.tasks.slam_checkpoint import save_log
 from fgslam.runs.tasks.slam_places import closures_of, place_numbers, write_closures
-from fgslam.runs.tasks.slam_recorder import STAGES, RunRecorder
 from fgslam.runs.tasks.slam_summary import estimator_metrics, run_numbers
 from fgslam.slam.pipeline import SlamPipeline
+from fgslam.slam.recorder import STAGES, RunRecorder
+from fgslam.slam.session import Session
 
 _VERSIONS_OF = ("numpy", "scipy", "opencv-python-headless", "gtsam", "open3d")
 
@@ -52,10 +53,19 @@ class RunOutputs:
     folder: Path
     config: ExperimentConfig
     sequence: Sequence
-    pipeline: SlamPipeline
-    recorder: RunRecorder
+    session: Session
     first_frame: int = 0
     notes: tuple[str, ...] = ()
+
+    @property
+    def pipeline(self) -> SlamPipeline:
+        """The session's parts."""
+        return self.session.pipeline
+
+    @property
+    def recorder(self) -> RunRecorder:
+        """The session's record of every frame."""
+        return self.session.recorder
 
     @property
     def title(self) -> str:

@@ -11,7 +11,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import EgoMotionStatus, Estimate, Trajectory, correlation
 from fgslam.evaluation.judging import Answer, Truth, judge_answer
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, UpdateTime
-from fgslam.runs.tasks.slam_recorder import STAGES, RunRecorder
+from fgslam.slam.recorder import STAGES, RunRecorder
 from fgslam.slam.replay import peak_memory_mb
 
 _ESTIMATOR_STAGES = ("predict", "update")

@@ -69,6 +69,17 @@ def test_one_thread_inside_and_as_before_outside() -> None:
         assert blas_threads() == before
 
 
+def test_who_leaves_first_takes_no_limit_from_the_others() -> None:
+    with threadpool_limits(limits=2, user_api="blas"):
+        first, second = one_blas_thread(), one_blas_thread()
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert set(blas_threads()) == {1}
+        second.__exit__(None, None, None)
+        assert max(blas_threads()) == 2
+
+
 def test_the_same_bytes_whatever_the_environment_says() -> None:
     (one, first), (two, second) = digest_with(1), digest_with(2)
     assert (one, two) == (1, 2)

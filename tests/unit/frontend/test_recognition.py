@@ -300,9 +300,9 @@ def test_a_correction_is_no_motion() -> None:
         jumps = []
         for found in seen(path, dark):
             report = pipeline.process(found, found.i, float(found.i))
-            expected = steady.between(found.i, float(found.i))
+            expected = steady.between(float(found.i))
             _observe(steady, report.increment, report.tracking, report.stats)
-            after = steady.between(found.i + 1, found.i + 1.0)
+            after = steady.between(found.i + 1.0)
             if report.increment.loops or report.increment.relocalised:
                 assert expected is not None
                 jumps.append(float(np.linalg.norm(after.motion[:3, 3])))

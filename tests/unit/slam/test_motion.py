@@ -21,25 +21,14 @@ SETTINGS = ConstantVelocitySettings()
 TWIST = np.array([0.05, -0.3, 0.1, 0.4, -0.1, 1.2])  # rad/s and m/s in the camera's frame
 
 
-class Recorded:
-    """A recording that has only what the motion model asks for."""
-
-    def __init__(self, rig: CameraRig, steps: list[Odometry | None]) -> None:
-        self.rig = rig
-        self._steps = steps
-
-    def odometry(self, i: int) -> Odometry | None:
-        return self._steps[i]
-
-
 def mounted(lever_arm: tuple[float, float, float]) -> CameraRig:
     bTc = g.BODY_FORWARD_LEFT_UP_FROM_CAMERA.copy()
     bTc[:3, 3] = lever_arm
     return dataclasses.replace(RIG, bTc=bTc)
 
 
-def odometry_motion(rig: CameraRig, steps: list[Odometry | None]) -> OdometryMotion:
-    return OdometryMotion(Recorded(rig, steps), "recorded", ConstantVelocityMotion(SETTINGS))
+def odometry_motion(rig: CameraRig) -> OdometryMotion:
+    return OdometryMotion(rig.bTc, "recorded", ConstantVelocityMotion(SETTINGS))
 
 
 def spin(angle: float, sigma: float = 0.01) -> Odometry:
@@ -54,8 +43,7 @@ def spin(angle: float, sigma: float = 0.01) -> Odometry:
 def test_a_spin_of_the_robot_is_an_arc_at_the_camera() -> None:
     """The camera half a metre ahead swings sideways while it turns."""
     angle, arm = np.deg2rad(30.0), 0.5
-    motion = odometry_motion(mounted((arm, 0.0, 0.8)), [None, spin(angle)])
-    moved = motion.between(1, 0.5)
+    moved = odometry_motion(mounted((arm, 0.0, 0.8))).between(0.5, spin(angle))
     assert moved is not None
     assert moved.measured
     # Turning left in body axes: the camera goes left (-x) and back by the cosine.
@@ -65,15 +53,14 @@ def test_a_spin_of_the_robot_is_an_arc_at_the_camera() -> None:
 
 
 def test_a_camera_over_the_centre_only_turns() -> None:
-    motion = odometry_motion(mounted((0.0, 0.0, 1.0)), [None, spin(0.4)])
-    moved = motion.between(1, 0.5)
+    moved = odometry_motion(mounted((0.0, 0.0, 1.0))).between(0.5, spin(0.4))
     assert moved is not None
     np.testing.assert_allclose(moved.motion[:3, 3], 0.0, atol=1e-12)
 
 
 def test_straight_ahead_is_the_cameras_z() -> None:
     ahead = Odometry(g.pose(np.eye(3), np.array([0.2, 0.0, 0.0])), 1e-6 * np.eye(6))
-    moved = odometry_motion(mounted((0.5, 0.1, 0.8)), [None, ahead]).between(1, 0.5)
+    moved = odometry_motion(mounted((0.5, 0.1, 0.8))).between(0.5, ahead)
     assert moved is not None
     np.testing.assert_allclose(
         moved.motion, g.pose(np.eye(3), np.array([0.0, 0.0, 0.2])), atol=1e-12
@@ -83,7 +70,7 @@ def test_straight_ahead_is_the_cameras_z() -> None:
 def test_uncertain_turning_is_uncertain_swinging() -> None:
     """The lever arm couples yaw with sideways motion, in the frame of the new pose."""
     arm, sigma = 0.5, 0.01
-    moved = odometry_motion(mounted((arm, 0.0, 0.8)), [None, spin(0.3, sigma)]).between(1, 0.5)
+    moved = odometry_motion(mounted((arm, 0.0, 0.8))).between(0.5, spin(0.3, sigma))
     assert moved is not None
     c = moved.covariance
     assert c[1, 1] == pytest.approx(sigma**2, rel=1e-6)
@@ -97,8 +84,7 @@ def test_the_cameras_covariance_matches_monte_carlo() -> None:
     rig = dataclasses.replace(rig, bTc=rig.bTc @ g.se3_exp(np.array([0.3, 0.2, -0.1, 0, 0, 0])))
     sigma = np.array([0.01, 0.02, 0.03, 0.02, 0.05, 0.01])
     step = g.se3_exp(np.array([0.0, 0.1, 0.4, 0.3, -0.1, 0.0]))
-    steps = [None, Odometry(step, np.diag(sigma**2))]
-    stated = odometry_motion(rig, steps).between(1, 0.5)
+    stated = odometry_motion(rig).between(0.5, Odometry(step, np.diag(sigma**2)))
     assert stated is not None
     errors = []
     for _ in range(6000):
@@ -111,29 +97,25 @@ def test_the_cameras_covariance_matches_monte_carlo() -> None:
 
 
 def test_the_first_frame_has_no_motion() -> None:
-    assert odometry_motion(RIG, [spin(1.0)]).between(0, 0.0) is None
-    assert ConstantVelocityMotion(SETTINGS).between(0, 0.0) is None
+    assert odometry_motion(RIG).between(0.0, None) is None
+    assert ConstantVelocityMotion(SETTINGS).between(0.0) is None
 
 
 def test_constant_velocity_bridges_a_gap() -> None:
-    motion = odometry_motion(mounted((0.3, 0.0, 0.5)), [None, spin(0.1), None, spin(0.1)])
+    motion = odometry_motion(mounted((0.3, 0.0, 0.5)))
     alone = ConstantVelocityMotion(SETTINGS)
-    for k, t in enumerate((0.0, 0.5)):
+    for t in (0.0, 0.5):
         wTc = g.se3_exp(TWIST * t)
-        step = motion.between(k, t)
-        assert (step is not None and step.measured) is (k > 0)
         motion.observe(t, wTc, measured=True)
         alone.observe(t, wTc, measured=True)
-    bridged = motion.between(2, 1.5)
+    bridged = motion.between(1.5, None)
     assert bridged is not None
     assert not bridged.measured
-    assert_same_bits(bridged, alone.between(2, 1.5))
+    assert_same_bits(bridged, alone.between(1.5))
     np.testing.assert_allclose(bridged.motion, g.se3_exp(TWIST), atol=1e-12)
     # After the gap the odometry is back.
     motion.observe(1.5, g.se3_exp(TWIST * 1.5), measured=True)
-    after = motion.between(3, 2.0)
-    assert after is not None
-    assert after.measured
+    assert motion.between(2.0, spin(0.1)).measured
 
 
 # --------------------------------------------------------------------------------------------
@@ -147,11 +129,10 @@ def test_constant_twists_are_predicted_exactly(start: FloatArray) -> None:
     # Uneven times on purpose.
     times = [0.0, 0.5, 0.7, 1.7, 2.0]
     for k, t in enumerate(times):
-        step = motion.between(k, t)
-        assert (step is None) is (k == 0)
+        step = motion.between(t)
+        assert step is None or not step.measured
         if k >= 2:
             assert step is not None
-            assert not step.measured
             predicted = origin @ g.se3_exp(TWIST * times[k - 1]) @ step.motion
             np.testing.assert_allclose(predicted, origin @ g.se3_exp(TWIST * t), atol=1e-12)
         motion.observe(t, origin @ g.se3_exp(TWIST * t), measured=True)
@@ -163,7 +144,7 @@ def test_uncertainty_grows_with_the_square_of_the_interval() -> None:
     motion.observe(0.0, np.eye(4), measured=True)
     motion.observe(0.5, g.se3_exp(0.5 * TWIST), measured=True)
     for dt in (0.1, 0.2, 1.0):
-        step = motion.between(2, 0.5 + dt)
+        step = motion.between(0.5 + dt)
         assert step is not None
         sigma = [*np.deg2rad(SETTINGS.rotation_sigma_dps2), *SETTINGS.translation_sigma_mps2]
         np.testing.assert_allclose(
@@ -175,10 +156,10 @@ def test_blind_frames_keep_the_velocity_and_lose_certainty() -> None:
     motion = ConstantVelocityMotion(SETTINGS)
     motion.observe(0.0, np.eye(4), measured=True)
     motion.observe(0.5, g.se3_exp(0.5 * TWIST), measured=True)
-    fresh = motion.between(2, 1.0)
+    fresh = motion.between(1.0)
     motion.observe(1.0, np.eye(4), measured=False)  # a pose that nobody measured
     motion.observe(1.5, np.eye(4), measured=False)
-    blind = motion.between(4, 2.0)
+    blind = motion.between(2.0)
     assert fresh is not None
     assert blind is not None
     np.testing.assert_array_equal(blind.motion, fresh.motion)
@@ -186,7 +167,7 @@ def test_blind_frames_keep_the_velocity_and_lose_certainty() -> None:
     np.testing.assert_allclose(ratio, 3.0, rtol=1e-12)
     # Seeing again, the velocity is the mean one since it was last measured.
     motion.observe(2.0, g.se3_exp(2.0 * TWIST), measured=True)
-    again = motion.between(5, 2.5)
+    again = motion.between(2.5)
     assert again is not None
     np.testing.assert_allclose(again.motion, g.se3_exp(0.5 * TWIST), atol=1e-12)
 
@@ -197,7 +178,7 @@ def test_a_motion_that_nobody_saw_is_no_part_of_the_velocity() -> None:
     motion.observe(0.0, np.eye(4), measured=False)
     motion.observe(0.1, np.eye(4), measured=True)
     motion.observe(0.2, g.se3_exp(0.1 * TWIST), measured=True)
-    step = motion.between(3, 0.3)
+    step = motion.between(0.3)
     assert step is not None
     np.testing.assert_allclose(step.motion, g.se3_exp(0.1 * TWIST), atol=1e-12)
 
@@ -206,7 +187,7 @@ def test_an_unmeasured_start_teaches_no_standstill() -> None:
     motion = ConstantVelocityMotion(SETTINGS)
     motion.observe(0.0, np.eye(4), measured=False)
     motion.observe(0.1, np.eye(4), measured=False)
-    step = motion.between(2, 0.2)
+    step = motion.between(0.2)
     assert step is not None
     assert step.covariance[3, 3] == pytest.approx((0.1 * SETTINGS.start_speed_sigma_mps) ** 2)
 
@@ -219,23 +200,23 @@ def test_a_displacement_is_no_velocity(carried: bool) -> None:
     motion.observe(0.5, g.se3_exp(0.5 * TWIST), measured=True)
     elsewhere = g.pose(np.eye(3), np.array([7.0, 0.0, -3.0]))
     motion.displaced(1.0, elsewhere @ g.se3_exp(TWIST), carried)
-    step = motion.between(3, 1.5)
+    step = motion.between(1.5)
     assert step is not None
     assert not step.measured
     expected = np.eye(4) if carried else g.se3_exp(0.5 * TWIST)
     np.testing.assert_allclose(step.motion, expected, atol=1e-12)
     if carried:
         rested.observe(1.0, np.eye(4), measured=True)
-        np.testing.assert_array_equal(step.covariance, rested.between(1, 1.5).covariance)
+        np.testing.assert_array_equal(step.covariance, rested.between(1.5).covariance)
     motion.observe(1.5, elsewhere @ g.se3_exp(1.5 * TWIST), measured=True)
-    np.testing.assert_allclose(motion.between(4, 2.0).motion, g.se3_exp(0.5 * TWIST), atol=1e-12)
+    np.testing.assert_allclose(motion.between(2.0).motion, g.se3_exp(0.5 * TWIST), atol=1e-12)
 
 
 def test_at_first_it_rests_and_knows_little() -> None:
     motion = ConstantVelocityMotion(SETTINGS)
     motion.observe(3.0, g.se3_exp(TWIST), measured=True)
     for dt in (0.1, 0.5):
-        step = motion.between(1, 3.0 + dt)
+        step = motion.between(3.0 + dt)
         assert step is not None
         assert not step.measured
         np.testing.assert_array_equal(step.motion, np.eye(4))
@@ -250,9 +231,9 @@ def test_asking_changes_nothing() -> None:
     motion = ConstantVelocityMotion(SETTINGS)
     motion.observe(0.0, np.eye(4), measured=True)
     motion.observe(0.5, g.se3_exp(0.5 * TWIST), measured=True)
-    first = motion.between(2, 1.0)
-    motion.between(2, 7.0)
-    assert_same_bits(first, motion.between(2, 1.0))
+    first = motion.between(1.0)
+    motion.between(7.0)
+    assert_same_bits(first, motion.between(1.0))
 
 
 @pytest.mark.parametrize("seen", [0, 1, 2, 3])
@@ -261,7 +242,7 @@ def test_a_restored_motion_continues_to_the_same_bits(seen: int, kind: str) -> N
     def make():
         if kind == "constant_velocity":
             return ConstantVelocityMotion(SETTINGS)
-        return odometry_motion(RIG, [None] * 9)
+        return odometry_motion(RIG)
 
     first, second = make(), make()
     for k in range(seen):
@@ -270,7 +251,7 @@ def test_a_restored_motion_continues_to_the_same_bits(seen: int, kind: str) -> N
     kept = copy.deepcopy(state)
     second.restore({name: np.array(array) for name, array in state.items()})
     for k in range(seen, 6):
-        a, b = first.between(k, 0.5 * k), second.between(k, 0.5 * k)
+        a, b = first.between(0.5 * k, None), second.between(0.5 * k, None)
         assert (a is None) == (b is None)
         if a is not None:
             assert_same_bits(a, b)
@@ -281,7 +262,7 @@ def test_a_restored_motion_continues_to_the_same_bits(seen: int, kind: str) -> N
 
 
 def test_descriptions_are_plain_values() -> None:
-    for motion in (ConstantVelocityMotion(SETTINGS), odometry_motion(RIG, [])):
+    for motion in (ConstantVelocityMotion(SETTINGS), odometry_motion(RIG)):
         described = json.loads(json.dumps(motion.description()))
         assert described["kind"] in ("constant_velocity", "recorded")
-    assert odometry_motion(RIG, []).description()["stand_in"]["kind"] == "constant_velocity"
+    assert odometry_motion(RIG).description()["stand_in"]["kind"] == "constant_velocity"

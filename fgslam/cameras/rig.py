@@ -1,0 +1,88 @@
+"""The rectified stereo rig as users describe it: checked, with defaults."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import CalibrationError
+from fgslam.core.geometry import is_rigid
+from fgslam.core.sensors import CameraRig
+
+
+def _identity() -> FloatArray:
+    return np.eye(4)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoRig(CameraRig):
+    """Two or three rectified cameras, checked; it goes wherever a :class:`CameraRig` is asked for.
+
+    The right camera is the reference. The left one sits ``baseline`` metres along its -x axis, the
+    top one, if any, ``vertical_baseline`` metres along its -y axis. Camera axes: x right, y down,
+    z forward; pixel (0, 0) is the centre of the top-left pixel.
+
+    Attributes:
+        width, height: image size, pixels.
+        fx, fy: focal lengths, pixels; equal in all cameras.
+        cx, cy: principal point (column, row), pixels.
+        baseline: distance of left and right camera, metres.
+        vertical_baseline: distance of top and right camera, metres; None without a top camera.
+        bTc: (4, 4) pose of the right camera in the robot's body, where its odometry is measured.
+            The identity where odometry is the camera's own motion, or there is none.
+
+    Raises:
+        CalibrationError: a size, focal length or baseline is not positive and finite, the
+            principal point is far from the image, or ``bTc`` is no rigid motion.
+    """
+
+    vertical_baseline: float | None = None
+    bTc: FloatArray = field(default_factory=_identity)
+
+    def __post_init__(self) -> None:
+        require_rig(self)
+
+
+def require_rig(rig: CameraRig) -> None:
+    """Raises CalibrationError where the numbers of a rig cannot be those of one."""
+    for name in ("width", "height"):
+        value = getattr(rig, name)
+        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value <= 0:
+            raise CalibrationError(f"rig: {name} is {value!r}; give the images' size in pixels")
+    for name in ("fx", "fy", "baseline", "vertical_baseline"):
+        _require_length(rig, name)
+    for name, extent in (("cx", rig.width), ("cy", rig.height)):
+        value = getattr(rig, name)
+        # Cropped images may have it outside, but hardly by more than their own size.
+        if not _is_finite(value) or not -extent <= value <= 2 * extent:
+            raise CalibrationError(
+                f"rig: {name} is {value!r}, far from the image of {rig.width}x{rig.height} pixels; "
+                "give the principal point (column, row) in pixels of these images"
+            )
+    if not is_rigid(np.asarray(rig.bTc, np.float64)):
+        raise CalibrationError(
+            "rig: bTc must be a rigid motion (4, 4), the pose of the right camera in the body; "
+            "correct it, or leave it out"
+        )
+
+
+def _require_length(rig: CameraRig, name: str) -> None:
+    value = getattr(rig, name)
+    if name == "vertical_baseline" and value is None:
+        return
+    if not _is_finite(value) or value <= 0.0:
+        what = (
+            "the distance between the cameras in metres; one camera alone cannot measure depth, "
+            "and a negative one means that left and right are swapped"
+            if "baseline" in name
+            else "the focal length in pixels"
+        )
+        raise CalibrationError(f"rig: {name} is {value!r}, not a positive number; give {what}")
+
+
+def _is_finite(value: object) -> bool:
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    return number and math.isfinite(float(value))  # type: ignore[arg-type]

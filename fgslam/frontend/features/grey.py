@@ -1,0 +1,57 @@
+"""Grey 8-bit images from what cameras and image libraries give."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from fgslam.core.arrays import Image
+from fgslam.core.errors import FrameError
+
+_CHANNELS = (1, 3, 4)
+
+
+def grey_image(image: npt.ArrayLike, name: str = "image") -> Image:
+    """The image in grey, (height, width) uint8, contiguous; the same input gives the same bytes.
+
+    Colour is weighted as in ITU-R BT.601 (0.299 R + 0.587 G + 0.114 B). Of uint16 the upper eight
+    bits are kept, whatever the image holds: stretching each image to its own contrast would change
+    its features from frame to frame. Scale 10- and 12-bit images to 16 bits first.
+
+    Args:
+        image: (height, width) grey, or (height, width, 1, 3 or 4) grey, RGB or RGBA; uint8 or
+            uint16; any memory layout. Not changed, and not copied where it is grey, uint8 and
+            contiguous already.
+        name: of the image in messages.
+
+    Raises:
+        FrameError: another type or shape.
+    """
+    array = _checked(np.asarray(image), name)
+    if array.dtype == np.uint16:
+        array = (array >> 8).astype(np.uint8)
+    if array.ndim == 2:
+        return np.ascontiguousarray(array, np.uint8)
+    if array.shape[2] == 1:
+        return np.ascontiguousarray(array[:, :, 0], np.uint8)
+    code = cv2.COLOR_RGB2GRAY if array.shape[2] == 3 else cv2.COLOR_RGBA2GRAY
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(array), code), np.uint8)
+
+
+def _checked(array: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
+    if array.dtype not in (np.uint8, np.uint16):
+        raise FrameError(
+            f"{name} is of type {array.dtype}; give uint8 or uint16 (a float image in 0 to 1: "
+            "(255 * image).astype(numpy.uint8))"
+        )
+    grey = array.ndim == 2
+    colour = array.ndim == 3 and array.shape[2] in _CHANNELS
+    if not (grey or colour) or 0 in array.shape:
+        raise FrameError(
+            f"{name} has shape {array.shape}; give (height, width), or (height, width, 3) in red, "
+            "green, blue"
+        )
+    return array

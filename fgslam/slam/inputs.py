@@ -1,0 +1,123 @@
+"""What users hand to a session, checked before it touches any state."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.errors import FrameError, OdometryError
+from fgslam.core.geometry import is_rigid
+from fgslam.core.measurements import Odometry
+from fgslam.core.sensors import CameraRig
+from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
+from fgslam.datasets.recorded_odometry import pose_noise
+from fgslam.frontend.features.grey import grey_image
+
+Images: TypeAlias = Sequence[npt.ArrayLike]
+"""Images (left, right[, top]) of one instant."""
+
+_NAMES = ("left", "right", "top")
+_SYMMETRY = 1e-6  # relative: covariances that were added up in another order
+
+
+def checked_time(t: float, last: float | None) -> float:
+    """The time stamp in seconds. Raises FrameError where it is none, or not after ``last``."""
+    try:
+        timestamp = float(t)
+    except (TypeError, ValueError):
+        raise FrameError(f"time stamp {t!r} is not a number; give seconds") from None
+    if not math.isfinite(timestamp):
+        raise FrameError(f"time stamp {timestamp} is not finite; give seconds")
+    if last is not None and not timestamp > last:
+        raise FrameError(
+            f"time stamp {timestamp:.9f} s does not come after {last:.9f} s; give the frames in "
+            "the order of their times, each once"
+        )
+    return timestamp
+
+
+def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
+    """Grey images (right, left[, top]) of the rig's size from (left, right[, top]).
+
+    Raises:
+        FrameError: another number of images, or one of another size, type or shape.
+    """
+    given = len(images)
+    if given != rig.cameras:
+        wanted = ", ".join(_NAMES[: rig.cameras])
+        raise FrameError(
+            f"{given} images given, the rig has {rig.cameras} cameras; give ({wanted}), or a rig "
+            f"{'with' if given == 3 else 'without'} vertical_baseline"
+        )
+    grey = []
+    for name, image in zip(_NAMES, images, strict=False):
+        converted = grey_image(image, f"{name} image")
+        if converted.shape != (rig.height, rig.width):
+            height, width = converted.shape
+            raise FrameError(
+                f"{name} image is {width}x{height}, the rig's are {rig.width}x{rig.height}; give "
+                "images of that size, or the calibration of these"
+            )
+        grey.append(converted)
+    left, right, *top = grey
+    return (right, left, *top)
+
+
+def checked_odometry(
+    given: Odometry | npt.ArrayLike | None, settings: OdometrySettings
+) -> Odometry | None:
+    """Motion of the body with covariance; a bare (4, 4) gets the noise of the settings.
+
+    Raises:
+        OdometryError: it is not finite, of another shape, no rigid motion, or its covariance is
+            not symmetric and positive semi-definite.
+    """
+    if given is None:
+        return None
+    if isinstance(given, Odometry):
+        motion = _rigid(given.motion)
+        return Odometry(motion, _covariance(given.covariance), given.measured)
+    motion = _rigid(given)
+    noise = settings if isinstance(settings, RecordedOdometrySettings) else None
+    return Odometry(motion, pose_noise(motion, noise or RecordedOdometrySettings()))
+
+
+def _numbers(given: npt.ArrayLike, what: str, shape: tuple[int, int]) -> FloatArray:
+    try:
+        array = np.array(given, np.float64)
+    except (TypeError, ValueError):
+        raise OdometryError(f"odometry: the {what} is no array of numbers; give {shape}") from None
+    if array.shape != shape:
+        raise OdometryError(f"odometry: the {what} has shape {array.shape}; give {shape}")
+    if not np.isfinite(array).all():
+        raise OdometryError(
+            f"odometry: the {what} is not finite; give None where nothing was measured"
+        )
+    return array
+
+
+def _rigid(given: npt.ArrayLike) -> FloatArray:
+    motion = _numbers(given, "motion", (4, 4))
+    if not is_rigid(motion):
+        raise OdometryError(
+            "odometry: the motion is no rigid motion; give the pose (4, 4) of the body now in its "
+            "frame before: an orthonormal rotation, metres, and 0 0 0 1 below"
+        )
+    return motion
+
+
+def _covariance(given: npt.ArrayLike) -> FloatArray:
+    covariance = _numbers(given, "covariance", (6, 6))
+    scale = float(np.abs(covariance).max())
+    symmetric = np.allclose(covariance, covariance.T, rtol=0.0, atol=_SYMMETRY * scale)
+    if not symmetric or np.linalg.eigvalsh(covariance).min() < -_SYMMETRY * scale:
+        raise OdometryError(
+            "odometry: the covariance is not symmetric and positive; give that of the tangent "
+            "vector [rotation, translation], radians and metres"
+        )
+    return covariance
