@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import difflib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -19,6 +19,7 @@ from pydantic_core import ErrorDetails
 
 from fgslam.core.errors import ConfigError
 from fgslam.runs.named_experiments import suggestion
+from fgslam.runs.override_values import Schema, accepted_at, typed_value
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -44,7 +45,8 @@ class Reader(Generic[Model]):
         """
         values, overrides = copy.deepcopy(values), tuple(overrides)
         before = {group: _kind(values, group) for group in self.groups}
-        apply_overrides(values, overrides)
+        if overrides:
+            apply_overrides(values, overrides, self.model.model_json_schema())
         given = {override.partition("=")[0].strip() for override in overrides}
         for group, kind in before.items():
             if _kind(values, group) != kind:
@@ -90,10 +92,20 @@ def with_default_kind(kind: str) -> Callable[[Any], Any]:
     return given
 
 
-def apply_overrides(values: dict[str, Any], overrides: Iterable[str]) -> None:
-    """Sets dotted keys, in place. Raises ConfigError where one is malformed."""
-    for override in overrides:
-        _apply(values, override)
+def apply_overrides(
+    values: dict[str, Any], overrides: Iterable[str], schema: Schema | None = None
+) -> None:
+    """Sets dotted keys, in place, to values of the type that the schema has for them.
+
+    Raises:
+        ConfigError: an override is malformed.
+    """
+    split = [_Override.of(override) for override in overrides]
+    after = copy.deepcopy(values)  # what a key means depends on the kinds in the end
+    for override in split:
+        override.apply(after, ())
+    for override in split:
+        override.apply(values, accepted_at(schema or {}, override.keys, after))
 
 
 def _kind(values: Mapping[str, Any], group: str) -> Any:
@@ -147,23 +159,39 @@ def _repeated_key(node: Any) -> Any:
     return None
 
 
-def _apply(values: dict[str, Any], override: str) -> None:
-    """Sets one dotted key, e.g. ``frontend.sift.octave_layers=3``; the value is YAML."""
-    dotted, separator, text = override.partition("=")
-    keys = dotted.strip().split(".")
-    if not separator or not all(keys):
-        raise ConfigError(f"--set {override}: not of the form a.b=value; e.g. --set seed=3")
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise ConfigError(f"--set {override}: the value is not valid YAML; quote it") from None
-    at = values
-    for key in keys[:-1]:
-        inner = at.setdefault(key, {})
-        if not isinstance(inner, dict):
-            raise ConfigError(f"--set {override}: {key} holds a value, not a group of keys")
-        at = inner
-    at[keys[-1]] = value
+@dataclass(frozen=True, slots=True)
+class _Override:
+    """One dotted key and its value as typed, e.g. ``frontend.sift.octave_layers=3``."""
+
+    given: str
+    keys: tuple[str, ...]
+    text: str
+
+    @staticmethod
+    def of(given: str) -> _Override:
+        dotted, separator, text = given.partition("=")
+        keys = tuple(dotted.strip().split("."))
+        if not separator or not all(keys):
+            raise ConfigError(f"--set {given}: not of the form a.b=value; e.g. --set seed=3")
+        return _Override(given, keys, text)
+
+    def apply(self, values: dict[str, Any], accepted: Sequence[Schema]) -> None:
+        """Sets the key; ``accepted`` empty: to plain YAML, or to text where it is none."""
+        try:
+            value = typed_value(self.text, accepted)
+        except yaml.YAMLError:
+            if accepted:
+                raise ConfigError(
+                    f"--set {self.given}: the value is not valid YAML; quote it"
+                ) from None
+            value = self.text
+        at = values
+        for key in self.keys[:-1]:
+            inner = at.setdefault(key, {})
+            if not isinstance(inner, dict):
+                raise ConfigError(f"--set {self.given}: {key} holds a value, not a group of keys")
+            at = inner
+        at[self.keys[-1]] = value
 
 
 # --------------------------------------------------------------------------------------------

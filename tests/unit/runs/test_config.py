@@ -13,7 +13,9 @@ from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.datasets.settings import ImageFolderSettings
 from fgslam.frontend.places.settings import LoopSettings
 from fgslam.runs.config import ExperimentConfig, load_config, parse_config
+from fgslam.runs.config_models import TASKS
 from fgslam.runs.config_reading import read_mapping
+from fgslam.runs.override_values import accepted_at, typed_value
 from fgslam.worlds.lab.settings import RenderedLabSettings
 
 EXPERIMENTS = [
@@ -223,6 +225,62 @@ def test_overrides_reach_any_depth_and_are_yaml(tmp_path: Path) -> None:
     assert config.frontend.matching.refine is True
 
 
+KITTI = {"name": "x", "dataset": {"kind": "kitti", "path": "there", "sequence": "00"}}
+
+
+@pytest.mark.parametrize(
+    ("typed", "expected"),
+    [
+        ("01", "01"),  # YAML: a whole number
+        ('"01"', "01"),
+        ("'01'", "01"),
+        (" 01 ", "01"),
+        ("[1, 2]", "[1, 2]"),
+        ("a: b", "a: b"),
+        ("{x", "{x"),  # no YAML
+        ("now # and here", "now # and here"),  # YAML: a comment
+        ("2020-01-01", "2020-01-01"),  # YAML: a date
+        ("no", "no"),  # YAML: false
+        ("null", "null"),
+        ("", ""),
+    ],
+)
+def test_a_setting_that_is_text_takes_the_text_as_typed(
+    typed: str, expected: str, tmp_path: Path
+) -> None:
+    """Through the schema alone; the drive of KITTI itself must have two digits."""
+    schema = ExperimentConfig.model_json_schema()
+    accepted = accepted_at(schema, ["dataset", "sequence"], KITTI)
+    assert typed_value(typed, accepted) == expected
+    if expected == "01":
+        config = load(tmp_path, f"dataset.sequence={typed}", base=KITTI)
+        assert config.as_values()["dataset"]["sequence"] == "01"
+
+
+def test_text_or_null_takes_null(tmp_path: Path) -> None:
+    for typed, expected in (("null", None), ("~", None), ("01", "01"), ("maps/no", "maps/no")):
+        assert load(tmp_path, f"map.load={typed}").map.load == expected
+
+
+def test_a_list_of_texts_holds_texts() -> None:
+    routes = TASKS["topological_map"].model_json_schema()
+    accepted = accepted_at(routes, ["routes"], {})
+    assert typed_value("[[01, 7], [a, no]]", accepted) == [["01", "7"], ["a", "no"]]
+
+
+def test_the_type_is_that_of_the_kind_chosen(tmp_path: Path) -> None:
+    """In whatever order the kind and its key are given."""
+    chosen = ["dataset.kind=kitti", "dataset.path=1e3", "dataset.sequence=01"]
+    for overrides in (chosen, chosen[::-1]):
+        dataset = load(tmp_path, *overrides, base=LAB).as_values()["dataset"]
+        assert (dataset["path"], dataset["sequence"]) == ("1e3", "01")
+
+
+def test_a_name_among_several_is_no_number_or_truth(tmp_path: Path) -> None:
+    message = message_of(LAB, tmp_path, "odometry.kind=no")
+    assert "odometry.kind is 'no'; use one of recorded" in message
+
+
 def test_the_last_override_wins(tmp_path: Path) -> None:
     assert load(tmp_path, "seed=3", "seed=4").seed == 4
 
@@ -239,7 +297,7 @@ def test_malformed_overrides(override: str, tmp_path: Path) -> None:
 
 
 def test_overrides_that_cannot_be_applied(tmp_path: Path) -> None:
-    assert "not valid YAML; quote it" in message_of(MINIMAL, tmp_path, "name=[1")
+    assert "not valid YAML; quote it" in message_of(MINIMAL, tmp_path, "seed=[1")
     message = message_of(MINIMAL, tmp_path, "name.first=1")
     assert "--set name.first=1: name holds a value, not a group" in message
     message = message_of(MINIMAL, tmp_path, "frontend.sift.octave_layrs=3")
