@@ -331,7 +331,7 @@ def export(
         typer.Option(help="measurements, poses and landmarks as .g2o, for other solvers"),
     ] = None,
     estimator: Annotated[
-        str | None, typer.Option(help="which estimator's; default the only one there is")
+        str | None, typer.Option(help="which estimator's; default the one that steered")
     ] = None,
     valid_only: Annotated[
         bool, typer.Option("--valid-only", help="landmarks seen in at least three frames")

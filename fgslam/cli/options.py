@@ -121,8 +121,9 @@ EstimatorOverrides = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
-        metavar="estimators.NAME.KEY=VALUE",
-        help="override one key of one estimator; may be repeated",
+        metavar="A.B=VALUE",
+        help="override one key of one estimator, estimators.NAME.KEY; with --trials also any key "
+        "of the experiment, e.g. dataset.stop; may be repeated",
     ),
 ]
 Out = Annotated[

@@ -44,11 +44,22 @@ class Choice:
     Attributes:
         names: titles of the configuration's estimators, or kinds; None: those of the configuration
             where it compares any, else every kind.
-        overrides: `estimators.TITLE.key=value`.
+        overrides: `estimators.TITLE.key=value` of an estimator, `key=value` of the experiment.
     """
 
     names: tuple[str, ...] | None = None
     overrides: tuple[str, ...] = ()
+
+    @property
+    def of_experiment(self) -> tuple[str, ...]:
+        """Overrides of the experiment's own keys."""
+        return tuple(o for o in self.overrides if not o.strip().startswith(_PREFIX))
+
+    @property
+    def of_estimators(self) -> Choice:
+        """The same without the overrides of the experiment's own keys."""
+        own = set(self.of_experiment)
+        return Choice(self.names, tuple(o for o in self.overrides if o not in own))
 
 
 EVERY = Choice()
@@ -83,6 +94,11 @@ def choose(config: Experiment, choice: Choice) -> tuple[Any, ...]:
     if unknown or not chosen:
         what = f"no estimator {unknown[0]!r}" if unknown else "no estimator named"
         raise ConfigError(f"{what}; give --estimators with some of {', '.join(known)}")
+    for override in choice.of_experiment:
+        raise ConfigError(
+            f"--set {override}: what was measured stays as it is; estimators.NAME.key=value with "
+            f"NAME one of {', '.join(chosen)}, or --trials to run the experiment again"
+        )
     for override in choice.overrides:
         if not any(_addresses(override, title) for title in chosen):
             raise ConfigError(

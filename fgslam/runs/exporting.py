@@ -8,7 +8,7 @@ from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.report.metrics import read_metrics
 from fgslam.report.point_cloud import read_ply, write_map
 from fgslam.report.trajectories import read_tum, write_trajectory
-from fgslam.runs.config import is_homing
+from fgslam.runs.config import is_homing, load_config
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
 from fgslam.runs.graph_export import export_graph
 from fgslam.runs.map_export import export_map
@@ -88,7 +88,9 @@ def _estimator_of(run: Path, wanted: str | None) -> str:
         raise DatasetError(f"{run}: holds no results yet; resume the run first")
     if wanted is None and len(found) == 1:
         return found[0]
-    if wanted not in found:
-        asked = f"no estimator {wanted!r}" if wanted else "several estimators"
-        raise ConfigError(f"{run}: {asked}; give --estimator with one of {', '.join(found)}")
-    return wanted
+    chosen = wanted or load_config(run / RUN_MARKER).estimator.title  # the one that steered
+    if chosen not in found:
+        raise ConfigError(
+            f"{run}: no estimator {chosen!r}; give --estimator with one of {', '.join(found)}"
+        )
+    return chosen

@@ -85,7 +85,7 @@ def run_trials(
     Args:
         source: an experiment's .yaml, or the run folder of one.
         seeds: how many trials, from which seed on.
-        choice: which estimators.
+        choice: which estimators, and overrides of theirs and of the experiment.
         out: folder of the results; None: `trials` in the run folder, or `runs/NAME_trials`.
         existing: what to do where results are already.
         jobs: processes at a time, each with linear algebra on one thread.
@@ -95,8 +95,8 @@ def run_trials(
     Raises:
         FgslamError: the experiment has one world of noise only, or cannot be run.
     """
-    config = _experiment(source)
-    estimators = choose(config, choice)
+    config = _experiment(source, choice.of_experiment)
+    estimators = choose(config, choice.of_estimators)
     folder = out or _default_folder(source, config)
     _require_room(folder, source, existing)
     first = config.seed if seeds.first is None else seeds.first
@@ -154,9 +154,9 @@ def _perform_all(
     return sorted(trials, key=lambda trial: trial.seed), sorted(failures)
 
 
-def _experiment(source: Path) -> ExperimentConfig:
+def _experiment(source: Path, overrides: tuple[str, ...]) -> ExperimentConfig:
     """The configuration, if other seeds make other worlds of it."""
-    config = load_config(source / RUN_MARKER if is_run_folder(source) else source)
+    config = load_config(source / RUN_MARKER if is_run_folder(source) else source, overrides)
     if not isinstance(config.dataset, RenderedLabSettings | SimulatedMeasurementsSettings):
         raise ConfigError(
             f"{source}: dataset.kind {config.dataset.kind} is a recording with one world of noise; "

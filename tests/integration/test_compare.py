@@ -14,11 +14,13 @@ import yaml
 from recordings import experiment
 from running import KIND, main, metrics_of, run_values, write_config
 
+from fgslam.backend.filters.settings import DeadReckoningSettings
+from fgslam.backend.smoothers.settings import Isam2Settings
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.report.point_cloud import read_ply
 from fgslam.report.trajectories import read_covariances, read_tum
-from fgslam.runs.config import parse_config
+from fgslam.runs.config import load_config, parse_config
 from fgslam.runs.tasks.slam_measurements import run_measured
 
 CONTRACT = set(EstimatorMetrics().as_json())
@@ -280,3 +282,27 @@ def test_trials_repeat_to_the_byte_and_need_noise_to_vary(
     assert document["estimators"][KIND]["nees_pose"]["independent"] == 2
     assert main(monkeypatch, "compare", finished.folder, "--trials", 2) == 2
     assert "one world of noise" in capsys.readouterr().err
+
+
+def test_trials_take_overrides_of_the_experiment_and_of_estimators(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    sets = ("--set", "dataset.stop=6", "--set", "estimators.isam2.update_every=2")
+    chosen = ("--estimators", "odometry,isam2")
+    assert (
+        main(monkeypatch, "compare", "lab_trials", "--trials", 1, *sets, *chosen, "--out", out) == 0
+    )
+    resolved = load_config(out / "config.yaml")
+    assert resolved.dataset.stop == 6
+    assert resolved.compare == (DeadReckoningSettings(), Isam2Settings(update_every=2))
+
+
+def test_export_takes_the_estimator_that_steered(
+    plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exported = tmp_path / "path.tum"
+    assert len(list(plain.glob("*/final.tum"))) > 1
+    assert main(monkeypatch, "export", plain, "--trajectory", exported) == 0
+    steered = read_tum(plain / KIND / "final.tum")
+    np.testing.assert_array_equal(read_tum(exported).poses, steered.poses)

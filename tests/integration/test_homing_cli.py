@@ -128,7 +128,7 @@ def test_logs_are_compared(
     [
         (("--estimators", "isam2"), "no estimator 'isam2'; give --estimators with some of homing_"),
         (("--set", "estimators.alv.gate=1"), "unknown key estimator.gate"),
-        (("--set", "gate=1"), "not of the form estimators.NAME.key=value"),
+        (("--set", "gate=1"), "what was measured stays as it is; estimators.NAME.key=value"),
         (("--trials", "3"), "--trials, --seed and baselines are not for homing runs"),
         (("--out", "{run}"), "holds the run itself"),
     ],

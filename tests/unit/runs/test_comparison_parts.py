@@ -78,7 +78,8 @@ def test_overrides_reach_one_estimator() -> None:
     ("override", "words"),
     [
         ("estimators.batch.method=gnc", "NAME one of landmark_kalman, isam2"),
-        ("isam2.update_every=3", "not of the form estimators.NAME.key=value"),
+        ("isam2.update_every=3", "estimators.NAME.key=value with NAME one of landmark_kalman"),
+        ("dataset.stop=3", "what was measured stays as it is; .* or --trials to run"),
         ("estimators.isam2.updat_every=3", "did you mean update_every"),
         ("estimators.isam2.update_every=0", "is not usable"),
         ("estimators.isam2.kind=batch", "the kind is what names it"),
@@ -87,6 +88,13 @@ def test_overrides_reach_one_estimator() -> None:
 def test_overrides_that_are_none(override: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         choose(config(compare=["isam2"]), Choice(None, (override,)))
+
+
+def test_overrides_of_estimators_and_of_the_experiment_are_told_apart() -> None:
+    of_estimators = ("estimators.isam2.update_every=7", " estimators.batch.method=gnc")
+    choice = Choice(("isam2",), (of_estimators[0], "dataset.stop=3", of_estimators[1], "seed=1"))
+    assert choice.of_experiment == ("dataset.stop=3", "seed=1")
+    assert choice.of_estimators == Choice(("isam2",), of_estimators)
 
 
 def test_the_same_estimator_twice_is_one() -> None:
