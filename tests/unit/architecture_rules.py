@@ -66,7 +66,17 @@ FORBIDDEN_LIBRARIES = frozenset(
 )
 FORBIDDEN_CALLS = frozenset({"eval", "exec", "compile", "__import__"})
 SAFE_YAML = frozenset(
-    {"safe_load", "safe_dump", "SafeLoader", "SafeDumper", "YAMLError", "MarkedYAMLError"}
+    {
+        "safe_load",
+        "safe_dump",
+        "SafeLoader",
+        "SafeDumper",
+        "YAMLError",
+        "MarkedYAMLError",
+        "Node",
+        "ScalarNode",
+        "SequenceNode",
+    }
 )
 MAX_MODULE_LINES = 450
 MAX_FUNCTION_LINES = 50
