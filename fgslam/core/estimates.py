@@ -8,17 +8,20 @@ from enum import Enum
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.trajectories import Trajectory
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
-    """Stamped poses of the reference camera: timestamps (n,) increasing, ``wTc`` (n, 4, 4)."""
-
-    timestamps: FloatArray
-    poses: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.timestamps)
+__all__ = [
+    "EgoMotion",
+    "EgoMotionStatus",
+    "Estimate",
+    "LandmarkMap",
+    "Prediction",
+    "Relocalisation",
+    "Trajectory",
+    "UpdateStats",
+    "Verdict",
+    "correlation",
+]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,12 +11,12 @@ import numpy as np
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.errors import DatasetError
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.trajectories import read_tum
 from fgslam.evaluation.judging import Truth, judge_replay, seen_often
 from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, read_landmark_truth
 from fgslam.report.point_cloud import MapPoints, read_ply
-from fgslam.report.trajectories import read_tum
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.estimator_files import write_replay
 from fgslam.runs.folder import RUN_MARKER, is_run_folder

@@ -16,8 +16,8 @@ from fgslam.core.atomic_files import make_subfolder, write_text
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.trajectories import write_covariances, write_tum
 from fgslam.report.point_cloud import MapPoints, write_ply
-from fgslam.report.trajectories import write_covariances, write_tum
 from fgslam.slam.replay import Replay, ReplayRow
 
 FRAMES_FILE = "frames.csv"

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from fgslam.core.errors import ConfigError, DatasetError
+from fgslam.core.trajectories import read_tum, write_trajectory
 from fgslam.report.metrics import read_metrics
 from fgslam.report.point_cloud import read_ply, write_map
-from fgslam.report.trajectories import read_tum, write_trajectory
 from fgslam.runs.config import is_homing, load_config
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
 from fgslam.runs.graph_export import export_graph

@@ -11,9 +11,9 @@ from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment
+from fgslam.core.trajectories import read_tum
 from fgslam.report.graph_file import PoseLandmarkGraph, require_graph_suffix, write_g2o
 from fgslam.report.point_cloud import read_ply
-from fgslam.report.trajectories import read_tum
 
 _HEADER = (
     "poses wTc of the reference camera; x right, y down, z forward; metres",

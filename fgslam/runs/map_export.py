@@ -10,8 +10,8 @@ import numpy as np
 from fgslam.core.arrays import BoolArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.saved_map import SavedMap, load_map
+from fgslam.core.trajectories import write_trajectory
 from fgslam.report.point_cloud import MapPoints, write_map
-from fgslam.report.trajectories import write_trajectory
 
 _VALID_HITS = 3  # where the map does not say how many its run asked for (Se et al. 6.1)
 

@@ -15,6 +15,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError, FgslamError
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.trajectories import read_covariances, read_tum
 from fgslam.report.metrics import read_metrics
 from fgslam.report.point_cloud import MapPoints, read_ply
 from fgslam.report.run_results import (
@@ -25,7 +26,6 @@ from fgslam.report.run_results import (
     truth_in_their_world,
 )
 from fgslam.report.slam_page import write_report
-from fgslam.report.trajectories import read_covariances, read_tum
 from fgslam.runs.folder import RUN_MARKER
 from fgslam.runs.report_parts import comparison_table, sample_pictures
 from fgslam.runs.tasks.slam_checkpoint import LOG_FILE

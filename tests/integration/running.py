@@ -17,8 +17,8 @@ import yaml
 
 from fgslam.cli import main as cli
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.trajectories import read_covariances, read_tum
 from fgslam.report.point_cloud import read_ply
-from fgslam.report.trajectories import read_covariances, read_tum
 from fgslam.runs.config import parse_config
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.tasks.slam import RunResult, run_experiment

@@ -24,7 +24,7 @@ from running import (
 )
 
 from fgslam.core.errors import OutputError
-from fgslam.report.trajectories import read_tum
+from fgslam.core.trajectories import read_tum
 
 Refusal = Callable[..., str]
 

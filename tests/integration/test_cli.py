@@ -24,8 +24,8 @@ from running import (
 )
 
 import fgslam
+from fgslam.core.trajectories import read_kitti, read_tum
 from fgslam.report.point_cloud import read_ply
-from fgslam.report.trajectories import read_kitti, read_tum
 
 Capture = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch

@@ -17,9 +17,9 @@ from running import KIND, main, metrics_of, run_values, write_config
 from fgslam.backend.filters.settings import DeadReckoningSettings
 from fgslam.backend.smoothers.settings import Isam2Settings
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.trajectories import read_covariances, read_tum
 from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.report.point_cloud import read_ply
-from fgslam.report.trajectories import read_covariances, read_tum
 from fgslam.runs.config import load_config, parse_config
 from fgslam.runs.tasks.slam_measurements import run_measured
 

@@ -9,8 +9,8 @@ import pytest
 
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import se3_exp
+from fgslam.core.trajectories import read_tum, write_tum
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory, path_length
-from fgslam.report.trajectories import read_tum, write_tum
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 pytestmark = pytest.mark.data

@@ -24,8 +24,8 @@ from running import (
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, EstimatorError, FgslamError, MapError, OutputError
 from fgslam.core.saved_map import load_map, save_map
+from fgslam.core.trajectories import read_tum
 from fgslam.report.point_cloud import read_ply
-from fgslam.report.trajectories import read_tum
 from fgslam.runs.tasks.slam_map_entry import arrival_of
 
 CUT = 7

@@ -12,8 +12,8 @@ from running import KIND, run_values
 
 from fgslam.core.estimates import Estimate
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.trajectories import write_tum
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.report.trajectories import write_tum
 from fgslam.runs.config import ExperimentConfig, parse_config
 from fgslam.slam import factory
 from fgslam.slam.pipeline import replay_step

@@ -16,9 +16,9 @@ from running import KIND, Finished, main
 from fgslam.core.errors import DatasetError, FgslamError, MissingDependencyError, OutputError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import rotation_from_quaternion
+from fgslam.core.trajectories import read_covariances, read_tum, write_tum
 from fgslam.evaluation.trajectory import to_estimate_world
 from fgslam.report.run_results import EstimatorReport
-from fgslam.report.trajectories import read_covariances, read_tum, write_tum
 from fgslam.runs.report import load_report, report_from_folder
 from fgslam.runs.viewing import ellipsoids, view_run
 

@@ -12,8 +12,8 @@ from hypothesis.extra import numpy as nps
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import pose, so3_exp
+from fgslam.core.trajectories import read_tum, write_tum
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory, umeyama
-from fgslam.report.trajectories import read_tum, write_tum
 
 UNIT = st.floats(-1.0, 1.0, allow_subnormal=False)
 ANGLES = st.one_of(

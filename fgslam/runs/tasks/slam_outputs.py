@@ -18,13 +18,13 @@ from fgslam import __version__
 from fgslam.core.atomic_files import make_subfolder, write_text
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.recordings import Sequence
+from fgslam.core.trajectories import write_tum
 from fgslam.evaluation.judging import Truth, closure_counts
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
 from fgslam.report.metrics import StageTime, write_metrics, write_timing
 from fgslam.report.point_cloud import MapPoints
-from fgslam.report.trajectories import write_tum
 from fgslam.runs.comparison import GROUND_TRUTH_FILE, load_truth, remark_of
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.config_models import HomingExperiment, LocalisationConfig

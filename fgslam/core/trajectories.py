@@ -1,4 +1,4 @@
-"""Trajectories as text: TUM and KITTI files, and the covariances of their poses as CSV.
+"""Trajectories, and their files: TUM and KITTI files, and the covariances of their poses as CSV.
 
 The same poses give the same bytes. Time stamps keep 9 decimals; positions and quaternions keep
 12, far below any measurement, with the quaternion's w not negative and no negative zeros.
@@ -7,6 +7,7 @@ The same poses give the same bytes. Time stamps keep 9 decimals; positions and q
 from __future__ import annotations
 
 import io
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,6 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.atomic_files import write_text
 from fgslam.core.errors import DatasetError, OutputError
-from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import pose, quaternion_from_rotation, rotation_from_quaternion
 
 _TUM_FORMAT = "%.9f" + 7 * " %.12f"
@@ -31,6 +31,43 @@ _COVARIANCE_HEADER = (
     "reference camera's frame at the estimate (x right, y down, z forward); rad, m\n"
     f"timestamp,{','.join(_COVARIANCE_NAMES)}\n"
 )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Stamped poses of the reference camera.
+
+    Attributes:
+        timestamps: (n,) seconds, increasing.
+        poses: (n, 4, 4) ``wTc``, metres.
+    """
+
+    timestamps: FloatArray
+    poses: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def save(self, path: str | Path, remark: str = "") -> None:
+        """Writes the poses in the format that the suffix names: `.tum` or `.kitti`.
+
+        Args:
+            path: the file, written whole or not at all.
+            remark: put into a comment line of `.tum`; `.kitti` knows neither times nor comments.
+
+        Raises:
+            OutputError: the suffix is another one, a pose is not finite, or writing failed.
+        """
+        write_trajectory(Path(path), self, remark)
+
+    @staticmethod
+    def load(path: str | Path) -> Trajectory:
+        """Reads a TUM file; `timestamp tx ty tz qx qy qz qw` a line, seconds and metres.
+
+        Raises:
+            DatasetError: the file is missing, a line is malformed, or the times do not increase.
+        """
+        return read_tum(Path(path))
 
 
 def write_trajectory(path: Path, trajectory: Trajectory, remark: str = "") -> None:

@@ -10,7 +10,7 @@ import pytest
 from fgslam.core.errors import DatasetError, OutputError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import se3_exp
-from fgslam.report.trajectories import (
+from fgslam.core.trajectories import (
     read_covariances,
     read_kitti,
     read_tum,
