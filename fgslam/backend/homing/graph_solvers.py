@@ -21,6 +21,9 @@ from fgslam.core.errors import EstimatorError
 from fgslam.factors.bearing import BearingFactors, tangent_to_pose
 from fgslam.factors.keys import is_pose, landmark_key, pose_key, target_key, velocity_key
 
+_TRUST_RADIUS = 1.0  # legs, radians: the first of Powell's dog leg
+_RELINEARISED = 0.01  # legs, radians: a variable that moves by more is linearised anew
+_MAX_ITERATIONS = 50  # of Levenberg-Marquardt; from the last solution it takes three to ten
 _RELATIVE_TOLERANCE = 1e-5  # of the cost: the estimate then moves by far less than its deviation
 
 
@@ -60,7 +63,11 @@ class Solver(Protocol):
 
 
 class GtsamSolver:
-    """What GTSAM's solvers share: parts become factors, values are looked up by key."""
+    """What GTSAM's solvers share: images become factors, values are looked up by key.
+
+    Where an update fails, the solver's own graph is solved as a batch, and the solver begins anew
+    from there: after an exception an ISAM2 object is corrupt.
+    """
 
     def __init__(self, settings: HomingGraphSettings) -> None:
         """Empty."""
@@ -68,7 +75,28 @@ class GtsamSolver:
         robust = BearingFactors(settings.kernel.name, settings.kernel.width)
         self._parts = GtsamParts(robust, settings.motion)
         self._image = 0
+        self._graph = gtsam.NonlinearFactorGraph()
         self.values = gtsam.Values()
+
+    def add(self, new: NewPart, time: float) -> None:
+        """See :class:`Solver`."""
+        self._image = new.image
+        graph, values, keys = self._parts.of(new)
+        before = self._factors()
+        try:
+            self._update(graph, values, (keys, time))
+        except RuntimeError:
+            self.values.insert(values)
+            whole = without_gaps(before)
+            whole.push_back(graph)
+            self.values = minimised(whole, self.values)
+            self._restart(whole, time)
+
+    def move(self, points: dict[int, FloatArray], time: float) -> None:
+        """See :class:`Solver`."""
+        for row, point in points.items():
+            self.values.update(landmark_key(row), point)
+        self._restart(without_gaps(self._factors()), time)
 
     def pose(self, image: int) -> FloatArray:
         """See :class:`Solver`."""
@@ -96,56 +124,43 @@ class GtsamSolver:
         turn[3:6, 3:6] = tangent_to_pose(self.target())
         return turn @ covariance @ turn.T
 
+    def _factors(self) -> Any:
+        """The graph so far, in which slots may be empty."""
+        return self._graph
+
+    def _update(self, graph: Any, values: Any, touched: tuple[set[int], float]) -> None:
+        """Brings an image in, by its factors and first guesses.
+
+        ``touched`` holds the keys that it touches, and its time. Raises RuntimeError, as GTSAM.
+        """
+        raise NotImplementedError
+
+    def _restart(self, graph: Any, time: float) -> None:
+        """Begins anew with a graph, at the values as they are."""
+        self._graph = graph
+
     def _joint(self, keys: list[int]) -> FloatArray:
         """Joint covariance of variables in the order given, in GTSAM's tangent spaces."""
         raise NotImplementedError
 
-    def _taken(self, new: NewPart) -> tuple[Any, Any, set[int]]:
-        self._image = new.image
-        return self._parts.of(new)
-
-    def _put_back(self, points: dict[int, FloatArray]) -> None:
-        for row, point in points.items():
-            self.values.update(landmark_key(row), point)
-
 
 class Isam2Solver(GtsamSolver):
-    """iSAM2 with Powell's dog leg over the whole homing.
-
-    After an exception an ISAM2 object is corrupt: it is built anew from the solver's own graph,
-    at the solution of a batch solver.
-    """
+    """iSAM2 with Powell's dog leg over the whole homing."""
 
     def __init__(self, settings: HomingGraphSettings) -> None:
         """Empty."""
         super().__init__(settings)
-        self._graph = gtsam.NonlinearFactorGraph()
-        self._isam = gtsam.ISAM2(isam2_parameters(settings))
+        self._isam = gtsam.ISAM2(isam2_parameters())
 
-    def add(self, new: NewPart, time: float) -> None:
-        """See :class:`Solver`."""
-        graph, values, keys = self._taken(new)
+    def _update(self, graph: Any, values: Any, touched: tuple[set[int], float]) -> None:
+        self._isam.update(graph, values, [], _last(touched[0]))
+        self.values = self._isam.calculateEstimate()
         self._graph.push_back(graph)
+
+    def _restart(self, graph: Any, time: float) -> None:
+        self._graph, self._isam = graph, gtsam.ISAM2(isam2_parameters())
         try:
-            self._isam.update(graph, values, [], _last(keys))
-            self.values = self._isam.calculateEstimate()
-        except RuntimeError:
-            self.values.insert(values)
-            self._rebuild()
-
-    def move(self, points: dict[int, FloatArray], time: float) -> None:
-        """See :class:`Solver`."""
-        self._put_back(points)
-        self._restart()
-
-    def _rebuild(self) -> None:
-        self.values = minimised(self._graph, self.values, self._settings.max_iterations)
-        self._restart()
-
-    def _restart(self) -> None:
-        self._isam = gtsam.ISAM2(isam2_parameters(self._settings))
-        try:
-            self._isam.update(self._graph, self.values)
+            self._isam.update(graph, self.values)
             self.values = self._isam.calculateEstimate()
         except RuntimeError as error:
             raise _failed(error) from None
@@ -164,39 +179,21 @@ class FixedLagSolver(GtsamSolver):
         self._smoother = self._new()
 
     def _new(self) -> Any:
-        params = isam2_parameters(self._settings)
+        params = isam2_parameters()
         params.findUnusedFactorSlots = True  # without it the smoother grows
         return gtsam.IncrementalFixedLagSmoother(self._settings.lag_s, params)
 
-    def add(self, new: NewPart, time: float) -> None:
-        """See :class:`Solver`."""
-        graph, values, _ = self._taken(new)
-        self._stamps |= dict.fromkeys(list(values.keys()), time)
-        self._stamps |= {key: time for key in self._stamps if not is_passing(key)}
-        before = self._smoother.getFactors()
-        try:
-            self._smoother.update(graph, values, self._recent(time))
-            self.values = self._smoother.calculateEstimate()
-        except RuntimeError:
-            self.values.insert(values)
-            whole = without_gaps(before)
-            whole.push_back(graph)
-            self._rebuild(whole, time)
+    def _factors(self) -> Any:
+        return self._smoother.getFactors()
 
-    def move(self, points: dict[int, FloatArray], time: float) -> None:
-        """See :class:`Solver`."""
-        self._put_back(points)
-        self._restart(without_gaps(self._smoother.getFactors()), time)
-
-    def _recent(self, time: float) -> dict[int, float]:
-        """Times of variables, those forgotten that leave with this update."""
-        stamps = self._stamps
-        self._stamps = {k: t for k, t in stamps.items() if t >= time - self._settings.lag_s}
-        return stamps
-
-    def _rebuild(self, graph: Any, time: float) -> None:
-        self.values = minimised(graph, self.values, self._settings.max_iterations)
-        self._restart(graph, time)
+    def _update(self, graph: Any, values: Any, touched: tuple[set[int], float]) -> None:
+        time = touched[1]
+        stamps = self._stamps | dict.fromkeys(list(values.keys()), time)
+        stamps |= {key: time for key in stamps if not is_passing(key)}
+        oldest = time - self._settings.lag_s
+        self._stamps = {key: stamp for key, stamp in stamps.items() if stamp >= oldest}
+        self._smoother.update(graph, values, stamps)  # those before the oldest leave with it
+        self.values = self._smoother.calculateEstimate()
 
     def _restart(self, graph: Any, time: float) -> None:
         self._smoother = self._new()
@@ -214,21 +211,10 @@ class FixedLagSolver(GtsamSolver):
 class BatchSolver(GtsamSolver):
     """Levenberg-Marquardt over the whole graph with every image, from the last solution."""
 
-    def __init__(self, settings: HomingGraphSettings) -> None:
-        """Empty."""
-        super().__init__(settings)
-        self._graph = gtsam.NonlinearFactorGraph()
-
-    def add(self, new: NewPart, time: float) -> None:
-        """See :class:`Solver`."""
-        graph, values, _ = self._taken(new)
+    def _update(self, graph: Any, values: Any, touched: tuple[set[int], float]) -> None:
         self._graph.push_back(graph)
         self.values.insert(values)
-        self.values = minimised(self._graph, self.values, self._settings.max_iterations)
-
-    def move(self, points: dict[int, FloatArray], time: float) -> None:
-        """See :class:`Solver`."""
-        self._put_back(points)
+        self.values = minimised(self._graph, self.values)
 
     def _joint(self, keys: list[int]) -> FloatArray:
         try:
@@ -251,22 +237,22 @@ def make_solver(settings: HomingGraphSettings) -> Solver:
             return BatchSolver(settings)
 
 
-def isam2_parameters(settings: HomingGraphSettings) -> Any:
+def isam2_parameters() -> Any:
     """Dog leg, because an undamped step may carry a landmark across a camera's centre."""
     dog_leg = gtsam.ISAM2DoglegParams()
-    dog_leg.setInitialDelta(settings.trust_radius)
+    dog_leg.setInitialDelta(_TRUST_RADIUS)
     params = gtsam.ISAM2Params()
     params.setOptimizationParams(dog_leg)
     params.setFactorization("CHOLESKY")
-    params.setRelinearizeThreshold(settings.relinearize_threshold)
+    params.setRelinearizeThreshold(_RELINEARISED)
     params.relinearizeSkip = 1
     return params
 
 
-def minimised(graph: Any, values: Any, iterations: int) -> Any:
+def minimised(graph: Any, values: Any) -> Any:
     """Values at the minimum, by Levenberg-Marquardt."""
     params = gtsam.LevenbergMarquardtParams()
-    params.setMaxIterations(iterations)
+    params.setMaxIterations(_MAX_ITERATIONS)
     params.setRelativeErrorTol(_RELATIVE_TOLERANCE)
     try:
         return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()

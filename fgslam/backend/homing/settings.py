@@ -180,13 +180,6 @@ class HomingGraphSettings(NamedSettings):
     lag_s: Annotated[
         float, Field(gt=0.0, description="fixed_lag: how long poses stay variables, seconds")
     ] = 1.0
-    relinearize_threshold: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="isam2, fixed_lag: change (legs, radians) that relinearises a variable",
-        ),
-    ] = 0.01
     max_steps: Annotated[
         int,
         Field(
@@ -204,13 +197,6 @@ class HomingGraphSettings(NamedSettings):
             "degrees of freedom where the match is right (13.8: one in a thousand). 0: never",
         ),
     ] = 13.8
-    trust_radius: Annotated[
-        float,
-        Field(gt=0.0, description="isam2, fixed_lag: first trust region of Powell's dog leg"),
-    ] = 1.0
-    max_iterations: Annotated[
-        int, Field(ge=1, description="batch: of Levenberg-Marquardt with every image")
-    ] = 50
     motion: GraphMotionSettings = GraphMotionSettings()
 
 
