@@ -16,16 +16,21 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.core.array_files import ArrayFile, Items, of_rows
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, StateArrays
 from fgslam.core.atomic_files import replacing
-from fgslam.core.errors import MapError, MeasurementLogError
+from fgslam.core.errors import MapError
 from fgslam.core.estimates import LandmarkMap, Trajectory
 from fgslam.core.features import LandmarkAppearances
-from fgslam.core.measurement_log import load_arrays
 from fgslam.core.sensors import CameraRig
 
-FORMAT = "fgslam map"
-VERSION = 1
+FILE = ArrayFile(
+    name="fgslam map",
+    versions=(1,),
+    error=MapError,
+    give="give a file that fgslam run --map-out wrote",
+    again="make the map again",
+)
 _SESSION = "session/"
 _UPPER = np.triu_indices(3)
 _LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the zip format's first moment: no file tells when it was made
@@ -33,7 +38,7 @@ _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baselin
 _SAME_RIG = 1e-6  # relative: the same calibration, perhaps read from another text
 
 # Arrays by what their first axis counts, with type and the shape of an item.
-_ITEMS: dict[str, dict[str, tuple[str, tuple[int, ...]]]] = {
+_ITEMS: dict[str, Items] = {
     "landmarks": {
         "landmark_id": ("i", ()),
         "landmark_position": ("f", (3,)),
@@ -102,7 +107,7 @@ def save_map(saved: SavedMap, path: Path) -> int:
     arrays, header["triangles"] = _without_mirrors(arrays)
     arrays, header["same_as"] = _without_repeats(arrays)
     header["sha256"] = _digest(header, arrays)
-    members = {"header": np.array(json.dumps(header, sort_keys=True))} | arrays
+    members = FILE.header(**header) | arrays
     with replacing(path) as partial, partial.open("wb") as file:
         with zipfile.ZipFile(file, "w", compresslevel=1) as archive:
             for name, array in members.items():
@@ -116,7 +121,7 @@ def load_map(path: Path) -> SavedMap:
     Raises:
         MapError: the file is missing, truncated, damaged, foreign, or of a newer fgslam.
     """
-    arrays = _read(path)
+    arrays = FILE.load(path)
     header = _read_header(arrays, str(path))
     if header.pop("sha256", None) != _digest(header, arrays):
         raise MapError(
@@ -222,7 +227,7 @@ def _with_mirrors(arrays: StateArrays, header: dict[str, Any], where: str) -> St
     for name in header["triangles"]:
         upper = arrays.get(name)
         if upper is None or upper.ndim != 2 or upper.shape[1] != 6:
-            raise MapError(f"{where}: array {name} is absent or damaged; make the map again")
+            raise FILE.damaged(name, where)
         full = np.empty((len(upper), 3, 3), upper.dtype)
         full[:, _UPPER[0], _UPPER[1]] = upper
         full[:, _UPPER[1], _UPPER[0]] = upper
@@ -252,7 +257,7 @@ def _with_repeats(arrays: StateArrays, header: dict[str, Any], where: str) -> St
     out = dict(arrays)
     for name, source in header["same_as"].items():
         if source not in arrays:
-            raise MapError(f"{where}: array {source} is absent or damaged; make the map again")
+            raise FILE.damaged(source, where)
         out[name] = arrays[source].copy()  # owners write to what they restore
     return out
 
@@ -263,8 +268,8 @@ def _with_repeats(arrays: StateArrays, header: dict[str, Any], where: str) -> St
 
 def _header(saved: SavedMap, where: str) -> dict[str, Any]:
     header = {
-        "format": FORMAT,
-        "version": VERSION,
+        "format": FILE.name,
+        "version": FILE.versions[-1],
         "counts": {
             "landmarks": len(saved),
             "views": len(saved.appearances),
@@ -282,37 +287,10 @@ def _header(saved: SavedMap, where: str) -> dict[str, Any]:
     return dict(told)
 
 
-def _read(path: Path) -> StateArrays:
-    try:
-        path.open("rb").close()
-        return load_arrays(path)
-    except FileNotFoundError:
-        raise MapError(f"{path}: no such file; save a map with fgslam run --map-out") from None
-    except IsADirectoryError:
-        raise MapError(f"{path}: is a folder; give the map file itself") from None
-    except OSError as error:
-        raise MapError(f"{path}: cannot be read ({error.strerror}); mend that") from None
-    except MeasurementLogError:
-        raise MapError(
-            f"{path}: not a readable map file: truncated, damaged, or something else altogether; "
-            "restore it or make the map again"
-        ) from None
-
-
 def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
     """Takes the header out of the arrays."""
-    try:
-        header = json.loads(str(arrays.pop("header")))
-    except (KeyError, json.JSONDecodeError):
-        header = None
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise MapError(f"{where}: not an fgslam map; give a file that fgslam run --map-out wrote")
-    version = header.get("version")
-    if version != VERSION:
-        raise MapError(
-            f"{where}: map of version {version}, this fgslam reads version {VERSION}; use the "
-            "fgslam that wrote it, or make the map again"
-        )
+    header = FILE.read_header(arrays, where)
+    del arrays["header"]
     groups = ("counts", "rig", "about", "same_as")
     sound = all(isinstance(header.get(name), dict) for name in groups)
     if not sound or not isinstance(header.get("triangles"), list):
@@ -336,14 +314,10 @@ def _digest_of(name: str, array: np.ndarray[Any, Any]) -> bytes:
 
 def _require_consistent(header: dict[str, Any], arrays: StateArrays, where: str) -> None:
     """Raises MapError unless all arrays are there, of the right type and size, and fit."""
-    expected: dict[str, tuple[str, tuple[int, ...]]] = {"rig_bTc": ("f", (4, 4))}
+    expected = of_rows(4, {"rig_bTc": ("f", (4,))})
     for counted, items in _ITEMS.items():
-        count = header["counts"].get(counted)
-        expected |= {name: (kind, (count, *item)) for name, (kind, item) in items.items()}
-    for name, (kind, shape) in expected.items():
-        array = arrays.get(name)
-        if array is None or array.dtype.kind != kind or array.shape != shape:
-            raise MapError(f"{where}: array {name} is absent or damaged; make the map again")
+        expected |= of_rows(header["counts"].get(counted), items)
+    FILE.require(arrays, expected, where)
     ids, views = arrays["landmark_id"], arrays["view_landmark"]
     finite = ("rig_bTc", "landmark_position", "landmark_covariance", "pose", "pose_time")
     for name, sound in {

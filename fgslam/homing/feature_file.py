@@ -1,7 +1,6 @@
 """Features of many images as one compact ``.npz`` of plain arrays: no pixels, no pickle.
 
-Features of all images lie one after the other, with offsets: those of image ``k`` are rows
-``start[k]:start[k + 1]``. SIFT descriptors are bytes; angles, sizes and column descriptors float32
+SIFT descriptors are bytes; angles, sizes and column descriptors float32
 (1e-7 of themselves); deviations and colours float16 (5e-4 of themselves). Every member of the
 archive carries a CRC, which reading checks. Where a feature lay in the image is not kept: it is NaN
 after reading.
@@ -9,18 +8,23 @@ after reading.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, IntArray, StateArrays
-from fgslam.core.atomic_files import replacing
-from fgslam.core.errors import MeasurementLogError, StoredMapError
+from fgslam.core.array_files import ArrayFile, joined, of_rows, offsets, split
+from fgslam.core.arrays import FloatArray, StateArrays
+from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import ColumnSegments, OmniFeatures, UprightFeatures
-from fgslam.core.measurement_log import load_arrays
+
+_FILE = ArrayFile(
+    name="fgslam features",
+    versions=(1,),
+    error=StoredMapError,
+    give="give a file that holds some",
+    again="write the file again",
+)
 
 # Arrays by what their first axis counts, with type and the shape of an item.
 _SIFT: dict[str, tuple[type, tuple[int, ...]]] = {
@@ -43,15 +47,14 @@ _COLUMNS: dict[str, tuple[type, tuple[int, ...]]] = {
 def pack_features(images: Sequence[OmniFeatures]) -> StateArrays:
     """All features of images, in their order, as the arrays of a file."""
     out: StateArrays = {
-        "sift_start": _offsets([len(i.sift) for i in images]),
-        "column_start": _offsets([len(i.columns) for i in images]),
+        "sift_start": offsets([len(i.sift) for i in images]),
+        "column_start": offsets([len(i.columns) for i in images]),
     }
     sift = [_sift_arrays(i.sift) for i in images]
     columns = [_column_arrays(i.columns) for i in images]
     for specification, parts in ((_SIFT, sift), (_COLUMNS, columns)):
         for name, (kind, item) in specification.items():
-            blank: np.ndarray[Any, Any] = np.empty((0, *item), dtype=kind)
-            out[name] = np.concatenate([blank, *(p[name].astype(kind) for p in parts)])
+            out[name] = joined([p[name].astype(kind) for p in parts], item, kind)
     return out
 
 
@@ -68,94 +71,25 @@ def unpack_features(arrays: Mapping[str, Any], where: str) -> tuple[OmniFeatures
     sift = _split(arrays, "sift_start", _SIFT, where)
     columns = _split(arrays, "column_start", _COLUMNS, where)
     if len(sift) != len(columns):
-        raise StoredMapError(f"{where}: array column_start is damaged; write the file again")
+        raise _FILE.damaged("column_start", where)
     return tuple(
         OmniFeatures(_sift(s), _column_segments(c)) for s, c in zip(sift, columns, strict=True)
     )
 
 
-def save_archive(path: Path, form: str, version: int, header: Any, arrays: StateArrays) -> int:
-    """Writes arrays with their header, whole or not at all; the same input gives the same bytes.
-
-    Args:
-        path: its folder must exist.
-        form: name of the format.
-        version: of the format.
-        header: plain JSON values.
-        arrays: without one called ``header``.
-
-    Returns:
-        Size of the file in bytes.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
-    text = json.dumps({"format": form, "version": version, **header}, sort_keys=True)
-    with replacing(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, header=np.array(text), **arrays)
-        return file.tell()
-
-
-def load_archive(path: Path, form: str, version: int) -> tuple[dict[str, Any], StateArrays]:
-    """Header and arrays of a file that :func:`save_archive` wrote.
-
-    Raises:
-        StoredMapError: it is missing, truncated, damaged, foreign, or of another version.
-    """
-    try:
-        arrays = load_arrays(path)
-    except MeasurementLogError as error:
-        raise StoredMapError(str(error)) from None
-    try:
-        header = json.loads(str(arrays.pop("header")))
-    except (KeyError, json.JSONDecodeError):
-        header = None
-    if not isinstance(header, dict) or header.get("format") != form:
-        raise StoredMapError(f"{path}: not an {form}; give a file that holds one")
-    if header.get("version") != version:
-        raise StoredMapError(
-            f"{path}: {form} of version {header.get('version')}, this fgslam reads version "
-            f"{version}; build it again or use the matching fgslam"
-        )
-    return header, arrays
-
-
-def require_array(
-    arrays: Mapping[str, Any], name: str, kind: str, shape: tuple[int, ...], where: str
-) -> np.ndarray[Any, Any]:
-    """An array of this kind (of ``numpy.dtype.kind``) and shape.
-
-    Raises:
-        StoredMapError: there is none.
-    """
-    array = arrays.get(name)
-    if not isinstance(array, np.ndarray) or array.dtype.kind != kind or array.shape != shape:
-        raise StoredMapError(f"{where}: array {name} is absent or damaged; write the file again")
-    return array
-
-
-def _offsets(sizes: Sequence[int]) -> IntArray:
-    return np.cumsum([0, *sizes]).astype(np.int64)
-
-
 def _split(
     arrays: Mapping[str, Any],
-    offsets: str,
+    start: str,
     specification: Mapping[str, tuple[type, tuple[int, ...]]],
     where: str,
 ) -> list[dict[str, Any]]:
-    start = arrays.get(offsets)
-    if not isinstance(start, np.ndarray) or start.dtype.kind != "i" or start.ndim != 1:
-        raise StoredMapError(f"{where}: array {offsets} is absent or damaged; write the file again")
-    if not len(start) or start[0] != 0 or (np.diff(start) < 0).any():
-        raise StoredMapError(f"{where}: array {offsets} is damaged; write the file again")
-    parts: list[dict[str, Any]] = [{} for _ in range(len(start) - 1)]
-    for name, (kind, item) in specification.items():
-        shape = (int(start[-1]), *item)
-        whole = require_array(arrays, name, np.dtype(kind).kind, shape, where)
-        for part, rows in zip(parts, np.split(whole, start[1:-1]), strict=len(parts) > 0):
-            part[name] = rows
-    return parts
+    rows = _FILE.require_offsets(arrays, start, None, where)
+    kinds = {name: (np.dtype(kind).kind, item) for name, (kind, item) in specification.items()}
+    _FILE.require(arrays, of_rows(rows, kinds), where)
+    whole = {name: split(arrays[name], arrays[start]) for name in specification}
+    return [
+        {name: parts[k] for name, parts in whole.items()} for k in range(len(arrays[start]) - 1)
+    ]
 
 
 # --------------------------------------------------------------------------------------------

@@ -6,12 +6,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from fgslam.core.array_files import ArrayFile, write_arrays
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import OmniFeatures
-from fgslam.homing.feature_file import load_archive, pack_features, save_archive, unpack_features
+from fgslam.homing.feature_file import pack_features, unpack_features
 
-FORMAT = "fgslam path memory"
-VERSION = 1
+FILE = ArrayFile(
+    name="fgslam path memory",
+    versions=(1,),
+    error=StoredMapError,
+    give="give a file that holds one",
+    again="write it again",
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,8 +58,8 @@ class PathMemory:
         Raises:
             OutputError: it cannot be written.
         """
-        header = {"names": list(self.names)}
-        size = save_archive(path, FORMAT, VERSION, header, pack_features(self.images))
+        arrays = FILE.header(names=list(self.names)) | pack_features(self.images)
+        size = write_arrays(path, arrays, compressed=True)
         return size / 1000.0 / max(len(self), 1)
 
     @staticmethod
@@ -63,7 +69,8 @@ class PathMemory:
         Raises:
             StoredMapError: the file is missing, truncated, damaged, foreign or of another version.
         """
-        header, arrays = load_archive(path, FORMAT, VERSION)
+        arrays = FILE.load(path)
+        header = FILE.read_header(arrays, str(path))
         images = unpack_features(arrays, str(path))
         return PathMemory(images, read_names(header, len(images), str(path)))
 

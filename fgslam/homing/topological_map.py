@@ -11,14 +11,12 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from fgslam.core.array_files import ArrayFile, Items, of_rows, rows_of, write_arrays
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import OmniFeatures
 from fgslam.homing.feature_file import (
-    load_archive,
     pack_features,
-    require_array,
-    save_archive,
     unpack_features,
 )
 from fgslam.homing.link_consistency import LinkConsistency
@@ -28,8 +26,20 @@ from fgslam.homing.retrieval import VisualWords, candidate_pairs
 from fgslam.homing.settings import TopologicalMapSettings
 from fgslam.homing.third_view_consistency import InlierRows, ThirdViewConsistency
 
-FORMAT = "fgslam topological map"
-VERSION = 1
+FILE = ArrayFile(
+    name="fgslam topological map",
+    versions=(1,),
+    error=StoredMapError,
+    give="give a file that holds one",
+    again="build it again",
+)
+_PER_LINK: Items = {
+    "link_support": ("i", ()),
+    "link_ends": ("i", (2,)),
+    "link_angles": ("f", (3,)),
+    "link_covariances": ("f", (2, 2, 2)),
+    "link_cost": ("f", ()),
+}
 _SIGMA_OF_ONE = np.deg2rad(5.0)  # direction's deviation that costs as much as a leg by itself
 
 
@@ -105,8 +115,9 @@ class TopologicalMap:
         Raises:
             OutputError: it cannot be written.
         """
-        arrays = pack_features(self.images) | _link_arrays(self.links, self.costs)
-        size = save_archive(path, FORMAT, VERSION, {"names": list(self.names)}, arrays)
+        arrays = FILE.header(names=list(self.names)) | pack_features(self.images)
+        arrays |= _link_arrays(self.links, self.costs)
+        size = write_arrays(path, arrays, compressed=True)
         return size / 1000.0 / max(len(self), 1)
 
     @staticmethod
@@ -116,7 +127,8 @@ class TopologicalMap:
         Raises:
             StoredMapError: the file is missing, truncated, damaged, foreign or of another version.
         """
-        header, arrays = load_archive(path, FORMAT, VERSION)
+        arrays = FILE.load(path)
+        header = FILE.read_header(arrays, str(path))
         images = unpack_features(arrays, str(path))
         names = read_names(header, len(images), str(path))
         links, costs = _read_links(arrays, len(images), str(path))
@@ -241,15 +253,13 @@ def _link_arrays(links: Sequence[Link], costs: FloatArray) -> StateArrays:
 def _read_links(
     arrays: Mapping[str, Any], count: int, where: str
 ) -> tuple[tuple[Link, ...], FloatArray]:
-    given = arrays.get("link_support")
-    m = len(given) if isinstance(given, np.ndarray) and given.ndim == 1 else 0
-    support = require_array(arrays, "link_support", "i", (m,), where)
-    ends = require_array(arrays, "link_ends", "i", (m, 2), where)
-    angles = require_array(arrays, "link_angles", "f", (m, 3), where)
-    covariances = require_array(arrays, "link_covariances", "f", (m, 2, 2, 2), where)
-    costs = require_array(arrays, "link_cost", "f", (m,), where)
-    ascending = m == 0 or bool((ends[:, 0] < ends[:, 1]).all())
-    if not ascending or ((ends < 0) | (ends >= count)).any() or not (costs > 0.0).all():
+    FILE.require(arrays, of_rows(rows_of(arrays, "link_support"), _PER_LINK), where)
+    support, ends, angles, covariances, costs = (arrays[name] for name in _PER_LINK)
+    if (
+        not (ends[:, 0] < ends[:, 1]).all()
+        or ((ends < 0) | (ends >= count)).any()
+        or not (costs > 0.0).all()
+    ):
         raise StoredMapError(f"{where}: array link_ends or link_cost is damaged; build it again")
     links = tuple(
         Link(
@@ -262,6 +272,6 @@ def _read_links(
             back_covariance=covariances[k, 1],
             support=int(support[k]),
         )
-        for k in range(m)
+        for k in range(len(support))
     )
     return links, np.array(costs)

@@ -8,7 +8,6 @@ from pathlib import Path
 from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.bearing_log import BearingLog
 from fgslam.core.errors import DatasetError
-from fgslam.runs.tasks.slam_checkpoint import write_arrays
 
 LOG_FOLDER = "logs"
 
@@ -18,7 +17,7 @@ def save_bearing_logs(run: Path, logs: Mapping[str, BearingLog]) -> None:
     if logs:
         folder = make_subfolder(run, LOG_FOLDER)
         for name, log in logs.items():
-            write_arrays(folder / f"{name}.npz", log.to_arrays())
+            log.save(folder / f"{name}.npz")
 
 
 def load_bearing_logs(run: Path) -> dict[str, BearingLog]:

@@ -158,7 +158,7 @@ def test_wrong_maps_and_recordings_are_told(
     assert "no such file" in line(tmp_path / "none.fgmap", own_recording)
     foreign = tmp_path / "foreign.fgmap"
     foreign.write_text("no map", encoding="utf-8")
-    assert "not a readable map file" in line(foreign, own_recording)
+    assert "not a readable map" in line(foreign, own_recording)
     assert str(tmp_path / "nowhere") in line(map_file, tmp_path / "nowhere")
     homing = tmp_path / "homing.yaml"
     homing.write_text(yaml.safe_dump({"task": "homing", "name": "h"}), encoding="utf-8")

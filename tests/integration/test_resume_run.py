@@ -25,6 +25,7 @@ from running import (
     write_config,
 )
 
+from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.errors import (
     ConfigError,
     DatasetError,
@@ -32,13 +33,11 @@ from fgslam.core.errors import (
     OdometryError,
     OutputError,
 )
-from fgslam.core.measurement_log import load_arrays
 from fgslam.core.measurements import Odometry
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import ImageFolderSettings
 from fgslam.runs.tasks.slam_beginning import resume_command
-from fgslam.runs.tasks.slam_checkpoint import write_arrays
 
 
 @pytest.mark.parametrize("frames", [1, 2, 7, 11])

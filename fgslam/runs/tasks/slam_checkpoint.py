@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
-import numpy as np
-
+from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.arrays import StateArrays
-from fgslam.core.atomic_files import write_bytes
 from fgslam.core.errors import OutputError
-from fgslam.core.measurement_log import MeasurementLog, load_arrays
+from fgslam.core.measurement_log import MeasurementLog
 from fgslam.slam.pipeline import SlamPipeline
 from fgslam.slam.recorder import RunRecorder
 
@@ -56,7 +53,7 @@ def restore(
 
 def save_log(folder: Path, log: MeasurementLog) -> None:
     """Writes the measurement log."""
-    write_arrays(folder / LOG_FILE, log.to_arrays())
+    log.save(folder / LOG_FILE)
 
 
 def exists(folder: Path) -> bool:
@@ -95,13 +92,6 @@ def load(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
             f"{folder / LOG_FILE}: holds {len(log)} frames, the checkpoint {len(recorder)}; "
             "restore it, or start again with --overwrite"
         )
-
-
-def write_arrays(path: Path, arrays: StateArrays) -> None:
-    """Writes an uncompressed ``.npz``, atomically; the same arrays give the same bytes."""
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **arrays)
-    write_bytes(path, buffer.getvalue())
 
 
 def _part(state: StateArrays, part: str) -> StateArrays:

@@ -54,7 +54,7 @@ def test_disorder_is_refused(log: BearingLog) -> None:
     arrays = log.to_arrays()
     start = arrays["image_start"].copy()
     start[1], start[2] = start[2] + 1, start[1]
-    with pytest.raises(MeasurementLogError, match="image_start is damaged"):
+    with pytest.raises(MeasurementLogError, match="image_start is absent or damaged"):
         BearingLog.from_arrays(arrays | {"image_start": start}, "a.npz")
     with pytest.raises(MeasurementLogError, match="do not increase"):
         BearingLog.from_arrays(arrays | {"image_time": arrays["image_time"][::-1]}, "a.npz")

@@ -14,11 +14,12 @@ import pytest
 from fgslam.core import atomic_files as whole_files
 from fgslam.core import geometry as g
 from fgslam.core import saved_map as map_file
+from fgslam.core.array_files import load_arrays
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import MapError, OutputError
 from fgslam.core.estimates import LandmarkMap, Trajectory
 from fgslam.core.features import LandmarkAppearances
-from fgslam.core.measurement_log import MeasurementLog, load_arrays
+from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.saved_map import SavedMap, load_map, require_rig, save_map
 from fgslam.core.sensors import CameraRig
 
@@ -161,7 +162,7 @@ def test_saving_changes_nothing_of_the_map(saved: SavedMap, tmp_path: Path) -> N
 def test_a_truncated_file_is_refused(file: Path, kept: float) -> None:
     content = file.read_bytes()
     file.write_bytes(content[: int(kept if kept in (0, 1, 30) else kept * len(content))])
-    with pytest.raises(MapError, match=r"not a readable map file: truncated"):
+    with pytest.raises(MapError, match=r"not a readable map .*truncated"):
         load_map(file)
 
 
@@ -205,7 +206,7 @@ def test_foreign_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(MapError, match="not an fgslam map; give a file"):
         load_map(path)
     path.write_text("ply\nformat ascii 1.0\n")
-    with pytest.raises(MapError, match="something else altogether"):
+    with pytest.raises(MapError, match="neither arrays nor an archive of them"):
         load_map(path)
     write_arrays(path, {"a": np.zeros(3)})
     with pytest.raises(MapError, match="not an fgslam map"):
@@ -213,7 +214,7 @@ def test_foreign_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_missing_files_and_folders_are_told_apart(tmp_path: Path) -> None:
-    with pytest.raises(MapError, match="no such file; save a map with"):
+    with pytest.raises(MapError, match="no such file; give a file that fgslam run --map-out wrote"):
         load_map(tmp_path / "none.fgmap")
     with pytest.raises(MapError, match="is a folder"):
         load_map(tmp_path)

@@ -12,7 +12,7 @@ import pytest
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import ColumnSegments, OmniFeatures, UprightFeatures
 from fgslam.homing.feature_file import pack_features
-from fgslam.homing.path_memory import FORMAT, PathMemory
+from fgslam.homing.path_memory import FILE, PathMemory
 from tests.landmark_world import no_columns
 
 
@@ -130,7 +130,7 @@ def test_foreign_files_are_refused(tmp_path: Path) -> None:
     """Another npz, another version, no file, a folder, arrays that do not fit together."""
     path = tmp_path / "path.npz"
     np.savez(path, a=np.arange(3))
-    with pytest.raises(StoredMapError, match=f"not an {FORMAT}"):
+    with pytest.raises(StoredMapError, match=f"not an {FILE.name}"):
         PathMemory.load(path)
     with pytest.raises(StoredMapError, match="no such file"):
         PathMemory.load(tmp_path / "none.npz")
@@ -155,7 +155,7 @@ def test_foreign_files_are_refused(tmp_path: Path) -> None:
 def test_nothing_is_unpickled(tmp_path: Path) -> None:
     """An object array would run what the file says; it is refused unread."""
     path = tmp_path / "path.npz"
-    np.savez(path, header=np.array({"format": FORMAT}, dtype=object))
+    np.savez(path, header=np.array({"format": FILE.name}, dtype=object))
     assert zipfile.is_zipfile(path)
     with pytest.raises(StoredMapError, match="neither arrays nor an archive"):
         PathMemory.load(path)

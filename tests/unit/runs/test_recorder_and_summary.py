@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.estimates import (
     EgoMotion,
     EgoMotionStatus,
@@ -18,12 +19,11 @@ from fgslam.core.estimates import (
 )
 from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.geometry import se3_exp
-from fgslam.core.measurement_log import MeasurementLog, load_arrays
+from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Observations
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
 from fgslam.evaluation.judging import Truth
-from fgslam.runs.tasks.slam_checkpoint import write_arrays
 from fgslam.runs.tasks.slam_summary import estimator_metrics, frame_problems, run_numbers
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.pipeline import FrameReport
