@@ -1,13 +1,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 from dataset_builders import curve, image_folder, picture, save, write_tum
 
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Trajectory
+from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.checks.findings import Finding, Level
 from fgslam.datasets.checks.images import check_images
@@ -176,6 +180,53 @@ def test_truth_that_jumps(tmp_path: Path) -> None:
     write_tum(root / "gt_right_cam.txt", 0.1 * np.arange(30), poses)
     found = texts(check_truth(opened(root)))
     assert "moves suddenly before its poses 12:" in found
+
+
+def flight(standing: int, flying: int, rate: float, seed: int = 3) -> Trajectory:
+    """A drone that stands, flies at up to 0.8 m/s, and stands again; truth good to 0.3 mm."""
+    count = 2 * standing + flying
+    speed = np.zeros(count)
+    speed[standing : standing + flying] = 0.8 * np.sin(np.linspace(0.0, np.pi, flying))
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 0, 3] = np.cumsum(speed) / rate
+    poses[:, :3, 3] += 0.0003 * np.random.default_rng(seed).standard_normal((count, 3))
+    return Trajectory(np.arange(count) / rate, poses)
+
+
+@dataclass(frozen=True)
+class WithTruth:
+    """What the check of ground truth asks a recording for."""
+
+    ground_truth: Trajectory
+
+    @property
+    def timestamps(self) -> FloatArray:
+        return self.ground_truth.timestamps
+
+    def __len__(self) -> int:
+        return len(self.ground_truth)
+
+
+@pytest.mark.parametrize("rate", [0.7, 3.3, 20.0, 200.0])
+@pytest.mark.parametrize("flying", [6, 40])
+def test_a_short_flight_after_long_standing_is_no_jump(rate: float, flying: int) -> None:
+    truth = flight(300, flying, rate)
+    assert "moves suddenly" not in texts(check_truth(cast(Sequence, WithTruth(truth))))
+
+
+@pytest.mark.parametrize("rate", [0.7, 3.3, 20.0, 200.0])
+@pytest.mark.parametrize("at", [100, 320])
+def test_a_jump_is_found_while_standing_and_while_flying(rate: float, at: int) -> None:
+    truth = flight(300, 40, rate)
+    fastest = 0.8 / rate
+    truth.poses[at:, 1, 3] += 0.1 + 20.0 * fastest
+    assert f"before its poses {at}:" in texts(check_truth(cast(Sequence, WithTruth(truth))))
+
+
+def test_one_bad_pose_is_found() -> None:
+    truth = flight(300, 40, 20.0)
+    truth.poses[50, 2, 3] += 1.0
+    assert "before its poses 50, 51:" in texts(check_truth(cast(Sequence, WithTruth(truth))))
 
 
 def test_sound_odometry_agrees_with_truth(tmp_path: Path) -> None:
