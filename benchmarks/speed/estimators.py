@@ -25,9 +25,9 @@ from fgslam.backend.common_settings import KernelSettings
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
 from fgslam.backend.filters.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
+from fgslam.backend.graphs import solver_parameters
 from fgslam.backend.smoothers.batch import BatchSolver
 from fgslam.backend.smoothers.marginals import marginals_of
-from fgslam.backend.smoothers.outliers import solver_parameters
 from fgslam.backend.smoothers.settings import BatchSettings, Isam2Settings
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core.arrays import FloatArray

@@ -1,13 +1,16 @@
-"""Settings that several estimators share: the floor, robust kernels, names."""
+"""Settings that several estimators share: the floor, robust kernels, names and families."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal, TypeAlias
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT
+
+Family: TypeAlias = Literal["filter", "smoother", "other"]
+"""Whether past poses are revised; paired tests compare smoothers with filters, and no others."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -47,6 +50,8 @@ class KernelSettings:
 @dataclass(frozen=True, config=STRICT)
 class NamedSettings:
     """What every estimator has."""
+
+    family: ClassVar[Family] = "other"
 
     label: Annotated[
         str | None,

@@ -1,13 +1,34 @@
-"""What every estimator, filter or smoother, offers.
+"""What every estimator, filter or smoother, offers: the protocol to write another one.
 
 The loop is always: ``predict`` with the odometry, match against ``landmarks()``, ``update`` with
 the frame's measurements. A live run and a replay of its log call the same three, so any estimator
 can steer the front-end and any log can be given to any estimator.
+
+To add an estimator:
+
+1. Write a class with the members of :class:`Estimator`. It needs no base class. It is handed plain
+   values (:mod:`fgslam.core.measurements`, :mod:`fgslam.core.estimates`): poses ``wTc`` in metres,
+   covariances in the pose's tangent space, rotation first. ``examples/`` shows a small one; an
+   object of it can be given to ``fgslam.Slam(rig, estimator=...)`` as it is.
+2. Where it can do more, add the members of :class:`Resumable` (interrupted runs),
+   :class:`JointCovariances` or :class:`MapUser` (beginning in a saved map). What asks for them
+   refuses an estimator without, in one line.
+3. To choose it in configurations, too: a frozen dataclass of settings beside the class, derived
+   from :class:`~fgslam.backend.common_settings.NamedSettings`, with its own ``kind`` and, for the
+   paired tests of many trials, its ``family``; add it to the union in
+   :mod:`fgslam.backend.settings`, and one ``case`` to ``make_estimator`` in
+   :mod:`fgslam.slam.factory`.
+
+``tests/contract/test_estimators.py`` then holds it to the protocol without further ado: predicting
+changes nothing, time must increase, arguments stay as they were, a restored one continues to the
+same bits. A graph can be had without writing one: hand a
+:class:`~fgslam.backend.smoothers.solver.GraphSolver` to
+:class:`~fgslam.backend.smoothers.smoother.Smoother`.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
@@ -15,7 +36,7 @@ from fgslam.core.measurements import Increment, MeasurementType, Odometry
 
 
 class Estimator(Protocol):
-    """A SLAM estimator over stereo landmarks.
+    """A SLAM estimator over landmarks of a stereo, trinocular or range-bearing sensor.
 
     Calls come in time order; a time stamp that does not increase raises EstimatorError and leaves
     the state as it was. Arguments are never mutated. Returned arrays must not be written to.
@@ -26,10 +47,13 @@ class Estimator(Protocol):
         """Names the estimator in configurations, tables and messages."""
         ...
 
-    supports: ClassVar[frozenset[MeasurementType]]
+    @property
+    def supports(self) -> frozenset[MeasurementType]:
+        """Kinds of measurement that it can use; a log that holds others is refused at once."""
+        ...
 
     def predict(self, odometry: Odometry | None) -> Prediction:
-        """Pose expected after the camera moved by ``odometry``; the prior pose for None.
+        """Pose expected after the camera moved by ``odometry``; the last (or prior) one for None.
 
         Does not change the state: predicting twice gives the same answer.
         """
@@ -38,13 +62,13 @@ class Estimator(Protocol):
     def landmarks(self) -> LandmarkMap:
         """Current landmarks, those initiated and not yet pruned, as matching should see them.
 
-        A smoother's covariances are here those of its tracker, given the poses; marginals are in
-        :meth:`estimate` and :meth:`landmark_covariances`.
+        Identities ascend; positions (n, 3) and covariances (n, 3, 3) in world axes. A smoother's
+        covariances are here those of its tracker, given the poses; :meth:`estimate` has marginals.
         """
         ...
 
     def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
-        """Take in one frame.
+        """Takes in one frame: landmarks matched, missed, new and pruned, and loops recognised.
 
         Args:
             increment: the frame's measurements; its odometry is what the pose was predicted with,
@@ -53,31 +77,48 @@ class Estimator(Protocol):
                 ``inliers`` run over the increment's matched (not new) observations, in order.
 
         Returns:
-            What it did, with a verdict on each of ``increment.loops``.
+            Pose ``wTc`` and covariance of the frame as known now, the number of landmarks, the
+            normalised innovation squared with its degrees of freedom (NaN and 0 where there is
+            none), and for each of ``increment.loops`` whether it was closed.
+
+        Raises:
+            EstimatorError: time does not increase, a number is not finite, or no solution exists.
         """
         ...
 
     def estimate(self) -> Estimate:
-        """Trajectory, pose covariances and map as known now."""
-        ...
+        """Trajectory, pose covariances (n, 6, 6) and map as known now; may be asked at any time.
 
-    def landmark_covariances(self, ids: IntArray) -> FloatArray:
-        """Marginal covariances (k, 3, 3) of the named landmarks. KeyError for an unknown one."""
-        ...
-
-    def joint_covariance(self, ids: IntArray) -> FloatArray:
-        """Joint covariance (6 + 3k, 6 + 3k) of the last pose and the named landmarks, in order.
-
-        KeyError for an unknown landmark.
+        A frame for each update; ``remarks`` say in words what a reader of the result must know.
         """
         ...
 
+
+class JointCovariances(Protocol):
+    """An estimator that knows how its landmarks' errors hang together; optional.
+
+    Each raises KeyError for a landmark that it does not hold.
+    """
+
+    def landmark_covariances(self, ids: IntArray) -> FloatArray:
+        """Marginal covariances (k, 3, 3) of the named landmarks, world axes, metres squared."""
+        ...
+
+    def joint_covariance(self, ids: IntArray) -> FloatArray:
+        """Joint covariance (6 + 3k, 6 + 3k) of the last pose and the named landmarks, in order."""
+        ...
+
+
+@runtime_checkable
+class Resumable(Protocol):
+    """An estimator whose run can be interrupted and resumed to the same bits; optional."""
+
     def state(self) -> StateArrays:
-        """Everything needed to continue bit by bit, as plain arrays."""
+        """Everything needed to continue, as plain arrays; later updates leave them alone."""
         ...
 
     def restore(self, state: StateArrays) -> None:
-        """Continue from what :meth:`state` gave."""
+        """Continues from what :meth:`state` gave; on a new estimator with the same settings."""
         ...
 
 
@@ -91,7 +132,7 @@ class MapUser(Protocol):
 
     @property
     def keeps_maps(self) -> bool:
-        """Whether it can leave the map's landmarks as they are, and estimate poses alone."""
+        """True if it can leave the map's landmarks as they are, and estimate poses alone."""
         ...
 
     def begin_in(self, landmarks: LandmarkMap, hits: IntArray, fixed: bool) -> None:
@@ -106,3 +147,7 @@ class MapUser(Protocol):
             EstimatorError: it holds more than the estimator can.
         """
         ...
+
+
+class FullEstimator(Estimator, JointCovariances, Resumable, Protocol):
+    """What the estimators of this package offer: everything but, in some, :class:`MapUser`."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, TypeAlias
+from typing import Annotated, TypeAlias, get_args
 
 from pydantic import Field
 
+from fgslam.backend.common_settings import Family
 from fgslam.backend.filters.settings import (
     DeadReckoningSettings,
     EkfSettings,
@@ -13,14 +14,6 @@ from fgslam.backend.filters.settings import (
     LandmarkKalmanSettings,
 )
 from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
-
-# --------------------------------------------------------------------------------------------
-# What several kinds share
-
-
-# --------------------------------------------------------------------------------------------
-# The estimators
-
 
 EstimatorSettings: TypeAlias = Annotated[
     DeadReckoningSettings
@@ -32,3 +25,11 @@ EstimatorSettings: TypeAlias = Annotated[
     | BatchSettings,
     Field(discriminator="kind"),
 ]
+
+
+def family_of(kind: str) -> Family:
+    """Whether estimators of a kind are filters, smoothers or neither."""
+    families: dict[str, Family] = {
+        settings.kind: settings.family for settings in get_args(get_args(EstimatorSettings)[0])
+    }
+    return families.get(kind, "other")

@@ -10,15 +10,13 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fgslam.backend.settings import family_of
 from fgslam.core.arrays import FloatArray
 from fgslam.evaluation.consistency import Consistency, Nees, judge
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, value_at
 from fgslam.evaluation.paired import MeanInterval, PairedTest, mean_interval, paired_test
 from fgslam.report.comparison_table import RESULT_COLUMNS, TIME_COLUMNS, write_comparison_csv
 from fgslam.report.metrics import write_metrics
-
-FILTERS = frozenset({"landmark_kalman", "landmark_kalman_graph", "ekf"})
-SMOOTHERS = frozenset({"fixed_lag", "isam2", "batch"})
 
 TrialRow: TypeAlias = tuple[int, dict[str, EstimatorMetrics], dict[str, dict[str, Nees]]]
 
@@ -187,8 +185,9 @@ def together(summary: TrialSummary, title: str) -> EstimatorMetrics:
 
 
 def _pairs(ate: Mapping[str, FloatArray], kinds: Mapping[str, str]) -> list[Pair]:
-    filters = [t for t, kind in kinds.items() if kind in FILTERS and np.isfinite(ate[t]).any()]
-    smoothers = [t for t, kind in kinds.items() if kind in SMOOTHERS]
+    families = {title: family_of(kind) for title, kind in kinds.items()}
+    filters = [t for t, f in families.items() if f == "filter" and np.isfinite(ate[t]).any()]
+    smoothers = [t for t, family in families.items() if family == "smoother"]
     if not filters:
         return []
     best = min(filters, key=lambda title: float(np.nanmean(ate[title])))

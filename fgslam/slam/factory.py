@@ -17,7 +17,7 @@ from fgslam.backend.filters.settings import (
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
 )
-from fgslam.backend.protocol import Estimator
+from fgslam.backend.protocol import Estimator, FullEstimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.core.errors import ConfigError
@@ -87,7 +87,7 @@ def make_estimator(
     settings: EstimatorSettings,
     ego_motion: EgoMotionSettings | None = None,
     prior: Prediction | None = None,
-) -> Estimator:
+) -> FullEstimator:
     """The estimator, at the prior pose; without one the world is the first camera frame, exactly.
 
     ``ego_motion`` are the front-end's settings: ``floor.mode: auto`` takes their degrees of freedom
@@ -95,48 +95,42 @@ def make_estimator(
     """
     prior = prior or Prediction(np.eye(4), np.zeros((6, 6)))
     ego_motion = ego_motion or EgoMotionSettings()
+    estimator: FullEstimator
     match settings:
         case DeadReckoningSettings():
             from fgslam.backend.filters.dead_reckoning import DeadReckoning
 
-            return DeadReckoning(rig, prior)
+            estimator = DeadReckoning(rig, prior)
         case LandmarkKalmanSettings():
             from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 
-            return LandmarkKalman(rig, settings, prior)
+            estimator = LandmarkKalman(rig, settings, prior)
         case LandmarkKalmanGraphSettings():
             from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
 
-            return LandmarkKalmanGraph(rig, settings, prior, ego_motion)
+            estimator = LandmarkKalmanGraph(rig, settings, prior, ego_motion)
         case EkfSettings():
             from fgslam.backend.filters.ekf import FullEkf
 
-            floor = make_floor(rig, settings.floor, ego_motion.dof)
-            return FullEkf(rig, settings, floor, prior)
-        case _:
-            floor = make_floor(rig, settings.floor, ego_motion.dof)
-            return _make_smoother(rig, settings, floor, prior)
-
-
-def _make_smoother(
-    rig: Sensor,
-    settings: FixedLagSettings | Isam2Settings | BatchSettings,
-    floor: Floor,
-    prior: Prediction,
-) -> Estimator:
-    match settings:
+            estimator = FullEkf(
+                rig, settings, make_floor(rig, settings.floor, ego_motion.dof), prior
+            )
         case FixedLagSettings():
             from fgslam.backend.smoothers.fixed_lag import fixed_lag_smoother
 
-            return fixed_lag_smoother(rig, settings, floor, prior)
+            floor = make_floor(rig, settings.floor, ego_motion.dof)
+            estimator = fixed_lag_smoother(rig, settings, floor, prior)
         case Isam2Settings():
             from fgslam.backend.smoothers.isam2 import isam2_smoother
 
-            return isam2_smoother(rig, settings, floor, prior)
+            floor = make_floor(rig, settings.floor, ego_motion.dof)
+            estimator = isam2_smoother(rig, settings, floor, prior)
         case BatchSettings():
             from fgslam.backend.smoothers.batch import batch_smoother
 
-            return batch_smoother(rig, settings, floor, prior)
+            floor = make_floor(rig, settings.floor, ego_motion.dof)
+            estimator = batch_smoother(rig, settings, floor, prior)
+    return estimator
 
 
 def make_floor(rig: Sensor, settings: FloorSettings, dof: DegreesOfFreedom) -> Floor:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.backend.common_settings import FloorSettings, NamedSettings
+from fgslam.backend.common_settings import Family, FloorSettings, NamedSettings
 from fgslam.core.settings import STRICT
 
 
@@ -60,6 +60,7 @@ class DeadReckoningSettings(NamedSettings):
 class LandmarkKalmanSettings(NamedSettings):
     """The paper's estimator: one 3x3 Kalman filter per landmark (Se et al. 4.1 and 6.4)."""
 
+    family: ClassVar[Family] = "filter"
     kind: Literal["landmark_kalman"] = "landmark_kalman"
     update: Annotated[
         Literal["pixel", "world", "running_mean", "half"],
@@ -88,6 +89,7 @@ class LandmarkKalmanSettings(NamedSettings):
 class LandmarkKalmanGraphSettings(NamedSettings):
     """The same estimator as factor graphs: equal to ``landmark_kalman`` up to rounding."""
 
+    family: ClassVar[Family] = "filter"
     kind: Literal["landmark_kalman_graph"] = "landmark_kalman_graph"
     update: Annotated[
         Literal["pixel", "world"],
@@ -102,6 +104,7 @@ class LandmarkKalmanGraphSettings(NamedSettings):
 class EkfSettings(NamedSettings):
     """Full stochastic mapping: one joint covariance of pose and landmarks, no relinearisation."""
 
+    family: ClassVar[Family] = "filter"
     kind: Literal["ekf"] = "ekf"
     floor: FloorSettings = FloorSettings()
     gate_sigmas: Annotated[

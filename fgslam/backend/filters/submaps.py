@@ -16,8 +16,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.backend.smoothers.graph_solution import poses_of_frame
-from fgslam.backend.smoothers.outliers import solver_parameters
+from fgslam.backend.graphs import poses_of_frame, solver_parameters
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.estimates import Prediction
 from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise, se3_log, skew

@@ -10,10 +10,18 @@ import numpy as np
 
 from fgslam.backend.common_settings import KernelSettings
 from fgslam.backend.filters.submaps import Constraint
+from fgslam.backend.graphs import poses_of_frame, solver_parameters
 from fgslam.backend.smoothers.graph_builder import NewFactors
-from fgslam.backend.smoothers.graph_solution import Solution, allowed_parts, poses_of_frame
+from fgslam.backend.smoothers.graph_solution import (
+    Solution,
+    allowed_parts,
+)
 from fgslam.backend.smoothers.loop_closing import GraphLoops, solved
-from fgslam.backend.smoothers.outliers import graduated, solver_parameters, trimmed, with_kernel
+from fgslam.backend.smoothers.outliers import (
+    graduated,
+    trimmed,
+    with_kernel,
+)
 from fgslam.backend.smoothers.refinement import Refined, WholeGraphAnswer, refine
 from fgslam.backend.smoothers.settings import BatchSettings
 from fgslam.backend.smoothers.smoother import GraphProblem, MapSmoother

@@ -14,14 +14,13 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.filters.submaps import Constraint, constraint_factor, nearest_positive
-from fgslam.backend.graphs import without_gaps
+from fgslam.backend.graphs import poses_of_frame, without_gaps
 from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.backend.smoothers.graph_solution import (
     Solution,
     allowed_joint,
     allowed_parts,
     points_of,
-    poses_of_frame,
     suspect,
 )
 from fgslam.backend.smoothers.loop_closing import misfit

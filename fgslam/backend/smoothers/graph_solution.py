@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from fgslam.backend.graphs import poses_of_frame
 from fgslam.backend.smoothers.marginals import marginals_of
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
@@ -112,11 +113,6 @@ def allowed_joint(floor: Floor, wTc: FloatArray, joint: FloatArray) -> FloatArra
     project = np.eye(len(joint))
     project[:6, :6] = basis @ basis.T
     return congruence(project, joint)
-
-
-def poses_of_frame(values: Any, frame: int) -> FloatArray:
-    """The pose (4, 4) of one frame."""
-    return np.asarray(values.atPose3(pose_key(frame)).matrix())
 
 
 def suspect(error: Exception) -> int | None:

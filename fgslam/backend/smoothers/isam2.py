@@ -8,15 +8,17 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.filters.submaps import Constraint
+from fgslam.backend.graphs import poses_of_frame, solver_parameters
 from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.backend.smoothers.graph_solution import (
     Solution,
     allowed_parts,
-    poses_of_frame,
     suspect,
 )
 from fgslam.backend.smoothers.loop_closing import GraphLoops
-from fgslam.backend.smoothers.outliers import solver_parameters, trimmed
+from fgslam.backend.smoothers.outliers import (
+    trimmed,
+)
 from fgslam.backend.smoothers.refinement import Refined, WholeGraphAnswer, refine
 from fgslam.backend.smoothers.segments import Segments
 from fgslam.backend.smoothers.settings import Isam2Settings

@@ -17,9 +17,8 @@ import numpy as np
 
 from fgslam.backend.filters.settings import LoopCorrectionSettings
 from fgslam.backend.filters.submaps import Chain, Constraint, changes, constraint_factor, corrected
+from fgslam.backend.graphs import poses_of_frame, solver_parameters
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
-from fgslam.backend.smoothers.graph_solution import poses_of_frame
-from fgslam.backend.smoothers.outliers import solver_parameters
 from fgslam.backend.smoothers.solver import Drive
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion

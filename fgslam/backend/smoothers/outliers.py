@@ -10,6 +10,7 @@ from typing import Any
 
 import gtsam
 
+from fgslam.backend.graphs import solver_parameters
 from fgslam.core.quantiles import chi_square_quantile
 from fgslam.factors.keys import is_pose, number
 
@@ -18,15 +19,6 @@ _KEPT = 0.5  # weights end at 0 or 1
 _ROUNDS = 10  # trims until the observations that fit do not change any more
 _QUICK_WIDTH = 3.0  # deviations, as the kernels' default
 _ROUGH = 1e-4  # of the cost: the minimum with the kernel only chooses what fits
-
-
-def solver_parameters(max_iterations: int, relative_tolerance: float) -> Any:
-    """Parameters of Levenberg-Marquardt that stop by the relative change of the cost alone."""
-    params = gtsam.LevenbergMarquardtParams()
-    params.setMaxIterations(max_iterations)
-    params.setRelativeErrorTol(relative_tolerance)
-    params.setAbsoluteErrorTol(0.0)
-    return params
 
 
 def graduated(graph: Any, values: Any, inner: Any, noise_factor: float = 1.0) -> tuple[Any, Any]:

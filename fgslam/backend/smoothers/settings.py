@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.backend.common_settings import FloorSettings, KernelSettings, NamedSettings
+from fgslam.backend.common_settings import Family, FloorSettings, KernelSettings, NamedSettings
 from fgslam.backend.filters.settings import LoopCorrectionSettings
 from fgslam.core.settings import STRICT
 
@@ -16,6 +16,7 @@ from fgslam.core.settings import STRICT
 class GraphSettings(NamedSettings):
     """What all smoothers share: how measurements become a graph that can be solved."""
 
+    family: ClassVar[Family] = "smoother"
     floor: FloorSettings = FloorSettings()
     kernel: KernelSettings = KernelSettings()
     noise_factor: Annotated[

@@ -21,11 +21,11 @@ import numpy as np
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.backend.filters.submaps import FREE, Constraint
-from fgslam.backend.inputs import RecordedInputs, require_finite
 from fgslam.backend.smoothers.between import fill_between
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.graph_solution import Solution
 from fgslam.backend.smoothers.loop_closing import carried_to
+from fgslam.backend.smoothers.recorded_inputs import RecordedInputs, require_finite
 from fgslam.backend.smoothers.segments import Segments, TrackedFrame
 from fgslam.backend.smoothers.settings import GraphSettings
 from fgslam.backend.smoothers.solver import Drive, GraphSolver, Smoothed

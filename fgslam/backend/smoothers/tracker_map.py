@@ -11,8 +11,11 @@ from typing import Any
 import numpy as np
 
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.graphs import poses_of_frame
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting
-from fgslam.backend.smoothers.graph_solution import Solution, poses_of_frame
+from fgslam.backend.smoothers.graph_solution import (
+    Solution,
+)
 from fgslam.backend.smoothers.solver import Smoothed
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction

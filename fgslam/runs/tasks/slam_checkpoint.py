@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from fgslam.backend.protocol import Estimator, Resumable
 from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import OutputError
@@ -24,7 +25,7 @@ def state_of(pipeline: SlamPipeline, recorder: RunRecorder) -> StateArrays:
     """All that changes during a run but its log, as arrays named ``part/name``."""
     parts = {
         "database": pipeline.tracker.database.state(),
-        "estimator": pipeline.estimator.state(),
+        "estimator": _resumable(pipeline.estimator).state(),
         "motion": pipeline.motion.state(),
         "recorder": recorder.state(),
     }
@@ -44,7 +45,7 @@ def restore(
         KeyError, ValueError, IndexError: the state is another's.
     """
     pipeline.tracker.database.restore(_part(state, "database"))
-    pipeline.estimator.restore(_part(state, "estimator"))
+    _resumable(pipeline.estimator).restore(_part(state, "estimator"))
     pipeline.motion.restore(_part(state, "motion"))
     recorder.restore(_part(state, "recorder"), log)
     if pipeline.places is not None:
@@ -92,6 +93,16 @@ def load(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
             f"{folder / LOG_FILE}: holds {len(log)} frames, the checkpoint {len(recorder)}; "
             "restore it, or start again with --overwrite"
         )
+
+
+def _resumable(estimator: Estimator) -> Resumable:
+    """The estimator, if its state can be kept. Raises OutputError where it cannot."""
+    if not isinstance(estimator, Resumable):
+        raise OutputError(
+            f"estimator {estimator.kind} has no state() and restore(): its run keeps no "
+            "checkpoint; give it both, or set output.checkpoint_seconds beyond the run's length"
+        )
+    return estimator
 
 
 def _part(state: StateArrays, part: str) -> StateArrays:

@@ -10,11 +10,11 @@ import pytest
 from smoothing import SMOOTHERS, answer, ate, build, drawn, run, wrong_matches
 
 from fgslam.backend.common_settings import KernelSettings
+from fgslam.backend.graphs import solver_parameters
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.backend.smoothers.outliers import (
     graduated,
     observed_variables,
-    solver_parameters,
     trimmed,
 )
 from fgslam.backend.smoothers.settings import BatchSettings
