@@ -4,7 +4,7 @@ PYTEST = .venv/bin/python -m pytest -n 2
 DEMO_OUT ?= runs/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check bench bench-long baseline clean
+.PHONY: help setup demo test test-all check docs bench bench-long baseline clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -31,6 +31,10 @@ check: setup ## linter, formatter and type checker; changes nothing
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
+
+docs: setup ## build the documentation into build/site; strict, without network
+	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict --quiet
+	.venv/bin/python -m scripts.check_site build/site
 
 bench: setup ## measure speed as ratios, write bench.json
 	.venv/bin/python -m benchmarks speed

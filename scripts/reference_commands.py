@@ -17,10 +17,9 @@ _INTRODUCTION = """# Command line
 _STATUS = """
 ## Exit status
 
-- 0: done.
-- 1: a baseline got worse (`compare --check-baseline`).
+- 0: done; of a comparison: at least one estimator finished.
+- 1: no estimator of a comparison finished, a trial failed, or a baseline got worse.
 - 2: a mistake in what was given: one line on standard error says what, where, and how to fix it.
-- 3: no estimator of a comparison finished.
 - 130: interrupted; the run folder holds everything computed so far.
 """
 
