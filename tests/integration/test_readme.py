@@ -1,0 +1,105 @@
+"""Every command and every line of Python in README.md runs, in the order in which it stands.
+
+The commands run in a copy of the checkout. One is replaced: `pip install .` would change the
+environment that runs the tests, so that it installs into a folder of its own, without dependencies
+and without downloading the build system. The fast test shortens the demo to its first frames, the
+slow one drives it whole.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+DEMO_SHORT = "fgslam run lab_loop --set dataset.stop=12 --set compare=[] --out runs/demo"
+
+
+def blocks(language: str) -> list[str]:
+    """Fenced blocks of one language, in order."""
+    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+
+
+def commands() -> list[str]:
+    """Lines of the shell blocks without their comments."""
+    lines = "".join(blocks("sh")).splitlines()
+    return [found for line in lines if (found := re.sub(r"\s+# .*", "", line).strip())]
+
+
+def run(command: list[str], folder: Path) -> None:
+    """Runs a command as a user would, with the tests' interpreter first on the path."""
+    paths = [str(Path(sys.executable).parent), os.environ["PATH"]]
+    environment = os.environ | {"PATH": os.pathsep.join(paths), "PYTHONPATH": str(folder)}
+    done = subprocess.run(  # noqa: S603  commands of the README
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, f"{shlex.join(command)}\n{done.stdout}\n{done.stderr}"
+
+
+def installed_elsewhere(folder: Path) -> list[str]:
+    """The installation into a folder of its own."""
+    target = ["--target", str(folder.parent / "installed"), "--no-deps", "--no-build-isolation"]
+    return [sys.executable, "-m", "pip", "install", "--quiet", *target, str(folder)]
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A copy of the checkout without what git ignores."""
+    left_out = shutil.ignore_patterns(".*", "build", "dist", "runs", "*.egg-info")
+    caches = shutil.ignore_patterns("__pycache__")
+
+    def ignore(folder: str, names: list[str]) -> set[str]:
+        return (left_out if Path(folder) == ROOT else caches)(folder, names)
+
+    return Path(shutil.copytree(ROOT, tmp_path / "checkout", ignore=ignore))
+
+
+def run_all(folder: Path, replaced: dict[str, list[str]]) -> None:
+    """All commands in order."""
+    for command in commands():
+        run(replaced.get(command, shlex.split(command)), folder)
+
+
+def test_readme_fits_a_screen_and_a_half() -> None:
+    assert len(README.splitlines()) <= 90
+    assert len(re.findall(r"!\[", README)) == 1
+    assert len(commands()) == 3
+
+
+def test_commands_run_in_order_with_a_short_demo(checkout: Path) -> None:
+    replaced = {
+        "pip install .": installed_elsewhere(checkout),
+        "fgslam demo": shlex.split(DEMO_SHORT),
+    }
+    assert set(replaced) <= set(commands())
+    run_all(checkout, replaced)
+    assert (checkout / "runs/demo/report.html").is_file()
+    assert (checkout / "runs/demo/compare/comparison.csv").is_file()
+    assert (checkout.parent / "installed/fgslam/py.typed").is_file()
+
+
+@pytest.mark.slow
+def test_commands_run_in_order(checkout: Path) -> None:
+    run_all(checkout, {"pip install .": installed_elsewhere(checkout)})
+    assert (checkout / "runs/demo/report.html").is_file()
+    assert (checkout / "runs/demo/compare/comparison.csv").is_file()
+
+
+def test_make_targets_that_the_documents_name_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = set(re.findall(r"^([a-z-]+):", makefile, flags=re.MULTILINE))
+    text = README + (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"\bmake ([a-z-]+)", text)) <= targets | {"test-all"}
+
+
+def test_links_of_the_readme_lead_to_files() -> None:
+    for target in re.findall(r"\]\(([^)#]+)\)", README):
+        assert (ROOT / target).is_file(), target
