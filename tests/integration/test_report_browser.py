@@ -58,7 +58,7 @@ def visible(browser: Browser, figure: str) -> list[str]:
 
 
 def switch(browser: Browser, selector: str) -> None:
-    """Clicks a control as a person would, and waits for the figures to follow."""
+    """Clicks a control as a person would; the figures follow."""
     box = browser.driver.find_element(By.CSS_SELECTOR, selector)
     browser.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", box)
     box.click()
@@ -161,15 +161,22 @@ def test_scales_are_linear_or_logarithmic(browser: Browser) -> None:
 
 
 def test_the_map_turns_by_mouse_and_stays_turned(browser: Browser) -> None:
-    eye = "document.getElementById('plot-map')._fullLayout.scene._scene.getCamera().eye"
+    scene_of = "document.getElementById('plot-map')._fullLayout.scene"
+    eye, saved = f"{scene_of}._scene.getCamera().eye", f"{scene_of}.camera.eye"
     before = browser.js(eye)
     scene = browser.driver.find_element(By.ID, "plot-map")
     browser.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", scene)
     drag = ActionChains(browser.driver).move_to_element_with_offset(scene, 40, 60).click_and_hold()
     drag.move_by_offset(120, 30).move_by_offset(80, 10).release().perform()
     browser.wait(f"Math.abs({eye}.x - ({before['x']})) > 0.05")
+    # Released, and come to rest: what is drawn is what the figure keeps.
+    browser.wait(f"['x', 'y', 'z'].every(k => Math.abs({eye}[k] - {saved}[k]) < 1e-9)")
     turned = browser.js(eye)
+    assert abs(turned["x"] - before["x"]) > 0.05
+    drawn = f"{DRAWN.format('map')}.filter(t => t.visible === true).length"
+    shown = browser.js(drawn)
     switch(browser, figure_switch("map", "truth"))
+    browser.wait(f"{drawn} !== {shown}")
     assert browser.js(eye) == pytest.approx(turned, abs=1e-6)
 
 
