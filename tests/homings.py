@@ -37,7 +37,7 @@ def trial(seed: int, settings: SimulatedBearingsSettings | None = None) -> Trial
     assert isinstance(vector, TwoViewVector), vector
     distance = make_local_map(vector, simulated.matches).distance
     rows = np.flatnonzero(vector.inliers & np.isfinite(distance) & (distance > 0.0))
-    matches = simulated.matches.taken(rows)
+    matches = simulated.matches.select(rows)
     start = HomingStart(simulated.time, vector, make_local_map(vector, matches), matches)
     tracks, truth = simulated.followed(rows)
     return Trial(start, tracks, truth, simulated.correct[rows])

@@ -8,6 +8,7 @@ from enum import Enum
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.rows import Rows
 from fgslam.core.trajectories import Trajectory
 
 __all__ = [
@@ -25,7 +26,7 @@ __all__ = [
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LandmarkMap:
+class LandmarkMap(Rows):
     """Landmark positions of an estimator, ids ascending.
 
     Attributes:
@@ -37,13 +38,6 @@ class LandmarkMap:
     ids: IntArray
     positions: FloatArray
     covariances: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def select(self, keep: BoolArray | IntArray) -> LandmarkMap:
-        """The chosen rows, ascending, as a new value."""
-        return LandmarkMap(self.ids[keep], self.positions[keep], self.covariances[keep])
 
     def without(self, ids: IntArray) -> LandmarkMap:
         """The map but for these landmarks, as a new value."""

@@ -9,10 +9,11 @@ import numpy.typing as npt
 
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray
 from fgslam.core.measurements import Observations
+from fgslam.core.rows import Rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Features:
+class Features(Rows):
     """SIFT features of one image.
 
     Attributes:
@@ -27,12 +28,9 @@ class Features:
     orientation: FloatArray
     descriptors: ByteArray
 
-    def __len__(self) -> int:
-        return len(self.scale)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StereoFeatures:
+class StereoFeatures(Rows):
     """Features matched over the rig: the paper's [r, c, s, o, d, X, Y, Z] (Se et al. 3).
 
     Attributes:
@@ -54,9 +52,6 @@ class StereoFeatures:
     position: FloatArray
     position_covariance: FloatArray
     pixels: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.scale)
 
     def observations(self, which: IntArray, ids: IntArray, is_new: bool) -> Observations:
         """Some of the features as observations of the landmarks ``ids``."""
@@ -88,7 +83,7 @@ Words = npt.NDArray[np.int16]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LandmarkAppearances:
+class LandmarkAppearances(Rows):
     """How landmarks look, one row a stored view; a landmark may have several (Se et al. 6.3).
 
     Attributes:
@@ -108,17 +103,6 @@ class LandmarkAppearances:
     direction: FloatArray
     words: Words | None = None
 
-    def __len__(self) -> int:
-        return len(self.ids)
-
     def of(self, ids: IntArray) -> LandmarkAppearances:
         """Only the views of the named landmarks (any order; unknown ones give none)."""
-        keep = np.isin(self.ids, ids)
-        return LandmarkAppearances(
-            self.ids[keep],
-            self.descriptors[keep],
-            self.size[keep],
-            self.orientation[keep],
-            self.direction[keep],
-            None if self.words is None else self.words[keep],
-        )
+        return self.select(np.isin(self.ids, ids))

@@ -17,6 +17,7 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
 from fgslam.core.planar import between, rotation, wrap
+from fgslam.core.rows import Rows
 
 
 def among(ids: IntArray, others: IntArray) -> BoolArray:
@@ -41,7 +42,7 @@ class FeatureKind(int, Enum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class UprightFeatures:
+class UprightFeatures(Rows):
     """Rotation-reduced colour SIFT features of one image (III-A1).
 
     Attributes:
@@ -61,12 +62,9 @@ class UprightFeatures:
     descriptors: ByteArray
     colour: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.bearing)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ColumnSegments:
+class ColumnSegments(Rows):
     """Invariant column segments of one image (III-A2).
 
     Attributes:
@@ -83,9 +81,6 @@ class ColumnSegments:
     sigma_tangents: FloatArray
     descriptors: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.bearing)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OmniFeatures:
@@ -96,7 +91,7 @@ class OmniFeatures:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BearingMatches:
+class BearingMatches(Rows):
     """Tentative or accepted correspondences of two views; ``a`` is the present, ``b`` the target.
 
     Attributes:
@@ -116,23 +111,6 @@ class BearingMatches:
     elevation_b: FloatArray
     sigma: FloatArray
     quality: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.kind)
-
-    def taken(self, which: BoolArray | IntArray) -> BearingMatches:
-        """Those matches alone."""
-        return BearingMatches(
-            self.kind[which],
-            self.index_a[which],
-            self.index_b[which],
-            self.bearing_a[which],
-            self.elevation_a[which],
-            self.bearing_b[which],
-            self.elevation_b[which],
-            self.sigma[which],
-            self.quality[which],
-        )
 
 
 # --------------------------------------------------------------------------------------------
@@ -200,7 +178,7 @@ class Refusal:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LocalMap:
+class LocalMap(Rows):
     """Features triangulated from start and target, polar around the start (III-C, fig. 4).
 
     Attributes:
@@ -213,9 +191,6 @@ class LocalMap:
     bearing: FloatArray
     distance: FloatArray
     covariance: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.ids)
 
     def points(self) -> FloatArray:
         """(n, 2) positions in the start frame, legs."""
@@ -246,7 +221,7 @@ class HomingStart:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TrackedBearings:
+class TrackedBearings(Rows):
     """What one image on the way says: eq. 6. A feature that is absent is lost for good.
 
     Attributes:
@@ -258,26 +233,14 @@ class TrackedBearings:
         sigma_elevation: (m,), NaN likewise.
     """
 
+    SHARED = frozenset({"time"})
+
     time: float
     ids: IntArray
     bearing: FloatArray
     sigma_bearing: FloatArray
     elevation: FloatArray
     sigma_elevation: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def taken(self, which: BoolArray | IntArray) -> TrackedBearings:
-        """Those features alone."""
-        return TrackedBearings(
-            self.time,
-            self.ids[which],
-            self.bearing[which],
-            self.sigma_bearing[which],
-            self.elevation[which],
-            self.sigma_elevation[which],
-        )
 
     def renumbered(self, ids: IntArray) -> TrackedBearings:
         """The same bearings under other identities (m,), ascending too."""

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-import numpy as np
-
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.rows import Rows
 
 
 class MeasurementType(str, Enum):
@@ -36,7 +35,7 @@ class Odometry:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Observations:
+class Observations(Rows):
     """Landmark observations of one frame, with their identity.
 
     Attributes:
@@ -53,29 +52,6 @@ class Observations:
     covariance: FloatArray
     pixels: FloatArray
     is_new: BoolArray
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def select(self, keep: BoolArray | IntArray) -> Observations:
-        """The chosen rows, as a new value."""
-        return Observations(
-            self.ids[keep],
-            self.measurement[keep],
-            self.covariance[keep],
-            self.pixels[keep],
-            self.is_new[keep],
-        )
-
-    def join(self, other: Observations) -> Observations:
-        """Both, one after the other."""
-        return Observations(
-            np.concatenate([self.ids, other.ids]),
-            np.concatenate([self.measurement, other.measurement]),
-            np.concatenate([self.covariance, other.covariance]),
-            np.concatenate([self.pixels, other.pixels]),
-            np.concatenate([self.is_new, other.is_new]),
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

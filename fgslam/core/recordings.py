@@ -9,6 +9,7 @@ from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.estimates import Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
+from fgslam.core.rows import Rows
 from fgslam.core.sensors import CameraRig
 
 
@@ -73,7 +74,7 @@ class Sequence(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class LandmarkTruth:
+class LandmarkTruth(Rows):
     """True landmark positions, in the frame of the ground-truth trajectory.
 
     Attributes:
@@ -83,9 +84,6 @@ class LandmarkTruth:
 
     ids: IntArray
     positions: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.ids)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.geometry import inverse
 from fgslam.core.quantiles import chi_square_quantile
+from fgslam.core.rows import Rows
 from fgslam.evaluation.consistency import pose_nees
 from fgslam.evaluation.trajectory import rotation_angles
 
@@ -33,7 +34,7 @@ class Bounds:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Answers:
+class Answers(Rows):
     """What was asked and answered, row by row.
 
     Attributes:
@@ -51,20 +52,6 @@ class Answers:
     truth: FloatArray
     visible: IntArray
     familiar: IntArray
-
-    def __len__(self) -> int:
-        return len(self.accepted)
-
-    def select(self, keep: BoolArray) -> Answers:
-        """The chosen rows."""
-        return Answers(
-            self.accepted[keep],
-            self.poses[keep],
-            self.covariances[keep],
-            self.truth[keep],
-            self.visible[keep],
-            self.familiar[keep],
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,7 +25,7 @@ from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.frontend.homing.bearing_tracking import BearingTracker
 from fgslam.frontend.homing.local_map import make_local_map, triangulable
-from fgslam.frontend.homing.matching import joined, match_features
+from fgslam.frontend.homing.matching import match_features
 from fgslam.frontend.homing.ransac import estimate_homing_vector, paired_anew
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.trackable_points import move_to_trackable
@@ -103,7 +103,7 @@ class ImageFrontEnd:
         if isinstance(answer, Refusal):
             return answer
         _, matches, vector = answer
-        return Sighting(vector, parallax(matches.taken(vector.inliers), vector.rotation))
+        return Sighting(vector, parallax(matches.select(vector.inliers), vector.rotation))
 
     def track(self, image: ByteArray, time: float) -> TrackedBearings:
         """The features in the next image. Raises as :meth:`BearingTracker.track`."""
@@ -146,13 +146,13 @@ class ImageFrontEnd:
         _, pixels, points = move_to_trackable(
             stabilised.grey(image),
             stabilised.view,
-            matches.taken(vector.inliers),
+            matches.select(vector.inliers),
             features,
             self._settings.tracking,
         )
         known = np.flatnonzero(triangulable(make_local_map(vector, points), _MAX_RELATIVE_SIGMA))
-        known = known[surest_all_around(points.taken(known), self._settings.tracking.max_points)]
-        points, pixels = points.taken(known), pixels[known]
+        known = known[surest_all_around(points.select(known), self._settings.tracking.max_points)]
+        points, pixels = points.select(known), pixels[known]
         least = self._settings.homing_vector.min_inliers
         if len(points) < least:
             return Refusal(
@@ -206,7 +206,7 @@ def mixed_with_wrong(
     if not first:
         return matches
     wrong = paired_anew(matches, np.concatenate(first), np.concatenate(second))
-    return joined(matches, wrong)
+    return matches.join(wrong)
 
 
 def unusable(image: ByteArray, present: OmniFeatures) -> Refusal | None:

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
 from fgslam.core.atomic_files import write_bytes
 from fgslam.core.errors import DatasetError, OutputError
+from fgslam.core.rows import Rows
 
 Records: TypeAlias = npt.NDArray[np.void]
 
@@ -68,7 +69,7 @@ _PLY_COMMENTS = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MapPoints:
+class MapPoints(Rows):
     """The landmarks of a run, as they are handed to other tools; one row each.
 
     Attributes:
@@ -105,22 +106,6 @@ class MapPoints:
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}, not {shape}")
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def select(self, keep: BoolArray | IntArray) -> MapPoints:
-        """The chosen rows, as a new value."""
-        return MapPoints(
-            self.ids[keep],
-            self.positions[keep],
-            self.covariances[keep],
-            self.colours[keep],
-            self.hits[keep],
-            self.misses[keep],
-            self.valid[keep],
-            self.permanent[keep],
-        )
 
 
 def write_map(path: Path, points: MapPoints, remark: str = "") -> None:

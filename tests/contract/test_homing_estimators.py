@@ -123,7 +123,7 @@ def test_lost_features_leave_for_good(case: Trial, settings: HomingEstimatorSett
     estimator = started(case, settings, 2)
     image = case.tracks[2]
     kept = image.ids[::2]
-    estimator.update(image.taken(np.isin(image.ids, kept)))
+    estimator.update(image.select(np.isin(image.ids, kept)))
     left = estimator.estimate().ids
     assert len(left) > 5
     assert np.isin(left, kept).all()
@@ -181,6 +181,6 @@ def test_features_without_elevations_are_estimated_by_their_bearings(
 
 
 def test_start_must_fit_together(case: Trial) -> None:
-    start = replace(case.start, matches=case.start.matches.taken(np.arange(3)))
+    start = replace(case.start, matches=case.start.matches.select(np.arange(3)))
     with pytest.raises(EstimatorError, match="3 matches for"):
         make_homing_estimator(start, HomingEkfSettings())

@@ -50,7 +50,7 @@ class Leg:
             stabilised.grey(self.images[0]), stabilised.view, matches, features, SETTINGS
         )
         found = self.world.camera.pixels(stabilised.view.rays(pixels))
-        return matches.taken(rows), moved, pixels, self.world.points(self.poses[0], found)
+        return matches.select(rows), moved, pixels, self.world.points(self.poses[0], found)
 
     def angles(self, pose: FloatArray, points: FloatArray) -> FloatArray:
         """(n, 2) true bearing and elevation of points (n, 3)."""

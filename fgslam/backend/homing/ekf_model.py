@@ -101,7 +101,7 @@ def _joint_covariance(start: HomingStart, kept: BoolArray, exact: bool) -> Float
     All distances hang on the same direction and rotation of the target, and each on its own pair
     of bearings; the target's are thereby used, once.
     """
-    vector, matches = start.vector, start.matches.taken(kept)
+    vector, matches = start.vector, start.matches.select(kept)
     n = len(matches)
     _, by = triangulated((vector.direction, vector.rotation), matches.bearing_a, matches.bearing_b)
     root = np.zeros((3 + 2 * n, 2 + 2 * n))  # by (theta, psi; delta_i; delta'_i)

@@ -36,4 +36,4 @@ def open_omni_path(settings: OmniPathSettings) -> OmniRecording:
         notes=(),
         load_image=lambda i: read_colour_image(paths[i]),
     )
-    return recording.taken(chosen)
+    return recording.select(chosen)

@@ -76,7 +76,7 @@ def open_panoramas(settings: PanoramasSettings) -> OmniRecording:
         + (() if places is None else _unlisted(root, paths)),
         load_image=_loader(paths, size, reduced),
     )
-    return recording.taken(chosen)
+    return recording.select(chosen)
 
 
 def _pictures_folder(root: Path) -> Path:

@@ -71,7 +71,7 @@ class OmniRecording:
             )
         return image
 
-    def taken(self, chosen: IntArray) -> OmniRecording:
+    def select(self, chosen: IntArray) -> OmniRecording:
         """Those pictures alone, in that order."""
         places = [int(i) for i in chosen]
         load = self.load_image

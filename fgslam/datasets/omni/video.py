@@ -44,7 +44,7 @@ def open_omni_video(settings: OmniVideoSettings) -> OmniRecording:
         notes=(),
         load_image=frames.load,
     )
-    return recording.taken(chosen)
+    return recording.select(chosen)
 
 
 class VideoFrames:

@@ -22,6 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.homing import ColumnSegments
+from fgslam.core.rows import Rows
 from fgslam.frontend.features.colour_moments import colour_from_means, moment_images
 from fgslam.frontend.features.colour_sift import inner_part, wrapping_period
 from fgslam.frontend.features.omni_settings import ColourMomentSettings, ColumnSegmentSettings
@@ -43,18 +44,12 @@ def dct_rows(samples: int = PROFILE_SAMPLES, count: int = COEFFICIENTS) -> Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Raw:
+class _Raw(Rows):
     """Segments of single columns: column, row of upper and lower end (sub-pixel)."""
 
     column: IntArray
     top: FloatArray
     bottom: FloatArray
-
-    def taken(self, which: IntArray | npt.NDArray[np.bool_]) -> _Raw:
-        return _Raw(self.column[which], self.top[which], self.bottom[which])
-
-    def __len__(self) -> int:
-        return len(self.column)
 
 
 class ColumnSegmentFinder:
@@ -88,9 +83,9 @@ class ColumnSegmentFinder:
         sums = _ColumnSums(image, self._colour)
         means, contrast = sums.means(raw.column, raw.top, raw.bottom)
         keep = contrast >= self._settings.min_contrast
-        raw, means = raw.taken(keep), means[keep]
+        raw, means = raw.select(keep), means[keep]
         chosen, width = self._representatives(raw)
-        return self._described(raw.taken(chosen), means[chosen], width, sums)
+        return self._described(raw.select(chosen), means[chosen], width, sums)
 
     def _segments(self, image: Image) -> _Raw:
         """Between consecutive maxima of the colour gradient along each column."""

@@ -64,7 +64,7 @@ class BearingTracker:
         if self._last is None or self._patches is None:
             raise EstimatorError("no image was tracked yet: start before adding points")
         places = self.stabilised.to_stabilised(pixels, self._last)
-        self._patches = self._patches.joined(self._anchored(self._last, places))
+        self._patches = self._patches.join(self._anchored(self._last, places))
         self._places = np.vstack([self._places, places])
         self._ids = np.concatenate([self._ids, ids])
 
@@ -85,7 +85,7 @@ class BearingTracker:
         now = self.stabilised.make(image, self._last, turn)
         if len(self._ids):
             places, kept = self._follow(self._last, now)
-            self._settle(now, places[kept], self._ids[kept], self._patches.taken(kept))
+            self._settle(now, places[kept], self._ids[kept], self._patches.select(kept))
         self._last, self._time = now, time
         return self._bearings(time)
 
@@ -112,7 +112,7 @@ class BearingTracker:
         kept = (correlation >= s.min_correlation) & (patches.deformation() <= s.max_deformation)
         kept &= self._inside(places)
         self._places, self._ids = self._centred(places[kept]), ids[kept]
-        self._patches = patches.taken(kept)
+        self._patches = patches.select(kept)
 
     def _centred(self, places: FloatArray) -> FloatArray:
         """Places between the margins; who crossed the seam goes on at the other end."""

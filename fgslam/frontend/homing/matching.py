@@ -43,22 +43,7 @@ def match_features(
         settings: thresholds.
     """
     sift = match_sift(a.sift, b.sift, settings)
-    return joined(sift, match_columns(a.columns, b.columns, settings))
-
-
-def joined(first: BearingMatches, second: BearingMatches) -> BearingMatches:
-    """Both lists, one after the other."""
-    return BearingMatches(
-        np.concatenate([first.kind, second.kind]),
-        np.concatenate([first.index_a, second.index_a]),
-        np.concatenate([first.index_b, second.index_b]),
-        np.concatenate([first.bearing_a, second.bearing_a]),
-        np.concatenate([first.elevation_a, second.elevation_a]),
-        np.concatenate([first.bearing_b, second.bearing_b]),
-        np.concatenate([first.elevation_b, second.elevation_b]),
-        np.concatenate([first.sigma, second.sigma]),
-        np.concatenate([first.quality, second.quality]),
-    )
+    return sift.join(match_columns(a.columns, b.columns, settings))
 
 
 # --------------------------------------------------------------------------------------------

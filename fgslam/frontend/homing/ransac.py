@@ -364,7 +364,7 @@ def _cells(matches: BearingMatches) -> IntArray:
 
 def paired_anew(matches: BearingMatches, first: IntArray, second: IntArray) -> BearingMatches:
     """(m) features of the first view, of matches (m,), each with one of the second view."""
-    a, b = matches.taken(first), matches.taken(second)
+    a, b = matches.select(first), matches.select(second)
     return BearingMatches(
         a.kind, a.index_a, b.index_b, a.bearing_a, a.elevation_a, b.bearing_b, b.elevation_b,
         np.column_stack([a.sigma[:, :2], b.sigma[:, 2:]]), a.quality,

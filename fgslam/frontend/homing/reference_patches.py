@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import BoolArray, FloatArray, Image
+from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
+from fgslam.core.rows import Rows
 
 Float32 = npt.NDArray[np.float32]
 
@@ -28,7 +29,7 @@ _FARTHEST_PX = 4.0  # of one alignment; the tracker was closer than this, or els
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ReferencePatches:
+class ReferencePatches(Rows):
     """Patches of n points, m pixels each.
 
     Attributes:
@@ -40,6 +41,8 @@ class ReferencePatches:
         maps: (n, 2, 2) from the first patch to the present one.
     """
 
+    SHARED = frozenset({"size"})
+
     size: int
     first: Float32
     light: Float32
@@ -47,32 +50,11 @@ class ReferencePatches:
     contrast: FloatArray
     maps: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.maps)
-
-    def taken(self, which: BoolArray) -> ReferencePatches:
-        """Those alone."""
-        if which.all():
+    def select(self, keep: BoolArray | IntArray) -> ReferencePatches:
+        """The chosen patches; none are copied where all are wanted."""
+        if keep.dtype == np.bool_ and keep.all():
             return self
-        return ReferencePatches(
-            self.size,
-            self.first[which],
-            self.light[which],
-            self.step[which],
-            self.contrast[which],
-            self.maps[which],
-        )
-
-    def joined(self, others: ReferencePatches) -> ReferencePatches:
-        """These, then others of the same size."""
-        return ReferencePatches(
-            self.size,
-            np.concatenate([self.first, others.first]),
-            np.concatenate([self.light, others.light]),
-            np.concatenate([self.step, others.step]),
-            np.concatenate([self.contrast, others.contrast]),
-            np.concatenate([self.maps, others.maps]),
-        )
+        return Rows.select(self, keep)
 
     def deformation(self) -> FloatArray:
         """(n,) Frobenius norm of how far each map is from none."""

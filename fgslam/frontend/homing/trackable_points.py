@@ -55,7 +55,7 @@ def move_to_trackable(
     moved = _moved(matches, points - centres, ratio, view, settings)
     chosen = points[rows]
     chosen[:, 0] %= view.width - 1
-    return rows, chosen, moved.taken(rows)
+    return rows, chosen, moved.select(rows)
 
 
 def _search_radius(

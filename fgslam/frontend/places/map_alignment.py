@@ -22,6 +22,7 @@ from fgslam.core.geometry import (
     so3_log,
     transform_to_world,
 )
+from fgslam.core.rows import Rows
 from fgslam.core.saved_map import SavedMap
 from fgslam.frontend.places.relocalisation.alignment import align_in_space
 from fgslam.frontend.places.relocalisation.appearance_index import AppearanceIndex
@@ -149,7 +150,7 @@ def _nearest_of_each(rows: IntArray, owners: IntArray, distances: FloatArray) ->
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Points:
+class _Points(Rows):
     """Matched landmarks: positions (n, 3) and covariances (n, 3, 3) in both maps' worlds."""
 
     a: FloatArray
@@ -167,9 +168,6 @@ class _Points:
             a.landmarks.covariances[mine] + slack,
             b.landmarks.covariances[yours],
         )
-
-    def select(self, keep: BoolArray) -> _Points:
-        return _Points(self.a[keep], self.b[keep], self.a_covariance[keep], self.b_covariance[keep])
 
     def residuals(self, aTb: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Differences (n, 3) in a's world, and the inverse of their covariances (n, 3, 3)."""

@@ -34,6 +34,7 @@ from fgslam.core.geometry import (
     transform_to_camera,
 )
 from fgslam.core.measurements import Observations
+from fgslam.core.rows import Rows
 from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 
@@ -46,7 +47,7 @@ _LEAST_CURVATURE = 1e-10  # of the Hessian with unit diagonal; below it the pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PoseProblem:
+class PoseProblem(Rows):
     """Matches of one frame: landmark positions and covariances, measurements and theirs.
 
     Attributes:
@@ -60,9 +61,6 @@ class PoseProblem:
     point_covariances: FloatArray
     measurement: FloatArray
     measurement_covariance: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.points)
 
     @staticmethod
     def of(landmarks: LandmarkMap, observed: Observations) -> PoseProblem:
@@ -80,15 +78,6 @@ class PoseProblem:
         """No match at all."""
         vectors, matrices = np.empty((0, 3)), np.empty((0, 3, 3))
         return PoseProblem(vectors, matrices, vectors, matrices)
-
-    def select(self, keep: BoolArray) -> PoseProblem:
-        """The chosen matches."""
-        return PoseProblem(
-            self.points[keep],
-            self.point_covariances[keep],
-            self.measurement[keep],
-            self.measurement_covariance[keep],
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
 from fgslam.core.features import StereoFeatures, Words
+from fgslam.core.rows import Rows
 from fgslam.frontend.features.vocabulary import words_of
 
 Places = npt.NDArray[np.int32]
@@ -29,7 +30,7 @@ _UNKNOWN = -1  # word of a view for which nobody has asked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Views:
+class Views(Rows):
     """Views, one a row.
 
     Attributes:
@@ -46,9 +47,6 @@ class Views:
     direction: Directions
     used: IntArray
 
-    def __len__(self) -> int:
-        return len(self.size)
-
     @staticmethod
     def of(
         features: StereoFeatures, which: IntArray, directions: FloatArray | None, frame: int
@@ -62,16 +60,6 @@ class Views:
             descriptors=features.descriptors[which],
             direction=directions.astype(np.float32),
             used=np.full(len(which), frame),
-        )
-
-    def select(self, rows: IntArray | BoolArray) -> Views:
-        """The chosen rows."""
-        return Views(
-            self.size[rows],
-            self.orientation[rows],
-            self.descriptors[rows],
-            self.direction[rows],
-            self.used[rows],
         )
 
 

@@ -18,6 +18,7 @@ from fgslam.core.geometry import (
     rotate_covariances,
     transform_to_camera,
 )
+from fgslam.core.rows import Rows
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.tracking.settings import DatabaseSettings
 
@@ -56,7 +57,7 @@ class ExpectedLandmarks:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class InView:
+class InView(Rows):
     """Points that may be in view.
 
     Attributes:
@@ -70,12 +71,6 @@ class InView:
     points: FloatArray
     measurement: FloatArray
     certain: BoolArray
-
-    def select(self, keep: BoolArray) -> InView:
-        """Only some of them."""
-        return InView(
-            self.rows[keep], self.points[keep], self.measurement[keep], self.certain[keep]
-        )
 
 
 class FieldOfView:

@@ -51,9 +51,9 @@ def draw_pair(folder: Path, views: Views, search: PairSearch, answer: PairAnswer
     a, b = views.names[answer.a], views.names[answer.b]
     vector = found.found
     kept = (
-        matches.taken(vector.inliers)
+        matches.select(vector.inliers)
         if isinstance(vector, TwoViewVector)
-        else matches.taken(np.zeros(len(matches), np.bool_))
+        else matches.select(np.zeros(len(matches), np.bool_))
     )
     camera = views.recording.camera
     pixels = MatchedPixels(

@@ -107,7 +107,7 @@ def search_of(search: PairSearch, pairs: Sequence[tuple[int, int]]) -> PairSearc
 def _inlier_rows(found: TwoViewVector | Refusal, matches: BearingMatches) -> IntArray | None:
     if isinstance(found, Refusal):
         return None
-    kept = matches.taken(found.inliers & (matches.kind == FeatureKind.SIFT))
+    kept = matches.select(found.inliers & (matches.kind == FeatureKind.SIFT))
     return np.column_stack([kept.index_a, kept.index_b])
 
 

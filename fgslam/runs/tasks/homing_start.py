@@ -29,6 +29,6 @@ def start_from_matches(
     if isinstance(vector, Refusal):
         return vector
     rows = np.flatnonzero(vector.inliers)
-    kept = matches.taken(rows)
+    kept = matches.select(rows)
     of_kept = dataclasses.replace(vector, inliers=np.ones(len(rows), np.bool_))
     return HomingStart(time, of_kept, make_local_map(of_kept, kept), kept), rows

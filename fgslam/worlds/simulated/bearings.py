@@ -49,7 +49,7 @@ class SimulatedHoming:
         number[rows] = np.arange(len(rows))
         tracks = []
         for image in self.tracks:
-            kept = image.taken(number[image.ids] >= 0)
+            kept = image.select(number[image.ids] >= 0)
             tracks.append(kept.renumbered(number[kept.ids]))
         truth = HomingTruth(self.truth.target, self.truth.robots, self.truth.landmarks[rows])
         return tuple(tracks), truth
@@ -235,4 +235,4 @@ class _Tracks:
             elevation=elevation,
             sigma_elevation=np.where(np.isnan(elevation), np.nan, tall),
         )
-        return everything.taken(alive)
+        return everything.select(alive)

@@ -27,7 +27,7 @@ def test_share_of_wrong_matches_is_as_asked_and_none_is_right() -> None:
     kinds = np.where(np.arange(70) < 40, int(FeatureKind.SIFT), int(FeatureKind.COLUMN))
     matches = dataclasses.replace(views.matches, kind=kinds)
     mixed = mixed_with_wrong(matches, 0.3, np.random.default_rng(1))
-    added = mixed.taken(np.arange(70, len(mixed)))
+    added = mixed.select(np.arange(70, len(mixed)))
     assert len(added) / len(mixed) == pytest.approx(0.3, abs=0.01)
     assert not np.any(added.index_a == added.index_b)
     of_b = dict(zip(matches.index_b.tolist(), matches.kind.tolist(), strict=True))

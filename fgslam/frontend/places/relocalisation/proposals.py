@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.rows import Rows
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.places.relocalisation.residuals import Pairs, log_likelihoods, residuals
 from fgslam.frontend.places.relocalisation.tentative import Tentative
@@ -15,27 +16,16 @@ _AT_ONCE = 40_000  # residuals computed together; a few megabytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Proposals:
+class Proposals(Rows):
     """Poses (h, 4, 4), covariances (h, 6, 6) and scores (h,), best first."""
 
     poses: FloatArray
     covariances: FloatArray
     scores: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.scores)
-
-    def select(self, rows: IntArray) -> Proposals:
-        """The chosen ones, in the order given."""
-        return Proposals(self.poses[rows], self.covariances[rows], self.scores[rows])
-
     def join(self, other: Proposals) -> Proposals:
         """Both, best first."""
-        joined = Proposals(
-            np.concatenate([self.poses, other.poses]),
-            np.concatenate([self.covariances, other.covariances]),
-            np.concatenate([self.scores, other.scores]),
-        )
+        joined = Rows.join(self, other)
         return joined.select(np.argsort(-joined.scores, kind="stable"))
 
     @staticmethod

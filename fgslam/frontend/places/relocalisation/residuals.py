@@ -16,6 +16,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import inverse_spd3, point_pose_jacobian, project, projection_jacobian
+from fgslam.core.rows import Rows
 from fgslam.core.sensors import CameraRig
 
 _NEAREST_DEPTH_M = 0.1
@@ -23,7 +24,7 @@ _LOG_TWO_PI = float(np.log(2.0 * np.pi))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SeenPoints:
+class SeenPoints(Rows):
     """Features as they are compared with landmarks.
 
     Attributes:
@@ -39,9 +40,6 @@ class SeenPoints:
     covariance: FloatArray
     position: FloatArray
     position_covariance: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.in_image)
 
     @staticmethod
     def of(features: StereoFeatures, rig: CameraRig, view_sigma_px: float = 0.0) -> SeenPoints:
@@ -67,19 +65,9 @@ class SeenPoints:
             position_covariance=features.position_covariance,
         )
 
-    def select(self, rows: IntArray) -> SeenPoints:
-        """The chosen rows."""
-        return SeenPoints(
-            self.in_image[rows],
-            self.value[rows],
-            self.covariance[rows],
-            self.position[rows],
-            self.position_covariance[rows],
-        )
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pairs:
+class Pairs(Rows):
     """Features matched with landmarks, row by row.
 
     Attributes:
@@ -92,17 +80,10 @@ class Pairs:
     points: FloatArray
     point_covariances: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.points)
-
     @staticmethod
     def of(seen: SeenPoints, features: IntArray, landmarks: LandmarkMap, rows: IntArray) -> Pairs:
         """Features (k,) by index with landmarks (k,) by row of the map."""
         return Pairs(seen.select(features), landmarks.positions[rows], landmarks.covariances[rows])
-
-    def select(self, rows: IntArray) -> Pairs:
-        """The chosen rows."""
-        return Pairs(self.seen.select(rows), self.points[rows], self.point_covariances[rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

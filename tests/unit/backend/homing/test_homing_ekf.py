@@ -106,7 +106,7 @@ def test_gate_keeps_gross_bearings_out() -> None:
     for image in case.tracks[:20]:
         bearing = image.bearing.copy()
         bearing[3] = wrap(bearing[3] + 2.0)
-        clean.update(image.taken(np.arange(len(image)) != 3))
+        clean.update(image.select(np.arange(len(image)) != 3))
         wrong = replace(image, bearing=bearing)
         gross.update(wrong)
         naive.update(wrong)
@@ -127,7 +127,7 @@ def round_start(
     angle = 2.0 * np.pi * (np.arange(n) + 0.3) / n
     points = 20.0 * np.column_stack([np.cos(angle), np.sin(angle)])
     matches = replace(
-        case.start.matches.taken(np.zeros(n, np.int64)),
+        case.start.matches.select(np.zeros(n, np.int64)),
         bearing_a=bearings(np.zeros(3), points),
         bearing_b=bearings(target, points),
     )

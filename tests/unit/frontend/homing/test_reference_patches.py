@@ -64,11 +64,11 @@ def test_something_else_does_not_correlate() -> None:
 
 def test_taken_joined_and_none() -> None:
     patches = anchor(GREY, PLACES, 13, 4.0, 0.05)
-    some = patches.taken(np.array([True, False, True, False]))
-    both = some.joined(patches.taken(np.array([False, True, False, True])))
+    some = patches.select(np.array([True, False, True, False]))
+    both = some.join(patches.select(np.array([False, True, False, True])))
     assert len(both) == 4
     np.testing.assert_array_equal(both.first, patches.first[[0, 2, 1, 3]])
     none = anchor(GREY, np.empty((0, 2)), 13, 4.0, 0.05)
     aligned, places, correlation = align(none, GREY, np.empty((0, 2)))
     assert len(aligned) == len(places) == len(correlation) == 0
-    assert len(none.joined(some)) == 2
+    assert len(none.join(some)) == 2

@@ -149,7 +149,7 @@ def test_nothing_to_track() -> None:
     matches, features = two_views(wall_points(30, 4))
     rows, pixels, moved = move_to_trackable(grey, CAMERA, matches, features, SETTINGS)
     assert len(rows) == len(pixels) == len(moved) == 0
-    none = matches.taken(np.empty(0, dtype=np.int64))
+    none = matches.select(np.empty(0, dtype=np.int64))
     rows, pixels, moved = move_to_trackable(grey, CAMERA, none, features, SETTINGS)
     assert rows.shape == (0,)
     assert pixels.shape == (0, 2)
