@@ -5,14 +5,16 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeAlias
+from typing import Protocol
+
+import numpy as np
 
 from fgslam.core.arrays import Image
-from fgslam.core.errors import FrameError
+from fgslam.core.errors import ConfigError, FrameError
 from fgslam.core.features import Features
 from fgslam.core.recordings import Frame, Sequence
 
@@ -42,8 +44,22 @@ class FeatureFrame:
     sift_ms: float
 
 
-FeatureExtractor: TypeAlias = Callable[[Image], Features]
-"""Features of a grey image (height, width); called from several threads at once."""
+class FeatureExtractor(Protocol):
+    """Finds the features of an image: an extension point, any callable of this form will do.
+
+    It is called from several threads at once, and must give the same features for the same image.
+    """
+
+    def __call__(self, image: Image, /) -> Features:
+        """Features of a grey image (height, width), uint8.
+
+        Returns:
+            n features: ``xy`` (n, 2) (column, row) in pixels, ``scale`` (n,) in pixels,
+            ``orientation`` (n,) in radians from x axis to y axis, in [0, 2 pi), ``descriptors``
+            (n, 128) uint8. Matching compares Euclidean distances of descriptors whose norm is about
+            512, as SIFT's is; shorter ones are padded with zeros.
+        """
+        ...
 
 
 class FrameDescriber:
@@ -119,7 +135,29 @@ class FeatureStream:
 
 def _timed(extract: FeatureExtractor, image: Image) -> tuple[Features, float]:
     start = time.perf_counter()
-    return extract(image), 1e3 * (time.perf_counter() - start)
+    return _checked(extract(image)), 1e3 * (time.perf_counter() - start)
+
+
+def _checked(found: Features) -> Features:
+    """What an extractor gave, if everything later can use it; raises ConfigError."""
+    if not isinstance(found, Features):
+        raise ConfigError(
+            f"features: the extractor returned {type(found).__name__}; return fgslam.Features"
+        )
+    n = len(found.scale)
+    shapes = {"xy": (n, 2), "scale": (n,), "orientation": (n,), "descriptors": (n, 128)}
+    for name, shape in shapes.items():
+        if np.shape(getattr(found, name)) != shape:
+            raise ConfigError(
+                f"features: {name} has shape {np.shape(getattr(found, name))}, not {shape}; {n} "
+                "features were found (pad shorter descriptors with zeros)"
+            )
+    if found.descriptors.dtype != np.uint8:
+        raise ConfigError(
+            f"features: descriptors are {found.descriptors.dtype}; give uint8, scaled as SIFT's to "
+            "a norm of about 512"
+        )
+    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)

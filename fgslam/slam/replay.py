@@ -99,7 +99,7 @@ class Replay:
 @one_blas_thread()
 def replay(
     log: MeasurementLog,
-    settings: EstimatorSettings,
+    settings: EstimatorSettings | Estimator,
     ego_motion: EgoMotionSettings,
     progress: Callable[[int, int], None] = lambda done, total: None,
     arrival: Arrival | None = None,
@@ -108,7 +108,7 @@ def replay(
 
     Args:
         log: the measurements; not changed.
-        settings: of the estimator.
+        settings: of the estimator; or a new one, at its prior pose.
         ego_motion: of the least squares that finds each frame's pose against the estimator's map.
         progress: told frames done and of how many.
         arrival: where the run began in a saved map; None began with an empty one.
@@ -195,7 +195,7 @@ def _require_support(estimator: Estimator, log: MeasurementLog) -> None:
 class _Replaying:
     """What has been computed so far."""
 
-    def __init__(self, log: MeasurementLog, settings: EstimatorSettings) -> None:
+    def __init__(self, log: MeasurementLog, settings: EstimatorSettings | Estimator) -> None:
         self._log = log
         self._settings = settings
         self._poses: list[FloatArray] = []
@@ -236,7 +236,7 @@ class _Replaying:
                 failure = f"{failure}; {why}" if failure else why
         final_ms = math.nan if estimate is None else 1e3 * (time.perf_counter() - start)
         return Replay(
-            title=self._settings.title,
+            title=getattr(self._settings, "title", self._settings.kind),
             kind=self._settings.kind,
             online=self._online(),
             online_covariances=np.array(self._covariances).reshape(-1, 6, 6),

@@ -42,6 +42,9 @@ class Session:
 
     Attributes:
         rig: the cameras.
+        frontend: settings of features, matching and tracking.
+        numbering: number in its recording of the first frame tracked, and the step to the next;
+            the log keeps them.
         pipeline: the parts: stereo matching, tracking, motion model, estimator, place recognition.
         recorder: everything computed so far, frame by frame.
     """
@@ -82,6 +85,8 @@ class Session:
         frontend = frontend or FrontendSettings()
         odometry = odometry or RecordedOdometrySettings()
         self.rig = rig
+        self.frontend = frontend
+        self.numbering = (0, 1)
         self.pipeline = make_pipeline(
             rig, frontend, odometry, chosen_estimator(estimator), seed, arrival
         )
@@ -143,12 +148,13 @@ class Session:
             found: the frame and its features; ``found.i`` counts the session's frames.
             timestamp: seconds.
             body: odometry of the body, checked.
-            index: number of the frame in its recording, for the log; None for ``found.i``.
+            index: number of the frame in its recording, for the log; None: by ``numbering``.
             wait_ms: time that the loop waited for this frame, for the record.
             precision_of: fraction of right stereo matches, where truth tells it, for the record.
         """
         self._require_open()
-        index = found.i if index is None else index
+        first, stride = self.numbering
+        index = first + stride * found.i if index is None else index
         try:
             report = self.pipeline.process(found, index, timestamp, self._usable(body))
         except BaseException as error:

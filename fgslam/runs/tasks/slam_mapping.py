@@ -21,6 +21,7 @@ from fgslam.runs.tasks import slam_checkpoint as checkpoint
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, entry_of
 from fgslam.runs.tasks.slam_outputs import RunOutputs
 from fgslam.slam.map_settings import MapSettings
+from fgslam.slam.maps import saved_map
 from fgslam.slam.pipeline import SlamPipeline
 from fgslam.slam.recorder import RunRecorder
 
@@ -185,24 +186,11 @@ def save(outputs: RunOutputs, given: GivenMap | None) -> str:
 
 
 def _saved_map(outputs: RunOutputs, given: GivenMap | None) -> SavedMap:
-    """The estimator's geometry joined with the database's looks and counts."""
-    database, estimate = outputs.pipeline.tracker.database, outputs.pipeline.estimator.estimate()
-    landmarks, places = estimate.landmarks, outputs.pipeline.places
-    if places is not None:  # no later frame of this run ends them
-        landmarks = landmarks.without(places.ending)
-    rows = database.rows(landmarks.ids)
-    return SavedMap(
-        rig=outputs.sequence.rig,
-        landmarks=landmarks,
-        appearances=database.appearances(landmarks.ids),
-        hits=database.hits[rows],
-        misses=database.misses[rows],
-        permanent=database.lasting[rows],
-        colour=database.colour[rows],
-        trajectory=estimate.trajectory,
-        about={"drives": [*_drives_before(outputs, given), _drive(outputs, estimate)]},
-        session=_session(outputs) if outputs.config.map.session else {},
-    )
+    """The session's map with what is known of its drives."""
+    estimate = outputs.pipeline.estimator.estimate()
+    about = {"drives": [*_drives_before(outputs, given), _drive(outputs, estimate)]}
+    session = _session(outputs) if outputs.config.map.session else None
+    return saved_map(outputs.pipeline, outputs.sequence.rig, estimate, about, session)
 
 
 def _drives_before(outputs: RunOutputs, given: GivenMap | None) -> list[Any]:

@@ -16,20 +16,19 @@ import yaml
 
 from fgslam import __version__
 from fgslam.core.atomic_files import make_subfolder, write_text
-from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
+from fgslam.core.estimates import Estimate, Trajectory
 from fgslam.core.recordings import Sequence
 from fgslam.core.trajectories import write_tum
 from fgslam.evaluation.judging import Truth, closure_counts
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
-from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
 from fgslam.report.metrics import StageTime, write_metrics, write_timing
-from fgslam.report.point_cloud import MapPoints
 from fgslam.runs.comparison import GROUND_TRUTH_FILE, load_truth, remark_of
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.config_models import HomingExperiment, LocalisationConfig
 from fgslam.runs.estimator_files import write_estimate
 from fgslam.runs.folder import RUN_MARKER
+from fgslam.runs.maps import map_points
 from fgslam.runs.tasks.rendered_truth import rendered_landmark_truth
 from fgslam.runs.tasks.slam_checkpoint import save_log
 from fgslam.runs.tasks.slam_places import closures_of, place_numbers, write_closures
@@ -169,21 +168,6 @@ def versions() -> dict[str, str | None]:
     """Versions of this program, of Python and of the packages that shape the numbers."""
     own = {"fgslam": __version__, "python": platform.python_version()}
     return own | {name: _version(name) for name in _VERSIONS_OF}
-
-
-def map_points(landmarks: LandmarkMap, database: LandmarkDatabase) -> MapPoints:
-    """The estimator's geometry joined with the database's bookkeeping."""
-    rows = database.rows(landmarks.ids)
-    return MapPoints(
-        ids=landmarks.ids,
-        positions=landmarks.positions,
-        covariances=landmarks.covariances,
-        colours=np.repeat(database.colour[rows, None], 3, axis=1),
-        hits=database.hits[rows],
-        misses=database.misses[rows],
-        valid=database.valid[rows],
-        permanent=database.permanent[rows],
-    )
 
 
 def _version(package: str) -> str | None:

@@ -1,0 +1,231 @@
+"""What `import fgslam` offers of recordings, runs and replays; each a few lines over the rooms."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from fgslam.backend.protocol import Estimator
+from fgslam.backend.settings import EstimatorSettings
+from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.errors import ConfigError, FrameError
+from fgslam.core.estimates import Trajectory
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.measurements import Odometry
+from fgslam.core.recordings import Sequence
+from fgslam.core.sensors import CameraRig
+from fgslam.datasets.layouts import recognise_layout
+from fgslam.frontend.tracking.settings import EgoMotionSettings
+from fgslam.runs.config import ExperimentConfig, load_experiment, make_config
+from fgslam.runs.config_models import Experiment, HomingExperiment, LocalisationConfig
+from fgslam.runs.folder import ExistingFolder
+from fgslam.runs.live import Overrides, override_texts, slam_config
+from fgslam.runs.named_experiments import find_experiment
+from fgslam.runs.opening import open_sequence
+from fgslam.slam.choosing import chosen_estimator
+from fgslam.slam.replay import Replay
+from fgslam.slam.replay import replay as replay_log
+
+RecordedFrame: TypeAlias = tuple[float, tuple[Image, ...] | None, Odometry | None]
+"""Time in seconds, images (left, right[, top]) or None, odometry of the body or None."""
+
+Progress: TypeAlias = Callable[[str, int, int], None]
+"""Told what is under way, how much of it is done, and of how much."""
+
+_WORLDS = {"lab": "lab_loop"}
+"""Worlds that are rendered, and the experiment that describes each."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedFrames:
+    """A recording as frames to track: ``for t, images, odometry in recording``.
+
+    Attributes:
+        sequence: the recording as its reader gives it.
+    """
+
+    sequence: Sequence
+
+    @property
+    def name(self) -> str:
+        """Short name for titles."""
+        return self.sequence.name
+
+    @property
+    def rig(self) -> CameraRig:
+        """The rectified cameras."""
+        return self.sequence.rig
+
+    @property
+    def timestamps(self) -> FloatArray:
+        """(n,) seconds, increasing."""
+        return self.sequence.timestamps
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """True poses of the right camera, n of them or fewer; None where they are not known."""
+        return self.sequence.ground_truth
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was tolerated when opening, in words: missing frames and the like."""
+        return self.sequence.notes
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    def __getitem__(self, i: int) -> RecordedFrame:
+        """Frame ``i``: time in seconds, images and odometry, as :meth:`fgslam.Slam.track` wants.
+
+        The images are (left, right[, top]), (height, width) uint8; None where one of them cannot be
+        read. The odometry is the body's motion since frame ``i - 1``; None for the first, and where
+        none was recorded.
+
+        Raises:
+            IndexError: there is no such frame.
+            OdometryError: the recording's odometry is malformed.
+        """
+        i = range(len(self))[i]
+        images: tuple[Image, ...] | None
+        try:
+            right, left, *top = self.sequence.frame(i).images
+            images = (left, right, *top)
+        except FrameError:
+            images = None
+        odometry = self.sequence.odometry(i) if i else None
+        return float(self.timestamps[i]), images, odometry
+
+    def __iter__(self) -> Iterator[RecordedFrame]:
+        return (self[i] for i in range(len(self)))
+
+
+def open_recording(path: str | Path, overrides: Overrides = ()) -> RecordedFrames:
+    """Opens a recording: a folder of any known layout, or that of an experiment.
+
+    Args:
+        path: folder of an image folder, KITTI, EuRoC or light-field recording; or the name or file
+            of an experiment, whose selection of frames and odometry then hold.
+        overrides: settings that differ, by dotted key: ``{"dataset.stop": 100}``.
+
+    Raises:
+        DatasetError: no such folder, none of the known layouts, or the recording is malformed.
+        CalibrationError: its calibration is missing or impossible.
+        ConfigError: no such experiment, or a key or value is wrong.
+    """
+    return RecordedFrames(open_sequence(_recording_config(Path(path), overrides)))
+
+
+def rendered_recording(world: str = "lab", frames: int | None = None) -> RecordedFrames:
+    """A drive through a rendered world with exact truth: data for examples and tests.
+
+    Three cameras of 320 x 240 pixels, wheel odometry with noise; always the same. Rendered images
+    are kept in the user's cache folder.
+
+    Args:
+        world: `lab`.
+        frames: only so many of the drive's frames; None for all.
+
+    Raises:
+        ConfigError: no such world, or not so many frames.
+        MissingDependencyError: a library that rendering needs is absent.
+    """
+    if world not in _WORLDS:
+        raise ConfigError(f"no rendered world {world!r}; known: {', '.join(_WORLDS)}")
+    overrides = {} if frames is None else {"dataset.stop": frames}
+    return open_recording(_WORLDS[world], overrides)
+
+
+def _recording_config(path: Path, overrides: Overrides) -> ExperimentConfig:
+    if not path.is_dir():
+        return slam_config(path, overrides)
+    values = {"name": "recording", "dataset": dict(recognise_layout(path))}
+    return make_config(values, override_texts(overrides), str(path))
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run that has ended.
+
+    Attributes:
+        folder: its files; docs describe each.
+        status: `finished`, or `interrupted` where it can be resumed.
+        metrics: the document of metrics.json.
+    """
+
+    folder: Path
+    status: str
+    metrics: dict[str, Any]
+
+
+def run(
+    experiment: str | Path,
+    out: str | Path | None = None,
+    overrides: Overrides = (),
+    existing: ExistingFolder = "refuse",
+    progress: Progress = lambda what, done, total: None,
+) -> Run:
+    """Runs an experiment of any task into a run folder, as ``fgslam run`` does.
+
+    Args:
+        experiment: the name of an experiment that comes with fgslam, or a YAML file.
+        out: the run folder; None for runs/NAME.
+        overrides: settings that differ, by dotted key: ``{"seed": 3}``; or texts: ``["seed=3"]``.
+        existing: what to do where the folder holds a run: `refuse`, `overwrite` or `resume`.
+        progress: told what is under way, how much of it is done, and of how much.
+
+    Raises:
+        FgslamError: of any kind, with one line that says what to do.
+    """
+    config = load_experiment(find_experiment(Path(experiment)), override_texts(overrides))
+    folder = Path("runs") / config.name if out is None else Path(out)
+    status = _perform(config, folder, existing, progress)
+    metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    return Run(folder, status, metrics)
+
+
+def _perform(config: Experiment, folder: Path, existing: ExistingFolder, progress: Progress) -> str:
+    """Runs a configuration of any task; how it ended. Each task is imported when it is run."""
+    if isinstance(config, HomingExperiment):
+        from fgslam.runs.homing_run import run_homing
+
+        return run_homing(config, folder, existing, progress).status
+    if isinstance(config, LocalisationConfig):
+        from fgslam.runs.tasks.localisation import run_localisation
+
+        return run_localisation(config, folder, existing, progress).status
+    if not isinstance(config, ExperimentConfig):
+        raise ConfigError(f"task {config.task_name}: cannot be run")
+    if config.on_measurements:
+        from fgslam.runs.tasks.slam_measurements import run_measured
+
+        run_measured(config, folder, existing, progress, lambda: False)
+        return "finished"
+    from fgslam.runs.tasks.slam import run_experiment
+
+    return run_experiment(config, folder, existing, progress).status
+
+
+def replay(
+    log: MeasurementLog,
+    estimator: str | EstimatorSettings | Estimator,
+    ego_motion: EgoMotionSettings | None = None,
+) -> Replay:
+    """Gives every frame of a log to an estimator, as the live loop would have done.
+
+    Args:
+        log: the measurements; not changed.
+        estimator: a kind, settings, or a new object with the members of :class:`fgslam.Estimator`.
+        ego_motion: of the least squares that finds each frame's pose against the estimator's map;
+            None for the defaults.
+
+    Returns:
+        Trajectory, covariances and map, with numbers of every frame. An estimator that fails ends
+        its replay, not the program: ``failure`` says where and why.
+
+    Raises:
+        ConfigError: no such estimator.
+    """
+    return replay_log(log, chosen_estimator(estimator), ego_motion or EgoMotionSettings())

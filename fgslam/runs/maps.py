@@ -1,0 +1,184 @@
+"""Maps for other tools and later days: point clouds, map files, and finding oneself in one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.errors import MapError, OutputError
+from fgslam.core.estimates import LandmarkMap, Relocalisation, Trajectory
+from fgslam.core.saved_map import SavedMap, load_map, require_rig, save_map
+from fgslam.core.sensors import CameraRig
+from fgslam.core.threads import one_blas_thread
+from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.report.point_cloud import MapPoints, write_map
+from fgslam.slam.factory import make_extractor, make_relocaliser, make_stereo_matcher
+from fgslam.slam.frontend_settings import FrontendSettings
+from fgslam.slam.inputs import checked_images
+
+_VALID_HITS = 3  # where the map does not say how many its run asked for (Se et al. 6.1)
+_SUFFIX = ".fgmap"
+
+
+@dataclass(frozen=True, eq=False)
+class Map:
+    """Landmarks with their covariances and appearance: a session's, or one that was saved.
+
+    Attributes:
+        saved: everything that a map file holds.
+        points: the landmarks as other tools get them: positions (n, 3) metres, covariances
+            (n, 3, 3), grey values, numbers of frames that saw and missed each.
+        remark: what must be said wherever the map is shown; mostly empty.
+    """
+
+    saved: SavedMap
+    points: MapPoints
+    remark: str = ""
+
+    @staticmethod
+    def load(path: str | Path) -> Map:
+        """Reads a `.fgmap` file and checks its checksum.
+
+        Raises:
+            MapError: the file is missing, truncated, damaged, foreign, or of a newer fgslam.
+        """
+        saved = load_map(Path(path))
+        return Map(saved, points_of(saved), remark_of_map(saved))
+
+    def save(self, path: str | Path) -> None:
+        """Writes the map in the format that the suffix names.
+
+        `.fgmap` holds all of it, for :meth:`load`; `.ply`, `.pcd` and `.off` are point clouds for
+        other tools, in the world: x right, y down, z forward, metres. The same map gives the same
+        bytes; a file is written whole or not at all.
+
+        Raises:
+            OutputError: the suffix is another one, or the file cannot be written.
+        """
+        path = Path(path)
+        if path.suffix.lower() == _SUFFIX:
+            save_map(self.saved, path)
+        elif path.suffix.lower() in (".ply", ".pcd", ".off"):
+            write_map(path, self.points, self.remark)
+        else:
+            raise OutputError(
+                f"cannot write {path}: unknown map format '{path.suffix}'; use .fgmap, .ply, .pcd "
+                "or .off"
+            )
+
+    def locate(
+        self,
+        rig: CameraRig,
+        images: Sequence[npt.ArrayLike],
+        frontend: FrontendSettings | None = None,
+        seed: int = 0,
+    ) -> Relocalisation:
+        """Pose of a frame in the map without a prior, or why there is none to be believed.
+
+        The same images, map and seed give the same answer. Of the landmarks those count that are
+        permanent or were seen often enough (Se et al. 6.1).
+
+        Args:
+            rig: the cameras that made the map.
+            images: (left, right[, top]), as for :meth:`fgslam.Slam.track`.
+            frontend: settings of features, matching and relocalisation; None for the defaults.
+            seed: of RANSAC's samples.
+
+        Returns:
+            ``found`` says whether to believe ``wTc`` (4, 4) with ``covariance`` (6, 6), ordered
+            [rotation, translation]; ``why`` gives the reason in words.
+
+        Raises:
+            MapError: the map is of other cameras, or holds no landmark.
+            FrameError: wrong number, size, type or shape of images.
+        """
+        require_rig(self.saved, rig, "the map")
+        if not len(self.saved):
+            raise MapError("the map holds no landmark; make it anew")
+        frontend = frontend or FrontendSettings()
+        checked = checked_images(images, rig)
+        extract = make_extractor(frontend)
+        with one_blas_thread():
+            relocaliser = make_relocaliser(rig, frontend)
+            sure = self.saved.permanent | valid_of(self.saved)
+            landmarks = self.saved.landmarks.select(sure)
+            relocaliser.learn(landmarks, self.saved.appearances.of(landmarks.ids))
+            features = tuple(extract(image) for image in checked)
+            stereo = make_stereo_matcher(rig, frontend).match(features)
+            return relocaliser.locate(stereo, np.random.default_rng(seed))
+
+    def __len__(self) -> int:
+        """Number of landmarks."""
+        return len(self.points)
+
+    @property
+    def positions(self) -> FloatArray:
+        """(n, 3) landmarks in the world, metres."""
+        return self.points.positions
+
+    @property
+    def covariances(self) -> FloatArray:
+        """(n, 3, 3) of the positions, metres squared."""
+        return self.points.covariances
+
+    @property
+    def rig(self) -> CameraRig:
+        """The cameras that made the map."""
+        return self.saved.rig
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The drive that made the map."""
+        return self.saved.trajectory
+
+
+def map_points(landmarks: LandmarkMap, database: LandmarkDatabase) -> MapPoints:
+    """The estimator's geometry joined with the database's bookkeeping."""
+    rows = database.rows(landmarks.ids)
+    return MapPoints(
+        ids=landmarks.ids,
+        positions=landmarks.positions,
+        covariances=landmarks.covariances,
+        colours=np.repeat(database.colour[rows, None], 3, axis=1),
+        hits=database.hits[rows],
+        misses=database.misses[rows],
+        valid=database.valid[rows],
+        permanent=database.permanent[rows],
+    )
+
+
+def drives_of(saved: SavedMap) -> list[dict[str, Any]]:
+    """What the map says about the drives that made it, the last one last."""
+    found = saved.about.get("drives")
+    return [drive for drive in found if isinstance(drive, dict)] if isinstance(found, list) else []
+
+
+def remark_of_map(saved: SavedMap) -> str:
+    """Marks maps whose odometry was made from ground truth; empty otherwise."""
+    return next((str(drive["remark"]) for drive in drives_of(saved) if drive.get("remark")), "")
+
+
+def valid_of(saved: SavedMap) -> BoolArray:
+    """(n,) landmarks seen as often as the strictest of the drives asked for (Se et al. 6.1)."""
+    least = max((int(d.get("valid_hits") or 0) for d in drives_of(saved)), default=_VALID_HITS)
+    return np.asarray(saved.hits >= least)
+
+
+def points_of(saved: SavedMap) -> MapPoints:
+    """The landmarks of a map file as a point cloud."""
+    return MapPoints(
+        ids=saved.landmarks.ids,
+        positions=saved.landmarks.positions,
+        covariances=saved.landmarks.covariances,
+        colours=np.repeat(saved.colour[:, None], 3, axis=1),
+        hits=saved.hits,
+        misses=saved.misses,
+        valid=valid_of(saved),
+        permanent=saved.permanent,
+    )
