@@ -1,41 +1,104 @@
-"""Filters and smoothers for stereo, trinocular and omnidirectional SLAM on one measurement log."""
+"""Filters and smoothers for stereo, trinocular and omnidirectional SLAM on one measurement log.
+
+::
+
+    import fgslam as fg
+
+    rig = fg.StereoRig(width=640, height=480, fx=500, fy=500, cx=319.5, cy=239.5, baseline=0.12)
+    slam = fg.Slam(rig, estimator="isam2")
+    for t, images, odometry in frames:
+        step = slam.track(t, images, odometry)
+    slam.result().trajectory.save("path.tum")
+
+Names are imported when they are first used: `import fgslam` itself loads no library. Every error
+that is raised on purpose descends from ``fgslam.errors.FgslamError``.
+"""
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from fgslam.core import errors
+from fgslam.core.version import __version__
+
 if TYPE_CHECKING:
+    from fgslam.backend.protocol import Estimator
     from fgslam.cameras.omni.camera_files import load_camera
+    from fgslam.cameras.rig import StereoRig
+    from fgslam.core.features import Features
     from fgslam.core.homing import Refusal, TwoViewVector
+    from fgslam.core.measurement_log import MeasurementLog
+    from fgslam.core.measurements import Odometry
+    from fgslam.core.trajectories import Trajectory
+    from fgslam.evaluation.comparing import compare
     from fgslam.homing.api import HomingVector, PathFollower, teach
     from fgslam.homing.command import DriveCommand
     from fgslam.homing.path_memory import PathMemory
-
-__version__ = "0.1.0"
+    from fgslam.report.plotting import plot
+    from fgslam.runs.library import open_recording, rendered_recording, replay, run
+    from fgslam.runs.live import Slam
+    from fgslam.runs.maps import Map
+    from fgslam.slam.feature_stream import FeatureExtractor
 
 __all__ = [
     "DriveCommand",
+    "Estimator",
+    "FeatureExtractor",
+    "Features",
     "HomingVector",
+    "Map",
+    "MeasurementLog",
+    "Odometry",
     "PathFollower",
     "PathMemory",
     "Refusal",
+    "Slam",
+    "StereoRig",
+    "Trajectory",
     "TwoViewVector",
     "__version__",
+    "compare",
+    "errors",
     "load_camera",
+    "open_recording",
+    "plot",
+    "rendered_recording",
+    "replay",
+    "run",
     "teach",
 ]
 
 _HOMES = {
     "DriveCommand": "fgslam.homing.command",
+    "Estimator": "fgslam.backend.protocol",
+    "FeatureExtractor": "fgslam.slam.feature_stream",
+    "Features": "fgslam.core.features",
     "HomingVector": "fgslam.homing.api",
+    "Map": "fgslam.runs.maps",
+    "MeasurementLog": "fgslam.core.measurement_log",
+    "Odometry": "fgslam.core.measurements",
     "PathFollower": "fgslam.homing.api",
     "PathMemory": "fgslam.homing.path_memory",
     "Refusal": "fgslam.core.homing",
+    "Slam": "fgslam.runs.live",
+    "StereoRig": "fgslam.cameras.rig",
+    "Trajectory": "fgslam.core.trajectories",
     "TwoViewVector": "fgslam.core.homing",
+    "compare": "fgslam.evaluation.comparing",
     "load_camera": "fgslam.cameras.omni.camera_files",
+    "open_recording": "fgslam.runs.library",
+    "plot": "fgslam.report.plotting",
+    "rendered_recording": "fgslam.runs.library",
+    "replay": "fgslam.runs.library",
+    "run": "fgslam.runs.library",
     "teach": "fgslam.homing.api",
 }
+"""Module that each public name is imported from, on first use (PEP 562)."""
+
+# Errors belong to core, where everything may raise them; users know them by this shorter name.
+sys.modules[f"{__name__}.errors"] = errors
 
 
 def __getattr__(name: str) -> Any:

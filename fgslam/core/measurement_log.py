@@ -165,14 +165,14 @@ class MeasurementLog:
             )
         return log
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Writes the log, whole or not at all. Raises OutputError when it cannot be written."""
-        write_arrays(path, self.to_arrays())
+        write_arrays(Path(path), self.to_arrays())
 
     @staticmethod
-    def load(path: Path) -> MeasurementLog:
+    def load(path: str | Path) -> MeasurementLog:
         """Reads a log. Raises MeasurementLogError for a missing, truncated or foreign file."""
-        return MeasurementLog.from_arrays(LOG.load(path), str(path))
+        return MeasurementLog.from_arrays(LOG.load(Path(path)), str(path))
 
 
 def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:

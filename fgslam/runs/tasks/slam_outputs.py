@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from fgslam import __version__
 from fgslam.core.atomic_files import make_subfolder, write_text
 from fgslam.core.estimates import Estimate, Trajectory
 from fgslam.core.recordings import Sequence
 from fgslam.core.trajectories import write_tum
+from fgslam.core.version import __version__
 from fgslam.evaluation.judging import Truth, closure_counts
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
 from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
