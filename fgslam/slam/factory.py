@@ -84,17 +84,15 @@ def make_motion(rig: CameraRig, settings: OdometrySettings) -> MotionModel:
 
 def make_estimator(
     rig: Sensor,
-    settings: EstimatorSettings | Estimator,
+    settings: EstimatorSettings,
     ego_motion: EgoMotionSettings | None = None,
     prior: Prediction | None = None,
 ) -> FullEstimator:
     """The estimator, at the prior pose; without one the world is the first camera frame, exactly.
 
     ``ego_motion`` are the front-end's settings: ``floor.mode: auto`` takes their degrees of freedom
-    over, ``landmark_kalman_graph`` their whole cost. An estimator that is made already is returned.
+    over, ``landmark_kalman_graph`` their whole cost.
     """
-    if not is_settings(settings):
-        return cast("Estimator", settings)
     prior = prior or Prediction(np.eye(4), np.zeros((6, 6)))
     ego_motion = ego_motion or EgoMotionSettings()
     estimator: FullEstimator
@@ -135,6 +133,18 @@ def make_estimator(
     return estimator
 
 
+def made_or_given(
+    rig: Sensor,
+    estimator: EstimatorSettings | Estimator,
+    ego_motion: EgoMotionSettings | None = None,
+    prior: Prediction | None = None,
+) -> Estimator:
+    """As :func:`make_estimator`; an estimator that is made already is handed back."""
+    if is_settings(estimator):
+        return make_estimator(rig, estimator, ego_motion, prior)
+    return cast("Estimator", estimator)
+
+
 def make_floor(rig: Sensor, settings: FloorSettings, dof: DegreesOfFreedom) -> Floor:
     """The floor as an estimator is to use it."""
     if settings.mode == "auto":
@@ -168,7 +178,7 @@ def make_pipeline(
         arrival: where the run begins in a saved map; None begins with an empty one.
     """
     prior = None if arrival is None else arrival.prior
-    estimator = make_estimator(rig, estimator_settings, frontend.ego_motion, prior)
+    estimator = made_or_given(rig, estimator_settings, frontend.ego_motion, prior)
     measured_odometry = odometry.kind != "constant_velocity"
     require_support(estimator, measured_odometry, loops=frontend.loops is not None)
     tracker = make_tracker(rig, frontend)

@@ -27,7 +27,7 @@ from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.slam.arrival import Arrival, take_over
-from fgslam.slam.factory import make_estimator
+from fgslam.slam.factory import made_or_given
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import ReplayedFrame, replay_frame
 
@@ -117,7 +117,7 @@ def replay(
     run = _Replaying(log, settings)
     try:
         prior = None if arrival is None else arrival.prior
-        estimator = make_estimator(log.rig, settings, ego_motion, prior)
+        estimator = made_or_given(log.rig, settings, ego_motion, prior)
         if arrival is not None:
             take_over(estimator, arrival)
         _require_support(estimator, log)
