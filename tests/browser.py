@@ -46,9 +46,7 @@ class Browser:
     def __init__(self, driver: WebDriver) -> None:
         self.driver = driver
         self.size(*WIDE)
-        self.driver.set_network_conditions(  # type: ignore[no-untyped-call]
-            offline=True, latency=0, throughput=0
-        )
+        self.driver.set_network_conditions(offline=True, latency=0, throughput=0)
 
     def size(self, width: int, height: int, *, phone: bool = False) -> None:
         """The window, or a phone's screen with its touch."""

@@ -59,7 +59,10 @@ def make_matches(angles: FloatArray, sigma: float) -> BearingMatches:
     index = np.arange(n, dtype=np.int64)
     kind = np.full(n, int(FeatureKind.SIFT), dtype=np.int64)
     noise = np.full((n, 4), sigma)
-    return BearingMatches(kind, index, index, *angles.T, noise, np.ones(n))
+    b_start, e_start, b_target, e_target = angles.T
+    return BearingMatches(
+        kind, index, index, b_start, e_start, b_target, e_target, noise, np.ones(n)
+    )
 
 
 def _seen(

@@ -49,9 +49,8 @@ def drive() -> Drive:
     headings = np.where(np.arange(n) < 3, np.nan, heading + 0.1)
     targets = np.array([[2.0, 0.0, 0.0], [2.0, 2.0, np.pi / 2]])
     walls = (np.array([[-1.0, -1.0], [3.5, -1.0], [3.5, 3.0]]), np.array([[0.0, 1.0], [1.0, 1.0]]))
-    return Drive(
-        0.1 * np.arange(n), np.column_stack([x, y, heading]), legs, headings, targets, walls
-    )
+    times = np.asarray(0.1 * np.arange(n), np.float64)
+    return Drive(times, np.column_stack([x, y, heading]), legs, headings, targets, walls)
 
 
 def page(title: str = "homing_lab") -> Page:

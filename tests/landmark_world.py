@@ -242,12 +242,12 @@ def points_along(way: FloatArray, per_metre: float, rng: np.random.Generator) ->
     base = base + rng.uniform(-4.0, 4.0, (count, 2))
     height = rng.uniform(0.2, 1.5, count) * rng.choice([-1.0, 1.0], count)
     near = np.min([_distance(base, a, b) for a, b in itertools.pairwise(way)], axis=0)
-    return np.column_stack([base, height])[near > 1.0]
+    return np.asarray(np.column_stack([base, height])[near > 1.0])
 
 
 def _distance(points: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
     along = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
-    return np.linalg.norm(points - a - along[:, None] * (b - a), axis=1)
+    return np.asarray(np.linalg.norm(points - a - along[:, None] * (b - a), axis=1))
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,8 @@ class _Book:
         self._seen.append(seen)
         is_new = np.arange(len(both)) >= len(matched)
         observed = observations(self._id[both], measured[both], np.array(drive.sigma_px), is_new)
-        loops, pruned, self._ending = (), self._ending, np.empty(0, np.int64)
+        loops: tuple[LoopClosure, ...] = ()
+        pruned, self._ending = self._ending, np.empty(0, np.int64)
         if closes:
             loop = self._loop(k, measured, seen, lie, rng)
             loops, self._ending = (loop,), np.sort(loop.merged[:, 0])

@@ -46,7 +46,7 @@ def write_recording(root: Path, frames: int = 12, top: bool = True, seed: int = 
             centre = wTc[:3, 3] + wTc[:3, :3] @ np.array([x, y, 0.0])
             image = _render(textures, wTc[:3, :3], centre, rng)
             assert cv2.imwrite(str(root / name / f"{k:06d}.png"), image)
-    stamps = 100.0 + PERIOD_S * np.arange(frames)
+    stamps = np.asarray(100.0 + PERIOD_S * np.arange(frames), np.float64)
     times = "".join(f"{k:06d} {t:.6f}\n" for k, t in enumerate(stamps))
     (root / "times.txt").write_text(times, encoding="utf-8")
     write_calibration(root)
@@ -132,6 +132,6 @@ def _render(
         size = (WIDTH, HEIGHT)
         painted = cv2.warpPerspective(texture, homography, size, flags=cv2.INTER_LINEAR)
         cover = cv2.warpPerspective(np.ones_like(texture), homography, size)
-        canvas = canvas * (1.0 - cover) + painted
+        canvas = np.asarray(canvas * (1.0 - cover) + painted, canvas.dtype)
     noisy = canvas + rng.standard_normal(canvas.shape)
     return np.asarray(np.clip(np.round(noisy), 0, 255), np.uint8)

@@ -22,7 +22,8 @@ def loop(frames: int) -> Trajectory:
     angle = np.linspace(0.0, 2.0 * np.pi, frames)
     places = 2.0 * np.column_stack([1.0 - np.cos(angle), np.zeros(frames), np.sin(angle)])
     turns = [so3_exp(np.array([0.0, a, 0.0])) for a in angle]
-    return Trajectory(100.0 + 0.25 * np.arange(frames), np.array([*map(pose, turns, places)]))
+    times = np.asarray(100.0 + 0.25 * np.arange(frames), np.float64)
+    return Trajectory(times, np.array([*map(pose, turns, places)]))
 
 
 def estimator_report(

@@ -87,7 +87,7 @@ def points_in_views(drive: Drive, poses: list[FloatArray], rng: np.random.Genera
     which = rng.integers(len(poses), size=drive.points)
     local = points_in_view(drive.rig, drive.points, drive.depth_m, rng)
     chosen = np.array(poses)[which]
-    return np.einsum("nij,nj->ni", chosen[:, :3, :3], local) + chosen[:, :3, 3]
+    return np.asarray(np.einsum("nij,nj->ni", chosen[:, :3, :3], local) + chosen[:, :3, 3])
 
 
 def points_in_view(
