@@ -5,7 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from fgslam.report.content import Page
-from fgslam.report.figures.over_time import error_over_time, nees_over_time, time_per_frame
+from fgslam.report.figures.over_time import (
+    error_by_axis,
+    error_over_time,
+    nees_over_time,
+    time_per_frame,
+)
 from fgslam.report.figures.trajectory import drive_from_above, map_to_turn
 from fgslam.report.headline import headline
 from fgslam.report.page import write_html
@@ -30,6 +35,7 @@ def slam_page(data: ReportData) -> Page:
             drive_from_above(data),
             map_to_turn(data),
             error_over_time(data),
+            error_by_axis(data),
             nees_over_time(data),
             time_per_frame(data),
         ),

@@ -18,10 +18,11 @@ _FIGURES_OF_A_FRAME = {
 }
 _FIGURES_OF_A_RUN = {
     "matches": "Landmarks matched and used in each frame, and landmarks in the map",
-    "map_from_above": "Map from above, landmarks coloured by height, 95 % ellipses",
-    "map_views": "Three views of the map in perspective",
-    "position_error": "Position error along the world's axes with three standard deviations",
 }
+
+
+_FIGURES_OF_THE_PAGE = frozenset({"map_from_above", "map_views", "position_error"})
+"""The page shows these as figures, drawn from the same values."""
 
 
 class _Metric(NamedTuple):
@@ -158,7 +159,8 @@ def comparison_table(estimators: Mapping[str, Any]) -> TextTable:
 
 def sample_pictures(folder: Path) -> Iterator[Picture]:
     """The pictures of a run's folder with captions, matches first; nothing where it is absent."""
-    for path in sorted(folder.glob("*.png"), key=_order):
+    drawn = (path for path in folder.glob("*.png") if path.stem not in _FIGURES_OF_THE_PAGE)
+    for path in sorted(drawn, key=_order):
         try:
             yield Picture(_caption(path.stem), path.read_bytes())
         except OSError as error:

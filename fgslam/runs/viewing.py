@@ -16,10 +16,10 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.atomic_files import replacing
 from fgslam.core.errors import MissingDependencyError, OutputError
 from fgslam.core.geometry import quaternion_from_rotation
+from fgslam.report.figures.ellipses import world_position_covariances
 from fgslam.report.figures.palette import COUNT, ON_DARK
 from fgslam.report.figures.traces import thinned
 from fgslam.report.figures.trajectory import level_axes
-from fgslam.report.pictures.birds_eye import world_position_covariances
 from fgslam.report.run_results import EstimatorReport, ReportData
 from fgslam.runs.report import load_report
 

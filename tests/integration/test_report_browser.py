@@ -18,7 +18,7 @@ from fgslam.report.content import Picture
 from fgslam.report.run_results import EstimatorReport, ReportData
 from fgslam.report.slam_page import write_report
 
-FIGURES = ("above", "map", "error", "nees", "time")
+FIGURES = ("above", "map", "error", "axes", "nees", "time")
 DRAWN = "document.getElementById('plot-{}')._fullData"
 
 
@@ -103,16 +103,29 @@ def test_an_estimator_is_hidden_and_shown_in_every_figure(browser: Browser) -> N
     def of_isam2(figure: str) -> list[str]:
         return [name for name in visible(browser, figure) if name.startswith("isam2")]
 
-    before = {figure: visible(browser, figure) for figure in FIGURES}
-    assert all(of_isam2(figure) for figure in FIGURES)
+    figures = [figure for figure in FIGURES if figure != "axes"]  # shows one that is chosen
+    before = {figure: visible(browser, figure) for figure in figures}
+    assert all(of_isam2(figure) for figure in figures)
     switch(browser, 'input[data-estimator="1"]')
     browser.wait(f"!{DRAWN.format('time')}[1].visible")
-    assert not any(of_isam2(figure) for figure in FIGURES)
-    assert all(visible(browser, figure) for figure in FIGURES)  # the others stay
+    assert not any(of_isam2(figure) for figure in figures)
+    assert all(visible(browser, figure) for figure in figures)  # the others stay
     box = browser.driver.find_element(By.CSS_SELECTOR, 'input[data-estimator="1"]')
     box.send_keys(Keys.SPACE)  # and back, by keyboard
     browser.wait(f"{DRAWN.format('time')}[1].visible === true")
-    assert {figure: visible(browser, figure) for figure in FIGURES} == before
+    assert {figure: visible(browser, figure) for figure in figures} == before
+
+
+def test_errors_along_the_axes_are_those_of_the_chosen_estimator(browser: Browser) -> None:
+    assert [name.split(",")[0] for name in visible(browser, "axes")][1::2] == ["isam2"] * 3
+    select = browser.driver.find_element(By.CSS_SELECTOR, 'select[data-figure="axes"]')
+    select.send_keys("landmark_kalman")
+    browser.wait(f"{DRAWN.format('axes')}[1].visible === true")
+    names = [name.split(",")[0] for name in visible(browser, "axes")][1::2]
+    assert names == ["landmark_kalman"] * 3
+    assert browser.js("Object.keys(document.getElementById('plot-axes')._fullLayout)").count(
+        "yaxis3"
+    )
 
 
 def test_ellipses_and_their_enlargement_are_switched(browser: Browser) -> None:

@@ -9,11 +9,10 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import HomingEstimate, HomingTruth
-from fgslam.report.figures.traces import Figure, Owner, Switch, Trace, thinned, trace
+from fgslam.report.figures.ellipses import SIGMAS, outlines
+from fgslam.report.figures.traces import Figure, Owner, Switch, Trace, joined, thinned, trace
 
 MAX_MOMENTS = 60
-SIGMAS = 3.0
-_CORNERS = 33
 _HEADING = 0.12  # length of the tick that points ahead, legs
 _BULK = (2.0, 98.0)
 _TOLD = "<b>%{fullData.name}</b><br>%{y:.3f} legs ahead, %{x:.3f} legs right<extra></extra>"
@@ -64,17 +63,6 @@ def upwards(points: FloatArray) -> dict[str, FloatArray]:
     return {"x": -points[:, 1], "y": points[:, 0]}
 
 
-def ellipse(centre: FloatArray, covariance: FloatArray, sigmas: float = SIGMAS) -> FloatArray:
-    """(m, 2) outline of a covariance (2, 2); nothing where it is not known or not one."""
-    if not np.isfinite(covariance).all():
-        return np.empty((0, 2))
-    values, vectors = np.linalg.eigh(covariance)
-    angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
-    circle = np.stack([np.cos(angle), np.sin(angle)])
-    scaled = vectors * (sigmas * np.sqrt(np.maximum(values, 0.0)))
-    return np.asarray(centre + (scaled @ circle).T)
-
-
 def _moment(
     estimates: Sequence[HomingEstimate],
     row: int,
@@ -108,8 +96,8 @@ def _place(
     yield trace(owner, upwards(np.array([pose[:2], ahead])), mode="lines", **line)
     marker = {"symbol": "square", "size": 13}
     yield trace(owner, upwards(pose[:2]), mode="markers", marker=marker, hovertemplate=_TOLD)
-    outline = ellipse(pose[:2], covariance)
-    if len(outline):
+    if np.isfinite(covariance).all():
+        outline = outlines(pose[None, :2], covariance[None])[0]
         claimed = Owner(f"{name}, {SIGMAS:.0f} sigma", when=("ellipses",), colour=number, step=step)
         yield trace(claimed, upwards(outline), mode="lines", line={"width": 1}, hoverinfo="skip")
 
@@ -130,15 +118,11 @@ def _features(estimates: Sequence[HomingEstimate], row: int, step: int) -> Itera
     lost = _lost(estimates, row)
     if len(lost):
         yield _dots("lost feature", step, lost, "star", paint="grey", when=("features",), size=7)
-    outlines = [
-        ellipse(*pair) for pair in zip(now.landmarks, now.landmark_covariances, strict=True)
-    ]
-    joined = [np.vstack([one, np.full((1, 2), np.nan)]) for one in outlines if len(one)]
-    if joined:
+    known = np.isfinite(now.landmark_covariances).all(axis=(1, 2))
+    if known.any():
+        around = joined(outlines(now.landmarks[known], now.landmark_covariances[known]))
         owner = Owner("features, 3 sigma", paint="grey", when=("feature-ellipses",), step=step)
-        yield trace(
-            owner, upwards(np.vstack(joined)), mode="lines", line={"width": 1}, hoverinfo="skip"
-        )
+        yield trace(owner, upwards(around), mode="lines", line={"width": 1}, hoverinfo="skip")
 
 
 def _lost(estimates: Sequence[HomingEstimate], row: int) -> FloatArray:

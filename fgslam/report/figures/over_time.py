@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray
-from fgslam.report.figures.traces import Figure, Owner, Switch, Trace, peaks, trace
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import Trajectory
+from fgslam.evaluation.trajectory import to_estimate_world
+from fgslam.report.figures.ellipses import SIGMAS, world_position_covariances
+from fgslam.report.figures.traces import (
+    Figure,
+    Owner,
+    Switch,
+    Trace,
+    peaks,
+    thinned,
+    trace,
+)
+from fgslam.report.figures.trajectory import level_axes
 from fgslam.report.run_results import EstimatorReport, ReportData
 
 MAX_POINTS = 2500
-SIGMAS = 3.0
+MAX_POINTS_ALONG = 800
+"""Of each of an estimator's three curves and bands."""
+
+_ALONG = ("right", "ahead", "up")
 _FINAL = {"dash": "solid", "width": 2}
 _ONLINE = {"dash": "dot", "width": 2}
 _CLAIMED = {"dash": "dash", "width": 1.2}
@@ -48,6 +64,7 @@ def error_over_time(data: ReportData) -> Figure:
             Switch("claimed", "claimed (3 sigma)"),
             Switch("log", "logarithmic", on=_differ_widely(data)),
         ),
+        missing=_missing(data),
         note="" if known else "Errors are not known: only what the estimators claim is drawn.",
     )
 
@@ -60,6 +77,97 @@ def _differ_widely(data: ReportData) -> bool:
         if np.isfinite(e.final_error_m).any()
     ]
     return bool(largest) and max(largest) > _WIDELY * min(largest)
+
+
+def error_by_axis(data: ReportData) -> Figure:
+    """Error of the chosen estimator's final position along right, ahead and up, with 3 sigma."""
+    known = [i for i, e in enumerate(data.estimators) if np.isfinite(e.final_error_m).any()]
+    largest = max((float(np.nanmax(data.estimators[i].final_error_m)) for i in known), default=0.0)
+    unit, factor = ("cm", 100.0) if largest < 1.0 else ("m", 1.0)
+    level = level_axes(data.up)
+    traces: list[Trace] = []
+    for i, estimator in enumerate(data.estimators):
+        rows, errors, sigmas = _errors_along(estimator, data.truth, level)
+        seconds = estimator.timestamps[rows] - data.start
+        for k, name in enumerate(_ALONG if len(rows) else ()):
+            error, sigma = factor * errors[:, k], factor * sigmas[:, k]
+            rmse = f"{float(np.sqrt(np.mean(error**2))):.2f} {unit}"
+            owner = Owner(f"{estimator.title}, {name}, rmse {rmse}", i, chosen=True)
+            traces += _error_with_band(owner, seconds, error, SIGMAS * sigma, k)
+    return Figure(
+        "axes",
+        "Position error along the axes",
+        "Estimate minus truth of the final positions of the estimator chosen, the first pose "
+        "aligned. Band: three standard deviations as claimed, which should hold nearly all of it.",
+        tuple(traces),
+        _panels([f"{name} ({unit})" for name in _ALONG]),
+        choices=tuple(known),
+        chosen=data.best if data.best in known else min(known, default=0),
+        missing=_missing(data),
+    )
+
+
+def _missing(data: ReportData) -> str:
+    return "there is no ground truth" if data.truth is None else "nothing was recorded"
+
+
+def _errors_along(
+    estimator: EstimatorReport, truth: Trajectory | None, level: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Rows (n,) with a truth, thinned, and errors and sigmas (n, 3) in the level axes, metres."""
+    found = None if truth is None else to_estimate_world(estimator.final, truth)
+    if found is None:
+        return np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3))
+    kept = thinned(len(found[0]), MAX_POINTS_ALONG)
+    rows, poses = found[0][kept], found[1][kept]
+    errors = estimator.final_poses[rows, :3, 3] - poses[:, :3, 3]
+    world = world_position_covariances(estimator.final_poses[rows], estimator.covariances[rows])
+    variances = np.einsum("ij,njk,ik->ni", level, world, level)
+    # A planar covariance, rotated, may round to just below zero.
+    return rows, errors @ level.T, np.sqrt(np.maximum(variances, 0.0))
+
+
+def _error_with_band(
+    owner: Owner, seconds: FloatArray, error: FloatArray, bound: FloatArray, panel: int
+) -> Iterator[Trace]:
+    axis = {"yaxis": f"y{panel + 1 if panel else ''}"}
+    known = np.isfinite(bound)
+    if known.any():
+        x, y = seconds[known], bound[known]
+        corners = {"x": np.concatenate([x, x[::-1]]), "y": np.concatenate([y, -y[::-1]])}
+        band = replace(owner, name="3 sigma", paint="band")
+        style: dict[str, Any] = {"fill": "toself", "line": {"width": 0}, "hoverinfo": "skip"}
+        yield trace(band, corners, mode="lines", **style, **axis)
+    axes, told = {"x": seconds, "y": error}, "%{y:.3g}"
+    yield trace(owner, axes, mode="lines", line={"width": 1.8}, hovertemplate=told, **axis)
+
+
+def matches_over_time(
+    frames: IntArray, matched: IntArray, inliers: IntArray, landmarks: IntArray
+) -> Figure:
+    """Matched landmarks of every frame, those that the pose kept, and the growth of the map.
+
+    Args:
+        frames: (n,) frame numbers.
+        matched: (n,) landmarks matched in the frame.
+        inliers: (n,) of them used for the pose.
+        landmarks: (n,) landmarks in the map after the frame.
+    """
+    traces = []
+    for colour, name, counts, axis in (
+        (1, "matched", matched, "y"),
+        (0, "used for the pose", inliers, "y"),
+        (2, "landmarks in the map", landmarks, "y2"),
+    ):
+        axes = {"x": frames.astype(np.float64), "y": counts.astype(np.float64)}
+        owner = Owner(name, colour=colour)
+        traces.append(trace(owner, axes, mode="lines", line={"width": 1.8}, yaxis=axis))
+    layout = _panels(["landmarks a frame", "landmarks in the map"], "frame")
+    for name in ("yaxis", "yaxis2"):
+        layout[name]["rangemode"] = "tozero"
+    note = f"median {np.median(matched):.0f} matched, least {matched.min()}" if len(frames) else ""
+    words = "Landmarks matched and used in each frame, and landmarks in the map."
+    return Figure("matches", "Matches and map", words, tuple(traces), layout, note=note)
 
 
 def nees_over_time(data: ReportData) -> Figure:
@@ -82,6 +190,7 @@ def nees_over_time(data: ReportData) -> Figure:
         f"of the values of a consistent estimator, frame by frame ({told}).",
         tuple(traces),
         _layout({"title": {"text": "NEES per degree of freedom"}, "type": "log"}),
+        missing=_missing(data),
     )
 
 
@@ -134,6 +243,19 @@ def _band(band: tuple[float, float], end: float) -> Trace:
     }
     owner = Owner("95 % band", paint="band")
     return trace(owner, corners, mode="lines", fill="toself", line={"width": 0}, hoverinfo="skip")
+
+
+def _panels(titles: Sequence[str], time: str = "time since the start (s)") -> dict[str, Any]:
+    """Panels over each other that share their axis of time."""
+    n = len(titles)
+    layout: dict[str, Any] = {
+        "xaxis": {"title": {"text": time}, "anchor": f"y{n}"},
+        "hovermode": "x unified",
+    }
+    for k, title in enumerate(titles):
+        top, bottom = 1.0 - k / n, 1.0 - (k + 1) / n + (0.07 if k < n - 1 else 0.0)
+        layout[f"yaxis{k + 1 if k else ''}"] = {"title": {"text": title}, "domain": [bottom, top]}
+    return layout
 
 
 def _layout(y: Mapping[str, Any]) -> dict[str, Any]:

@@ -22,6 +22,14 @@ Paint: TypeAlias = Literal["estimator", "truth", "grey", "band", "own"]
 """What colour the page gives a trace: its estimator's, the ink's (dashed), grey, or none."""
 
 
+MAP_AXES: Mapping[str, Any] = {
+    "xaxis": {"title": {"text": "right (m)"}, "constrain": "domain"},
+    "yaxis": {"title": {"text": "ahead (m)"}, "scaleanchor": "x"},
+    "hovermode": "closest",
+}
+"""Layout of what is seen from above: equal axes, metres."""
+
+
 @dataclass(frozen=True, slots=True)
 class Owner:
     """Who a trace belongs to, and when it is seen.
@@ -111,8 +119,9 @@ class Figure:
 
     @property
     def tall(self) -> bool:
-        """Whether it needs height: a plane of equal axes, or space."""
-        return self.turns or "scaleanchor" in self.layout.get("yaxis", {})
+        """Whether it needs height: a plane of equal axes, panels over each other, or space."""
+        layout = self.layout
+        return self.turns or "scaleanchor" in layout.get("yaxis", {}) or "yaxis3" in layout
 
 
 def trace(owner: Owner, axes: Mapping[str, FloatArray], **more: Any) -> Trace:

@@ -7,13 +7,21 @@ level, "ahead" completes them, so that z is up whatever the camera's tilt.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.geometry import congruence
+from fgslam.report.figures.ellipses import (
+    SIGMAS,
+    exaggeration,
+    in_plane,
+    outlines,
+    world_position_covariances,
+)
 from fgslam.report.figures.traces import (
+    MAP_AXES,
     Figure,
     Owner,
     Paint,
@@ -24,15 +32,9 @@ from fgslam.report.figures.traces import (
     thinned,
     trace,
 )
-from fgslam.report.pictures.birds_eye import exaggeration, world_position_covariances
 from fgslam.report.run_results import EstimatorReport, ReportData
 
-MAX_POSES = 1_500
-MAX_DOTS_ABOVE = 3_000
-MAX_DOTS_MAP = 6_000
 ELLIPSES = 40
-SIGMAS = 3.0
-_CORNERS = 33
 _DENSE = 3_000  # dots; finer ones keep the paths in sight
 # Dead reckoning beside smoothers: enlarged as these need it, its ellipses would cover everything.
 _FLOOD = 0.25
@@ -48,6 +50,28 @@ _TOLD_3D = (
 _TOLD_DOT = "%{fullData.name}<br>%{x:.2f} m right, %{y:.2f} m ahead, %{z:.2f} m up<extra></extra>"
 
 
+@dataclass(frozen=True, slots=True)
+class Detail:
+    """How much is drawn at most, evenly spread.
+
+    Attributes:
+        poses: of each path.
+        dots_above: landmarks of an estimator seen from above.
+        dots_map: and in space.
+        landmark_ellipses: of the landmarks seen from above, where there is one estimator.
+    """
+
+    poses: int = 1_500
+    dots_above: int = 3_000
+    dots_map: int = 6_000
+    landmark_ellipses: int = 300
+
+
+ON_PAGE = Detail()
+ON_PAPER = Detail(20_000, 100_000, 100_000, 5_000)
+"""A picture does not grow with what it shows."""
+
+
 def level_axes(up: FloatArray) -> FloatArray:
     """Rotation (3, 3) from the world to (right, ahead, up)."""
     vertical = up / np.linalg.norm(up)
@@ -58,23 +82,34 @@ def level_axes(up: FloatArray) -> FloatArray:
     return np.array([right, np.cross(vertical, right), vertical])
 
 
-def drive_from_above(data: ReportData) -> Figure:
-    """Truth, every estimator's final and online path, ellipses and landmarks, equal axes."""
+def drive_from_above(data: ReportData, detail: Detail = ON_PAGE) -> Figure:
+    """Truth, every estimator's final and online path, ellipses and landmarks, equal axes.
+
+    Of a single estimator the landmarks are coloured by height and have ellipses, too: Fig. 5 of
+    Se, Lowe and Little (2001).
+    """
     level = level_axes(data.up)
-    x, y = _limits(data, level)[:2]
+    x, y = _readable(_limits(data, level)[:2])
     ellipses, of_ellipses = _uncertainty(data, level)
     layout = {
-        "xaxis": {"title": {"text": "right (m)"}, "range": x, "constrain": "domain"},
-        "yaxis": {"title": {"text": "ahead (m)"}, "range": y, "scaleanchor": "x"},
-        "hovermode": "closest",
+        **MAP_AXES,
+        "xaxis": {**MAP_AXES["xaxis"], "range": x},
+        "yaxis": {**MAP_AXES["yaxis"], "range": y},
     }
+    alone = len(data.estimators) == 1
+    dots = "coloured by height" if alone else "of the estimator chosen"
     return Figure(
         "above",
         "The drive from above",
         "Solid: the path as known at the end. Dotted: each pose as first estimated. Dashed: the "
         f"truth. An ellipse reaches {SIGMAS:.0f} standard deviations of the position as the "
-        "estimator claims it. Grey dots: landmarks of the estimator chosen.",
-        (*_dots_above(data, level), *_paths(data, level[:2]), *ellipses, *_returns(data, level)),
+        f"estimator claims it. Dots: landmarks, {dots}. Cross: start; dot: end.",
+        (
+            *_dots_above(data, level, detail),
+            *_paths(data, level[:2], detail),
+            *ellipses,
+            *_returns(data, level),
+        ),
         layout,
         (
             Switch("truth", "truth"),
@@ -82,15 +117,16 @@ def drive_from_above(data: ReportData) -> Figure:
             Switch("online", "path as first estimated", on=False),
             *of_ellipses,
             Switch("landmarks", "landmarks"),
+            *([Switch("landmark-ellipses", "their uncertainty", on=False)] if alone else []),
             *([Switch("returns", "loops closed")] if data.closures else []),
         ),
         choices=_with_landmarks(data),
         chosen=data.best,
-        note=_thinning_note(data, MAX_DOTS_ABOVE),
+        note=_thinning_note(data, detail.poses, detail.dots_above),
     )
 
 
-def map_to_turn(data: ReportData) -> Figure:
+def map_to_turn(data: ReportData, detail: Detail = ON_PAGE) -> Figure:
     """The landmarks of the chosen estimator and the paths, in three dimensions."""
     level = level_axes(data.up)
     limits = _limits(data, level)
@@ -113,7 +149,7 @@ def map_to_turn(data: ReportData) -> Figure:
         "Drag to turn, pinch or scroll to come closer, drag with the right button to shift; or use "
         "arrow keys, plus and minus. "
         "Dots: landmarks of the estimator chosen, coloured by height. Lines as above.",
-        (*_dots_in_space(data, level, limits), *_paths(data, level)),
+        (*_dots_in_space(data, level, limits, detail), *_paths(data, level, detail)),
         {"scene": scene},
         (
             Switch("truth", "truth"),
@@ -124,7 +160,13 @@ def map_to_turn(data: ReportData) -> Figure:
         choices=_with_landmarks(data),
         chosen=data.best,
         note=" ".join(
-            filter(None, [_thinning_note(data, MAX_DOTS_MAP), _outside(data, level, limits)])
+            filter(
+                None,
+                [
+                    _thinning_note(data, detail.poses, detail.dots_map),
+                    _outside(data, level, limits),
+                ],
+            )
         ),
     )
 
@@ -134,13 +176,13 @@ def _with_landmarks(data: ReportData) -> tuple[int, ...]:
     return tuple(i for i, e in enumerate(data.estimators) if len(e.landmarks))
 
 
-def _thinning_note(data: ReportData, dots: int) -> str:
+def _thinning_note(data: ReportData, most_poses: int, dots: int) -> str:
     """What is left out to keep the page small; empty where all is drawn."""
     poses = max((len(e) for e in data.estimators), default=0)
     landmarks = max((len(e.landmarks) for e in data.estimators), default=0)
     parts = []
-    if poses > MAX_POSES:
-        parts.append(f"{MAX_POSES:,} of up to {poses:,} poses")
+    if poses > most_poses:
+        parts.append(f"{most_poses:,} of up to {poses:,} poses")
     if landmarks > dots:
         parts.append(f"{dots:,} of up to {landmarks:,} landmarks")
     if not parts:
@@ -163,7 +205,7 @@ def _outside(data: ReportData, level: FloatArray, limits: list[list[float]]) -> 
 # Lines
 
 
-def _paths(data: ReportData, level: FloatArray) -> Iterator[Trace]:
+def _paths(data: ReportData, level: FloatArray, detail: Detail) -> Iterator[Trace]:
     """Lines in the axes that the rows of ``level`` (2 or 3, 3) span; the truth on top."""
     for i, estimator in enumerate(data.estimators):
         for key, poses, style in (
@@ -171,11 +213,29 @@ def _paths(data: ReportData, level: FloatArray) -> Iterator[Trace]:
             ("final", estimator.final_poses, {"dash": "solid", "width": 2.5}),
         ):
             owner = Owner(f"{estimator.title}, {key}", i, (key,))
-            yield _path(owner, estimator.timestamps - data.start, poses, level, style)
+            rows = thinned(len(poses), detail.poses)
+            times = estimator.timestamps[rows] - data.start
+            yield _path(owner, times, poses[rows], level, style)
+        if len(estimator):
+            yield _place(f"{estimator.title}, end", estimator.final_poses[-1], level, i)
     if data.truth is not None and len(data.truth):
         owner = Owner("truth", None, ("truth",), paint="truth")
-        times = data.truth.timestamps - data.start
-        yield _path(owner, times, data.truth.poses, level, {"dash": "dash", "width": 2})
+        rows = thinned(len(data.truth), detail.poses)
+        times = data.truth.timestamps[rows] - data.start
+        yield _path(owner, times, data.truth.poses[rows], level, {"dash": "dash", "width": 2})
+    start = next((e.final_poses[0] for e in data.estimators if len(e)), None)
+    if start is not None:
+        yield _place("start", start, level)
+
+
+def _place(name: str, pose: FloatArray, level: FloatArray, number: int | None = None) -> Trace:
+    """A dot where an estimator's path ends, a cross where all of them start."""
+    axes = dict(zip("xyz", (level @ pose[:3, 3])[:, None], strict=False))
+    owner, symbol = Owner(name, number, ("final",)), "circle"
+    if number is None:
+        owner, symbol = Owner(name, paint="truth"), "cross"
+    marker = {"symbol": symbol, "size": 10 if len(level) == 2 else 4}
+    return trace(owner, axes, mode="markers", marker=marker, hoverinfo="name")
 
 
 def _returns(data: ReportData, level: FloatArray) -> Iterator[Trace]:
@@ -192,12 +252,11 @@ def _returns(data: ReportData, level: FloatArray) -> Iterator[Trace]:
 def _path(
     owner: Owner, times: FloatArray, poses: FloatArray, level: FloatArray, style: dict[str, Any]
 ) -> Trace:
-    rows = thinned(len(poses), MAX_POSES)
-    points = poses[rows, :3, 3] @ level.T
+    points = poses[:, :3, 3] @ level.T
     solid = len(level) == 3
     if solid:  # lines in space are drawn thinner than those of a plane
         style = style | {"width": 2 * style["width"]}
-    axes = dict(zip("xyz", points.T, strict=False)) | {"customdata": times[rows]}
+    axes = dict(zip("xyz", points.T, strict=False)) | {"customdata": times}
     told = _TOLD_3D if solid else _TOLD
     return trace(owner, axes, mode="lines", line=style, hovertemplate=told)
 
@@ -212,8 +271,7 @@ def _uncertainty(data: ReportData, level: FloatArray) -> tuple[list[Trace], list
     wide = [_is_wide(estimator, level, span) for estimator in data.estimators]
     claimed = [_claimed(estimator, level[:2]) for estimator in data.estimators]
     narrow = [found[1] for found, hidden in zip(claimed, wide, strict=True) if not hidden]
-    judged = np.concatenate([np.empty((0, 2, 2)), *narrow])
-    factor = exaggeration(judged, span) if len(judged) else 1
+    factor = exaggeration(np.concatenate([np.empty((0, 2, 2)), *narrow]), span)
     switches = [Switch("ellipses", "uncertainty (3 sigma)")]
     if any(wide):
         switches.append(Switch("wide", "very large ones, too", on=False))
@@ -239,7 +297,7 @@ def _uncertainty(data: ReportData, level: FloatArray) -> tuple[list[Trace], list
 
 
 def _ellipses(owner: Owner, centres: FloatArray, covariances: FloatArray, scale: int) -> Trace:
-    x, y = joined(centres[:, None] + scale * _outlines(covariances)).T
+    x, y = joined(outlines(centres, covariances, scale)).T
     return trace(owner, {"x": x, "y": y}, mode="lines", line={"width": 1.2}, hoverinfo="skip")
 
 
@@ -249,18 +307,7 @@ def _claimed(estimator: EstimatorReport, plane: FloatArray) -> tuple[FloatArray,
     known = np.flatnonzero(np.isfinite(covariances[:, 3:, 3:]).all(axis=(1, 2)))
     rows = known[thinned(len(known), ELLIPSES)]
     world = world_position_covariances(poses[rows], covariances[rows])
-    return poses[rows, :3, 3] @ plane.T, congruence(
-        np.broadcast_to(plane, (len(rows), 2, 3)), world
-    )
-
-
-def _outlines(covariances: FloatArray) -> FloatArray:
-    """Ellipses (k, corners, 2) of SIGMAS standard deviations about zero."""
-    variances, directions = np.linalg.eigh(covariances)
-    radii = SIGMAS * np.sqrt(np.maximum(variances, 0.0))
-    angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
-    circle = np.column_stack([np.cos(angle), np.sin(angle)])
-    return np.asarray(np.einsum("kij,kj,mj->kmi", directions, radii, circle))
+    return poses[rows, :3, 3] @ plane.T, in_plane(world, plane)
 
 
 def _is_wide(estimator: EstimatorReport, level: FloatArray, span: float) -> bool:
@@ -285,28 +332,53 @@ def _span(data: ReportData, level: FloatArray) -> float:
 # Landmarks
 
 
-def _dots_above(data: ReportData, level: FloatArray) -> Iterator[Trace]:
+def _dots_above(data: ReportData, level: FloatArray, detail: Detail) -> Iterator[Trace]:
+    alone = len(data.estimators) == 1
     for i, estimator in enumerate(data.estimators):
-        points = _dots(estimator, MAX_DOTS_ABOVE) @ level.T
-        owner = _map_of(i, estimator, "grey")
+        if alone:
+            yield _landmark_ellipses(i, estimator, level[:2], detail.landmark_ellipses)
+        points = _dots(estimator, detail.dots_above) @ level.T
+        marker: dict[str, Any] = {"size": 3}
+        if alone and len(points):
+            points = points[np.argsort(points[:, 2], kind="stable")]  # as seen from above
+            low, high = np.percentile(points[:, 2], [2.0, 98.0]).tolist()
+            marker |= _by_height(points[:, 2], low, high)
+        owner = _map_of(i, estimator, "own" if alone else "grey")
         axes = {"x": points[:, 0], "y": points[:, 1]}
-        yield trace(owner, axes, mode="markers", marker={"size": 3}, hoverinfo="skip")
+        yield trace(owner, axes, mode="markers", marker=marker, hoverinfo="skip")
+
+
+def _landmark_ellipses(i: int, estimator: EstimatorReport, plane: FloatArray, most: int) -> Trace:
+    landmarks = estimator.landmarks
+    rows = thinned(len(landmarks), most)
+    centres = landmarks.positions[rows] @ plane.T
+    owner = Owner("uncertainty of a landmark", i, ("landmark-ellipses",), paint="grey")
+    x, y = joined(outlines(centres, in_plane(landmarks.covariances[rows], plane))).T
+    return trace(owner, {"x": x, "y": y}, mode="lines", line={"width": 0.6}, hoverinfo="skip")
+
+
+def _by_height(heights: FloatArray, low: float, high: float) -> dict[str, Any]:
+    """Colours of dots; the bar is drawn on paper only."""
+    return {
+        "color": packed(heights),
+        "colorscale": "Viridis",
+        "cmin": low,
+        "cmax": high,
+        "colorbar": {"title": {"text": "height above the first camera (m)"}},
+    }
 
 
 def _dots_in_space(
-    data: ReportData, level: FloatArray, limits: list[list[float]]
+    data: ReportData, level: FloatArray, limits: list[list[float]], detail: Detail
 ) -> Iterator[Trace]:
     low, high = np.array(limits).T
     for i, estimator in enumerate(data.estimators):
-        points = _dots(estimator, MAX_DOTS_MAP) @ level.T
+        points = _dots(estimator, detail.dots_map) @ level.T
         # Plotly would draw what lies outside the axes across the page.
         points = points[((points >= low) & (points <= high)).all(axis=1)]
         marker = {
             "size": 2.5 if len(points) < _DENSE else 1.6,
-            "color": packed(points[:, 2]),
-            "colorscale": "Viridis",
-            "cmin": low[2],
-            "cmax": high[2],
+            **_by_height(points[:, 2], float(low[2]), float(high[2])),
         }
         owner, axes = _map_of(i, estimator, "own"), dict(zip("xyz", points.T, strict=True))
         yield trace(owner, axes, mode="markers", marker=marker, hovertemplate=_TOLD_DOT)
@@ -323,18 +395,29 @@ def _map_of(i: int, estimator: EstimatorReport, paint: Paint) -> Owner:
 
 
 def _limits(data: ReportData, level: FloatArray) -> list[list[float]]:
-    """Limits along right, ahead and up: all of the paths and the bulk of the landmarks.
-
-    A few far landmarks of tiny disparity must not shrink the rest to a dot.
-    """
+    """Limits along right, ahead and up."""
     paths = [np.zeros((1, 3)), *(e.final_poses[:, :3, 3] for e in data.estimators)]
     if data.truth is not None:
         paths.append(data.truth.poses[:, :3, 3])
-    points = np.concatenate(paths)
-    corners = [points[np.isfinite(points).all(axis=1)] @ level.T]
-    for estimator in data.estimators:
-        if len(estimator.landmarks):
-            corners.append(np.percentile(estimator.landmarks.positions @ level.T, _BULK, axis=0))
+    poses = np.concatenate(paths)
+    maps = [e.landmarks.positions @ level.T for e in data.estimators]
+    return bulk_limits(poses @ level.T, *maps)
+
+
+def _readable(limits: list[list[float]]) -> list[list[float]]:
+    """The limits, no side shorter than half the other: a road is long and thin."""
+    least = 0.5 * max(high - low for low, high in limits)
+    wider = [max(least - (high - low), 0.0) / 2.0 for low, high in limits]
+    return [[low - more, high + more] for (low, high), more in zip(limits, wider, strict=True)]
+
+
+def bulk_limits(path: FloatArray, *maps: FloatArray) -> list[list[float]]:
+    """Limits along each of d axes: all of the path (n, d) and the bulk of every map (m, d).
+
+    A few far landmarks of tiny disparity must not shrink the rest to a dot.
+    """
+    corners = [path[np.isfinite(path).all(axis=1)]]
+    corners += [np.percentile(points, _BULK, axis=0) for points in maps if len(points)]
     everything = np.concatenate(corners)
     low, high = everything.min(axis=0), everything.max(axis=0)
     centre, half = 0.5 * (low + high), 0.53 * np.maximum(high - low, 0.2)

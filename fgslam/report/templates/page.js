@@ -87,8 +87,8 @@
         dressed.scene[axis] = dressedAxis(layout.scene[axis], false);
       return dressed;
     }
-    dressed.xaxis = dressedAxis(layout.xaxis, true);
-    dressed.yaxis = dressedAxis(layout.yaxis, true);
+    for (const name of Object.keys(layout).filter((name) => /^[xy]axis/.test(name)))
+      dressed[name] = dressedAxis(layout[name], true);
     const log = switchOf(key, "log");
     if (log !== null) dressed.yaxis.type = log.checked ? "log" : "linear";
     dressed.yaxis.exponentformat = "power"; // not 100µ, beside a unit of its own

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -12,9 +11,11 @@ from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.geometry import yaw_pitch_roll
 from fgslam.evaluation.localisation import Bounds, LocalisationScore, Spread
 from fgslam.evaluation.metrics import JsonValue
-from fgslam.report.content import Page, Picture
+from fgslam.report.content import Page
+from fgslam.report.figures.located import Located, located_figure
+from fgslam.report.figures.traces import Figure
 from fgslam.report.page import write_html
-from fgslam.report.pictures.located import LocatedDrawing, draw_located
+from fgslam.report.pictures.on_paper import draw_figure
 from fgslam.report.tables import Cell, write_csv, write_json
 from fgslam.runs.tasks.localisation_results import (
     LocalisationResult,
@@ -72,17 +73,19 @@ def write_results(result: LocalisationResult, given: GivenMap, subtitle: str) ->
     write_csv(folder / TIMING_FILE, ("frame", "frames", "locate_ms", "frontend_ms"), timing)
     write_json(folder / METRICS_FILE, _document(result, judged))
     output = result.config.output
-    pictures: tuple[Picture, ...] = ()
+    bounds = bounds_of(result.config)
+    figures = {one.frames: _figure(given, one, bounds) for one in judged}
     if output.pictures:
-        bounds = bounds_of(result.config)
-        pictures = tuple(_draw(folder, given, one, bounds) for one in judged)
+        pictures = make_subfolder(folder, "pictures")
+        for frames, figure in figures.items():
+            draw_figure(pictures / f"localisation_{frames}.png", figure, figure.heading)
     if output.report:
         page = Page(
             title=result.config.name,
             subtitle=subtitle,
             headline=result.verdict,
             tables=result.tables,
-            pictures=pictures,
+            figures=tuple(figures.values()),
             notes=result.notes,
             config_yaml=(folder / "config.yaml").read_text(encoding="utf-8"),
             versions=versions(),
@@ -165,12 +168,10 @@ def _spread_numbers(values: Spread) -> dict[str, JsonValue]:
     return {"median": values.median, "p95": values.p95, "max": values.largest}
 
 
-def _draw(folder: Path, given: GivenMap, judged: Scored, bounds: Bounds) -> Picture:
-    path = make_subfolder(folder, "pictures") / f"localisation_{judged.frames}.png"
+def _figure(given: GivenMap, judged: Scored, bounds: Bounds) -> Figure:
     answers, errors = judged.answers, judged.errors
-    title = f"Found from {in_frames(judged.frames)}"
     false = (errors.metres > bounds.wrong_m) | (errors.radians > bounds.wrong_rad)
-    drawing = LocatedDrawing(
+    located = Located(
         landmarks=given.saved.landmarks.positions,
         path=given.saved.trajectory.poses,
         found=answers.accepted,
@@ -178,7 +179,6 @@ def _draw(folder: Path, given: GivenMap, judged: Scored, bounds: Bounds) -> Pict
         covariances=answers.covariances,
         truth=answers.truth,
         false=np.asarray(false),
-        title=title,
     )
-    draw_located(path, drawing)
-    return Picture(title, path.read_bytes())
+    title = f"Found from {in_frames(judged.frames)}"
+    return located_figure(located, f"localisation-{judged.frames}", title)

@@ -158,4 +158,5 @@ def _figures(
         matched=counts[0],
         inliers=counts[1],
         landmarks=counts[2],
+        up=recording.log.rig.bTc[2, :3],
     )

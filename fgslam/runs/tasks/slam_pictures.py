@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,18 +11,11 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.estimates import Estimate, Trajectory
 from fgslam.core.measurements import Increment
-from fgslam.evaluation.trajectory import to_estimate_world
-from fgslam.report.pictures import (
-    MapDrawing,
-    draw_birds_eye,
-    draw_disparities,
-    draw_errors,
-    draw_features,
-    draw_flow,
-    draw_map_views,
-    draw_matches,
-)
-from fgslam.report.pictures.birds_eye import world_position_covariances
+from fgslam.report.figures.over_time import error_by_axis, matches_over_time
+from fgslam.report.figures.trajectory import ON_PAPER, drive_from_above, map_to_turn
+from fgslam.report.pictures.image_overlays import draw_disparities, draw_features, draw_flow
+from fgslam.report.pictures.on_paper import draw_figure, draw_views
+from fgslam.report.run_results import ReportData, judged_report, truth_in_their_world
 from fgslam.runs.tasks.slam_outputs import RunOutputs
 from fgslam.slam.pipeline import FrameReport
 
@@ -66,6 +59,7 @@ class RunFigures:
         valid: (n,) which landmarks of the estimate were seen often enough (Se et al. 6.1).
         frames: (m,) the recording's numbers of the frames.
         matched, inliers, landmarks: (m,) counts of each frame.
+        up: (3,) the vertical in the first camera's frame.
     """
 
     name: str
@@ -77,6 +71,7 @@ class RunFigures:
     matched: IntArray
     inliers: IntArray
     landmarks: IntArray
+    up: FloatArray
 
     def title(self, what: str) -> str:
         """Title of one picture."""
@@ -98,56 +93,37 @@ def figures_of(outputs: RunOutputs) -> RunFigures:
         matched=recorder.column("matched"),
         inliers=recorder.column("inliers"),
         landmarks=recorder.column("landmarks"),
+        up=outputs.sequence.rig.bTc[2, :3],
     )
 
 
 def draw_run(run: Path, figures: RunFigures) -> list[Path]:
     """Map from above (Fig. 5), in perspective (Fig. 6), errors and matches over time."""
     folder = make_subfolder(run, FOLDER)
-    estimate, truth = figures.estimate, figures.truth
-    found = None if truth is None else to_estimate_world(estimate.trajectory, truth)
-    drawing = _map_drawing(figures, None if found is None else found[1])
-    draw_birds_eye(folder / "map_from_above.png", drawing)
-    draw_map_views(folder / "map_views.png", drawing)
+    results = _results(figures)
+    what = figures.title("valid landmarks" if figures.valid.any() else "landmarks")
+    above, ellipses = drive_from_above(results, ON_PAPER), {"landmark-ellipses": True}
+    draw_figure(folder / "map_from_above.png", above, what, ellipses)
+    draw_views(folder / "map_views.png", map_to_turn(results, ON_PAPER), what)
     # The first frame has no landmarks to match.
-    draw_matches(
-        folder / "matches.png",
-        figures.frames[1:],
-        figures.matched[1:],
-        figures.inliers[1:],
-        figures.landmarks[1:],
-        figures.title("landmark matches"),
-    )
-    if found is not None:
-        _draw_position_errors(folder / "position_error.png", figures, *found)
+    counts = (figures.frames, figures.matched, figures.inliers, figures.landmarks)
+    matches = matches_over_time(*(values[1:] for values in counts))
+    draw_figure(folder / "matches.png", matches, figures.title("landmark matches"))
+    if results.truth is not None:
+        title = figures.title("position error, first pose aligned")
+        draw_figure(folder / "position_error.png", error_by_axis(results), title)
     return sorted(folder.glob("*.png"))
 
 
-def _draw_position_errors(
-    path: Path, figures: RunFigures, rows: IntArray, true_poses: FloatArray
-) -> None:
-    trajectory = figures.estimate.trajectory
-    errors = trajectory.poses[rows, :3, 3] - true_poses[:, :3, 3]
-    covariances = world_position_covariances(
-        trajectory.poses[rows], figures.estimate.covariances[rows]
-    )
-    # A planar covariance, rotated, may round to just below zero.
-    sigmas = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
-    title = figures.title("position error, first pose aligned")
-    draw_errors(path, trajectory.timestamps[rows], errors, sigmas, title)
-
-
-def _map_drawing(figures: RunFigures, true_poses: FloatArray | None) -> MapDrawing:
+def _results(figures: RunFigures) -> ReportData:
     """Valid landmarks only (6.1), as in the paper's Figure 6; all while the run is too short."""
-    valid, estimate = figures.valid, figures.estimate
-    shown = valid if valid.any() else np.ones_like(valid)
-    return MapDrawing(
-        landmarks=estimate.landmarks.positions[shown],
-        poses=estimate.trajectory.poses,
-        landmark_covariances=estimate.landmarks.covariances[shown],
-        pose_covariances=estimate.covariances,
-        truth=true_poses,
-        title=figures.title("valid landmarks" if valid.any() else "landmarks"),
+    estimate, valid = figures.estimate, figures.valid
+    if valid.any():
+        estimate = replace(estimate, landmarks=estimate.landmarks.select(valid))
+    report = judged_report("estimate", "", estimate, None, figures.truth)
+    truth = truth_in_their_world((report,), figures.truth)
+    return ReportData(
+        title=figures.name, subtitle="", estimators=(report,), truth=truth, up=figures.up
     )
 
 

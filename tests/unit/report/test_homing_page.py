@@ -16,7 +16,8 @@ from reports import HOSTILE
 from fgslam.core.arrays import FloatArray
 from fgslam.report.content import Column, TextTable
 from fgslam.report.figures.curves import claimed_against_true, sorted_errors
-from fgslam.report.figures.local_map import MAX_MOMENTS, SIGMAS, ellipse, local_map_figure, upwards
+from fgslam.report.figures.ellipses import SIGMAS, outlines
+from fgslam.report.figures.local_map import MAX_MOMENTS, local_map_figure, upwards
 from fgslam.report.figures.network import Links, network_figure, unfolded
 from fgslam.report.figures.plan import catchment_figure, drive_figure
 from fgslam.report.figures.traces import Figure, Trace, unpacked
@@ -38,10 +39,10 @@ def test_ahead_is_up_and_left_is_left() -> None:
 
 def test_an_ellipse_lies_at_its_deviations() -> None:
     covariance = np.array([[4.0, 1.0], [1.0, 2.0]])
-    outline = ellipse(np.array([1.0, -1.0]), covariance) - [1.0, -1.0]
+    outline = outlines(np.array([[1.0, -1.0]]), covariance[None])[0] - [1.0, -1.0]
     distance = np.einsum("ni,ij,nj->n", outline, np.linalg.inv(covariance), outline)
     np.testing.assert_allclose(distance, SIGMAS**2, rtol=1e-12)
-    assert len(ellipse(np.zeros(2), np.full((2, 2), np.nan))) == 0
+    assert np.isnan(outlines(np.zeros((1, 2)), np.full((1, 2, 2), np.nan))).all()
 
 
 def test_a_lost_feature_becomes_a_star_where_it_was_last() -> None:

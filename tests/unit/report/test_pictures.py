@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,22 +15,24 @@ from matplotlib.image import imread
 
 from fgslam.core.arrays import Image
 from fgslam.core.errors import OutputError
+from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.features import Features
 from fgslam.core.geometry import pose, se3_exp, so3_exp
-from fgslam.report.pictures import (
-    MapDrawing,
-    draw_birds_eye,
+from fgslam.report.figures import palette
+from fgslam.report.figures.ellipses import SIGMAS, exaggeration, world_position_covariances
+from fgslam.report.figures.located import Located, located_figure
+from fgslam.report.figures.over_time import error_by_axis, matches_over_time
+from fgslam.report.figures.printing import printed
+from fgslam.report.figures.trajectory import bulk_limits, drive_from_above, map_to_turn
+from fgslam.report.pictures import style
+from fgslam.report.pictures.image_overlays import (
     draw_disparities,
-    draw_errors,
     draw_features,
     draw_flow,
-    draw_map_views,
-    draw_matches,
-    style,
+    oriented_squares,
 )
-from fgslam.report.pictures.birds_eye import exaggeration, view_limits, world_position_covariances
-from fgslam.report.pictures.image_overlays import oriented_squares
-from fgslam.report.pictures.map_views import Viewer
+from fgslam.report.pictures.on_paper import draw_figure, draw_views
+from fgslam.report.run_results import ReportData, judged_report
 
 YELLOW = np.array([0xF0, 0xE4, 0x42]) / 255.0
 
@@ -63,31 +66,46 @@ def pixels(n: int, cameras: int) -> np.ndarray:
     return np.stack([right, left, top], axis=1)
 
 
-def drawing(n: int, frames: int, *, full: bool) -> MapDrawing:
+def results(n: int, frames: int, *, full: bool) -> ReportData:
+    """One estimator with n landmarks; its truth and covariances where ``full``."""
     rng = np.random.default_rng(4)
     steps = [np.array([0, 0.03 * i, 0, 0, 0, 0.1 * i]) for i in range(frames)]
     poses = np.array([se3_exp(xi) for xi in steps]).reshape(-1, 4, 4)
-    return MapDrawing(
-        rng.normal(scale=3.0, size=(n, 3)),
-        poses,
-        np.tile(0.01 * np.eye(3), (n, 1, 1)) if full else None,
-        np.tile(1e-4 * np.eye(6), (frames, 1, 1)) if full else None,
-        poses if full else None,
-    )
+    path = Trajectory(0.5 * np.arange(frames), poses)
+    covariances = np.tile(1e-4 * np.eye(6) if full else np.full((6, 6), np.nan), (frames, 1, 1))
+    unknown = 0.01 * np.eye(3) if full else np.full((3, 3), np.nan)
+    positions = rng.normal(scale=3.0, size=(n, 3))
+    landmarks = LandmarkMap(np.arange(n), positions, np.tile(unknown, (n, 1, 1)))
+    truth = path if full and frames else None
+    report = judged_report("a", "a", Estimate(path, covariances, landmarks), None, truth)
+    return ReportData("", "", (report,), truth)
+
+
+def located(n: int) -> Located:
+    """Every second query is found, the last of them somewhere else."""
+    poses = results(n, n, full=True).estimators[0].final_poses
+    found = np.arange(n) % 2 == 0
+    false = found & (np.arange(n) == 2)
+    covariances = np.tile(1e-4 * np.eye(6), (n, 1, 1))
+    drive = np.tile(np.eye(4), (2, 1, 1))
+    drive[1, 2, 3] = 5.0
+    return Located(np.zeros((n, 3)), drive, found, poses, covariances, poses, false)
 
 
 def all_pictures(n: int, *, full: bool) -> dict[str, Callable[[Path], None]]:
     images = (grey(), grey(), grey()) if full else (grey(), grey())
     counts = np.arange(n)
-    sigmas = np.full((n, 3), 0.02) if full else None
     return {
         "features": lambda p: draw_features(p, images, (features(n),) * len(images), "Frame 1"),
         "disparities": lambda p: draw_disparities(p, grey(), pixels(n, len(images))),
         "flow": lambda p: draw_flow(p, grey(), features(n).xy, features(n, 9).xy),
-        "birds_eye": lambda p: draw_birds_eye(p, drawing(n, n, full=full)),
-        "views": lambda p: draw_map_views(p, drawing(n, n, full=full)),
-        "errors": lambda p: draw_errors(p, 0.5 * counts, np.full((n, 3), 0.01), sigmas),
-        "matches": lambda p: draw_matches(p, counts, counts + 5, counts, 10 * counts),
+        "above": lambda p: draw_figure(p, drive_from_above(results(n, n, full=full)), "Above"),
+        "views": lambda p: draw_views(p, map_to_turn(results(n, n, full=full)), "Map"),
+        "errors": lambda p: draw_figure(p, error_by_axis(results(n, n, full=full)), "Errors"),
+        "matches": lambda p: draw_figure(
+            p, matches_over_time(counts, counts + 5, counts, 10 * counts), "Matches"
+        ),
+        "located": lambda p: draw_figure(p, located_figure(located(n), "k", "Found"), "Found"),
     }
 
 
@@ -120,7 +138,7 @@ def test_same_input_same_bytes_whatever_the_users_style(tmp_path: Path, name: st
 
 
 def test_pictures_need_no_display_and_no_pyplot() -> None:
-    code = "import sys, fgslam.report.pictures; print('matplotlib.pyplot' in sys.modules)"
+    code = "import sys, fgslam.report.pictures.on_paper; print('matplotlib.pyplot' in sys.modules)"
     done = subprocess.run(  # noqa: S603
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
@@ -173,19 +191,48 @@ def test_feature_appears_where_it_was_found(tmp_path: Path) -> None:
 
 def test_far_landmarks_do_not_shrink_the_map() -> None:
     rng = np.random.default_rng(5)
-    near = rng.uniform(-5, 5, (500, 3))
-    far = np.array([[900.0, 0.0, 4000.0]])
-    path = np.array([pose(np.eye(3), [0, 0, z]) for z in (0.0, 7.5)])
-    (left, right), (bottom, top) = view_limits(MapDrawing(np.concatenate([near, far]), path))
+    near = rng.uniform(-5, 5, (500, 2))
+    path = np.array([[0.0, 0.0], [0.0, 7.5]])
+    (left, right), (bottom, top) = bulk_limits(path, np.vstack([near, [[900.0, 4000.0]]]))
     assert -6 < left < -4 < 4 < right < 6
     assert -6 < bottom < -4
     assert 7.5 < top < 9
 
 
+def test_switches_that_are_off_and_other_moments_are_not_printed() -> None:
+    figure = drive_from_above(results(5, 5, full=True))
+    names = [trace["name"] for trace in printed(figure)]
+    assert "uncertainty of a landmark" not in names
+    assert {"a, final", "truth", "start", "landmark of a"} <= set(names)
+    shown = printed(figure, {"landmark-ellipses": True, "final": False})
+    names = [trace["name"] for trace in shown]
+    assert "uncertainty of a landmark" in names
+    assert "a, final" not in names
+    assert {t["line"]["color"] for t in shown if t["name"] == "truth"} == {palette.INK}
+
+
+def test_errors_along_the_axes_are_those_of_the_level_world() -> None:
+    data = results(0, 20, full=True)
+    poses = data.estimators[0].final_poses.copy()
+    poses[1:, 1, 3] -= 0.02  # the world's y points down
+    moved = dataclasses.replace(data.estimators[0], final_poses=poses)
+    figure = error_by_axis(dataclasses.replace(data, estimators=(moved,)))
+    lines = {t["yaxis"]: t for t in printed(figure) if "rmse" in t["name"]}
+    np.testing.assert_allclose(lines["y3"]["y"][1:], 2.0, atol=1e-5)  # up, in centimetres
+    np.testing.assert_allclose(lines["y"]["y"], 0.0, atol=1e-5)
+    bands = {t["yaxis"]: t for t in printed(figure) if t["name"] == "3 sigma"}
+    assert np.abs(bands["y3"]["y"]).max() == pytest.approx(3.0, rel=1e-5)  # of 1 cm each
+
+
+def test_located_poses_refusals_and_false_ones_differ() -> None:
+    names = [t["name"] for t in located_figure(located(8), "k", "Found").traces]
+    assert {"found", "found, but false", "refused", "to the true pose"} <= set(names)
+
+
 @pytest.mark.parametrize("sigma", [1e-5, 1e-3, 0.02, 1.0])
 def test_pose_ellipses_are_enlarged_just_enough(sigma: float) -> None:
     factor = exaggeration(np.tile(sigma**2 * np.eye(2), (10, 1, 1)), span=10.0)
-    width = 2 * 2.4477 * sigma
+    width = 2 * SIGMAS * sigma
     assert factor == 1000 or factor * width >= 0.2
     assert factor == 1 or (factor / 2.5) * width < 0.2
     assert exaggeration(np.zeros((3, 2, 2)), span=10.0) == 1
@@ -201,16 +248,3 @@ def test_position_covariance_is_turned_into_the_world() -> None:
     expected = np.cov(positions.T)
     found = world_position_covariances(wTc[None], covariance[None])[0]
     np.testing.assert_allclose(found, expected, atol=0.05 * np.trace(expected))
-
-
-def test_viewer_is_a_pinhole() -> None:
-    target = np.array([1.0, -2.0, 3.0])
-    up = np.array([0.0, -1.0, 0.0])
-    viewer = Viewer.looking_at(target, np.array([1.0, 0.0, 0.0]), up, distance=10.0)
-    np.testing.assert_allclose(viewer.eye, target + np.array([10.0, 0.0, 0.0]))
-    # Seen from the right of the map: ahead (z) lies to the viewer's right, height is up.
-    points = target + np.array([[0, 0, 0], [0, -1, 0], [0, 0, 2], [5, 0, 2], [11, 0, 0.0]])
-    page, nearness, ahead = viewer.project(points)
-    np.testing.assert_allclose(page[:4], [[0, 0], [0, 1], [2, 0], [4, 0]], atol=1e-12)
-    np.testing.assert_allclose(nearness[:4], [1, 1, 1, 2])
-    np.testing.assert_array_equal(ahead, [True, True, True, True, False])

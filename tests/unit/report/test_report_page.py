@@ -23,10 +23,9 @@ from fgslam.core.geometry import so3_exp
 from fgslam.report.content import Column, Picture, TextTable
 from fgslam.report.embedding import BUDGET_BYTES, MAX_WIDTH, embed
 from fgslam.report.figures import palette
-from fgslam.report.figures import trajectory as drawn
 from fgslam.report.figures.over_time import error_over_time, nees_over_time, position_sigma
 from fgslam.report.figures.traces import Figure, Trace, peaks, thinned, unpacked
-from fgslam.report.figures.trajectory import drive_from_above, level_axes, map_to_turn
+from fgslam.report.figures.trajectory import Detail, drive_from_above, level_axes, map_to_turn
 from fgslam.report.headline import headline
 from fgslam.report.page import render as render_page
 from fgslam.report.run_results import EstimatorReport, ReportData
@@ -206,12 +205,10 @@ def test_covariances_that_are_not_known_have_no_ellipse() -> None:
     assert np.isnan(position_sigma(data.estimators[0])).all()
 
 
-def test_large_maps_and_long_runs_are_thinned_and_it_is_said(monkeypatch: Any) -> None:
+def test_large_maps_and_long_runs_are_thinned_and_it_is_said() -> None:
     data = full_report(frames=300, landmarks=900)
     assert drive_from_above(data).note == ""
-    monkeypatch.setattr(drawn, "MAX_POSES", 100)
-    monkeypatch.setattr(drawn, "MAX_DOTS_ABOVE", 500)
-    above = drive_from_above(data)
+    above = drive_from_above(data, Detail(poses=100, dots_above=500))
     assert "100 of up to 300 poses and 500 of up to 900 landmarks" in above.note
     assert len(unpacked(named(above, "isam2, final")["x"])) == 100
     assert len(unpacked(named(above, "landmark of isam2")["x"])) == 500
@@ -277,7 +274,7 @@ def test_only_the_two_scripts_may_run() -> None:
     digests = [base64.b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in run]
     assert re.findall(r"'sha256-([^']+)'", policy) == digests
     assert "unsafe-inline'" not in policy.split("style-src")[0]
-    assert set(json.loads(text_of(data))) == {"above", "map", "error", "nees", "time"}
+    assert set(json.loads(text_of(data))) == {"above", "map", "error", "axes", "nees", "time"}
     (element,) = [a for a in reader.all("script") if a.get("id") == "report-data"]
     assert element["data-colours"] == str(palette.COUNT) == str(len(palette.ON_DARK))
 

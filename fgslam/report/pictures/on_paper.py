@@ -1,0 +1,189 @@
+"""Figures as PNG: what a page shows as Plotly's traces, drawn by matplotlib from the same values.
+
+Plotly's own export would need a browser. Of the traces, lines, markers, bands and the colour bar
+are drawn: what the figures of this package are made of.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure as Canvas
+from matplotlib.ticker import MaxNLocator
+
+from fgslam.core.arrays import FloatArray
+from fgslam.report.figures.printing import printed
+from fgslam.report.figures.traces import Figure, Trace
+from fgslam.report.pictures.style import MAP_COLOURS, colour_bar, picture
+
+_DASHES = {"solid": "-", "dash": "--", "dot": ":"}
+_MARKERS = {"circle": "o", "cross": "P", "square": "s", "x-thin-open": "x"}
+_POINTS_A_PIXEL = 0.75
+_STEEP = 45.0
+_BAND = {"color": "#c9d3dc", "linewidth": 0.0}
+_FEW_ENTRIES = 3
+_FINE = 3.0e4
+# From where the three views of a map look: name, elevation and azimuth in degrees.
+_VIEWS = (
+    ("From above", 65.0, -90.0),
+    ("From the left", 22.0, -160.0),
+    ("From the right", 22.0, -20.0),
+)
+
+
+def draw_figure(
+    path: Path, figure: Figure, title: str, switches: Mapping[str, bool] | None = None
+) -> None:
+    """A figure of a plane, or panels over each other, with a legend.
+
+    Args:
+        path: the PNG to write.
+        figure: of the plane.
+        title: heading.
+        switches: states by key that differ from how they start.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    traces = printed(figure, switches)
+    panels = sorted(name.replace("axis", "") for name in figure.layout if name.startswith("yaxis"))
+    with picture(path, *_size(figure, len(panels))) as canvas:
+        found = canvas.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, panel in zip(found, panels, strict=True):
+            own = [trace for trace in traces if trace.get("yaxis", "y") == panel]
+            for order, trace in enumerate(own):
+                _draw(axes, trace, order)
+            _dress(axes, figure.layout, panel)
+            if len(panels) > 1 and own:
+                # Above the panel, where no curve is.
+                axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=_FEW_ENTRIES)
+        found[0].set_title(title, pad=22.0)
+        _note(found[0], figure, switches)
+        found[-1].set_xlabel(figure.layout["xaxis"]["title"]["text"])
+        canvas.align_ylabels()
+        if len(panels) == 1:
+            _legend(canvas, found[0])
+
+
+def draw_views(path: Path, figure: Figure, title: str) -> None:
+    """A figure in space, in perspective from above, from the left and from the right.
+
+    Args:
+        path: the PNG to write.
+        figure: in space.
+        title: heading.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    traces, scene = printed(figure), figure.layout["scene"]
+    with picture(path, 17.0, 6.4) as canvas:
+        for k, (name, elevation, azimuth) in enumerate(_VIEWS):
+            place = (1, len(_VIEWS), k + 1)
+            axes: Any = canvas.add_subplot(*place, projection="3d", proj_type="persp")
+            for order, trace in enumerate(traces):
+                _draw(axes, trace, order, "xyz")
+            axes.set(**{f"{a}lim": scene[f"{a}axis"]["range"] for a in "xyz"})
+            axes.set_box_aspect([scene["aspectratio"][a] for a in "xyz"], zoom=1.25)
+            axes.view_init(elevation, azimuth)
+            axes.set_title(name, y=0.98)
+            for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+                axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
+                axis.set_tick_params(labelsize=8.0)
+            axes.set(xlabel="right (m)", ylabel="ahead (m)")
+            if elevation < _STEEP:
+                axes.set_zlabel("up (m)")
+            else:
+                axes.set_zticks([])
+        canvas.suptitle(title, fontsize=16, fontweight="bold", x=0.01, ha="left")
+        canvas.supxlabel(figure.note, fontsize=12.0)
+        _legend(canvas, canvas.axes[0], "outside upper right")
+
+
+def _draw(axes: Any, trace: Trace, order: int, names: str = "xy") -> None:
+    points = [trace[name] for name in names]
+    if trace.get("fill") == "toself":
+        axes.fill(*points, label=_label(trace), zorder=2.0 + 0.01 * order, **_BAND)
+        return
+    if "lines" in trace["mode"]:
+        line = trace.get("line", {})
+        style = {"color": line.get("color"), "linestyle": _DASHES[line.get("dash", "solid")]}
+        width = line.get("width", 2.0) * (0.5 if len(names) == 3 else _POINTS_A_PIXEL)
+        axes.plot(*points, linewidth=width, label=_label(trace), zorder=2.0 + 0.01 * order, **style)
+    if "markers" in trace["mode"] and len(points[0]):
+        _draw_markers(axes, trace, order, points)
+
+
+def _draw_markers(axes: Any, trace: Trace, order: int, points: Sequence[FloatArray]) -> None:
+    marker = trace["marker"]
+    style: dict[str, Any] = {
+        "label": _label(trace),
+        "marker": _MARKERS[marker.get("symbol", "circle")],
+        "zorder": 2.0 + 0.01 * order,
+    }
+    # Dense maps get finer dots.
+    size = (_POINTS_A_PIXEL * marker["size"]) ** 2
+    style["s"] = min(size, max(_FINE / len(points[0]), 1.0))
+    if len(points) == 3:
+        style["depthshade"] = False
+    colours = marker["color"]
+    if isinstance(colours, str):
+        axes.scatter(*points, color=colours, linewidths=1.4, **style)
+        return
+    if len(colours):
+        norm = Normalize(marker["cmin"], marker["cmax"])
+        axes.scatter(*points, c=colours, cmap=MAP_COLOURS, norm=norm, linewidths=0, **style)
+        if len(points) == 2:
+            bar = marker["colorbar"]["title"]["text"]
+            colour_bar(axes, ScalarMappable(norm, MAP_COLOURS), bar, extend="both")
+
+
+def _label(trace: Trace) -> str:
+    """Words of the legend."""
+    return html.unescape(trace["name"])
+
+
+def _dress(axes: Axes, layout: Mapping[str, Any], panel: str) -> None:
+    vertical = layout[f"yaxis{panel[1:]}"]
+    axes.set_ylabel(vertical["title"]["text"])
+    axes.grid(visible=True)
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10]))
+    if vertical.get("rangemode") == "tozero":
+        axes.set_ylim(0.0, None)
+    if "scaleanchor" in vertical:
+        axes.set(xlim=layout["xaxis"]["range"], ylim=vertical["range"], aspect="equal")
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=9, steps=[1, 2, 5, 10]))
+
+
+def _note(axes: Axes, figure: Figure, switches: Mapping[str, bool] | None) -> None:
+    """What is left out, and that ellipses are larger than they are."""
+    states = {switch.key: switch.on for switch in figure.switches} | dict(switches or {})
+    larger = [s.label for s in figure.switches if s.key == "enlarged" and states[s.key]]
+    text = "; ".join(filter(None, [*(f"ellipses {label}" for label in larger), figure.note]))
+    axes.annotate(text, (0.0, 1.0), (0.0, 8.0), "axes fraction", textcoords="offset points")
+
+
+def _legend(canvas: Canvas, axes: Axes, where: Any = "outside lower center") -> None:
+    """One entry a name, in the order of drawing."""
+    handles, labels = axes.get_legend_handles_labels()
+    unique = dict(zip(labels, handles, strict=True))
+    if unique:
+        canvas.legend(list(unique.values()), list(unique), loc=where, ncols=_FEW_ENTRIES)
+
+
+def _size(figure: Figure, panels: int) -> tuple[float, float]:
+    """Inches: panels are wide; a plane keeps its shape, with room for a bar and a legend."""
+    if "scaleanchor" not in figure.layout["yaxis"]:
+        return 11.0, 1.6 + 2.0 * panels
+    (left, right), (low, high) = (figure.layout[axis]["range"] for axis in ("xaxis", "yaxis"))
+    # A straight road is long and thin; half its length keeps the picture readable.
+    aspect = float(np.clip((high - low) / (right - left), 0.2, 5.0))
+    height = float(np.clip(8.2 * aspect, 3.6, 9.0))
+    return min(height / aspect, 16.0) + 2.4, height + 1.8
