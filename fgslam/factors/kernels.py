@@ -1,14 +1,51 @@
-"""Robust kernels as plain functions of whitened residuals, the same as GTSAM's M-estimators.
+"""Robust kernels (M-estimators): GTSAM's, and the same as plain functions of whitened residuals.
 
-For solvers that linearise many factors at once; :mod:`fgslam.factors.noise` makes GTSAM's models.
+A kernel sees the norm of the *whole* whitened measurement, three numbers for a landmark
+observation, whose square is chi-square with three degrees of freedom where the noise is normal.
+The plain functions are for solvers that linearise many factors at once.
 """
 
 from __future__ import annotations
 
+from typing import Any, Literal, TypeAlias
+
+import gtsam
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.factors.noise import KernelName
+
+KernelName: TypeAlias = Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"]
+
+
+def m_estimator(name: KernelName, width: float) -> Any:
+    """GTSAM's M-estimator of a scale in standard deviations; None for least squares."""
+    estimators = gtsam.noiseModel.mEstimator
+    match name:
+        case "none":
+            return None
+        case "huber":
+            return estimators.Huber.Create(width)
+        case "cauchy":
+            return estimators.Cauchy.Create(width)
+        case "geman_mcclure":
+            return estimators.GemanMcClure.Create(width)
+        case "tukey":
+            return estimators.Tukey.Create(width)
+
+
+def robust(factor: Any, name: KernelName, width: float) -> Any:
+    """A plain GTSAM factor with a kernel around its noise model."""
+    kernel = m_estimator(name, width)
+    model = gtsam.noiseModel.Robust.Create(kernel, factor.noiseModel())
+    return factor.cloneWithNewNoiseModel(model)
+
+
+def plain(factor: Any) -> Any:
+    """A GTSAM factor without its kernel."""
+    model = factor.noiseModel()
+    if isinstance(model, gtsam.noiseModel.Robust):
+        return factor.cloneWithNewNoiseModel(model.noise())
+    return factor
 
 
 def kernel_weights(name: KernelName, width: float, squared: FloatArray) -> FloatArray:

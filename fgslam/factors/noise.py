@@ -1,19 +1,14 @@
-"""Noise models: full covariances, and robust kernels around them.
-
-A robust kernel sees the norm of the *whole* whitened measurement, three numbers for a landmark
-observation, whose square is chi-square with three degrees of freedom where the noise is normal.
-"""
+"""Noise models of full covariances, with a robust kernel around them where one is asked for."""
 
 from __future__ import annotations
 
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 import gtsam
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-
-KernelName: TypeAlias = Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"]
+from fgslam.factors.kernels import KernelName, m_estimator
 
 STIFF_RAD, STIFF_M = 1e-5, 1e-4
 """Deviations of a hard floor. GTSAM's constrained models would be exact, and make every solve
@@ -33,7 +28,7 @@ class Whitening:
 
     def __init__(self, kernel: KernelName = "none", width: float = 1.0) -> None:
         """``width`` is the kernel's scale in standard deviations of the whole measurement."""
-        self._kernel = _kernel(kernel, width)
+        self._kernel = m_estimator(kernel, width)
         self._known: dict[bytes, Any] = {}
 
     def model(self, covariance: FloatArray, jacobian: FloatArray | None = None) -> Any:
@@ -47,21 +42,6 @@ class Whitening:
                 found = gtsam.noiseModel.Robust.Create(self._kernel, found)
             self._known[name] = found
         return found
-
-
-def _kernel(name: KernelName, width: float) -> Any:
-    estimators = gtsam.noiseModel.mEstimator
-    match name:
-        case "none":
-            return None
-        case "huber":
-            return estimators.Huber.Create(width)
-        case "cauchy":
-            return estimators.Cauchy.Create(width)
-        case "geman_mcclure":
-            return estimators.GemanMcClure.Create(width)
-        case "tukey":
-            return estimators.Tukey.Create(width)
 
 
 def positive_definite(covariance: FloatArray) -> FloatArray:

@@ -21,6 +21,7 @@ from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.estimates import Prediction
 from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise, se3_log, skew
 from fgslam.core.measurements import Odometry
+from fgslam.factors.kernels import robust
 from fgslam.factors.keys import pose_key
 from fgslam.factors.motion import odometry_factor, pose_prior
 
@@ -163,10 +164,7 @@ def constraint_factor(known: Constraint) -> Any:
     factor = odometry_factor(pose_key(known.before), pose_key(known.after), step)
     if not known.doubted:
         return factor
-    kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(_DOUBT_WIDTH)
-    return factor.cloneWithNewNoiseModel(
-        gtsam.noiseModel.Robust.Create(kernel, factor.noiseModel())
-    )
+    return robust(factor, "cauchy", _DOUBT_WIDTH)
 
 
 def rotated(transforms: FloatArray, covariances: FloatArray) -> FloatArray:

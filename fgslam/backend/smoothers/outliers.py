@@ -12,6 +12,7 @@ import gtsam
 
 from fgslam.backend.graphs import solver_parameters
 from fgslam.core.quantiles import chi_square_quantile
+from fgslam.factors.kernels import plain, robust
 from fgslam.factors.keys import is_pose, number
 
 _GATE = float(chi_square_quantile(0.999, 3))  # 16.3, of a landmark observation's three numbers
@@ -70,7 +71,7 @@ def trimmed(graph: Any, values: Any, params: Any, noise_factor: float = 1.0) -> 
     observed = [_landmark(factor) is not None for factor in factors]
     # A robust factor whitens with its kernel's weight, after which everything would seem to fit.
     # Loops keep their kernels: they are too few to be told apart by a trim.
-    factors = [_plain(f) if is_one else f for f, is_one in zip(factors, observed, strict=True)]
+    factors = [plain(f) if is_one else f for f, is_one in zip(factors, observed, strict=True)]
     gate = _GATE / noise_factor**2
     fits: list[bool] = []
     for _ in range(_ROUNDS):
@@ -89,14 +90,11 @@ def trimmed(graph: Any, values: Any, params: Any, noise_factor: float = 1.0) -> 
 
 def with_kernel(graph: Any) -> Any:
     """The graph with Cauchy's kernel around its landmark observations, for a quick solution."""
-    kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(_QUICK_WIDTH)
     out = gtsam.NonlinearFactorGraph()
     for row in range(graph.size()):
         factor = graph.at(row)
-        if _landmark(factor) is not None:
-            model = gtsam.noiseModel.Robust.Create(kernel, factor.noiseModel())
-            factor = factor.cloneWithNewNoiseModel(model)
-        out.add(factor)
+        observed = _landmark(factor) is not None
+        out.add(robust(factor, "cauchy", _QUICK_WIDTH) if observed else factor)
     return out
 
 
@@ -104,14 +102,6 @@ def _squared(factor: Any, values: Any) -> float:
     """Whitened residual squared of a plain factor."""
     residual = factor.whitenedError(values)
     return float(residual @ residual)
-
-
-def _plain(factor: Any) -> Any:
-    """The factor without its kernel."""
-    model = factor.noiseModel()
-    if isinstance(model, gtsam.noiseModel.Robust):
-        return factor.cloneWithNewNoiseModel(model.noise())
-    return factor
 
 
 def observed_variables(graph: Any) -> set[int]:

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from fgslam.factors.bearing_residuals import constant_velocity, constant_velocity_covariance
-from fgslam.factors.kernels import kernel_losses, kernel_weights
+from fgslam.factors.kernels import KernelName, kernel_losses, kernel_weights
 from fgslam.factors.motion_residuals import constant_velocities, motion_informations
-from fgslam.factors.noise import KernelName
 
 NAMES: list[KernelName] = ["none", "huber", "cauchy", "geman_mcclure", "tukey"]
 
