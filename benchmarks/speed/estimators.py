@@ -109,7 +109,7 @@ def problem(drive: MeasuredDrive) -> tuple[Any, Any]:
 
 def minimum(graph: Any, values: Any) -> Any:
     """By Levenberg-Marquardt, as batch does it."""
-    params = solver_parameters(LEAST_SQUARES.max_iterations, 1e-9)
+    params = solver_parameters(100, 1e-9)
     return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
 

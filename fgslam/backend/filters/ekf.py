@@ -281,7 +281,7 @@ class FullEkf:
         except DivergedError as cause:
             self._remarks.append(f"{what} left out: {cause}")
             return False
-        excess, gate = found.nis - found.nis_dof, self._settings.loop_gate_sigmas
+        excess, gate = found.nis - found.nis_dof, self._settings.loops.gate_sigmas
         said = f"(innovation squared {found.nis:.0f}, {found.nis_dof} expected)"
         if gate > 0.0 and not excess <= gate**2:
             self._remarks.append(f"{what} refused: the covariance does not admit it {said}")

@@ -13,7 +13,7 @@ import dataclasses
 import numpy as np
 
 from fgslam.backend.filters.settings import LoopCorrectionSettings
-from fgslam.backend.filters.submaps import FREE, Chain, Constraint
+from fgslam.backend.filters.submaps import CLOSURE_FACTOR, FREE, SUBMAP_FRAMES, Chain, Constraint
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion
@@ -64,7 +64,7 @@ class DriveBook:
         if free:
             covariance = FREE
         elif known is None or (before and self._sound and tracking.status.measured):
-            covariance = self._settings.drift_factor**2 * tracking.covariance
+            covariance = tracking.covariance
         else:
             motion, covariance = known.motion, known.covariance
         self._chain.append(motion, covariance)
@@ -82,7 +82,7 @@ class DriveBook:
             tracking: how it was tracked.
             free: it was found without a prior.
         """
-        frame, every = len(self._chain) - 1, self._settings.submap_frames
+        frame, every = len(self._chain) - 1, SUBMAP_FRAMES
         homes = np.maximum(homes, 0)  # a saved map's landmarks stay, and so does the first pose
         old = homes[homes < (frame if free else frame - _OLD * every)]
         due = self._sound and (self._tied < 0 or frame - self._tied >= every)
@@ -113,9 +113,9 @@ class DriveBook:
         what = f"{where}: loop closure to frame {loop.frame} of the log"
         if not 0 <= loop.frame < last:
             raise EstimatorError(f"{what}, which does not come before it; mend the log")
-        covariance = self._settings.closure_factor**2 * loop.covariance
+        covariance = CLOSURE_FACTOR**2 * loop.covariance
         known = Constraint(loop.frame, last, loop.oTc, covariance)
-        every, gate = self._settings.submap_frames, self._settings.gate_sigmas
+        every, gate = SUBMAP_FRAMES, self._settings.gate_sigmas
         before = self._chain.cost(self._chain.constraints, every)
         found = self._chain.solve([*self._chain.constraints, known], every)
         rise = found.cost - before

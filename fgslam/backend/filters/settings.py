@@ -13,38 +13,14 @@ from fgslam.core.settings import STRICT
 
 @dataclass(frozen=True, config=STRICT)
 class LoopCorrectionSettings:
-    """What closing a loop does to the drive so far (docs/derivations/submaps.md)."""
+    """Which loop closures an estimator accepts (docs/derivations/submaps.md)."""
 
-    submap_frames: Annotated[
-        int,
-        Field(
-            ge=1,
-            description="frames to a submap, whose beginnings are the variables of the pose graph "
-            "that corrects the drive backwards; within one the change is spread",
-        ),
-    ] = 10
-    drift_factor: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="deviations of a frame's tracked pose are multiplied by this for the step "
-            "to it: the tracked pose's own covariance takes the landmarks as they are",
-        ),
-    ] = 1.0
-    closure_factor: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="deviations of a closure are multiplied by this: its own covariance takes "
-            "the map around both frames as rigid",
-        ),
-    ] = 3.0
     gate_sigmas: Annotated[
         float,
         Field(
             ge=0.0,
             description="a loop closure is refused where it raises the cost by more than the "
-            "square of this; 0: none is",
+            "square of this (ekf: its innovation squared beyond what is expected); 0: none is",
         ),
     ] = 10.0
 
@@ -57,19 +33,10 @@ class DeadReckoningSettings(NamedSettings):
 
 
 @dataclass(frozen=True, config=STRICT)
-class LandmarkKalmanSettings(NamedSettings):
-    """The paper's estimator: one 3x3 Kalman filter per landmark (Se et al. 4.1 and 6.4)."""
+class PerLandmarkSettings(NamedSettings):
+    """What the paper's filter and its twin of factor graphs share."""
 
     family: ClassVar[Family] = "filter"
-    kind: Literal["landmark_kalman"] = "landmark_kalman"
-    update: Annotated[
-        Literal["pixel", "world", "running_mean", "half"],
-        Field(
-            description="how a matched landmark moves: `pixel` Kalman update on (column, row, "
-            "disparity), the most accurate measured; `world` Kalman fusion of 3-D positions "
-            "(6.4); `running_mean` and `half` the plain averaging of 4.1 (with and without a count)"
-        ),
-    ] = "pixel"
     pose_covariance: Annotated[
         bool,
         Field(
@@ -86,18 +53,29 @@ class LandmarkKalmanSettings(NamedSettings):
 
 
 @dataclass(frozen=True, config=STRICT)
-class LandmarkKalmanGraphSettings(NamedSettings):
+class LandmarkKalmanSettings(PerLandmarkSettings):
+    """The paper's estimator: least-squares pose, one 3x3 filter per landmark (6.4)."""
+
+    kind: Literal["landmark_kalman"] = "landmark_kalman"
+    update: Annotated[
+        Literal["pixel", "world", "running_mean", "half"],
+        Field(
+            description="how a matched landmark moves: `pixel` Kalman update on (column, row, "
+            "disparity), the most accurate measured; `world` Kalman fusion of 3-D positions "
+            "(6.4); `running_mean` and `half` the plain averaging of 4.1 (with and without a count)"
+        ),
+    ] = "pixel"
+
+
+@dataclass(frozen=True, config=STRICT)
+class LandmarkKalmanGraphSettings(PerLandmarkSettings):
     """The same estimator as factor graphs: equal to ``landmark_kalman`` up to rounding."""
 
-    family: ClassVar[Family] = "filter"
     kind: Literal["landmark_kalman_graph"] = "landmark_kalman_graph"
     update: Annotated[
         Literal["pixel", "world"],
         Field(description="as landmark_kalman's; the averaging of 4.1 is no least-squares problem"),
     ] = "pixel"
-    pose_covariance: Annotated[bool, Field(description="as landmark_kalman's")] = True
-    miss_growth_m: Annotated[float, Field(ge=0.0, description="as landmark_kalman's")] = 0.0001
-    loops: LoopCorrectionSettings = LoopCorrectionSettings()
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -115,14 +93,7 @@ class EkfSettings(NamedSettings):
             "deviations (Mahalanobis distance); 0: no gate",
         ),
     ] = 5.0
-    loop_gate_sigmas: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="a loop closure is refused where its innovation squared exceeds its "
-            "degrees of freedom by more than the square of this; 0: none is",
-        ),
-    ] = 10.0
+    loops: LoopCorrectionSettings = LoopCorrectionSettings()
     max_landmarks: Annotated[
         int,
         Field(

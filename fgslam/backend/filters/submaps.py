@@ -26,6 +26,12 @@ from fgslam.factors.keys import pose_key
 from fgslam.factors.motion import odometry_factor, pose_prior
 
 _DOUBT_WIDTH = 3.0  # deviations of the whole closure; its squared residual is 6 on average
+SUBMAP_FRAMES = 10
+"""Frames to a submap: enough that the pose graph of a long drive stays small, few enough that what
+a submap's frames measured hardly bends within it."""
+CLOSURE_FACTOR = 3.0
+"""By which deviations of a loop closure are multiplied: its own covariance takes the map around
+both frames as rigid, whose landmarks are as uncertain as the poses that saw them."""
 _ITERATIONS = 100
 _TOLERANCE = 1e-12  # of the cost
 _EXACT_SIGMA = 1e-6  # radians and metres: a step's least deviation, for what a floor excludes

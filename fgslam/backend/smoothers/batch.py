@@ -33,6 +33,7 @@ from fgslam.core.geometry import reorthonormalise
 from fgslam.core.sensors import Sensor
 from fgslam.factors.keys import pose_key
 
+_MAX_ITERATIONS = 100  # a bound, for graphs that do not settle
 _RELATIVE_TOLERANCE = 1e-9  # of the cost; the estimate then moves by less than a micrometre
 
 
@@ -121,7 +122,7 @@ class BatchSolver:
 
     def _minimise(self, graph: Any, values: Any) -> tuple[Any, Any]:
         """Values at the minimum, and the factors that have a say in it."""
-        params = solver_parameters(self._settings.max_iterations, _RELATIVE_TOLERANCE)
+        params = solver_parameters(_MAX_ITERATIONS, _RELATIVE_TOLERANCE)
         if self._settings.method == "gnc":
             return graduated(graph, values, params, self._settings.noise_factor)
         if self._settings.trim:

@@ -28,6 +28,8 @@ from fgslam.factors.noise import Whitening
 from fgslam.factors.range_bearing import RangeBearingFactors
 from fgslam.factors.stereo import StereoFactors
 
+_WEAK_PRIOR_RANGES = 2.0  # keeps a first step before the camera: docs/derivations/smoothers.md
+
 
 class LandmarkFactors(Protocol):
     """Makes the factor of one landmark observation."""
@@ -240,7 +242,7 @@ class GraphBuilder:
             self._rows[track.variable].append(self._push(new, point_prior(key, *saved)))
         elif parallax < self._settings.weak_parallax:
             distance = float(np.linalg.norm(position - wTc[:3, 3]))
-            sigma = self._settings.weak_prior_ranges * distance
+            sigma = _WEAK_PRIOR_RANGES * distance
             self._rows[track.variable].append(
                 self._push(new, weak_point_prior(key, position, sigma))
             )

@@ -149,7 +149,7 @@ class Isam2Solver:
         params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams())
         params.setFactorization("QR" if self._careful else "CHOLESKY")
         params.setRelinearizeThreshold(self._settings.relinearize_threshold)
-        params.relinearizeSkip = self._settings.relinearize_skip
+        params.relinearizeSkip = 1  # looks for variables to relinearise in every update
         return gtsam.ISAM2(params)
 
     def _flush(self) -> None:

@@ -16,7 +16,14 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.filters.settings import LoopCorrectionSettings
-from fgslam.backend.filters.submaps import Chain, Constraint, changes, constraint_factor, corrected
+from fgslam.backend.filters.submaps import (
+    SUBMAP_FRAMES,
+    Chain,
+    Constraint,
+    changes,
+    constraint_factor,
+    corrected,
+)
 from fgslam.backend.graphs import poses_of_frame, solver_parameters
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.solver import Drive
@@ -89,8 +96,7 @@ class GraphLoops:
         factors = graph()
         before = minimum(factors)
         cost, loops = float(factors.error(before)), [*self._accepted, known]
-        every = self._settings.submap_frames
-        guess = first_guess(self._builder, before, drive.chain, loops, every)
+        guess = first_guess(self._builder, before, drive.chain, loops)
         factors.add(constraint_factor(known))
         found = solved(factors, guess)
         rise, gate = 2.0 * (float(factors.error(found)) - cost), self._settings.gate_sigmas
@@ -137,9 +143,7 @@ def carried_to(frame: int, loop: LoopClosure, trackings: list[EgoMotion], last: 
     return Constraint(frame, last, kTo @ loop.oTc, covariance)
 
 
-def first_guess(
-    builder: GraphBuilder, values: Any, chain: Chain, loops: list[Constraint], every: int
-) -> Any:
+def first_guess(builder: GraphBuilder, values: Any, chain: Chain, loops: list[Constraint]) -> Any:
     """Values of all variables with the last of ``loops`` closed, each place moved as a whole.
 
     Args:
@@ -147,7 +151,6 @@ def first_guess(
         values: its solution without that loop.
         chain: the drive as tracked, for the uncertainty of its steps and for what ties it.
         loops: all that are closed; those before the last are held as the values have them.
-        every: poses to a submap.
     """
     frames = np.array(builder.frames)
     poses = np.array([poses_of_frame(values, frame) for frame in builder.frames])
@@ -155,7 +158,7 @@ def first_guess(
     ends = [_row(frames, loops[-1].before), _row(frames, loops[-1].after)]
     new = dataclasses.replace(loops[-1], before=ends[0], after=ends[1])
     constraints = [known for known in held if known.before != known.after]
-    found = corrected(poses, chain.steps_between(frames), [*constraints, new], every).poses
+    found = corrected(poses, chain.steps_between(frames), [*constraints, new], SUBMAP_FRAMES).poses
     return _moved(builder, values, frames, found, changes(poses, found))
 
 

@@ -58,10 +58,6 @@ class GraphSettings(NamedSettings):
             "cannot be thrown behind the camera",
         ),
     ] = 8.0
-    weak_prior_ranges: Annotated[
-        float,
-        Field(gt=0.0, description="standard deviation of that prior, in ranges of the landmark"),
-    ] = 2.0
     contradicted_after: Annotated[
         int,
         Field(
@@ -119,9 +115,6 @@ class Isam2Settings(GraphSettings):
             "leaves a drive of 50 m twice as far off as 0.01",
         ),
     ] = 0.01
-    relinearize_skip: Annotated[
-        int, Field(ge=1, description="updates between looks for variables to relinearise")
-    ] = 1
     keyframe_every: Annotated[
         int,
         Field(
@@ -135,7 +128,7 @@ class Isam2Settings(GraphSettings):
         Field(
             ge=0,
             description="further updates without measurements, relinearising everything that "
-            "moved, before the estimate is told",
+            "moved, before the estimate is reported",
         ),
     ] = 5
 
@@ -164,7 +157,6 @@ class BatchSettings(GraphSettings):
             "(truncated least squares) without"
         ),
     ] = "levenberg_marquardt"
-    max_iterations: Annotated[int, Field(ge=1, description="of the solver")] = 100
     solve_every: Annotated[
         int,
         Field(

@@ -20,7 +20,7 @@ import numpy as np
 
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
-from fgslam.backend.filters.submaps import FREE, Constraint
+from fgslam.backend.filters.submaps import CLOSURE_FACTOR, FREE, Constraint
 from fgslam.backend.smoothers.between import fill_between
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.graph_solution import Solution
@@ -104,7 +104,6 @@ class Smoother:
         self._tracker, self._builder = problem.tracker, problem.builder
         self._solver, self._segments = solver, segments
         self._map = TrackerMap(problem.sensor, problem.tracker, problem.builder.admission)
-        self._closure_factor = problem.settings.loops.closure_factor
         self._inputs = RecordedInputs()
         self._smoothed = problem.prior
         self._answer: Solution | None = None
@@ -281,7 +280,7 @@ class Smoother:
         era, frames = self._eras[loop.frame], self._builder.frames
         fellows = [frame for frame in frames if self._eras[frame] == era] or frames
         near = min(fellows, key=lambda frame: abs(frame - loop.frame))
-        covariance = self._closure_factor**2 * loop.covariance
+        covariance = CLOSURE_FACTOR**2 * loop.covariance
         loop = dataclasses.replace(loop, covariance=covariance)
         return carried_to(near, loop, self._inputs.trackings, last)
 

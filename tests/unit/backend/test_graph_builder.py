@@ -108,7 +108,7 @@ def test_parallax_decides_between_waiting_a_weak_prior_and_none(
 
 def test_the_weak_prior_holds_two_ranges_about_the_place() -> None:
     points = {7: [3.0, 0.0, 4.0]}
-    made = builder(least_sightings=1, weak_prior_ranges=2.0)
+    made = builder(least_sightings=1)
     new = made.add(frame(0, points, True), known(points, 5.0 / 4))
     rows = [new.graph.at(row) for row in range(new.graph.size())]
     prior = next(f for f in rows if tuple(f.keys()) == (landmark_key(0),))

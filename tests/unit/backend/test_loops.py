@@ -120,7 +120,7 @@ def test_without_the_gate_the_wrong_loop_is_taken(name: str) -> None:
     """So it is the gate that refuses it."""
     settings = CLOSING[name]
     if isinstance(settings, EkfSettings):
-        settings = dataclasses.replace(settings, loop_gate_sigmas=0.0)
+        settings = dataclasses.replace(settings, loops=LoopCorrectionSettings(gate_sigmas=0.0))
     else:
         settings = dataclasses.replace(settings, loops=LoopCorrectionSettings(gate_sigmas=0.0))
     drive = returned(lies=True)
