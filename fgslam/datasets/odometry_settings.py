@@ -99,12 +99,6 @@ class RecordedOdometrySettings:
     rotation_sigma_fraction: Annotated[
         float, Field(ge=0.0, description="poses: noise per axis as a fraction of the step's angle")
     ] = 0.05
-    translation_floor_m: Annotated[
-        float, Field(gt=0.0, description="poses: least noise per axis and step, metres")
-    ] = 0.002
-    rotation_floor_deg: Annotated[
-        float, Field(gt=0.0, description="poses: least noise per axis and step, degrees")
-    ] = 0.1
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -121,12 +115,6 @@ class SyntheticOdometrySettings:
     rotation_sigma_deg: Annotated[
         float, Field(ge=0.0, description="per axis and step, degrees")
     ] = 1.0
-    translation_floor_m: Annotated[
-        float, Field(gt=0.0, description="least noise per axis and step, metres")
-    ] = 0.001
-    rotation_floor_deg: Annotated[
-        float, Field(gt=0.0, description="least noise per axis and step, degrees")
-    ] = 0.01
 
 
 OdometrySettings: TypeAlias = Annotated[

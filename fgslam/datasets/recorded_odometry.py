@@ -24,6 +24,8 @@ from fgslam.datasets.trajectories import interpolate_poses, read_tum_table
 
 SPEED_COLUMNS = ("time", "forward speed", "yaw rate")
 _POSE_HOLD_S = 1e-3
+# Least noise of a step between two poses: what the encoders of a standing robot leave open.
+_TRANSLATION_FLOOR_M, _ROTATION_FLOOR_DEG = 0.002, 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,8 +188,6 @@ def pose_noise(motion: FloatArray, settings: RecordedOdometrySettings) -> FloatA
     """Covariance (6, 6) of a body motion (4, 4): a fraction of its length and angle, no less."""
     length = float(np.linalg.norm(motion[:3, 3]))
     angle = rotation_angle(motion[:3, :3])
-    rotation = max(
-        settings.rotation_sigma_fraction * angle, float(np.radians(settings.rotation_floor_deg))
-    )
-    translation = max(settings.translation_sigma_fraction * length, settings.translation_floor_m)
+    rotation = max(settings.rotation_sigma_fraction * angle, float(np.radians(_ROTATION_FLOOR_DEG)))
+    translation = max(settings.translation_sigma_fraction * length, _TRANSLATION_FLOOR_M)
     return np.diag(np.repeat([rotation**2, translation**2], 3))

@@ -15,6 +15,8 @@ from fgslam.datasets.odometry_settings import SyntheticOdometrySettings
 from fgslam.datasets.trajectories import rows_at
 
 _STAMP_TOLERANCE_S = 1e-6
+# Least noise per axis and step: a covariance of a standing robot must be invertible.
+_TRANSLATION_FLOOR_M, _ROTATION_FLOOR_DEG = 0.001, 0.01
 
 
 class SyntheticOdometry:
@@ -106,8 +108,8 @@ class SyntheticOdometry:
     def _sigmas(self, length: float) -> FloatArray:
         """Standard deviations (6,) [rotation, translation] for a step of this length in metres."""
         s = self._settings
-        rotation = np.radians(max(s.rotation_sigma_deg, s.rotation_floor_deg))
-        translation = max(s.translation_sigma_fraction * length, s.translation_floor_m)
+        rotation = np.radians(max(s.rotation_sigma_deg, _ROTATION_FLOOR_DEG))
+        translation = max(s.translation_sigma_fraction * length, _TRANSLATION_FLOOR_M)
         return np.repeat([rotation, translation], 3)
 
     def _generator(self, i: int) -> np.random.Generator:

@@ -15,7 +15,7 @@ from fgslam.frontend.homing.matching import match_features
 from fgslam.frontend.homing.trackable_points import move_to_trackable
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from fgslam.worlds.house.settings import HousePathSettings, OmniHouseSettings
-from fgslam.worlds.house.world import OmniWorld
+from fgslam.worlds.house.world import CAMERA_HEIGHT_M, OmniWorld
 
 SETTINGS = OmniTrackingSettings()
 STEPS = 20
@@ -54,7 +54,7 @@ class Leg:
 
     def angles(self, pose: FloatArray, points: FloatArray) -> FloatArray:
         """(n, 2) true bearing and elevation of points (n, 3)."""
-        away = points - np.array([*pose[:2], self.world.settings.camera_height_m])
+        away = points - np.array([*pose[:2], CAMERA_HEIGHT_M])
         bearing = np.arctan2(away[:, 1], away[:, 0]) - pose[2]
         return np.column_stack([bearing, np.arctan2(away[:, 2], np.hypot(*away[:, :2].T))])
 

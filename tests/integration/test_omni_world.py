@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from fgslam.worlds.driving.wheelchair import RADIUS_M
 from fgslam.worlds.house.settings import (
     HouseLightSettings,
     HousePanoramaSettings,
@@ -109,7 +110,7 @@ def test_wheelchair_is_stopped_by_furniture_and_walls(world: OmniWorld) -> None:
         least = min(least, float(world.clearance(world.true_pose[None, :2])[0]))
         ran_into |= world.collided
     assert ran_into
-    assert least > SETTINGS.wheelchair.radius_m - 0.01
+    assert least > RADIUS_M - 0.01
     assert world.time == pytest.approx(30.0)
     world.put(world.reference_poses[0])
     assert world.time == 0.0

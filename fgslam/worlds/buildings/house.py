@@ -51,6 +51,7 @@ _LINES = (
 )
 
 _LAMP_SPACING = 3.2
+_DOOR_WIDTH = 1.6  # a wheelchair passes with room to turn in
 _ROOMY = FittingStyle(
     ("shelf", "shelf", "desk", "cabinet", "sofa", "gap", "gap"),
     cloths=("cloth", "cloth_red", "cloth_green"),
@@ -75,14 +76,13 @@ class House:
     doors: tuple[Opening, ...]
 
 
-def build_house(rng: np.random.Generator, door_width: float) -> House:
+def build_house(rng: np.random.Generator) -> House:
     """The house with all its furniture.
 
     Args:
         rng: for layout and small things.
-        door_width: of the openings, metres.
     """
-    plan = house_plan(door_width)
+    plan = house_plan()
     lamps = ceiling_lamps(plan, _LAMP_SPACING)
     things = [*shell(plan), *lamp_things(lamps)]
     for room in plan.rooms:
@@ -124,17 +124,17 @@ def _islands(rng: np.random.Generator) -> list[Thing]:
     return [Thing(name, tuple(placed(p, x, y, 0.0, yaw))) for name, p, x, y, yaw in pieces]
 
 
-def house_plan(door_width: float) -> FloorPlan:
+def house_plan() -> FloorPlan:
     """The whole plan; the opening between hall and office is half as wide again."""
     doors = (
-        Opening(2.5, 7.5, door_width, True),
-        Opening(8.5, 7.5, door_width, True),
-        Opening(16.5, 7.5, door_width, True),
-        Opening(11.0, 3.75, 1.5 * door_width, False),
-        Opening(3.5, 9.9, door_width, True),
-        Opening(10.25, 9.9, door_width, True),
-        Opening(17.0, 9.9, door_width, True),
-        Opening(7.0, 12.5, door_width, False),
-        Opening(13.5, 12.5, door_width, False),
+        Opening(2.5, 7.5, _DOOR_WIDTH, True),
+        Opening(8.5, 7.5, _DOOR_WIDTH, True),
+        Opening(16.5, 7.5, _DOOR_WIDTH, True),
+        Opening(11.0, 3.75, 1.5 * _DOOR_WIDTH, False),
+        Opening(3.5, 9.9, _DOOR_WIDTH, True),
+        Opening(10.25, 9.9, _DOOR_WIDTH, True),
+        Opening(17.0, 9.9, _DOOR_WIDTH, True),
+        Opening(7.0, 12.5, _DOOR_WIDTH, False),
+        Opening(13.5, 12.5, _DOOR_WIDTH, False),
     )
     return FloorPlan(ROOMS, _LINES, doors, WIDTH, DEPTH, floor_tile_m=_FLOOR_TILE_M)

@@ -6,8 +6,13 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import unit, wrap
-from fgslam.worlds.house.settings import RangeSensorSettings
 from fgslam.worlds.rendering.raycaster import RayCaster
+
+BEAMS = 32
+"""Evenly spread, the first ahead: as many as the sonars below the paper's obstacle avoidance."""
+MAX_RANGE_M = 5.0
+NOISE_M = 0.02
+_HEIGHTS_M = (0.15, 0.45, 0.72, 1.0)  # of chair legs, seats, table tops and shelves
 
 
 class RangeSensor:
@@ -16,9 +21,10 @@ class RangeSensor:
     A beam reports the nearest of what it meets at several heights, so that table tops are seen.
     """
 
-    def __init__(self, settings: RangeSensorSettings, caster: RayCaster) -> None:
-        self._settings, self._caster = settings, caster
-        angle = 2.0 * np.pi * np.arange(settings.beams) / settings.beams
+    def __init__(self, caster: RayCaster, noise_m: float = NOISE_M) -> None:
+        """Scans the scene of ``caster``; ``noise_m`` is the standard deviation of a range."""
+        self._caster, self._noise_m = caster, noise_m
+        angle = 2.0 * np.pi * np.arange(BEAMS) / BEAMS
         self.angles: FloatArray = wrap(angle)
 
     def scan(
@@ -26,25 +32,24 @@ class RangeSensor:
     ) -> tuple[FloatArray, FloatArray]:
         """Angles (n,) in the robot's axes, radians, and ranges (n,), metres.
 
-        A range of ``max_range_m`` means that nothing was seen.
+        A range of ``MAX_RANGE_M`` means that nothing was seen.
 
         Args:
             pose: (3,) true pose.
             discs: (k, 3) x, y and radius of people.
             rng: of the noise.
         """
-        s = self._settings
         direction = unit(self.angles + pose[2])
         ranges = np.minimum(self._to_things(pose, direction), _to_discs(pose[:2], direction, discs))
-        seen = ranges < s.max_range_m
-        noise = s.noise_m * rng.standard_normal(s.beams)
-        noisy = np.clip(ranges + noise, 0.0, s.max_range_m)
-        return self.angles.copy(), np.where(seen, noisy, s.max_range_m)
+        seen = ranges < MAX_RANGE_M
+        noise = self._noise_m * rng.standard_normal(BEAMS)
+        noisy = np.clip(ranges + noise, 0.0, MAX_RANGE_M)
+        return self.angles.copy(), np.where(seen, noisy, MAX_RANGE_M)
 
     def _to_things(self, pose: FloatArray, direction: FloatArray) -> FloatArray:
         rays = np.column_stack([direction, np.zeros(len(direction))]).astype(np.float32)
         nearest = np.full(len(rays), np.inf)
-        for height in self._settings.heights_m:
+        for height in _HEIGHTS_M:
             _, distance = self._caster.cast(np.array([pose[0], pose[1], height]), rays)
             nearest = np.minimum(nearest, distance)
         return nearest

@@ -67,7 +67,7 @@ class PathPlanner:
         where = "the house" if within is None else f"the {within}"
         raise DatasetError(
             f"no path of {legs} legs of {spacing} m with {self._clearance} m of clearance is found "
-            f"in {where}; lower path.spacing_m, path.legs or path.clearance_m"
+            f"in {where}; lower path.spacing_m or path.legs"
         )
 
     def walk(

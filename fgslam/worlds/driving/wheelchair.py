@@ -12,6 +12,12 @@ from fgslam.core.planar import wrap
 from fgslam.worlds.house.settings import WheelchairSettings
 
 _STEP_S = 0.01
+# Of an electric wheelchair indoors: half a metre a second squared is what its passenger takes
+# without holding on.
+MAX_ACCELERATION_M_S2 = 0.5
+MAX_TURN_ACCELERATION_DEG_S2 = 120.0
+RADIUS_M = 0.35
+"""Of the disc that must not touch anything; a door is twice as wide and a half."""
 
 Blocked = Callable[[FloatArray], bool]
 """Whether the wheelchair, its middle at a place (2,), would touch something."""
@@ -81,9 +87,8 @@ class Wheelchair:
     def _step(self) -> bool:
         while self._pending and self._pending[0][0] <= self.time + 1e-9:
             self._aim = self._pending.popleft()[1:]
-        s = self._settings
-        gain = s.max_acceleration_m_s2 * _STEP_S
-        turn_gain = np.deg2rad(s.max_turn_acceleration_deg_s2) * _STEP_S
+        gain = MAX_ACCELERATION_M_S2 * _STEP_S
+        turn_gain = np.deg2rad(MAX_TURN_ACCELERATION_DEG_S2) * _STEP_S
         self.speed += float(np.clip(self._aim[0] - self.speed, -gain, gain))
         self.turn_rate += float(np.clip(self._aim[1] - self.turn_rate, -turn_gain, turn_gain))
         self._steps += 1

@@ -13,6 +13,9 @@ from fgslam.worlds.house.settings import (
 )
 from fgslam.worlds.rendering.scene import Layer
 
+_WAVE_PERIOD_S = 20.0  # automatic exposure follows the scene slowly
+_SWAY_PERIOD_S = 7.0  # of a wheelchair on a soft floor
+
 Float32 = npt.NDArray[np.float32]
 
 
@@ -29,11 +32,8 @@ def white_balance(settings: HouseLightSettings) -> Float32:
 
 def exposed(levels: Float32, settings: HouseExposureSettings, time: float) -> Float32:
     """(3, n) levels as the camera's exposure makes them at a time in seconds."""
-    wave = 1.0 + settings.wave * np.sin(2.0 * np.pi * time / settings.period_s)
-    out = levels * np.float32(settings.gain * wave)
-    if settings.gamma != 1.0:
-        out = np.float32(255.0) * (out / np.float32(255.0)) ** np.float32(settings.gamma)
-    return np.asarray(out + np.float32(settings.offset))
+    wave = 1.0 + settings.wave * np.sin(2.0 * np.pi * time / _WAVE_PERIOD_S)
+    return np.asarray(levels * np.float32(settings.gain * wave))
 
 
 def noisy(levels: Float32, sigma: float, seed: tuple[int, ...]) -> Float32:
@@ -60,7 +60,7 @@ class CameraTilt:
     def angles(self, time: float) -> FloatArray:
         """(2,) roll about the forward axis and pitch about the left one, radians."""
         s = self._settings
-        turn = 2.0 * np.pi * time / s.period_s * np.array([1.0, 0.77]) + self._phase
+        turn = 2.0 * np.pi * time / _SWAY_PERIOD_S * np.array([1.0, 0.77]) + self._phase
         return np.asarray(self._constant + np.deg2rad(s.sway_deg) * np.sin(turn))
 
 

@@ -63,16 +63,9 @@ class WheelchairSettings:
     max_turn_deg_s: Annotated[float, Field(gt=0.0, le=180.0, description="limit, either way")] = (
         45.0
     )
-    max_acceleration_m_s2: Annotated[float, Field(gt=0.0, le=10.0, description="limit")] = 0.5
-    max_turn_acceleration_deg_s2: Annotated[
-        float, Field(gt=0.0, le=1000.0, description="limit")
-    ] = 120.0
     latency_s: Annotated[
         float, Field(ge=0.0, le=2.0, description="from a command to its effect, seconds")
     ] = 0.1
-    radius_m: Annotated[
-        float, Field(gt=0.05, le=1.0, description="of the disc that must not touch anything")
-    ] = 0.35
     speed_scale: Annotated[
         float,
         Field(ge=0.0, le=0.5, description="relative error of speed, drawn once a drive (sigma)"),
@@ -94,29 +87,11 @@ class WheelchairSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
-class RangeSensorSettings:
-    """Range finders around the wheelchair, like the sonars below the paper's obstacle avoidance."""
-
-    beams: Annotated[int, Field(ge=4, le=720, description="evenly spread, the first ahead")] = 32
-    heights_m: Annotated[
-        tuple[Annotated[float, Field(gt=0.0, le=2.0)], ...],
-        Field(min_length=1, description="a beam sees what stands at any of these heights"),
-    ] = (0.15, 0.45, 0.72, 1.0)
-    max_range_m: Annotated[float, Field(gt=0.1, le=50.0, description="nothing is seen beyond")] = (
-        5.0
-    )
-    noise_m: Annotated[float, Field(ge=0.0, le=0.5, description="sigma of a range, metres")] = 0.02
-
-
-@dataclass(frozen=True, config=STRICT)
 class HouseExposureSettings:
     """A camera's automatic exposure, over time."""
 
     gain: Annotated[float, Field(gt=0.05, lt=10.0, description="mean factor of all levels")] = 1.25
     wave: Annotated[float, Field(ge=0.0, lt=0.9, description="amplitude of the gain's wave")] = 0.0
-    period_s: Annotated[float, Field(gt=0.1, description="of that wave, seconds")] = 20.0
-    offset: Annotated[float, Field(ge=-50.0, le=50.0, description="added grey levels")] = 0.0
-    gamma: Annotated[float, Field(gt=0.2, lt=5.0, description="exponent of brightness")] = 1.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -146,7 +121,6 @@ class HouseTiltSettings:
     sway_deg: Annotated[
         float, Field(ge=0.0, le=10.0, description="amplitude of a slow swaying, roll and pitch")
     ] = 0.0
-    period_s: Annotated[float, Field(gt=0.5, description="of the swaying, seconds")] = 7.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -163,10 +137,6 @@ class HousePathSettings:
             description="`house`: through doors from room to room; `hall`: within the largest room"
         ),
     ] = "house"
-    clearance_m: Annotated[
-        float,
-        Field(ge=0.3, le=1.0, description="of the straight line from a target to the next, metres"),
-    ] = 0.55
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -175,13 +145,7 @@ class OmniHouseSettings:
 
     kind: Literal["omni_house"] = "omni_house"
     camera: HouseCameraSettings = HouseMirrorSettings()
-    camera_height_m: Annotated[
-        float, Field(gt=0.2, lt=2.4, description="viewpoint above the floor, metres")
-    ] = 1.2
     house_seed: Annotated[int, Field(ge=0, description="of textures and furniture")] = 0
-    door_width_m: Annotated[
-        float, Field(ge=0.9, le=2.4, description="of the openings between rooms, metres")
-    ] = 1.6
     frame_rate_hz: Annotated[
         float, Field(gt=0.0, le=120.0, description="images a second while driving")
     ] = 10.0
@@ -191,7 +155,6 @@ class OmniHouseSettings:
     people: Annotated[int, Field(ge=0, le=8, description="who walk about in the house")] = 0
     path: HousePathSettings = HousePathSettings()
     wheelchair: WheelchairSettings = WheelchairSettings()
-    range_sensor: RangeSensorSettings = RangeSensorSettings()
     exposure: HouseExposureSettings = HouseExposureSettings()
     light: HouseLightSettings = HouseLightSettings()
     tilt: HouseTiltSettings = HouseTiltSettings()

@@ -17,7 +17,7 @@ from fgslam.worlds.buildings.house import DEPTH, WIDTH, build_house
 from fgslam.worlds.driving.floor_space import FloorSpace
 from fgslam.worlds.driving.range_scan import RangeSensor
 from fgslam.worlds.driving.reference_paths import PathPlanner
-from fgslam.worlds.driving.wheelchair import Wheelchair
+from fgslam.worlds.driving.wheelchair import RADIUS_M, Wheelchair
 from fgslam.worlds.house import disturbances
 from fgslam.worlds.house.camera import make_house_camera
 from fgslam.worlds.house.people import PERSON_RADIUS, People
@@ -37,6 +37,10 @@ _LIGHT_SPACING_M = 0.2
 # not worth it.
 _EDGE_CONTRAST = 24.0
 _PEOPLE_STEPS, _PEOPLE_STEP_M, _PEOPLE_CLEARANCE_M = 16, 0.7, 0.45
+CAMERA_HEIGHT_M = 1.2
+"""Of the viewpoint above the floor: on a pole behind the passenger's head."""
+# Of the straight line from a target to the next: the wheelchair's radius and a hand more each side.
+_PATH_CLEARANCE_M = 0.55
 # Nearer than this to an obstacle's coarse distance, contact is decided exactly; metres.
 _CONTACT_M = 0.06
 
@@ -51,9 +55,9 @@ class HouseModel:
         bank: all textures.
     """
 
-    def __init__(self, seed: int, door_width: float) -> None:
+    def __init__(self, seed: int) -> None:
         """Builds everything, some seconds. Raises MissingDependencyError without Open3D."""
-        self.house = build_house(np.random.default_rng([seed, 2]), door_width)
+        self.house = build_house(np.random.default_rng([seed, 2]))
         patches = stack(self.house.things)
         caster = RayCaster(patches)
         self.bank = ColourBank(build_colour_library(np.random.default_rng([seed, 1])))
@@ -68,9 +72,9 @@ class HouseModel:
 
 
 @lru_cache(maxsize=2)
-def open_house(seed: int, door_width: float) -> HouseModel:
+def open_house(seed: int) -> HouseModel:
     """The house, kept for the next world in it (some 100 MB each)."""
-    return HouseModel(seed, door_width)
+    return HouseModel(seed)
 
 
 class OmniWorld:
@@ -91,10 +95,10 @@ class OmniWorld:
             MissingDependencyError: Open3D cannot be loaded.
         """
         self.settings, self._seed = settings, seed
-        self.model = open_house(settings.house_seed, settings.door_width_m)
+        self.model = open_house(settings.house_seed)
         self.camera: OmniCamera = make_house_camera(settings.camera)
         self._renderer = Renderer(OmniView(self.camera), self.model.bank, _EDGE_CONTRAST)
-        planner = PathPlanner(self.model.space, settings.path.clearance_m)
+        planner = PathPlanner(self.model.space, _PATH_CLEARANCE_M)
         within = None if settings.path.rooms == "house" else settings.path.rooms
         self.reference_poses = planner.reference_path(
             settings.path.spacing_m, settings.path.legs, self._rng(0), within
@@ -103,7 +107,7 @@ class OmniWorld:
             self._people_routes(), self._rng(1), self.model.bank, self._lets_people_stand
         )
         self._tilt = disturbances.CameraTilt(settings.tilt, self._rng(2))
-        self._sensor = RangeSensor(settings.range_sensor, self.model.layer.caster)
+        self._sensor = RangeSensor(self.model.layer.caster)
         self._scene = disturbances.lit(self.model.layer, self.model.evening, settings.light)
         self.put(self.reference_poses[0])
 
@@ -146,7 +150,7 @@ class OmniWorld:
         """
         s = self.settings
         tilt = self._tilt.angles(time)
-        pose = disturbances.camera_pose(self.wheelchair.pose, s.camera_height_m, tilt)
+        pose = disturbances.camera_pose(self.wheelchair.pose, CAMERA_HEIGHT_M, tilt)
         levels = self._renderer.levels(self._scene, pose, self._people.bodies())
         levels *= disturbances.white_balance(s.light)
         levels = disturbances.exposed(levels, s.exposure, time)
@@ -179,7 +183,7 @@ class OmniWorld:
         s = self.settings
         scene = disturbances.lit(self.model.layer, self.model.evening, s.target_light)
         upright = np.zeros(2) if tilt is None else tilt
-        seen_from = disturbances.camera_pose(pose, s.camera_height_m, upright)
+        seen_from = disturbances.camera_pose(pose, CAMERA_HEIGHT_M, upright)
         levels = self._renderer.levels(scene, seen_from)
         levels *= disturbances.white_balance(s.target_light)
         levels = disturbances.exposed(levels, s.target_exposure, 0.0)
@@ -210,7 +214,7 @@ class OmniWorld:
         return self._renderer.distances(self.model.layer, self._untilted(pose))
 
     def _untilted(self, pose: FloatArray) -> FloatArray:
-        return disturbances.camera_pose(pose, self.settings.camera_height_m, np.zeros(2))
+        return disturbances.camera_pose(pose, CAMERA_HEIGHT_M, np.zeros(2))
 
     def _rng(self, stream: int) -> np.random.Generator:
         return np.random.default_rng([self._seed, 100 + stream])
@@ -232,12 +236,11 @@ class OmniWorld:
         return self.clearance(places) > PERSON_RADIUS
 
     def _touches(self, place: FloatArray) -> bool:
-        radius = self.settings.wheelchair.radius_m
         people = self._people.places()
         if len(people):
             away = np.linalg.norm(people - place, axis=1)
             before = np.linalg.norm(people - self.wheelchair.pose[:2], axis=1)
             # Whoever walks into the wheelchair does not glue it to the spot.
-            if bool(np.any((away < radius + PERSON_RADIUS) & (away < before))):
+            if bool(np.any((away < RADIUS_M + PERSON_RADIUS) & (away < before))):
                 return True
-        return self.model.space.touches(place, radius, _CONTACT_M)
+        return self.model.space.touches(place, RADIUS_M, _CONTACT_M)

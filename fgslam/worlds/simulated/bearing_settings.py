@@ -30,40 +30,15 @@ class SimulatedBearingsSettings:
         float, Field(gt=0.0, description="distance of the nearest points from the way, metres")
     ] = 0.8
     farthest_m: Annotated[float, Field(gt=0.0, description="and of the farthest ones")] = 2.5
-    lowest_m: Annotated[
-        float, Field(gt=0.0, description="points are at least so far above or below the camera")
-    ] = 0.2
-    highest_m: Annotated[float, Field(gt=0.0, description="and at most so far")] = 1.5
     leg_m: Annotated[
         float, Field(gt=0.0, description="from start to target, metres (paper: about 2 m)")
     ] = 2.0
-    direction_deg: Annotated[
-        float, Field(ge=0.0, description="the target lies up to so far off the start's heading")
-    ] = 20.0
-    rotation_deg: Annotated[
-        float, Field(ge=0.0, description="and is turned by up to so much against it")
-    ] = 30.0
     part: Annotated[
         float, Field(gt=0.0, lt=1.0, description="part of the way after which the drive ends")
     ] = 0.8
-    speed_mps: Annotated[float, Field(gt=0.0, description="of the robot")] = 0.3
     images_per_s: Annotated[
         float, Field(gt=0.0, description="tracked images a second (paper: 10)")
     ] = 10.0
-    wander_deg: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="deviation of the turning rate that comes on top of the steering, "
-            "degrees/s, correlated over half a second: the way is curved",
-        ),
-    ] = 10.0
-    slip: Annotated[
-        float,
-        Field(
-            ge=0.0, description="deviation of the sideways speed, as part of the speed; likewise"
-        ),
-    ] = 0.05
     bearing_sigma_deg: Annotated[
         float, Field(gt=0.0, description="noise of all bearings (0.5 to 1)")
     ] = 1.0

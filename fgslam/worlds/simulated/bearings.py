@@ -18,6 +18,12 @@ from fgslam.core.planar import bearings, rotation, wrap
 from fgslam.worlds.simulated.bearing_settings import SimulatedBearingsSettings
 
 _CORRELATION_S = 0.5  # of the disturbances of the drive
+_LOWEST_M, _HIGHEST_M = 0.2, 1.5  # of points above or below the camera: furniture and ceiling
+_DIRECTION_DEG, _ROTATION_DEG = 20.0, 30.0  # the target's, at most, against the start
+_SPEED_MPS = 0.3  # the paper's wheelchair while homing
+# Deviations of the turning rate, degrees/s, and of the sideways speed, as part of the speed, come
+# on top of the steering: the way is curved.
+_WANDER_DEG, _SLIP = 10.0, 0.05
 _STEERING = 2.0  # 1/s: turning rate over the bearing of the target
 _FASTEST_TURN = np.deg2rad(60.0)  # radians a second
 _NEAR_SIDE, _NEAR_REACH = 0.8, 0.35  # anisotropic: part of the points, and of the range
@@ -68,7 +74,7 @@ def simulate_homing(
     wrong = round(settings.features * settings.wrong_matches / (1.0 - settings.wrong_matches))
     n = settings.features + wrong
     points, decoys = np.split(_points(settings, target, 2 * n, rng), 2)
-    heights = rng.uniform(settings.lowest_m, settings.highest_m, n) * rng.choice([-1.0, 1.0], n)
+    heights = rng.uniform(_LOWEST_M, _HIGHEST_M, n) * rng.choice([-1.0, 1.0], n)
     matches, correct = _matches(settings, target, (points, heights), wrong, rng)
     robots = _drive(settings, target, rng)
     tracks = _Tracks(settings, points, decoys, heights, rng).images(robots)
@@ -77,13 +83,12 @@ def simulate_homing(
 
 
 def _require_room(settings: SimulatedBearingsSettings) -> None:
-    for low, high in (("nearest_m", "farthest_m"), ("lowest_m", "highest_m")):
-        if not getattr(settings, low) < getattr(settings, high):
-            raise ConfigError(f"simulated bearings: {low} must be below {high}")
+    if not settings.nearest_m < settings.farthest_m:
+        raise ConfigError("simulated bearings: nearest_m must be below farthest_m")
 
 
 def _target(settings: SimulatedBearingsSettings, rng: np.random.Generator) -> FloatArray:
-    reach = np.deg2rad([settings.direction_deg, settings.rotation_deg])
+    reach = np.deg2rad([_DIRECTION_DEG, _ROTATION_DEG])
     direction, turn = rng.uniform(-reach, reach)
     return np.array([*(settings.leg_m * np.array([np.cos(direction), np.sin(direction)])), turn])
 
@@ -166,18 +171,18 @@ def _drive(
     """(k, 3) true poses at the images: steered to the target, disturbed on the way."""
     step = 1.0 / settings.images_per_s
     keep = np.exp(-step / _CORRELATION_S)
-    spread = np.array([np.deg2rad(settings.wander_deg), settings.slip * settings.speed_mps])
+    spread = np.array([np.deg2rad(_WANDER_DEG), _SLIP * _SPEED_MPS])
     spread = spread * np.sqrt(1.0 - keep**2)
     disturbance = np.zeros(2)
     pose, poses = np.zeros(3), list[FloatArray]()
     left = settings.leg_m
-    longest = _LONGEST * settings.leg_m / (settings.speed_mps * step)
+    longest = _LONGEST * settings.leg_m / (_SPEED_MPS * step)
     while left > (1.0 - settings.part) * settings.leg_m and len(poses) < longest:
         disturbance = keep * disturbance + spread * rng.standard_normal(2)
         aim = bearings(pose, target[None, :2])[0]
         rate = np.clip(_STEERING * aim, -_FASTEST_TURN, _FASTEST_TURN) + disturbance[0]
         middle = pose[2] + 0.5 * step * rate
-        moved = rotation(middle) @ np.array([settings.speed_mps, disturbance[1]]) * step
+        moved = rotation(middle) @ np.array([_SPEED_MPS, disturbance[1]]) * step
         pose = np.array([*(pose[:2] + moved), wrap(pose[2] + step * rate)])
         poses.append(pose)
         left = float(np.hypot(*(target[:2] - pose[:2])))

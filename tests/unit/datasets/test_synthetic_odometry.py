@@ -12,6 +12,7 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
+from fgslam.datasets import synthetic_odometry
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.odometry_settings import SyntheticOdometrySettings
 from fgslam.datasets.recording import Recording
@@ -89,13 +90,12 @@ def test_standard_deviations_follow_the_settings(folder: Path) -> None:
     np.testing.assert_allclose(sigmas[3:], 0.02 * np.linalg.norm(body[:3, 3]))
 
 
-def test_without_noise_but_the_floor_it_is_the_truth(folder: Path) -> None:
-    still = SyntheticOdometrySettings(
-        translation_sigma_fraction=0.0,
-        rotation_sigma_deg=0.0,
-        translation_floor_m=1e-9,
-        rotation_floor_deg=1e-9,
-    )
+def test_without_noise_but_the_floor_it_is_the_truth(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(synthetic_odometry, "_TRANSLATION_FLOOR_M", 1e-9)
+    monkeypatch.setattr(synthetic_odometry, "_ROTATION_FLOOR_DEG", 1e-9)
+    still = SyntheticOdometrySettings(translation_sigma_fraction=0.0, rotation_sigma_deg=0.0)
     sequence = SyntheticOdometry(opened(folder), still, 1)
     truth = sequence.ground_truth
     assert truth is not None
