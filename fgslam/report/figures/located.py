@@ -72,7 +72,7 @@ def located_figure(located: Located, key: str, heading: str) -> Figure:
         key,
         heading,
         "Dots with their headings: poses that were accepted, with ellipses of "
-        f"{SIGMAS:.0f} standard deviations{f', {factor} times larger' if factor > 1 else ''}. "
+        f"{SIGMAS:.0f} standard deviations. "
         "Crosses: true poses of queries that were refused. Lines lead from false poses to the true "
         "ones. Grey: landmarks, and the drive that made the map.",
         (
@@ -82,6 +82,7 @@ def located_figure(located: Located, key: str, heading: str) -> Figure:
         ),
         {"xaxis": {**MAP_AXES["xaxis"], "range": x}, "yaxis": {**MAP_AXES["yaxis"], "range": y}},
         (Switch("landmarks", "landmarks"), Switch("ellipses", "uncertainty")),
+        note=f"Ellipses are drawn {factor} times larger." if factor > 1 else "",
     )
 
 

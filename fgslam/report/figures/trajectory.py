@@ -364,6 +364,7 @@ def _by_height(heights: FloatArray, low: float, high: float) -> dict[str, Any]:
         "colorscale": "Viridis",
         "cmin": low,
         "cmax": high,
+        "showscale": False,
         "colorbar": {"title": {"text": "height above the first camera (m)"}},
     }
 

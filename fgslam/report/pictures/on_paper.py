@@ -173,7 +173,9 @@ def _note(axes: Axes, figure: Figure, switches: Mapping[str, bool] | None) -> No
 def _legend(canvas: Canvas, axes: Axes, where: Any = "outside lower center") -> None:
     """One entry a name, in the order of drawing."""
     handles, labels = axes.get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
+    unique: dict[str, Any] = {}
+    for label, handle in zip(labels, handles, strict=True):
+        unique.setdefault(label, handle)
     if unique:
         canvas.legend(list(unique.values()), list(unique), loc=where, ncols=_FEW_ENTRIES)
 
