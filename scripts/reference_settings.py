@@ -13,7 +13,7 @@ from scripts.markdown import item, paragraph
 Node: TypeAlias = dict[str, Any]
 
 _UNWRITTEN = ("kind", "task", "provenance")
-_TOLD_ELSEWHERE = ("map.made_from.dataset", "map.made_from.odometry")
+_DESCRIBED_ELSEWHERE = ("map.made_from.dataset", "map.made_from.odometry")
 FIRST = {
     "dataset.kind, dataset.path": "the recording: its layout and its folder",
     "odometry.kind": "`recorded`, `constant_velocity`, or `synthetic` (truth plus stated noise)",
@@ -47,7 +47,7 @@ unless the key's name or meaning says otherwise. Experiments of homing have a ke
 
 _LOCALISATION = """## Task `localisation`
 
-{told}
+{described}
 `dataset`, `odometry`, `frontend`, `estimator` and `output` have the keys that they have above;
 `estimator` is that of the drive that makes the map.
 """
@@ -62,7 +62,7 @@ them.
 def settings_page() -> str:
     """The whole page, in Markdown."""
     schema = ExperimentConfig.model_json_schema()
-    first = [line for key, told in FIRST.items() for line in item(f"`{key}`: {told}")]
+    first = [line for key, described in FIRST.items() for line in item(f"`{key}`: {described}")]
     sections = [_INTRODUCTION, "## The keys that matter first\n\n" + "\n".join(first)]
     sections += ["## The experiment\n\n" + "\n".join(_keys(schema, schema))]
     for name, node in schema["properties"].items():
@@ -76,9 +76,9 @@ def settings_page() -> str:
 def _localisation() -> Iterator[str]:
     """The keys that only this task has; the others are those of the experiments above."""
     schema = LocalisationConfig.model_json_schema()
-    told = " ".join(schema.get("description", "").split())
+    described = " ".join(schema.get("description", "").split())
     yield (
-        _LOCALISATION.format(told="\n".join(paragraph(told)))
+        _LOCALISATION.format(described="\n".join(paragraph(described)))
         + "\n"
         + "\n".join(_keys(schema, schema))
     )
@@ -93,8 +93,10 @@ def _homing() -> Iterator[str]:
     groups: dict[str, None] = {}
     for task in HOMING_TASKS:
         schema = TASKS[task].model_json_schema()
-        told = " ".join(schema.get("description", "").split())
-        yield "\n".join([f"### Task `{task}`", "", *paragraph(told), "", *_keys(schema, schema)])
+        described = " ".join(schema.get("description", "").split())
+        yield "\n".join(
+            [f"### Task `{task}`", "", *paragraph(described), "", *_keys(schema, schema)]
+        )
         for name, node in schema["properties"].items():
             if name not in _UNWRITTEN:
                 groups |= dict.fromkeys(_sections(schema, node, name, 3))
@@ -107,13 +109,13 @@ def _sections(schema: Node, node: Node, dotted: str, level: int) -> Iterator[str
     for group in (g for g in groups if "properties" in g):
         kind = group["properties"].get("kind", {}).get("const")
         title = f"`{dotted}`" + (f", kind `{kind}`" if kind else "")
-        told = " ".join(group.get("description", "").split())
-        lines = [f"{'#' * level} {title}", "", *([*paragraph(told), ""] if told else [])]
+        described = " ".join(group.get("description", "").split())
+        lines = [f"{'#' * level} {title}", "", *([*paragraph(described), ""] if described else [])]
         keys = _keys(schema, group)
         yield "\n".join([*lines, *(keys or ["Groups of keys:"])])
         for name, inner in group["properties"].items():
             below = f"{dotted}.{name}"
-            if name not in _UNWRITTEN and below not in _TOLD_ELSEWHERE:
+            if name not in _UNWRITTEN and below not in _DESCRIBED_ELSEWHERE:
                 yield from _sections(schema, inner, below, min(level + 1, 4))
 
 

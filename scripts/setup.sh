@@ -85,7 +85,7 @@ install_package() {
   # Twice quiet: errors only.
   .venv/bin/python -m pip install -qq --disable-pip-version-check --editable "$target" </dev/null ||
     fail "pip could not install what pyproject.toml asks for (see above);" \
-      "mend the connection to the package index and run make again"
+      "check the connection to the package index and run make again"
 }
 
 # Open3D renders the lab; all else runs without it, so that nothing here is an error.

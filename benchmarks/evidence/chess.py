@@ -28,7 +28,7 @@ MODES: tuple[Appearance, ...] = ("descriptor", "paper")
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """Right-left matches with a verdict.
+    """Right-left matches, each judged right or wrong.
 
     Attributes:
         correct: (n,) whether the disparity is right.
@@ -99,13 +99,13 @@ def judge_chess(
         reference = spacing - 1 + frame.i
         left = reference - spacing
         if left < 0:
-            continue  # its left view is column 0, whose true position the row does not tell
+            continue  # its left view is column 0, whose true position the row does not give
         i, j, confirmed = _pairs(matcher, frame)
         right = frame.features[0].xy[i]
         raw = right + per_metre * truth.poses[frame.i, :2, 3]
         shifted = frame.features[1].xy[j, 0] - right[:, 0]
         disparity = shifted - settings.shift_px_per_step * spacing
-        parts.append(_verdict(row, (reference, left), raw, disparity, confirmed))
+        parts.append(_judged(row, (reference, left), raw, disparity, confirmed))
     return _joined(parts)
 
 
@@ -118,7 +118,7 @@ def _pairs(matcher: StereoMatcher, frame: FeatureFrame) -> tuple[IntArray, IntAr
     return i, j, confirmed
 
 
-def _verdict(
+def _judged(
     row: epi.Row,
     views: tuple[int, int],
     raw: FloatArray,
@@ -128,9 +128,9 @@ def _verdict(
     reference, left = views
     baseline = row.places[reference, 0] - row.places[left, 0]
     slopes = np.arange(-3.0, 16.01, 0.25) / baseline
-    verdict = epi.judge(row, reference, np.array([left]), raw, slopes)
-    error = np.abs(verdict.slope * baseline - disparity)
-    return Judged(error <= CORRECT_PX, verdict.decided, confirmed)
+    found = epi.judge(row, reference, np.array([left]), raw, slopes)
+    error = np.abs(found.slope * baseline - disparity)
+    return Judged(error <= CORRECT_PX, found.decided, confirmed)
 
 
 def judge_lab(mode: Appearance) -> Judged:

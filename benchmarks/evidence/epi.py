@@ -48,7 +48,7 @@ def open_row(settings: LightFieldSettings) -> Row:
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class SlopeFound:
     """What the judge says of points.
 
     Attributes:
@@ -62,7 +62,7 @@ class Verdict:
 
 def judge(
     row: Row, reference: int, hidden: IntArray, xy: FloatArray, slopes: FloatArray
-) -> Verdict:
+) -> SlopeFound:
     """Finds the slope of points by the views that the matches did not use.
 
     Args:
@@ -88,8 +88,8 @@ def judge(
     best = cost.argmin(axis=0)
     step = row.places[reference, 0] - row.places[hidden[0], 0] if len(hidden) else 1.0
     apart = np.abs(slopes[:, None] - slopes[best]) * abs(step) > _DISTINCT_PX
-    rival = np.where(apart, cost, np.inf).min(axis=0)
-    return Verdict(slopes[best], rival > _AMBIGUOUS * cost.min(axis=0))
+    second = np.where(apart, cost, np.inf).min(axis=0)
+    return SlopeFound(slopes[best], second > _AMBIGUOUS * cost.min(axis=0))
 
 
 def _step(row: Row, reference: int, view: int) -> FloatArray:

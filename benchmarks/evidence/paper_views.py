@@ -104,7 +104,7 @@ def matches_table(lab: LabViews, triples: list[Triple]) -> Table:
 
 
 def _quantities(counts: FloatArray) -> dict[str, FloatArray]:
-    """What the paper tells of the three views, (n,) each, under the names of _PAPER_STEREO."""
+    """What the paper reports of the three views, (n,) each, under the names of _PAPER_STEREO."""
     pairs, final, features = np.moveaxis(counts, 2, 0)
     values = (
         pairs[:, 0],

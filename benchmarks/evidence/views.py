@@ -125,7 +125,7 @@ class ViewPair:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Nothing to tell."""
+        """No remarks."""
         return ()
 
     @property

@@ -80,7 +80,7 @@ class Played:
     Attributes:
         estimator: after the last frame.
         cpu_s, wall_s: (n,) its own seconds a frame, of the processor and on the clock.
-        online: (n, 4, 4) poses as first told.
+        online: (n, 4, 4) poses as first estimated.
     """
 
     estimator: Estimator
@@ -90,7 +90,7 @@ class Played:
 
 
 class Player:
-    """Replays a log through a new estimator, as far as it is told to at a time."""
+    """Replays a log through a new estimator, as far as it is asked to at a time."""
 
     def __init__(self, drive: MeasuredDrive, settings: EstimatorSettings) -> None:
         self._log = drive.log
@@ -133,7 +133,7 @@ def cpu_seconds(work: Callable[[], object]) -> float:
 
 
 def interleaved(works: Mapping[str, Callable[[], float]], repeats: int) -> dict[str, float]:
-    """Medians of timings that take turns, so that a machine's moods meet all of them alike."""
+    """Medians of timings that take turns, so that other load meets all alike."""
     series: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(repeats):
         for name, work in works.items():

@@ -45,7 +45,7 @@ def last_over_early(drive: MeasuredDrive, settings: EstimatorSettings) -> float:
 
 
 def fixed_lag_flat(drive: MeasuredDrive) -> dict[str, float]:
-    """Of the fixed lag; beside the filter, which tells how much of it is the drive itself."""
+    """Of the fixed lag; beside the filter, which shows how much of it is the drive itself."""
     return {
         "fixed_lag_last_over_early": last_over_early(drive, FixedLagSettings()),
         "landmark_kalman_last_over_early": last_over_early(drive, LandmarkKalmanSettings()),

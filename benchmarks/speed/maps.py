@@ -134,10 +134,10 @@ class Walk:
             raise RuntimeError(f"frame {k}: {tracked.ego_motion.status.value}; nothing to time")
 
     def _features(self, wTc: FloatArray, rng: np.random.Generator) -> StereoFeatures:
-        """Half of the room's landmarks in view, and as many strangers as a frame brings."""
+        """Half of the room's landmarks in view, and as many unmapped features as a frame brings."""
         seen = self.database.expected(self.map, wTc)
         own = np.flatnonzero(seen.certain & (seen.rows < PER_ROOM) & (rng.random(len(seen)) < 0.5))
-        strangers = np.column_stack(
+        unmapped = np.column_stack(
             [
                 rng.uniform(20.0, 280.0, NEW_A_FRAME),
                 rng.uniform(40.0, 230.0, NEW_A_FRAME),
@@ -145,7 +145,7 @@ class Walk:
             ]
         )
         measured = seen.measurement[own] + SIGMA_PX * rng.standard_normal((len(own), 3))
-        measured = np.concatenate([measured, strangers])
+        measured = np.concatenate([measured, unmapped])
         covariance = np.tile(SIGMA_PX**2 * np.eye(3), (len(measured), 1, 1))
         new = (NEW_A_FRAME, 128)
         return StereoFeatures(

@@ -6,8 +6,8 @@ the rooms have textures of their own whose statistics are SIFT's. The drive's fr
 the building by a robot that is lost there: all that place recognition then does in a frame, which
 is to choose the landmarks, to learn them, to locate the frame among them and to track it there. A
 look for a return does the same with fewer landmarks. Both times are the processor's; each look is
-made three times, the maps taking turns, and its median counts, so that a shared machine's moods do
-not make the slowest frame.
+made three times, the maps taking turns, and its median counts, so that other load of the machine
+does not make the slowest frame.
 """
 
 from __future__ import annotations

@@ -88,17 +88,17 @@ def test_judge_finds_the_true_slope(slope: float) -> None:
     rng = np.random.default_rng(0)
     row = textured_row(rng, slope, views=13)
     points = np.column_stack([rng.uniform(60.0, 140.0, 30), rng.uniform(8.0, 32.0, 30)])
-    verdict = epi.judge(row, 6, np.array([2]), points, np.arange(-100.0, 400.1, 10.0))
-    assert verdict.decided.all()
-    np.testing.assert_allclose(verdict.slope, slope, atol=1e-9)
+    found = epi.judge(row, 6, np.array([2]), points, np.arange(-100.0, 400.1, 10.0))
+    assert found.decided.all()
+    np.testing.assert_allclose(found.slope, slope, atol=1e-9)
 
 
 def test_judge_is_undecided_where_texture_repeats() -> None:
     rng = np.random.default_rng(1)
     row = textured_row(rng, 100.0, views=13, period=2)  # columns alternate: all even shifts agree
     points = np.column_stack([rng.uniform(60.0, 140.0, 30), rng.uniform(8.0, 32.0, 30)])
-    verdict = epi.judge(row, 6, np.array([2]), points, np.arange(-100.0, 400.1, 10.0))
-    assert not verdict.decided.any()
+    found = epi.judge(row, 6, np.array([2]), points, np.arange(-100.0, 400.1, 10.0))
+    assert not found.decided.any()
 
 
 def test_depth_between_pixels_is_exact_on_a_slanted_plane() -> None:

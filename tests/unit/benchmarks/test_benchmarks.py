@@ -101,9 +101,9 @@ def test_a_missing_recording_is_one_line_and_status_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert runner.main(["chess", "--data", str(tmp_path)]) == 2
-    told = capsys.readouterr().err.strip().splitlines()[-1]
-    assert told.startswith("error: ")
-    assert str(tmp_path) in told
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert line.startswith("error: ")
+    assert str(tmp_path) in line
 
 
 def test_pages_of_results_are_those_of_the_committed_measurements() -> None:

@@ -11,10 +11,13 @@ from fgslam.cli.main import app
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.config_models import HOMING_TASKS, TASKS, LocalisationConfig
 from scripts import reference_settings
-from scripts.make_reference import PAGES, REFERENCE
+from scripts.make_reference import DOCS, pages
 from scripts.markdown import WIDTH, item
 from scripts.reference_commands import commands_page
 from scripts.reference_settings import settings_page
+from scripts.tutorials import EXAMPLES, tutorial_page
+
+PAGES = pages()
 
 
 @pytest.fixture(scope="module")
@@ -22,15 +25,29 @@ def page() -> str:
     return settings_page()
 
 
-@pytest.mark.parametrize("name", PAGES)
-def test_committed_page_is_current(name: str) -> None:
-    text = (REFERENCE / f"{name}.md").read_text(encoding="utf-8")
-    assert text == PAGES[name](), "stale: run python -m scripts.make_reference"
+@pytest.mark.parametrize("path", PAGES)
+def test_committed_page_is_current(path: str) -> None:
+    text = (DOCS / path).read_text(encoding="utf-8")
+    assert text == PAGES[path](), "stale: run python -m scripts.make_reference"
 
 
-@pytest.mark.parametrize("name", PAGES)
-def test_lines_fit(name: str) -> None:
-    assert max(map(len, PAGES[name]().splitlines())) <= WIDTH
+@pytest.mark.parametrize("path", PAGES)
+def test_lines_fit(path: str) -> None:
+    assert max(map(len, PAGES[path]().splitlines())) <= WIDTH
+
+
+def test_no_tutorial_stands_without_its_example() -> None:
+    tutorials = {f"tutorials/{page.name}" for page in (DOCS / "tutorials").glob("*.md")}
+    assert tutorials == {path for path in PAGES if path.startswith("tutorials/")}
+
+
+def test_tutorial_holds_text_and_code_of_its_example() -> None:
+    source = (EXAMPLES / "homing_vector.py").read_text(encoding="utf-8")
+    page = tutorial_page("homing_vector")
+    code = "".join(re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL))
+    written = [line for line in source.splitlines() if line and not line.startswith("#")]
+    assert [line for line in code.splitlines() if line and not line.startswith("#")] == written
+    assert page.startswith("# ")
 
 
 def test_every_key_and_kind_is_on_the_page(page: str) -> None:
