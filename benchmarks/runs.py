@@ -13,8 +13,9 @@ from typing import Any
 from fgslam.core.recordings import Sequence
 from fgslam.evaluation.trajectory import Alignment, TrajectoryError, evaluate_trajectory
 from fgslam.runs.config import ExperimentConfig, load_config
+from fgslam.runs.engine import run_task
 from fgslam.runs.opening import open_sequence
-from fgslam.runs.tasks.slam import RunResult, run_experiment
+from fgslam.runs.tasks.slam import SlamResult, open_slam
 from fgslam.slam.factory import make_pipeline, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
@@ -48,7 +49,7 @@ def experiment(name: str, overrides: Iterable[str] = (), data: Path = DATA) -> E
 class Run:
     """A finished run: what it computed, and its metrics.json."""
 
-    result: RunResult
+    result: SlamResult
     metrics: dict[str, Any]
 
     @property
@@ -68,7 +69,7 @@ def run_whole(config: ExperimentConfig) -> Run:
     """Exactly what `fgslam run` does, into a folder that is thrown away afterwards."""
     say(f"running {config.name} (seed {config.seed})")
     with tempfile.TemporaryDirectory() as folder:
-        result = run_experiment(config, Path(folder) / "run")
+        result = run_task(open_slam, config, Path(folder) / "run")
         text = (result.folder / "metrics.json").read_text(encoding="utf-8")
     return Run(result, json.loads(text))
 

@@ -21,8 +21,9 @@ from fgslam.evaluation.trajectory import rotation_angles
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 from fgslam.runs.config import load_experiment
 from fgslam.runs.config_models import LocalisationConfig
+from fgslam.runs.engine import run_task
 from fgslam.runs.opening import open_sequence
-from fgslam.runs.tasks.localisation import run_localisation
+from fgslam.runs.tasks.localisation import open_localisation
 from fgslam.runs.tasks.localisation_submap import Window, submap_features
 from fgslam.runs.tasks.localisation_truth import truth_in_map
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map, trusted
@@ -115,7 +116,7 @@ def _config(*overrides: str) -> LocalisationConfig:
 
 def _make_map(folder: Path) -> GivenMap:
     say("making the map of kidnapped")
-    run_localisation(_config("dataset.drive.frames=3"), folder)
+    run_task(open_localisation, _config("dataset.drive.frames=3"), folder)
     return open_map(folder / FIRST_FOLDER / MAP_FILE)
 
 

@@ -14,7 +14,8 @@ from benchmarks.tables import Table
 from fgslam.core.arrays import BoolArray
 from fgslam.core.saved_map import SavedMap, load_map
 from fgslam.datasets.rendered_lab import RenderedLabSequence
-from fgslam.runs.tasks.slam import RunResult, run_experiment
+from fgslam.runs.engine import run_task
+from fgslam.runs.tasks.slam import SlamResult, open_slam
 from fgslam.runs.tasks.slam_map_entry import MAP_FILE
 from fgslam.runs.tasks.slam_mapping import first_config
 from fgslam.worlds.buildings.lab import build_lab
@@ -66,7 +67,7 @@ def first_visit(folder: Path) -> FirstVisit:
     if config is None:
         raise ValueError(f"{EXPERIMENT} makes no map of its own")
     say("the first visit")
-    result = run_experiment(config, folder / "run")
+    result = run_task(open_slam, config, folder / "run")
     saved = load_map(folder / MAP_FILE)
     return FirstVisit(folder / MAP_FILE, saved, _things(result, saved))
 
@@ -77,12 +78,12 @@ def second_visit(first: FirstVisit, overrides: tuple[str, ...]) -> SecondVisit:
     config = experiment(EXPERIMENT, [*given, *overrides])
     say(f"the second visit: {', '.join(overrides)}")
     with tempfile.TemporaryDirectory() as folder:
-        result = run_experiment(config, Path(folder) / "run")
+        result = run_task(open_slam, config, Path(folder) / "run")
     database = result.outputs.pipeline.tracker.database
     ids = first.saved.landmarks.ids
     there = np.isin(ids, database.ids)
     visit = getattr(config.dataset, "visit", 1)
-    ate_m = result.metrics.ate_rmse_m
+    ate_m = result.live.ate_rmse_m
     return SecondVisit(
         ate_m=float("nan") if ate_m is None else ate_m,
         moved=np.isin(first.things, _moved_things(visit)),
@@ -129,7 +130,7 @@ def _percent(which: BoolArray, among: BoolArray) -> float | None:
     return 100.0 * float(which[among].mean()) if among.any() else None
 
 
-def _things(result: RunResult, saved: SavedMap) -> npt.NDArray[np.str_]:
+def _things(result: SlamResult, saved: SavedMap) -> npt.NDArray[np.str_]:
     """(n,) the thing under each landmark's first sighting."""
     sequence = result.outputs.sequence
     if not isinstance(sequence, RenderedLabSequence):

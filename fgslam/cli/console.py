@@ -1,8 +1,8 @@
-"""What a person sees in the terminal: progress and the summary of a run."""
+"""What a person sees in the terminal: progress, and what any run, comparison or trial says."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -17,13 +17,16 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from fgslam.runs.tasks.slam_summary import frame_problems, run_numbers
+from fgslam.runs.files import METRICS_FILE, REPORT_FILE
 
 if TYPE_CHECKING:
-    from fgslam.runs.tasks.slam import RunResult
-    from fgslam.runs.tasks.slam_beginning import Progress as Tell
+    from fgslam.report.content import TextTable
+    from fgslam.runs.engine import RunResult
+    from fgslam.runs.units import Progress as Tell
 
-_PROBLEMS_SHOWN = 5
+_NOTES_SHOWN = 8
+_LABEL_WIDTH = 12
+_WIDTH_OF_FILES = 130
 
 
 @contextmanager
@@ -53,114 +56,56 @@ def progress_bar() -> Iterator[Tell]:
             bars.stop()
 
 
-def show_result(result: RunResult, resume: str) -> None:
-    """Summary table and where everything is; ``resume`` is what to type where it is unfinished."""
-    console = Console()
-    console.print(_table(result))
-    for line in _remarks(result):
-        console.out(line)
-    folder = result.folder
-    title = result.outputs.title
-    # Paths are printed plain, so that they can be copied whatever the terminal's width.
-    console.out(f"trajectory  {folder / title / 'final.tum'}")
-    console.out(f"map         {folder / title / 'map.ply'}")
-    if result.about_map:
-        console.out(f"saved map   {result.about_map}")
-    if result.pictures:
-        console.out(f"pictures    {result.pictures[0].parent}{'/'}")
-    console.out(f"metrics     {folder / 'metrics.json'}")
-    compared = bool(result.outputs.config.compare)  # then named below the comparison
-    if not compared and (folder / "report.html").is_file():
-        console.out(f"report      {folder / 'report.html'}  (open it in a browser)")
+def show(result: RunResult, resume: str = "") -> None:
+    """Sentences, tables, notes, where everything is; ``resume`` is what goes on with the rest."""
+    notes = list(result.notes[:_NOTES_SHOWN])
+    if len(result.notes) > _NOTES_SHOWN:
+        notes.append(f"and {len(result.notes) - _NOTES_SHOWN} more, see {METRICS_FILE}")
+    labelled = [*(("note", note) for note in notes), *result.particulars, *_files(result)]
+    show_parts(result.lines, result.tables, labelled)
     if result.status == "interrupted":
-        console.out(f"interrupted after {len(result.outputs.recorder)} frames; go on: {resume}")
+        rest = f"go on: {resume}" if resume else "what was done is in valid files"
+        reached = f" {result.reached}" if result.reached else ""
+        _console().out(f"interrupted{reached}; {rest}")
 
 
-def _table(result: RunResult) -> Table:
-    outputs, metrics = result.outputs, result.metrics
-    numbers = run_numbers(outputs.recorder)
-    remark = f"\n{outputs.remark}" if outputs.remark else ""
-    table = Table(title=f"{outputs.config.name}: {outputs.title}{remark}", show_header=False)
-    matches = numbers["landmark_matches"]
-    rows: list[tuple[str, object]] = [
-        ("frames", f"{len(outputs.recorder)} of {len(outputs.sequence)}"),
-        ("pose found from", _counts(numbers["status_counts"])),
-        ("landmarks", metrics.landmarks),
-        ("landmarks matched, median (5 %)", _spread(matches)),
-        ("ATE rms, SE3 aligned", _metres(metrics.ate_rmse_m)),
-        ("RPE a frame", f"{_metres(metrics.rpe_trans_m)}, {_degrees(metrics.rpe_rot_deg)}"),
-        ("end error, first pose aligned", _end(result)),
-        ("end against start", _start(result)),
-        ("drift", "unknown" if metrics.drift_percent is None else f"{metrics.drift_percent:.2f} %"),
-        ("pose NEES per dof", _nees(result)),
-        ("loop without SIFT, median", _milliseconds(numbers["loop_ms"])),
-    ]
-    for name, value in rows:
-        table.add_row(name, str(value))
+def show_parts(
+    lines: Sequence[str],
+    tables: Sequence[TextTable] = (),
+    labelled: Sequence[tuple[str, str]] = (),
+) -> None:
+    """Lines, then tables, then lines with a label."""
+    console = _console()
+    # Lines are printed plain, so that paths can be copied whatever the terminal's width.
+    for line in lines:
+        console.out(line)
+    for table in tables:
+        console.print(_table(table))
+    for label, text in labelled:
+        console.out(f"{label:<{_LABEL_WIDTH}}{text}")
+
+
+def _files(result: RunResult) -> Iterator[tuple[str, str]]:
+    if not result.written:
+        return
+    if (result.folder / METRICS_FILE).is_file():
+        yield "metrics", str(result.folder / METRICS_FILE)
+    if (result.folder / REPORT_FILE).is_file():
+        yield "report", f"{result.folder / REPORT_FILE}  (open it in a browser)"
+
+
+def _console() -> Console:
+    console = Console()
+    # A file or a pipe has no width to keep to.
+    return console if console.is_terminal else Console(width=_WIDTH_OF_FILES)
+
+
+def _table(found: TextTable) -> Table:
+    headed = bool(found.first) or any(column.name for column in found.columns)
+    table = Table(title=found.heading, title_justify="left", show_header=headed)
+    table.add_column(found.first, no_wrap=True)
+    for column in found.columns:
+        table.add_column(column.name, justify="right" if headed else "left")
+    for name, values in found.rows:
+        table.add_row(name, *values)
     return table
-
-
-def _remarks(result: RunResult) -> list[str]:
-    """What was tolerated: notes on the recording, and frames that could not be used."""
-    problems = frame_problems(result.outputs.recorder)
-    outputs = result.outputs
-    lines = [*outputs.sequence.notes, *outputs.notes, *problems[:_PROBLEMS_SHOWN]]
-    if len(problems) > _PROBLEMS_SHOWN:
-        lines.append(f"and {len(problems) - _PROBLEMS_SHOWN} more such frames, see metrics.json")
-    if not result.metrics.landmarks:
-        lines.append("there is no landmark in the map; fgslam inspect says what ails the recording")
-    return [f"note        {line}" for line in lines]
-
-
-def _metres(value: float | None) -> str:
-    if value is None:
-        return "unknown"
-    return f"{100.0 * value:.2f} cm" if value < 1.0 else f"{value:.3f} m"
-
-
-def _degrees(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.3f} deg"
-
-
-def _counts(counts: object) -> str:
-    if not isinstance(counts, dict):
-        return "unknown"
-    return ", ".join(f"{name} {count}" for name, count in counts.items())
-
-
-def _spread(spread: object) -> str:
-    if not isinstance(spread, dict):
-        return "none"
-    return f"{spread['median']:.0f} ({spread['p05']:.0f})"
-
-
-def _milliseconds(times: object) -> str:
-    known = isinstance(times, dict) and times["median"] is not None
-    return f"{times['median']:.1f} ms" if known and isinstance(times, dict) else "unknown"
-
-
-def _end(result: RunResult) -> str:
-    metrics = result.metrics
-    if metrics.end_error_m is None or len(result.outputs.recorder) < 2:
-        return "unknown"
-    return f"{_metres(metrics.end_error_m)}, {_degrees(metrics.end_error_deg)}"
-
-
-def _start(result: RunResult) -> str:
-    end = result.metrics.more.get("end_against_start")
-    if not isinstance(end, dict) or len(result.outputs.recorder) < 2:
-        return "unknown"
-    # Adding zero turns -0.00 into 0.00.
-    x, y, z = (f"{round(end[name], 2) + 0.0:.2f}" for name in ("x_cm", "y_cm", "z_cm"))
-    yaw, pitch, roll = (
-        f"{round(end[name], 2) + 0.0:.2f}" for name in ("yaw_deg", "pitch_deg", "roll_deg")
-    )
-    return f"{x}, {y}, {z} cm\nyaw {yaw}, pitch {pitch}, roll {roll} deg"
-
-
-def _nees(result: RunResult) -> str:
-    found = result.metrics.more.get("nees_pose")
-    if not isinstance(found, dict):
-        return "unknown"
-    band = f"{found['lower']:.2f}-{found['upper']:.2f}"
-    return f"{found['per_dof']:.1f}: {found['verdict']} (band {band})"

@@ -9,7 +9,7 @@ from types import FrameType
 
 Tell = Callable[[str, int, int], None]
 
-_SAVED_WHEN_STOPPED = ("tracking", "replaying", "trials", "localising")
+_NOTHING_TO_SAVE = ("rendering", "reading", "matching")
 
 
 @contextmanager
@@ -40,7 +40,7 @@ def stoppable(progress: Tell, stopped: Callable[[], bool]) -> Tell:
     """While frames are rendered there is nothing to save yet: stopping just ends it."""
 
     def tell(what: str, done: int, total: int) -> None:
-        if what not in _SAVED_WHEN_STOPPED and stopped():
+        if what in _NOTHING_TO_SAVE and stopped():
             raise KeyboardInterrupt
         progress(what, done, total)
 

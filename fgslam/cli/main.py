@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from fgslam.cli import options
-from fgslam.cli.interruption import stop_flag, stoppable
+from fgslam.cli.interruption import Tell, stop_flag, stoppable
 from fgslam.core.errors import FgslamError
 from fgslam.runs.named_experiments import find_experiment
 
 if TYPE_CHECKING:
     from fgslam.runs.baseline import Results
-    from fgslam.runs.choosing import Choice
-    from fgslam.runs.comparison import Compared
-    from fgslam.runs.config import ExperimentConfig
-    from fgslam.runs.config_models import HomingExperiment, LocalisationConfig
+    from fgslam.runs.engine import RunResult
     from fgslam.runs.folder import ExistingFolder
 
 EXIT_USER = 2
@@ -57,12 +57,9 @@ def run(
     Ctrl-C ends it early with all files valid; --resume goes on from there.
     """
     from fgslam.core.errors import ConfigError
-    from fgslam.runs.config import (
-        ExperimentConfig,
-        HomingExperiment,
-        LocalisationConfig,
-        load_experiment,
-    )
+    from fgslam.runs.config import load_experiment
+    from fgslam.runs.engine import resume_command
+    from fgslam.runs.run import run_experiment
 
     if overwrite and resume:
         raise ConfigError("--overwrite and --resume exclude each other; give one of them")
@@ -71,14 +68,10 @@ def run(
     settings = load_experiment(config, [*(overrides or ()), *given])
     folder = out or Path("runs") / settings.name
     existing: ExistingFolder = "resume" if resume else "overwrite" if overwrite else "refuse"
-    if isinstance(settings, HomingExperiment):
-        return _run_homing(settings, folder, existing)
-    if isinstance(settings, LocalisationConfig):
-        return _run_localisation(settings, folder, existing)
-    if not isinstance(settings, ExperimentConfig):
-        raise ConfigError(f"task {settings.task_name}: cannot be run")
-    run_it = _run_measurements if settings.on_measurements else _run_images
-    return run_it(settings, folder, existing)
+    with _under_way() as (progress, stopped):
+        result = run_experiment(settings, folder, existing, progress, stopped)
+    _show([result], resume_command(folder))
+    _exit_as([result])
 
 
 @app.command()
@@ -94,65 +87,28 @@ def demo(
     run(find_experiment(Path("lab_loop")), out, overwrite=True)
 
 
-def _run_homing(settings: HomingExperiment, folder: Path, existing: ExistingFolder) -> None:
+@contextmanager
+def _under_way() -> Iterator[tuple[Tell, Callable[[], bool]]]:
+    """Progress bar and stop flag while something is under way."""
     from fgslam.cli.console import progress_bar
-    from fgslam.cli.homing_console import show_homing
-    from fgslam.runs.homing_run import run_homing
 
     with stop_flag() as stopped, progress_bar() as progress:
-        result = run_homing(settings, folder, existing, progress, stopped)
-    show_homing(result)
-    if result.status == "interrupted":
+        yield stoppable(progress, stopped), stopped
+
+
+def _show(results: Sequence[RunResult], resume: str = "") -> None:
+    from fgslam.cli.console import show
+
+    for result in results:
+        show(result, resume)
+
+
+def _exit_as(results: Sequence[RunResult]) -> None:
+    """Exits as the results ended: with 0, interrupted, or an estimator was asked in vain."""
+    if any(result.status == "interrupted" for result in results):
         raise typer.Exit(EXIT_INTERRUPTED)
-
-
-def _run_localisation(settings: LocalisationConfig, folder: Path, existing: ExistingFolder) -> None:
-    from fgslam.cli.console import progress_bar
-    from fgslam.cli.localisation_console import show_localisation
-    from fgslam.runs.tasks.localisation import run_localisation
-
-    with stop_flag() as stopped, progress_bar() as progress:
-        tell = stoppable(progress, stopped)
-        result = run_localisation(settings, folder, existing, tell, stopped)
-    show_localisation(result)
-    if result.status == "interrupted":
-        raise typer.Exit(EXIT_INTERRUPTED)
-
-
-def _run_images(settings: ExperimentConfig, folder: Path, existing: ExistingFolder) -> None:
-    from fgslam.cli.comparison_console import show_comparisons
-    from fgslam.cli.console import progress_bar, show_result
-    from fgslam.runs.tasks.slam import run_experiment
-    from fgslam.runs.tasks.slam_beginning import resume_command
-
-    with stop_flag() as stopped, progress_bar() as progress:
-        result = run_experiment(settings, folder, existing, stoppable(progress, stopped), stopped)
-        interrupted = stopped() and result.compared is not None
-    show_result(result, resume_command(folder))
-    if result.compared is not None:
-        show_comparisons([result.compared])
-    if interrupted or result.status == "interrupted":
-        raise typer.Exit(EXIT_INTERRUPTED)
-
-
-def _run_measurements(settings: ExperimentConfig, folder: Path, existing: ExistingFolder) -> None:
-    from fgslam.cli.comparison_console import show_comparisons
-    from fgslam.cli.console import progress_bar
-    from fgslam.runs.tasks.slam_measurements import run_measured
-
-    with stop_flag() as stopped, progress_bar() as progress:
-        compared = run_measured(settings, folder, existing, progress, stopped)
-        interrupted = stopped()
-    show_comparisons([compared])
-    if status := _status_of([compared], interrupted):
-        raise typer.Exit(status)
-
-
-def _status_of(compared: list[Compared], interrupted: bool) -> int:
-    """Exit status of a comparison: a failed estimator is told, all of them are a fault."""
-    if interrupted:
-        return EXIT_INTERRUPTED
-    return EXIT_FAULT if any(len(c.failures) == len(c.metrics) for c in compared) else 0
+    if any(result.failed for result in results):
+        raise typer.Exit(EXIT_FAULT)
 
 
 @app.command()
@@ -174,112 +130,52 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     says where and why; the others go on. With --trials the experiment is repeated with new noise,
     and paired tests say whether the smoothers beat the filters.
     """
+    from fgslam.cli.console import show_parts
     from fgslam.core.errors import ConfigError
     from fgslam.runs.baseline import read_baseline
     from fgslam.runs.choosing import Choice
-    from fgslam.runs.homing_compare import all_homing
+    from fgslam.runs.compare import ate_tables, compare_runs, metrics_of
+    from fgslam.runs.trials import Seeds, run_trials
 
     names = None if estimators is None else tuple(estimators.split(","))
     choice, existing = Choice(names, tuple(overrides or ())), _existing(overwrite)
-    if all_homing(runs):
-        if any(given is not None for given in (trials, seed, write_baseline, check_baseline)):
-            raise ConfigError(
-                "--trials, --seed and baselines are not for homing runs; set `trials` and `seed` "
-                "in the experiment"
-            )
-        return _compare_homing(runs, choice, out, existing, jobs)
     expected = None if check_baseline is None else read_baseline(check_baseline)
     if trials is None and seed is not None:
         raise ConfigError("--seed means nothing without --trials; give both or none")
-    if trials is None:
-        results, status = _compare_runs(runs, choice, out, existing, jobs)
-    elif len(runs) == 1:
-        results, status = _compare_trials(runs[0], (trials, seed), choice, out, existing, jobs)
-    else:
+    if trials is not None and len(runs) != 1:
         raise ConfigError("--trials takes one run or experiment at a time; give one")
-    if write_baseline is not None:
-        _write_baseline(write_baseline, results)
-    regression = expected is not None and _check_baseline(expected, results)
-    if status or regression:
-        raise typer.Exit(status or EXIT_FAULT)
-    return None
+    with _under_way() as (progress, stopped):
+        if trials is None:
+            results = compare_runs(runs, choice, out, existing, jobs, progress, stopped)
+        else:
+            seeds = Seeds(trials, seed)
+            tried = run_trials(runs[0], seeds, choice, out, existing, jobs, progress, stopped)
+            results = [tried]
+    _show(results)
+    show_parts((), ate_tables(results))
+    regression = _baselines(metrics_of(results), write_baseline, expected)
+    _exit_as(results)
+    if regression:
+        raise typer.Exit(EXIT_FAULT)
 
 
-def _compare_homing(
-    runs: list[Path], choice: Choice, out: Path | None, existing: ExistingFolder, jobs: int
-) -> None:
-    from fgslam.cli.console import progress_bar
-    from fgslam.cli.homing_console import show_homing
-    from fgslam.runs.homing_compare import compare_homing_runs
+def _baselines(results: Results, written: Path | None, expected: dict[str, Any] | None) -> bool:
+    """Writes and checks baselines where that is asked for; whether something became worse."""
+    from fgslam.cli.console import show_parts
+    from fgslam.runs.baseline import check_baseline, deviation_lines, write_baseline
 
-    with stop_flag() as stopped, progress_bar() as progress:
-        results = compare_homing_runs(runs, choice, out, existing, jobs, progress, stopped)
-    for result in results:
-        show_homing(result)
-    if any(result.status == "interrupted" for result in results):
-        raise typer.Exit(EXIT_INTERRUPTED)
+    if written is not None:
+        write_baseline(written, results, shlex.join(["fgslam", *sys.argv[1:]]))
+        show_parts((), (), [("baseline", str(written))])
+    if expected is None:
+        return False
+    deviations = check_baseline(expected, results)
+    show_parts((), (), deviation_lines(deviations))
+    return any(deviation.regression for deviation in deviations)
 
 
 def _existing(overwrite: bool) -> ExistingFolder:
     return "overwrite" if overwrite else "refuse"
-
-
-def _compare_runs(
-    runs: list[Path], choice: Choice, out: Path | None, existing: ExistingFolder, jobs: int
-) -> tuple[Results, int]:
-    """Metrics by run and estimator, and the exit status."""
-    from fgslam.cli.comparison_console import show_comparisons
-    from fgslam.cli.console import progress_bar
-    from fgslam.runs.compare import compare_runs
-
-    with stop_flag() as stopped, progress_bar() as progress:
-        compared = compare_runs(runs, choice, out, existing, jobs, progress, stopped)
-        interrupted = stopped()
-    show_comparisons(compared)
-    return {one.name: one.metrics for one in compared}, _status_of(compared, interrupted)
-
-
-def _compare_trials(
-    source: Path,
-    seeds: tuple[int, int | None],
-    choice: Choice,
-    out: Path | None,
-    existing: ExistingFolder,
-    jobs: int,
-) -> tuple[Results, int]:
-    """Means over the trials by run and estimator, and the exit status."""
-    from fgslam.cli.comparison_console import show_trials
-    from fgslam.cli.console import progress_bar
-    from fgslam.runs.trial_results import together
-    from fgslam.runs.trials import Seeds, run_trials
-
-    with stop_flag() as stopped, progress_bar() as progress:
-        tell = stoppable(progress, stopped)
-        trials = run_trials(source, Seeds(*seeds), choice, out, existing, jobs, tell, stopped)
-        interrupted = stopped()
-    show_trials(trials)
-    means = {title: together(trials.summary, title) for title in trials.summary.means}
-    status = EXIT_INTERRUPTED if interrupted else EXIT_FAULT if trials.failures else 0
-    return {trials.name: means}, status
-
-
-def _write_baseline(path: Path, results: Results) -> None:
-    import shlex
-
-    from fgslam.runs.baseline import write_baseline
-
-    write_baseline(path, results, shlex.join(["fgslam", *sys.argv[1:]]))
-    typer.echo(f"baseline    {path}")
-
-
-def _check_baseline(expected: dict[str, Any], results: Results) -> bool:
-    """Shows what differs; whether something became worse."""
-    from fgslam.cli.comparison_console import show_deviations
-    from fgslam.runs.baseline import check_baseline
-
-    deviations = check_baseline(expected, results)
-    show_deviations(deviations)
-    return any(deviation.regression for deviation in deviations)
 
 
 @app.command()
@@ -304,19 +200,16 @@ def localize(
     A pose is told only where it is beyond doubt, with the reasons. Exits with 0 whatever the
     answers are, with 2 where map or recording cannot be used.
     """
-    from fgslam.cli.console import progress_bar
-    from fgslam.cli.localisation_console import show_localisation
     from fgslam.runs.tasks.localisation_command import Wanted
     from fgslam.runs.tasks.localisation_command import localize as locate
 
     wanted = Wanted(
         map_file, recording, tuple(overrides or ()), frame, frames, out, _existing(overwrite)
     )
-    with stop_flag() as stopped, progress_bar() as progress:
-        result = locate(wanted, stoppable(progress, stopped), stopped)
-    show_localisation(result, one_by_one=True)
-    if result.status == "interrupted":
-        raise typer.Exit(EXIT_INTERRUPTED)
+    with _under_way() as (progress, stopped):
+        result = locate(wanted, progress, stopped)
+    _show([result])
+    _exit_as([result])
 
 
 @app.command()

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from fgslam.core.atomic_files import write_text
 from fgslam.core.errors import ConfigError
-from fgslam.evaluation.metrics import EstimatorMetrics, value_at
+from fgslam.evaluation.metrics import value_at
 from fgslam.report.comparison_table import RESULT_COLUMNS
 
-Results: TypeAlias = Mapping[str, Mapping[str, EstimatorMetrics]]
-"""Metrics by the run's name and the estimator's title."""
+Results: TypeAlias = Mapping[str, Mapping[str, Mapping[str, Any]]]
+"""Numbers as in metrics.json, by the run's name and the estimator's title."""
 
 FORMAT = "fgslam baseline"
 VERSION = 1
@@ -28,8 +28,21 @@ _SMALLER_IS_BETTER = (
     "end_error_final_deg",
     "landmark_rmse_m",
     "landmark_median_m",
+    # of homing runs
+    "direction_median_deg",
+    "direction_p95_deg",
+    "rotation_median_deg",
+    "distance_median",
 )
-_ONE_IS_BEST = ("nees_pose_final_per_dof", "nees_landmark_per_dof", "nis_per_dof")
+_ONE_IS_BEST = (
+    "nees_pose_final_per_dof",
+    "nees_landmark_per_dof",
+    "nis_per_dof",
+    # of homing runs
+    "nees_robot_per_dof",
+    "nees_target_per_dof",
+    "nees_home_per_dof",
+)
 _TOLERANCES = dict.fromkeys(_SMALLER_IS_BETTER, 0.05) | dict.fromkeys(_ONE_IS_BEST, 0.10)
 _FLOOR = 1e-6  # metres, degrees: less is rounding, whatever the ratio
 _WHERE = dict(RESULT_COLUMNS)
@@ -104,10 +117,16 @@ def check_baseline(document: Mapping[str, Any], results: Results) -> list[Deviat
     return out
 
 
-def _numbers(metrics: EstimatorMetrics) -> dict[str, float]:
+def deviation_lines(deviations: Sequence[Deviation]) -> list[tuple[str, str]]:
+    """What differs from the baseline, label and text each, or that nothing does."""
+    if not deviations:
+        return [("baseline", "all values are within their tolerances")]
+    return [("REGRESSION" if d.regression else "deviation", d.text) for d in deviations]
+
+
+def _numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
     """The checked columns whose value is known."""
-    values = metrics.as_json()
-    found = {name: value_at(values, _WHERE[name]) for name in _TOLERANCES}
+    found = {name: value_at(metrics, _WHERE.get(name, name)) for name in _TOLERANCES}
     return {name: float(value) for name, value in found.items() if value is not None}
 
 

@@ -1,33 +1,47 @@
-"""`fgslam compare`: run folders in, tables and pages out."""
+"""`fgslam compare`: the logs of runs through other estimators, set side by side."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from fgslam.backend.settings import EstimatorSettings
-from fgslam.core.errors import ConfigError, OutputError
+from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
 from fgslam.report.comparison_table import write_comparison_csv
+from fgslam.report.content import TextTable
 from fgslam.report.metrics import read_metrics, write_metrics
 from fgslam.runs.choosing import EVERY, Choice, choose
 from fgslam.runs.comparison import (
-    COMPARISON_FILE,
     Compared,
-    Progress,
     load_run,
     load_truth,
     remark_of,
     replay_apart,
     tasks_of,
 )
-from fgslam.runs.config import ExperimentConfig
-from fgslam.runs.folder import ExistingFolder, create_run_folder, is_run_folder
+from fgslam.runs.comparison_tables import ate_table, comparison_particulars, comparison_tables
+from fgslam.runs.config import is_homing, load_homing
+from fgslam.runs.config_models import Experiment, ExperimentConfig, HomingExperiment
+from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, run_task
+from fgslam.runs.files import COMPARISON_FILE, METRICS_FILE
+from fgslam.runs.folder import RUN_MARKER, ExistingFolder, is_run_folder
+from fgslam.runs.homing_compare import open_homing_comparison
+from fgslam.runs.homing_logs import load_bearing_logs
 from fgslam.runs.report import report_from_folder
-from fgslam.runs.tasks.slam_outputs import write_config
+from fgslam.runs.units import Progress, Stopped
 
 DEFAULT_FOLDER = "compare"
-METRICS_FILE = "metrics.json"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ComparedResult(RunResult):
+    """How a comparison of SLAM ended; ``compared`` are its estimators."""
+
+    compared: Compared = field(kw_only=True)
 
 
 def compare_runs(
@@ -37,12 +51,12 @@ def compare_runs(
     existing: ExistingFolder = "refuse",
     jobs: int = 1,
     progress: Progress = lambda what, done, total: None,
-    stopped: Callable[[], bool] = lambda: False,
-) -> list[Compared]:
-    """Replays the logs of runs through estimators.
+    stopped: Stopped = lambda: False,
+) -> list[RunResult]:
+    """Replays the logs of runs through estimators: measurements of SLAM, or bearings of homing.
 
     Args:
-        runs: run folders.
+        runs: run folders, of SLAM or of homing.
         choice: which estimators.
         out: folder of the results; of several runs each gets one below it, by its folder's name.
             None: `compare` inside each run.
@@ -54,44 +68,36 @@ def compare_runs(
     Raises:
         FgslamError: a run cannot be read, a name is unknown, or the results cannot be written.
     """
+    opener: Callable[[Path, Choice], tuple[Experiment, Task[RunResult]]]
+    opener = _open_homing if _all_homing(runs) else _open_slam
     folders = _folders(runs, out)
-    chosen = [_estimators_for(run, choice) for run in runs]
-    compared = []
+    opened = [opener(run, choice) for run in runs]
     for run, folder in zip(runs, folders, strict=True):
         _require_apart(run, folder, existing)
-    for run, folder, estimators in zip(runs, folders, chosen, strict=True):
-        create_run_folder(folder, existing)
-        compared.append(compare_run(run, estimators, folder, jobs, progress, stopped))
-    if out is not None and len(runs) > 1:
+    results = []
+    for (config, task), folder in zip(opened, folders, strict=True):
+        opener_now = functools.partial(_opened, task)
+        results.append(run_task(opener_now, config, folder, existing, progress, stopped, jobs))
+    compared = [one.compared for one in results if isinstance(one, ComparedResult)]
+    if out is not None and len(compared) > 1:
         write_comparison_csv(out / COMPARISON_FILE, [(c.name, c.metrics) for c in compared])
-    return compared
+    return results
 
 
-def compare_run(
-    run: Path,
-    estimators: Sequence[EstimatorSettings],
-    out: Path,
-    jobs: int = 1,
-    progress: Progress = lambda what, done, total: None,
-    stopped: Callable[[], bool] = lambda: False,
-) -> Compared:
-    """One run's log through the estimators, into the existing folder ``out``."""
-    config, log = load_run(run)
-    dataset = (config.provenance or {}).get("dataset")
-    now_compared = config.model_copy(update={"compare": tuple(estimators)})
-    write_config(out, now_compared, {"dataset": dataset, "run": str(run)})
-    metrics = replay_apart(tasks_of(config, run, out, estimators), jobs, progress, stopped)
-    interrupted = stopped()
-    about: dict[str, JsonValue] = {
-        "name": config.name,
-        "status": "interrupted" if interrupted else "finished",
-        "run": str(run),
-        "odometry": config.odometry.kind,
-        "remark": remark_of(config) or None,
-        "notes": _notes(run),
-    }
-    write_comparison(out, config, len(log), metrics, about, run)
-    return Compared(config.name, run, out, len(log), metrics)
+def metrics_of(results: Sequence[RunResult]) -> dict[str, dict[str, Any]]:
+    """Numbers of estimators, as metrics.json has them, by the run's name and their title."""
+    return {result.config.name: result.metrics["estimators"] for result in results}
+
+
+def ate_tables(results: Sequence[RunResult]) -> tuple[TextTable, ...]:
+    """Final ATE of each estimator on each run, where there are several runs of SLAM."""
+    compared = [one.compared for one in results if isinstance(one, ComparedResult)]
+    return (ate_table(compared),) if len(compared) > 1 else ()
+
+
+def _opened(task: Task[RunResult], config: Experiment, opening: Opening) -> Task[RunResult]:
+    """A task whose run was read already."""
+    return task
 
 
 def write_comparison(
@@ -109,11 +115,59 @@ def write_comparison(
         report_from_folder(out, run)
 
 
-def _estimators_for(run: Path, choice: Choice) -> tuple[EstimatorSettings, ...]:
-    """What is to be replayed; a run that cannot be judged is told before anything is written."""
+# --------------------------------------------------------------------------------------------
+# One run
+
+
+def _open_slam(run: Path, choice: Choice) -> tuple[ExperimentConfig, Task[RunResult]]:
+    """The comparison of a run; one that cannot be judged is told before anything is written."""
     config, log = load_run(run)
     load_truth(run, log)
-    return choose(config, choice)
+    estimators = choose(config, choice)
+    provenance = {"dataset": (config.provenance or {}).get("dataset"), "run": str(run)}
+    now = config.model_copy(update={"compare": estimators})
+
+    def compared(context: Context) -> ComparedResult:
+        return _compare(run, config, len(log), estimators, context)
+
+    return now, Task(provenance, compared)
+
+
+def _open_homing(run: Path, choice: Choice) -> tuple[HomingExperiment, Task[RunResult]]:
+    config, logs = load_homing(run / RUN_MARKER), load_bearing_logs(run)
+    return config, open_homing_comparison(config, logs, choose(config, choice), run)
+
+
+def _compare(
+    run: Path,
+    config: ExperimentConfig,
+    frames: int,
+    estimators: Sequence[EstimatorSettings],
+    context: Context,
+) -> ComparedResult:
+    """One run's log through the estimators."""
+    out = context.folder
+    metrics = replay_apart(tasks_of(config, run, out, estimators), context)
+    status: Status = "interrupted" if context.stopped() else "finished"
+    about: dict[str, JsonValue] = {
+        "name": config.name,
+        "status": status,
+        "run": str(run),
+        "odometry": config.odometry.kind,
+        "remark": remark_of(config) or None,
+        "notes": _notes(run),
+    }
+    write_comparison(out, config, frames, metrics, about, run)
+    compared = Compared(config.name, run, out, frames, metrics)
+    return ComparedResult(
+        config,
+        out,
+        status,
+        tables=comparison_tables(compared),
+        particulars=comparison_particulars(compared),
+        failed=len(compared.failures) == len(metrics),
+        compared=compared,
+    )
 
 
 def _notes(run: Path) -> list[str]:
@@ -121,6 +175,25 @@ def _notes(run: Path) -> list[str]:
     path = run / METRICS_FILE
     notes = read_metrics(path).get("notes") if path.is_file() else None
     return [str(note) for note in notes or ()]
+
+
+# --------------------------------------------------------------------------------------------
+# Folders
+
+
+def _all_homing(runs: Sequence[Path]) -> bool:
+    """Whether all runs are of homing; False where none is.
+
+    Raises:
+        FgslamError: some are and some are not, or one is no run folder.
+    """
+    kinds = [is_run_folder(run) and is_homing(run / RUN_MARKER) for run in runs]
+    if any(kinds) and not all(kinds):
+        other = runs[kinds.index(False)]
+        raise DatasetError(
+            f"{other}: is no homing run, others are; compare homing runs by themselves"
+        )
+    return all(kinds)
 
 
 def _require_apart(run: Path, folder: Path, existing: ExistingFolder) -> None:

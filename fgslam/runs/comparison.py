@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,18 +18,16 @@ from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, read_landmark_truth
 from fgslam.report.point_cloud import MapPoints, read_ply
 from fgslam.runs.config import ExperimentConfig, load_config
+from fgslam.runs.engine import Context
 from fgslam.runs.estimator_files import write_replay
+from fgslam.runs.files import LOG_FILE
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
-from fgslam.runs.processes import WorkerEnded, run_apart
-from fgslam.runs.tasks.slam_checkpoint import LOG_FILE
 from fgslam.runs.tasks.slam_map_entry import arrival_of
+from fgslam.runs.units import Stage, one_by_one
 from fgslam.slam.replay import replay
 
-COMPARISON_FILE = "comparison.csv"
 GROUND_TRUTH_FILE = "ground_truth.tum"
 SYNTHETIC_REMARK = "odometry: SYNTHETIC (ground truth plus stated noise, see config.yaml)"
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,24 +84,30 @@ def tasks_of(
 
 
 def replay_apart(
-    tasks: Sequence[ReplayTask],
-    jobs: int,
-    progress: Progress,
-    stopped: Callable[[], bool],
+    tasks: Sequence[ReplayTask], context: Context, single_threaded: bool = False
 ) -> dict[str, EstimatorMetrics]:
     """Every task in its own process; metrics by title, in the order of the tasks.
 
     With one job the times do not disturb each other.
     """
-    found: dict[int, EstimatorMetrics] = {}
-    progress("replaying", 0, len(tasks))
-    for index, result in run_apart(perform, tasks, jobs, stopped):
-        if isinstance(result, WorkerEnded):
-            kind = tasks[index].settings.kind
-            result = EstimatorMetrics(more={"kind": kind, "failure": result.why})
-        found[index] = result
-        progress("replaying", len(found), len(tasks))
+    stage = Stage(
+        name="replays",
+        label="replaying",
+        count=len(tasks),
+        work=_perform_all,
+        argument=lambda units: [tasks[k] for k in units],
+        kind=EstimatorMetrics,
+        blocks=one_by_one,
+    )
+    done = context.perform(stage, single_threaded)
+    found = dict(done.results)
+    for (k,), why in done.ended:
+        found[k] = EstimatorMetrics(more={"kind": tasks[k].settings.kind, "failure": why})
     return {task.settings.title: found[k] for k, task in enumerate(tasks)}
+
+
+def _perform_all(tasks: Sequence[ReplayTask]) -> list[EstimatorMetrics]:
+    return [perform(task) for task in tasks]
 
 
 def perform(task: ReplayTask) -> EstimatorMetrics:

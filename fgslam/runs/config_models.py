@@ -5,6 +5,7 @@ Each field has its unit and meaning. A file without the key `task` is one of SLA
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
@@ -88,6 +89,15 @@ class Experiment(BaseModel):
     def task_name(self) -> str | None:
         """Value of the key `task`; None for SLAM, which has no such key."""
         return getattr(self, "task", None)
+
+    @property
+    def wants_report(self) -> bool:
+        """Whether report.html is to be written."""
+        return bool(getattr(self, "output", OutputSettings()).report)
+
+    def resolved(self) -> Experiment:
+        """What the run's own config.yaml says: all that the task settles by itself filled in."""
+        return self
 
     def problem(self) -> str:
         """What is contradictory, with its fix; empty where nothing is."""
@@ -335,6 +345,12 @@ class HomingConfig(DrivingConfig):
     """One homing in closed loop: the path's first leg alone."""
 
     task: Annotated[Literal["homing"], _TASK]
+
+    def resolved(self) -> HomingConfig:
+        """A path of one leg: a single homing."""
+        path = dataclasses.replace(self.dataset.path, legs=1)
+        dataset = dataclasses.replace(self.dataset, path=path)
+        return self.model_copy(update={"dataset": dataset})
 
 
 class PathFollowingConfig(DrivingConfig):

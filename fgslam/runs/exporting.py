@@ -9,10 +9,10 @@ from fgslam.core.trajectories import read_tum, write_trajectory
 from fgslam.report.metrics import read_metrics
 from fgslam.report.point_cloud import read_ply, write_map
 from fgslam.runs.config import is_homing, load_config
+from fgslam.runs.files import LOG_FILE
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
 from fgslam.runs.graph_export import export_graph
 from fgslam.runs.map_export import export_map
-from fgslam.runs.tasks.slam_checkpoint import LOG_FILE
 
 
 def export_run(

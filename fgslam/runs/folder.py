@@ -65,6 +65,7 @@ _RESULT_FILES = (
     "commands.csv",
     "trajectory.csv",
     "logs/*.npz",
+    "units/*.npz",
     "pictures/*.png",
     *(f"*/{name}" for name in _ESTIMATOR_FILES),
 )

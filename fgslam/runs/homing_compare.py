@@ -11,7 +11,6 @@ import numpy as np
 
 from fgslam.backend.homing.settings import HomingEstimatorSettings
 from fgslam.core.bearing_log import BearingLog
-from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.evaluation.homing import HomingErrors, homing_errors, summarise_homings
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
 from fgslam.report.content import TextTable
@@ -19,26 +18,14 @@ from fgslam.report.figures.curves import Line, curve_figure
 from fgslam.report.figures.local_map import local_map_figure
 from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv
-from fgslam.runs.choosing import EVERY, Choice, choose
-from fgslam.runs.config import is_homing, load_homing
 from fgslam.runs.config_models import HomingExperiment
-from fgslam.runs.folder import RUN_MARKER, ExistingFolder, is_run_folder
-from fgslam.runs.homing_logs import load_bearing_logs
+from fgslam.runs.documents import write_document, write_page
+from fgslam.runs.engine import Context, RunResult, Status, Task
+from fgslam.runs.files import COMPARISON_FILE
 from fgslam.runs.homing_replay import ReplayedHoming, replay_homing
-from fgslam.runs.homing_results import (
-    HomingResult,
-    Progress,
-    Status,
-    Stopped,
-    begin,
-    write_document,
-    write_page,
-)
-from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.runs.tasks.homing_trial_results import TRIAL_COLUMNS, summary_numbers, trial_row
+from fgslam.runs.units import Stage, one_by_one
 
-DEFAULT_FOLDER = "compare"
-COMPARISON_FILE = "comparison.csv"
 ESTIMATES_FILE = "estimates.csv"
 _LEFT = 0.199
 """Judged where a fifth of the leg is left, as simulated homings end there: nearer to the target its
@@ -63,61 +50,44 @@ class _Task:
     settings: HomingEstimatorSettings
 
 
-def compare_homing_runs(
-    runs: Sequence[Path],
-    choice: Choice = EVERY,
-    out: Path | None = None,
-    existing: ExistingFolder = "refuse",
-    jobs: int = 1,
-    progress: Progress = lambda what, done, total: None,
-    stopped: Stopped = lambda: False,
-) -> list[HomingResult]:
-    """Replays the bearing logs of homing runs through estimators.
+def open_homing_comparison(
+    config: HomingExperiment,
+    logs: dict[str, BearingLog],
+    estimators: Sequence[HomingEstimatorSettings],
+    run: Path,
+) -> Task[RunResult]:
+    """The bearings that a run logged, through estimators."""
 
-    Args:
-        runs: run folders.
-        choice: which estimators.
-        out: folder of the results; of several runs each gets one below it, by its folder's name.
-            None: `compare` inside each run.
-        existing: what to do where results are already.
-        jobs: processes at a time; more than one disturbs the times.
-        progress: told of each estimator that is done.
-        stopped: True ends the replays; what was finished is kept.
+    def compared(context: Context) -> RunResult:
+        replays = _replay_all([_Task(logs, settings) for settings in estimators], context)
+        status: Status = "interrupted" if context.stopped() else "finished"
+        return _finish(config, context.folder, status, logs, replays)
 
-    Raises:
-        FgslamError: a run cannot be read, a name is unknown, or the results cannot be written.
-    """
-    found = []
-    for run in runs:
-        config = load_homing(run / RUN_MARKER)
-        found.append((run, config, load_bearing_logs(run), choose(config, choice)))
-    folders = [_folder(run, out, len(runs)) for run in runs]
-    for run, folder in zip(runs, folders, strict=True):
-        _require_apart(run, folder, existing)
-    results = []
-    for (run, config, logs, estimators), folder in zip(found, folders, strict=True):
-        begin(config, folder, existing, {"run": str(run)})
-        tasks = [_Task(logs, settings) for settings in estimators]
-        replays = _replay_all(tasks, jobs, progress, stopped)
-        status: Status = "interrupted" if stopped() else "finished"
-        results.append(_finish(config, folder, status, logs, replays))
-    return results
+    return Task({"run": str(run)}, compared)
 
 
-def _replay_all(
-    tasks: Sequence[_Task], jobs: int, progress: Progress, stopped: Stopped
-) -> dict[str, dict[str, ReplayedHoming]]:
+def _replay_all(tasks: Sequence[_Task], context: Context) -> dict[str, dict[str, ReplayedHoming]]:
     """By title, then by log; every estimator in a process of its own."""
-    found: dict[int, dict[str, ReplayedHoming]] = {}
-    progress("replaying", 0, len(tasks))
-    for index, result in run_apart(_perform, tasks, jobs, stopped, single_threaded=True):
-        settings = tasks[index].settings
-        if isinstance(result, WorkerEnded):
-            ended = ReplayedHoming(settings.title, settings.kind, (), np.empty(0), result.why)
-            result = dict.fromkeys(tasks[index].logs, ended)
-        found[index] = result
-        progress("replaying", len(found), len(tasks))
+    stage = Stage(
+        name="replays",
+        label="replaying",
+        count=len(tasks),
+        work=_perform_all,
+        argument=lambda units: [tasks[k] for k in units],
+        kind=dict[str, ReplayedHoming],
+        blocks=one_by_one,
+    )
+    done = context.perform(stage)
+    found = dict(done.results)
+    for (k,), why in done.ended:
+        settings = tasks[k].settings
+        ended = ReplayedHoming(settings.title, settings.kind, (), np.empty(0), why)
+        found[k] = dict.fromkeys(tasks[k].logs, ended)
     return {task.settings.title: found[k] for k, task in enumerate(tasks)}
+
+
+def _perform_all(tasks: Sequence[_Task]) -> list[dict[str, ReplayedHoming]]:
+    return [_perform(task) for task in tasks]
 
 
 def _perform(task: _Task) -> dict[str, ReplayedHoming]:
@@ -138,7 +108,7 @@ def _finish(
     status: Status,
     logs: dict[str, BearingLog],
     replays: dict[str, dict[str, ReplayedHoming]],
-) -> HomingResult:
+) -> RunResult:
     errors = {
         title: {name: _errors(one, logs[name]) for name, one in by_log.items()}
         for title, by_log in replays.items()
@@ -152,9 +122,7 @@ def _finish(
     with_truth = sum(log.truth is not None for log in logs.values())
     heading = f"{len(logs)} homings replayed, {with_truth} with ground truth"
     tables = (TextTable("compared", heading, "estimator", TRIAL_COLUMNS, tuple(rows)),)
-    result = HomingResult(
-        config, folder, status, (f"{heading}.",), tables, tuple(_failures(replays))
-    )
+    result = RunResult(config, folder, status, (f"{heading}.",), tables, tuple(_failures(replays)))
     write_csv(folder / ESTIMATES_FILE, _ESTIMATE_COLUMNS, _estimate_rows(replays, errors))
     columns = ("estimator", *(column.name for column in TRIAL_COLUMNS))
     write_csv(folder / COMPARISON_FILE, columns, [[title, *row] for title, row in rows])
@@ -243,38 +211,3 @@ def _figures(
             heading = f"The local map of {title}, {first}"
             yield local_map_figure(estimates, logs[first].truth, f"local-map-{i}", heading)
             return
-
-
-# --------------------------------------------------------------------------------------------
-# Folders
-
-
-def _folder(run: Path, out: Path | None, count: int) -> Path:
-    if out is None:
-        return run / DEFAULT_FOLDER
-    return out if count == 1 else out / run.resolve().name
-
-
-def _require_apart(run: Path, folder: Path, existing: ExistingFolder) -> None:
-    """A comparison may replace an earlier one, never the run that it is made from."""
-    if folder.resolve() == run.resolve() or folder.resolve() in run.resolve().parents:
-        raise ConfigError(f"--out {folder}: holds the run itself; choose another folder")
-    if existing == "refuse" and is_run_folder(folder):
-        raise OutputError(
-            f"{folder} holds results already; choose another --out, or add --overwrite"
-        )
-
-
-def all_homing(runs: Sequence[Path]) -> bool:
-    """Whether all runs are of homing; False where none is.
-
-    Raises:
-        FgslamError: some are and some are not, or one is no run folder.
-    """
-    kinds = [is_run_folder(run) and is_homing(run / RUN_MARKER) for run in runs]
-    if any(kinds) and not all(kinds):
-        other = runs[kinds.index(False)]
-        raise DatasetError(
-            f"{other}: is no homing run, others are; compare homing runs by themselves"
-        )
-    return all(kinds)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
@@ -20,11 +19,12 @@ from fgslam.core.sensors import CameraRig
 from fgslam.datasets.layouts import recognise_layout
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.runs.config import ExperimentConfig, load_experiment, make_config
-from fgslam.runs.config_models import Experiment, HomingExperiment, LocalisationConfig
+from fgslam.runs.engine import RunResult
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.live import Overrides, override_texts, slam_config
 from fgslam.runs.named_experiments import find_experiment
 from fgslam.runs.opening import open_sequence
+from fgslam.runs.run import run_experiment
 from fgslam.slam.choosing import chosen_estimator
 from fgslam.slam.replay import Replay
 from fgslam.slam.replay import replay as replay_log
@@ -145,28 +145,13 @@ def _recording_config(path: Path, overrides: Overrides) -> ExperimentConfig:
     return make_config(values, override_texts(overrides), str(path))
 
 
-@dataclass(frozen=True, eq=False)
-class Run:
-    """A run that has ended.
-
-    Attributes:
-        folder: its files; docs describe each.
-        status: `finished`, or `interrupted` where it can be resumed.
-        metrics: the document of metrics.json.
-    """
-
-    folder: Path
-    status: str
-    metrics: dict[str, Any]
-
-
 def run(
     experiment: str | Path,
     out: str | Path | None = None,
     overrides: Overrides = (),
     existing: ExistingFolder = "refuse",
     progress: Progress = lambda what, done, total: None,
-) -> Run:
+) -> RunResult:
     """Runs an experiment of any task into a run folder, as ``fgslam run`` does.
 
     Args:
@@ -176,36 +161,16 @@ def run(
         existing: what to do where the folder holds a run: `refuse`, `overwrite` or `resume`.
         progress: told what is under way, how much of it is done, and of how much.
 
+    Returns:
+        How it ended: `folder`, `status` (`finished` or `interrupted`), `metrics` (the document of
+        metrics.json), and what `fgslam run` would print.
+
     Raises:
         FgslamError: of any kind, with one line that says what to do.
     """
     config = load_experiment(find_experiment(Path(experiment)), override_texts(overrides))
     folder = Path("runs") / config.name if out is None else Path(out)
-    status = _perform(config, folder, existing, progress)
-    metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-    return Run(folder, status, metrics)
-
-
-def _perform(config: Experiment, folder: Path, existing: ExistingFolder, progress: Progress) -> str:
-    """Runs a configuration of any task; how it ended. Each task is imported when it is run."""
-    if isinstance(config, HomingExperiment):
-        from fgslam.runs.homing_run import run_homing
-
-        return run_homing(config, folder, existing, progress).status
-    if isinstance(config, LocalisationConfig):
-        from fgslam.runs.tasks.localisation import run_localisation
-
-        return run_localisation(config, folder, existing, progress).status
-    if not isinstance(config, ExperimentConfig):
-        raise ConfigError(f"task {config.task_name}: cannot be run")
-    if config.on_measurements:
-        from fgslam.runs.tasks.slam_measurements import run_measured
-
-        run_measured(config, folder, existing, progress, lambda: False)
-        return "finished"
-    from fgslam.runs.tasks.slam import run_experiment
-
-    return run_experiment(config, folder, existing, progress).status
+    return run_experiment(config, folder, existing, progress)
 
 
 def replay(

@@ -26,9 +26,9 @@ from fgslam.report.run_results import (
     truth_in_their_world,
 )
 from fgslam.report.slam_page import write_report
+from fgslam.runs.files import LOG_FILE
 from fgslam.runs.folder import RUN_MARKER
 from fgslam.runs.report_parts import comparison_table, sample_pictures
-from fgslam.runs.tasks.slam_checkpoint import LOG_FILE
 from fgslam.runs.tasks.slam_places import LOOPS_FILE, read_closures
 
 REPORT = "report.html"

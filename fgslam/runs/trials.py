@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.errors import ConfigError, OutputError
@@ -16,18 +18,26 @@ from fgslam.evaluation.consistency import Nees
 from fgslam.evaluation.judging import judge_replay
 from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.runs.choosing import EVERY, Choice, choose
-from fgslam.runs.comparison import Progress, load_truth
-from fgslam.runs.config import ExperimentConfig, load_config
-from fgslam.runs.folder import RUN_MARKER, ExistingFolder, create_run_folder, is_run_folder
+from fgslam.runs.comparison import load_truth
+from fgslam.runs.comparison_tables import TRIAL_COLUMNS, metrics_table
+from fgslam.runs.config import load_experiment
+from fgslam.runs.config_models import Experiment, ExperimentConfig, HomingTrialsConfig
+from fgslam.runs.engine import Context, Opener, Opening, RunResult, Status, Task, run_task
+from fgslam.runs.files import LOG_FILE
+from fgslam.runs.folder import RUN_MARKER, ExistingFolder, is_run_folder
 from fgslam.runs.opening import open_sequence
-from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.runs.settings import OutputSettings
-from fgslam.runs.tasks.slam import run_experiment
-from fgslam.runs.tasks.slam_checkpoint import LOG_FILE
+from fgslam.runs.tasks.slam import open_slam
 from fgslam.runs.tasks.slam_map_entry import arrival_of
 from fgslam.runs.tasks.slam_measurements import open_measured, write_recording
-from fgslam.runs.tasks.slam_outputs import write_config
-from fgslam.runs.trial_results import TrialSummary, summarise, write_trials
+from fgslam.runs.trial_results import (
+    TrialSummary,
+    failures_of,
+    summarise,
+    together,
+    write_trials,
+)
+from fgslam.runs.units import Progress, Stage, Stopped, one_by_one
 from fgslam.slam.replay import replay
 
 DEFAULT_FOLDER = "trials"
@@ -61,13 +71,10 @@ class Trial:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Trials:
-    """All trials, and what follows from them."""
+class TrialsResult(RunResult):
+    """How trials of SLAM ended; ``summary`` is what follows from all of them."""
 
-    name: str
-    out: Path
-    summary: TrialSummary
-    failures: tuple[str, ...]
+    summary: TrialSummary = field(kw_only=True)
 
 
 def run_trials(
@@ -78,8 +85,8 @@ def run_trials(
     existing: ExistingFolder = "refuse",
     jobs: int = 1,
     progress: Progress = lambda what, done, total: None,
-    stopped: Callable[[], bool] = lambda: False,
-) -> Trials:
+    stopped: Stopped = lambda: False,
+) -> RunResult:
     """Runs the experiment with several seeds in a row and compares the estimators on each.
 
     Args:
@@ -100,18 +107,85 @@ def run_trials(
     folder = out or _default_folder(source, config)
     _require_room(folder, source, existing)
     first = config.seed if seeds.first is None else seeds.first
-    _prepare(config, progress)
-    create_run_folder(folder, existing)
-    chosen = config.model_copy(update={"compare": estimators})
-    write_config(folder, chosen, {"trials": seeds.count, "first_seed": first})
-    tasks = [TrialTask(config, first + k, estimators) for k in range(seeds.count)]
-    trials, failures = _perform_all(tasks, jobs, progress, stopped)
-    if not trials:
+    opener: Opener[RunResult]
+    if isinstance(config, ExperimentConfig):
+        opener = functools.partial(_open, config, seeds.count, first, estimators)
+        chosen: Experiment = config.model_copy(update={"compare": estimators})
+    else:
+        from fgslam.runs.tasks.homing_trials import open_trials
+
+        opener = open_trials
+        changes: dict[str, Any] = {"trials": seeds.count, "seed": first}
+        changes |= {"estimator": estimators[0], "compare": estimators[1:]}
+        chosen = config.model_copy(update=changes)
+    return run_task(opener, chosen, folder, existing, progress, stopped, jobs)
+
+
+def _open(
+    config: ExperimentConfig,
+    count: int,
+    first: int,
+    estimators: tuple[EstimatorSettings, ...],
+    chosen: Experiment,
+    opening: Opening,
+) -> Task[TrialsResult]:
+    """Trials of SLAM; what they share is rendered once, before several processes would do so."""
+    if not config.on_measurements:
+        open_sequence(config, lambda done, total: opening.progress("rendering", done, total))
+    tasks = [TrialTask(config, first + k, estimators) for k in range(count)]
+    provenance = {"trials": count, "first_seed": first}
+    return Task(provenance, lambda context: _run(config, tasks, context))
+
+
+def _run(config: ExperimentConfig, tasks: Sequence[TrialTask], context: Context) -> TrialsResult:
+    """Finished trials by seed, and a line for each that ended without a result."""
+    stage = Stage(
+        name="trials",
+        label="trials",
+        count=len(tasks),
+        work=_perform_all,
+        argument=lambda units: [tasks[k] for k in units],
+        kind=Trial,
+        blocks=one_by_one,
+    )
+    done = context.perform(stage)
+    failures = sorted(f"trial with seed {tasks[k].seed}: {why}" for (k,), why in done.ended)
+    if not done.results:
         raise OutputError(f"no trial was finished; {failures[0] if failures else 'interrupted'}")
-    kinds = {settings.title: settings.kind for settings in estimators}
-    summary = summarise([(t.seed, t.metrics, t.nees) for t in trials], kinds)
-    write_trials(folder, config.name, summary, failures)
-    return Trials(config.name, folder, summary, tuple(failures))
+    rows = [(trial.seed, trial.metrics, trial.nees) for trial in done.results.values()]
+    kinds = {settings.title: settings.kind for settings in tasks[0].estimators}
+    summary = summarise(rows, kinds)
+    write_trials(context.folder, config.name, summary, failures)
+    status: Status = "interrupted" if context.stopped() else "finished"
+    return _result(config, context.folder, status, summary, failures)
+
+
+def _result(
+    config: ExperimentConfig,
+    folder: Path,
+    status: Status,
+    summary: TrialSummary,
+    failures: Sequence[str],
+) -> TrialsResult:
+    """Means over the trials, the verdict on each estimator, and who beats whom."""
+    values = {title: together(summary, title).as_json() for title in summary.means}
+    count = len(summary.rows)
+    heading = f"{config.name}: {count} trials, mean [95 % interval]; NEES pooled, 1 is right"
+    failed = [("failed", line) for line in (*failures, *failures_of(summary))]
+    return TrialsResult(
+        config,
+        folder,
+        status,
+        lines=tuple(pair.sentence for pair in summary.pairs),
+        tables=(metrics_table(heading, TRIAL_COLUMNS, values),),
+        particulars=(*failed, ("results", str(folder))),
+        failed=bool(failures),
+        summary=summary,
+    )
+
+
+def _perform_all(tasks: Sequence[TrialTask]) -> list[Trial]:
+    return [perform_trial(task) for task in tasks]
 
 
 def perform_trial(task: TrialTask) -> Trial:
@@ -126,7 +200,7 @@ def perform_trial(task: TrialTask) -> Trial:
             run.mkdir()
             write_recording(run, config, open_measured(config))
         else:
-            run_experiment(config, run)
+            run_task(open_slam, config, run)
         log = MeasurementLog.load(run / LOG_FILE)
         truth, arrival = load_truth(run, log), arrival_of(run)
     metrics, nees = {}, {}
@@ -139,24 +213,16 @@ def perform_trial(task: TrialTask) -> Trial:
     return Trial(task.seed, metrics, nees)
 
 
-def _perform_all(
-    tasks: Sequence[TrialTask], jobs: int, progress: Progress, stopped: Callable[[], bool]
-) -> tuple[list[Trial], list[str]]:
-    """Finished trials by seed, and a line for each that ended without a result."""
-    trials, failures = [], []
-    progress("trials", 0, len(tasks))
-    for _, result in run_apart(perform_trial, tasks, jobs, stopped, single_threaded=True):
-        if isinstance(result, WorkerEnded):
-            failures.append(f"trial with seed {result.argument.seed}: {result.why}")
-        else:
-            trials.append(result)
-        progress("trials", len(trials) + len(failures), len(tasks))
-    return sorted(trials, key=lambda trial: trial.seed), sorted(failures)
-
-
-def _experiment(source: Path, overrides: tuple[str, ...]) -> ExperimentConfig:
+def _experiment(source: Path, overrides: tuple[str, ...]) -> ExperimentConfig | HomingTrialsConfig:
     """The configuration, if other seeds make other worlds of it."""
-    config = load_config(source / RUN_MARKER if is_run_folder(source) else source, overrides)
+    config = load_experiment(source / RUN_MARKER if is_run_folder(source) else source, overrides)
+    if isinstance(config, HomingTrialsConfig):
+        return config
+    if not isinstance(config, ExperimentConfig):
+        raise ConfigError(
+            f"{source}: task {config.task_name} has no trials of estimators side by side; "
+            "--trials needs an experiment of SLAM or of the task homing_trials"
+        )
     if not isinstance(config.dataset, RenderedLabSettings | SimulatedMeasurementsSettings):
         raise ConfigError(
             f"{source}: dataset.kind {config.dataset.kind} is a recording with one world of noise; "
@@ -165,13 +231,7 @@ def _experiment(source: Path, overrides: tuple[str, ...]) -> ExperimentConfig:
     return config
 
 
-def _prepare(config: ExperimentConfig, progress: Progress) -> None:
-    """Renders what is not in the cache once, before several processes would do so at a time."""
-    if not config.on_measurements:
-        open_sequence(config, lambda done, total: progress("rendering", done, total))
-
-
-def _default_folder(source: Path, config: ExperimentConfig) -> Path:
+def _default_folder(source: Path, config: Experiment) -> Path:
     if is_run_folder(source):
         return source / DEFAULT_FOLDER
     return Path("runs") / f"{config.name}_{DEFAULT_FOLDER}"

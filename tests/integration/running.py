@@ -20,8 +20,9 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.trajectories import read_covariances, read_tum
 from fgslam.report.point_cloud import read_ply
 from fgslam.runs.config import parse_config
+from fgslam.runs.engine import run_task
 from fgslam.runs.folder import ExistingFolder
-from fgslam.runs.tasks.slam import RunResult, run_experiment
+from fgslam.runs.tasks.slam import SlamResult, open_slam
 from fgslam.slam.recorder import STAGES
 
 KIND = "landmark_kalman"
@@ -42,7 +43,7 @@ class Finished:
 
     values: dict[str, Any]
     folder: Path
-    result: RunResult
+    result: SlamResult
 
 
 def run_values(
@@ -52,7 +53,7 @@ def run_values(
     stopped: Callable[[], bool] = lambda: False,
 ) -> Finished:
     config = parse_config(values, "test")
-    return Finished(values, folder, run_experiment(config, folder, existing, stopped=stopped))
+    return Finished(values, folder, run_task(open_slam, config, folder, existing, stopped=stopped))
 
 
 def stop_after(frames: int) -> Callable[[], bool]:

@@ -137,15 +137,15 @@ def test_black_and_white_frames_are_bridged(grey: int, own_recording: Path, tmp_
     status = run.result.outputs.recorder.column("status").tolist()
     assert status[5] == "too_few_matches"
     assert status[6:] == ["ok"] * 6
-    assert run.result.metrics.ate_rmse_m is not None
-    assert run.result.metrics.ate_rmse_m < 0.01
+    assert run.result.live.ate_rmse_m is not None
+    assert run.result.live.ate_rmse_m < 0.01
 
 
 def test_nothing_but_black_frames_leaves_the_odometry(own_recording: Path, tmp_path: Path) -> None:
     for path in own_recording.glob("*/*.png"):
         assert cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH), np.uint8))
     run = run_values(experiment(own_recording), tmp_path / "run")
-    assert run.result.metrics.landmarks == 0
+    assert run.result.live.landmarks == 0
     truth = read_tum(run.folder / "ground_truth.tum")
     final = read_tum(run.folder / KIND / "final.tum")
     assert np.abs(final.poses[-1] - truth.poses[-1]).max() < 0.05

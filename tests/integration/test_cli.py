@@ -26,6 +26,8 @@ from running import (
 import fgslam
 from fgslam.core.trajectories import read_kitti, read_tum
 from fgslam.report.point_cloud import read_ply
+from fgslam.runs.config_models import Experiment
+from fgslam.runs.engine import RunResult
 
 Capture = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch
@@ -93,10 +95,12 @@ def test_shells_complete_commands_and_names_of_experiments() -> None:
 
 def test_demo_is_the_loop_of_the_paper(monkeypatch: Patch, tmp_path: Path) -> None:
     ran: list[tuple[str, Path, str]] = []
-    monkeypatch.setattr(
-        "fgslam.cli.main._run_images",
-        lambda settings, folder, existing: ran.append((settings.name, folder, existing)),
-    )
+
+    def noted(config: Experiment, folder: Path, existing: str, *rest: object) -> RunResult:
+        ran.append((config.name, folder, existing))
+        return RunResult(config, folder, "finished", written=False)
+
+    monkeypatch.setattr("fgslam.runs.run.run_experiment", noted)
     assert main(monkeypatch, "demo", "--out", tmp_path / "demo") == 0
     assert ran == [("lab_loop", tmp_path / "demo", "overwrite")]
 

@@ -21,7 +21,7 @@ from fgslam.core.trajectories import read_covariances, read_tum
 from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.report.point_cloud import read_ply
 from fgslam.runs.config import load_config, parse_config
-from fgslam.runs.tasks.slam_measurements import run_measured
+from fgslam.runs.run import run_experiment
 
 CONTRACT = set(EstimatorMetrics().as_json())
 FRAMES = 30
@@ -39,7 +39,7 @@ SAME = ("final.tum", "online.tum", "covariance.csv", "map.ply")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run on simulated measurements, two estimators; read only."""
     folder = tmp_path_factory.mktemp("measured") / "run"
-    run_measured(parse_config(DRIVE, "test"), folder)
+    run_experiment(parse_config(DRIVE, "test"), folder)
     return folder
 
 
@@ -106,12 +106,12 @@ def test_metrics_hold_the_names_of_the_contract_and_true_landmarks(measured: Pat
     ]
 
 
-def test_a_run_on_measurements_starts_anew(
+def test_a_finished_run_on_measurements_is_neither_resumed_nor_replaced(
     measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     config = write_config(tmp_path / "c.yaml", DRIVE)
     assert main(monkeypatch, "run", config, "--out", measured, "--resume") == 2
-    assert "cannot be resumed" in capsys.readouterr().err
+    assert "the run has finished" in capsys.readouterr().err
     assert main(monkeypatch, "run", config, "--out", measured) == 2
     assert "holds a run already" in capsys.readouterr().err
 

@@ -23,15 +23,15 @@ from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import Steering
 from fgslam.runs.config import parse_homing
-from fgslam.runs.config_models import PathFollowingConfig
+from fgslam.runs.config_models import HomingConfig, PathFollowingConfig
+from fgslam.runs.files import write_config
 from fgslam.runs.homing_logs import load_bearing_logs
 from fgslam.runs.homing_replay import replay_homing
-from fgslam.runs.homing_results import begin
 from fgslam.runs.tasks.homing_drive_files import bearing_log, drive_of
 from fgslam.runs.tasks.homing_drive_pictures import DriveWatcher, Unwrapping, draw_leg_views
 from fgslam.runs.tasks.homing_drive_results import drive_numbers, finish_drives
 from fgslam.runs.tasks.homing_driven import DrivenSeed
-from fgslam.runs.tasks.homing_drives import _displaced, with_one_leg
+from fgslam.runs.tasks.homing_drives import _displaced
 
 EKF = {"kind": "homing_ekf"}
 
@@ -89,9 +89,9 @@ def test_covariances_of_landmarks_are_kept_where_wanted(record: DriveRecord) -> 
 
 def test_files_and_numbers_of_drives(record: DriveRecord, tmp_path: Path) -> None:
     config = configuration(output={"logs": 1})
-    begin(config, tmp_path, "refuse", {})
+    write_config(tmp_path, config, {})
     result = finish_drives(config, tmp_path, "finished", [driven(record)], [])
-    assert "1 of 1 drives arrive" in result.verdict[0]
+    assert "1 of 1 drives arrive" in result.lines[0]
     with (tmp_path / "legs.csv").open(encoding="utf-8") as lines:
         legs = list(csv.DictReader(lines))
     assert [(leg["seed"], leg["leg"], leg["result"]) for leg in legs] == [
@@ -111,7 +111,7 @@ def test_a_drive_by_an_average_has_a_page_without_a_map(
 ) -> None:
     """Estimators without a map, and without a covariance, are no reason to lose a drive."""
     config = configuration(estimator={"kind": "alv"})
-    begin(config, tmp_path, "refuse", {})
+    write_config(tmp_path, config, {})
     finish_drives(config, tmp_path, "finished", [driven(record)], [])
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert 'id="plot-drive"' in page
@@ -186,7 +186,8 @@ def test_slope_of_pass_distances_leaves_the_last_target_out(record: DriveRecord)
 
 
 def test_one_homing_is_a_path_of_one_leg() -> None:
-    assert with_one_leg(configuration()).dataset.path.legs == 1
+    values = {"task": "homing", "name": "x", "estimator": EKF}
+    assert cast(HomingConfig, parse_homing(values, "test")).resolved().dataset.path.legs == 1
 
 
 def test_displaced_starts_stay_near_and_free() -> None:

@@ -9,7 +9,8 @@ import pytest
 
 from fgslam.runs.config import load_experiment
 from fgslam.runs.config_models import LocalisationConfig
-from fgslam.runs.tasks.localisation import run_localisation
+from fgslam.runs.engine import run_task
+from fgslam.runs.tasks.localisation import open_localisation
 from fgslam.runs.tasks.localisation_results import Scored, scored
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
@@ -23,7 +24,7 @@ QUIET = ("output.pictures=false", "output.report=false", "output.checkpoint_seco
 def asked(name: str, folder: Path, *overrides: str) -> tuple[Scored, ...]:
     config = load_experiment(EXPERIMENTS / f"{name}.yaml", [*QUIET, *overrides])
     assert isinstance(config, LocalisationConfig)
-    return scored(config, run_localisation(config, folder).asked)
+    return scored(config, run_task(open_localisation, config, folder).asked)
 
 
 @pytest.mark.parametrize("name", ["kidnapped", "kidnapped_euroc"])

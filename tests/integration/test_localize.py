@@ -17,7 +17,8 @@ from running import main, run_values
 from fgslam.core.errors import ConfigError
 from fgslam.runs.config import load_experiment, parse_localisation
 from fgslam.runs.config_models import LocalisationConfig
-from fgslam.runs.tasks.localisation import run_localisation
+from fgslam.runs.engine import run_task
+from fgslam.runs.tasks.localisation import open_localisation
 
 
 @pytest.fixture(scope="module")
@@ -79,14 +80,14 @@ def test_every_frame_with_files_that_repeat_the_run(
     again = tmp_path / "again"
     config = load_experiment(out / "config.yaml", ["output.report=false"])
     assert isinstance(config, LocalisationConfig)
-    run_localisation(config, again)
+    run_task(open_localisation, config, again)
     assert (again / "localisation.csv").read_bytes() == (out / "localisation.csv").read_bytes()
 
 
 def test_a_submap_is_located_at_its_last_frame(recording: Path, map_file: Path) -> None:
     values = values_of(recording, map_file, localisation={"frames": [1, 3], "every": 2})
     config = parse_localisation(values, "test")
-    result = run_localisation(config, map_file.parent / "submaps")
+    result = run_task(open_localisation, config, map_file.parent / "submaps")
     one, three = result.asked.of(1), result.asked.of(3)
     assert [a.frame for a in one] == [a.frame for a in three] == [5, 9]
     rows = rows_of(map_file.parent / "submaps")
@@ -180,7 +181,7 @@ def test_a_map_that_is_made_first_and_one_that_is_there_answer_alike(
     made = given | {"map": {"made_from": {"dataset": dataset}}}
     rows = []
     for name, values in (("given", given), ("made", made)):
-        result = run_localisation(parse_localisation(values, "test"), tmp_path / name)
+        result = run_task(open_localisation, parse_localisation(values, "test"), tmp_path / name)
         assert result.status == "finished"
         rows.append(rows_of(tmp_path / name))
     assert (tmp_path / "made" / "first" / "map.fgmap").is_file()
@@ -191,7 +192,7 @@ def test_a_map_that_is_made_first_and_one_that_is_there_answer_alike(
 def test_stopping_leaves_valid_files(recording: Path, map_file: Path, tmp_path: Path) -> None:
     asked = iter((False, True))
     config = parse_localisation(values_of(recording, map_file), "test")
-    result = run_localisation(config, tmp_path / "run", stopped=lambda: next(asked))
+    result = run_task(open_localisation, config, tmp_path / "run", stopped=lambda: next(asked))
     assert result.status == "interrupted"
     assert len(rows_of(tmp_path / "run")) == 2
 

@@ -37,7 +37,7 @@ from fgslam.core.measurements import Odometry
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import ImageFolderSettings
-from fgslam.runs.tasks.slam_beginning import resume_command
+from fgslam.runs.engine import resume_command
 
 
 @pytest.mark.parametrize("frames", [1, 2, 7, 11])

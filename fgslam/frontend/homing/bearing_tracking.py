@@ -7,6 +7,8 @@ back to where it came from, when it no longer looks as it did when its tracking 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +26,25 @@ Float32 = npt.NDArray[np.float32]
 _GAIN = (0.2, 5.0)  # from one exposure to the next
 _SAME_GAIN, _SAME_LEVEL = 0.02, 1.0  # less is left as it is: rounding would be worse
 _MAX_TURN = np.deg2rad(60.0)  # between two images; 40 deg/s of a wheelchair seen 5 times a second
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackerState:
+    """All that a tracker knows of the images before.
+
+    Attributes:
+        last: the last image.
+        places: (n, 2) of the points in it.
+        patches: what the points looked like at first.
+        ids: (n,) ascending.
+        time: of the last image, seconds.
+    """
+
+    last: StabilisedImage
+    places: FloatArray
+    patches: ReferencePatches
+    ids: IntArray
+    time: float
 
 
 class BearingTracker:
@@ -88,6 +109,18 @@ class BearingTracker:
             self._settle(now, places[kept], self._ids[kept], self._patches.select(kept))
         self._last, self._time = now, time
         return self._bearings(time)
+
+    def state(self) -> TrackerState | None:
+        """What it takes to go on later; None before the first image."""
+        if self._last is None or self._patches is None:
+            return None
+        return TrackerState(self._last, self._places, self._patches, self._ids, self._time)
+
+    def restore(self, state: TrackerState | None) -> None:
+        """Goes on from :meth:`state`, to the same bits."""
+        if state is not None:
+            self._last, self._places, self._patches = state.last, state.places, state.patches
+            self._ids, self._time = state.ids, state.time
 
     def bearings(self) -> TrackedBearings:
         """The points as the last image shows them."""

@@ -10,7 +10,7 @@ import numpy as np
 from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.homing import TrackedBearings
-from fgslam.frontend.homing.bearing_tracking import BearingTracker
+from fgslam.frontend.homing.bearing_tracking import BearingTracker, TrackerState
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 
 
@@ -27,6 +27,19 @@ class TrackedImage:
     tracked: TrackedBearings
     survivors: int
     added: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VideoState:
+    """All that goes over from one image to the next.
+
+    Attributes:
+        tracker: of the points; None before the first image.
+        next: identity of the next new point.
+    """
+
+    tracker: TrackerState | None
+    next: int
 
 
 class ReplenishedTracker:
@@ -61,6 +74,15 @@ class ReplenishedTracker:
         if tracked is None or len(added):
             tracked = self._tracker.bearings()
         return TrackedImage(tracked, survivors, added)
+
+    def state(self) -> VideoState:
+        """What it takes to go on later."""
+        return VideoState(self._tracker.state(), self._next)
+
+    def restore(self, state: VideoState) -> None:
+        """Goes on from :meth:`state`, to the same bits."""
+        self._tracker.restore(state.tracker)
+        self._next, self._started = state.next, state.tracker is not None
 
     def pixels(self) -> FloatArray:
         """(n, 2) where the points are in the view (:meth:`view`) of the last image."""

@@ -28,8 +28,9 @@ from fgslam.report.figures.local_map import local_map_figure
 from fgslam.report.figures.plan import PASS_RADIUS_M, catchment_figure, drive_figure
 from fgslam.report.figures.traces import Figure
 from fgslam.runs.config_models import DrivingConfig
+from fgslam.runs.documents import write_document, write_page
+from fgslam.runs.engine import RunResult, Status
 from fgslam.runs.homing_replay import replay_homing
-from fgslam.runs.homing_results import HomingResult, Status, write_document, write_page
 from fgslam.runs.tasks.homing_drive_files import (
     bearing_log,
     drive_of,
@@ -50,7 +51,7 @@ def finish_drives(
     status: Status,
     driven: Sequence[DrivenSeed],
     failures: Sequence[str],
-) -> HomingResult:
+) -> RunResult:
     """All files, numbers and the page of drives. Raises OutputError."""
     records = [(one.seed, one.record) for one in driven]
     write_legs(folder, records)
@@ -61,9 +62,7 @@ def finish_drives(
     if driven:
         numbers["kilobytes_per_image"] = driven[0].memory.save(folder / MEMORY_FILE)
     numbers["seeds"] = [one.seed for one in driven]
-    result = HomingResult(
-        config, folder, status, _verdict(numbers), _tables(driven), tuple(failures)
-    )
+    result = RunResult(config, folder, status, _verdict(numbers), _tables(driven), tuple(failures))
     write_document(result, numbers)
     subtitle = f"seeds {config.seed} to {config.seed + config.trials - 1}, {len(driven)} driven"
     if config.trials == 1:

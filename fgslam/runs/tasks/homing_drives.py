@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol, TypeAlias
 
 import numpy as np
@@ -13,19 +11,20 @@ import numpy as np
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import OutputError
+from fgslam.datasets.omni.house import open_house
 from fgslam.homing.avoidance import make_avoider
 from fgslam.homing.closed_loop import Driver, World, follow
 from fgslam.homing.front_end import HomingFrontEnd
+from fgslam.homing.image_front_end import FrontEndSettings, make_front_end
 from fgslam.homing.path_following import HomingChain
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.steering import Steering
 from fgslam.runs.config_models import DrivingConfig
-from fgslam.runs.folder import ExistingFolder
-from fgslam.runs.homing_results import HomingResult, Progress, Status, Stopped, begin, jobs_of
-from fgslam.runs.processes import WorkerEnded, run_apart
+from fgslam.runs.engine import Context, Opening, RunResult, Status, Task
 from fgslam.runs.tasks.homing_drive_pictures import DriveWatcher, Unwrapping
 from fgslam.runs.tasks.homing_drive_results import finish_drives
 from fgslam.runs.tasks.homing_driven import DrivenSeed
+from fgslam.runs.units import Stage, one_by_one
 
 _TRIES = 50  # places drawn for a start that is free
 
@@ -71,31 +70,48 @@ class DriveTask:
     opener: Opener
 
 
-def run_driving(
-    config: DrivingConfig,
-    folder: Path,
-    existing: ExistingFolder,
-    progress: Progress,
-    stopped: Stopped,
-    opener: Opener,
-) -> HomingResult:
-    """Drives the path once for each seed; stopped early, the drives that are done count."""
-    begin(config, folder, existing, {"dataset": {"name": config.dataset.kind}})
-    tasks = [DriveTask(config, config.seed + k, opener) for k in range(config.trials)]
-    driven: list[DrivenSeed] = []
-    failures: list[str] = []
-    progress("drives", 0, len(tasks))
-    for _, result in run_apart(perform_drive, tasks, jobs_of(config), stopped, True):
-        if isinstance(result, WorkerEnded):
-            failures.append(f"seed {result.argument.seed}: {result.why}")
-        else:
-            driven.append(result)
-        progress("drives", len(driven) + len(failures), len(tasks))
-    if not driven and not stopped():
+def open_drives(config: DrivingConfig, opening: Opening) -> Task[RunResult]:
+    """Drives in the rendered house, which each process builds for itself."""
+    return drives_task(config, open_house_drive)
+
+
+def drives_task(config: DrivingConfig, opener: Opener) -> Task[RunResult]:
+    """Drives of the path, once for each seed, in worlds that ``opener`` opens."""
+    provenance = {"dataset": {"name": config.dataset.kind}}
+    return Task(provenance, lambda context: _run(config, opener, context))
+
+
+def open_house_drive(config: DrivingConfig, seed: int) -> Opened:
+    """World and front-end of one seed. Raises FgslamError where the house cannot be built."""
+    world = open_house(config.dataset, seed)
+    settings = FrontEndSettings(
+        config.features, config.homing_vector, config.tracking, config.wrong_matches
+    )
+    return world, make_front_end(world.camera, settings, seed)
+
+
+def _run(config: DrivingConfig, opener: Opener, context: Context) -> RunResult:
+    """Stopped early, the drives that are done count."""
+    stage = Stage(
+        name="drives",
+        label="drives",
+        count=config.trials,
+        work=_perform,
+        argument=lambda units: [DriveTask(config, config.seed + k, opener) for k in units],
+        kind=DrivenSeed,
+        blocks=one_by_one,
+    )
+    done = context.perform(stage)
+    driven = list(done.results.values())
+    failures = sorted(f"seed {config.seed + k}: {why}" for (k,), why in done.ended)
+    if not driven and not context.stopped():
         raise OutputError(f"no drive was finished; {failures[0]}")
-    driven.sort(key=lambda one: one.seed)
-    status: Status = "finished" if len(driven) == len(tasks) else "interrupted"
-    return finish_drives(config, folder, status, driven, sorted(failures))
+    status: Status = "finished" if len(driven) == config.trials else "interrupted"
+    return finish_drives(config, context.folder, status, driven, failures)
+
+
+def _perform(tasks: Sequence[DriveTask]) -> list[DrivenSeed]:
+    return [perform_drive(task) for task in tasks]
 
 
 def perform_drive(task: DriveTask) -> DrivenSeed:
@@ -134,9 +150,3 @@ def _displaced(world: PathWorld, radius: float, rng: np.random.Generator) -> Flo
         if world.clearance(place[None])[0] >= min(room, 0.5):
             return np.array([*place, rng.uniform(-np.pi, np.pi)])
     return pose
-
-
-def with_one_leg(config: DrivingConfig) -> DrivingConfig:
-    """The same with a path of one leg: a single homing."""
-    path = dataclasses.replace(config.dataset.path, legs=1)
-    return config.model_copy(update={"dataset": dataclasses.replace(config.dataset, path=path)})

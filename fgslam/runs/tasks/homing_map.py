@@ -20,16 +20,8 @@ from fgslam.report.figures.network import Links, network_figure, unfolded
 from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.config_models import TopologicalMapConfig
-from fgslam.runs.folder import ExistingFolder
-from fgslam.runs.homing_results import (
-    HomingResult,
-    Progress,
-    Stopped,
-    begin,
-    jobs_of,
-    write_document,
-    write_page,
-)
+from fgslam.runs.documents import write_document, write_page
+from fgslam.runs.engine import Context, Opening, RunResult, Task
 from fgslam.runs.tasks.homing_map_localising import (
     Localised,
     localise,
@@ -76,26 +68,24 @@ class Route:
     reason: str
 
 
-def run_topological_map(
-    config: TopologicalMapConfig,
-    folder: Path,
-    existing: ExistingFolder,
-    progress: Progress,
-    stopped: Stopped,
-) -> HomingResult:
-    """Features once a view, homings of all candidates both ways, the map of those believed."""
+def open_topological_map(config: TopologicalMapConfig, opening: Opening) -> Task[RunResult]:
+    """Opens the recording. Raises DatasetError, or ConfigError of routes to unknown views."""
     views = open_views(config.dataset)
     _require_nodes(config, views.names)
-    begin(config, folder, existing, {"dataset": views.provenance})
-    jobs = jobs_of(config)
-    features = extract_features(views, config.features, jobs, progress, stopped)
+    return Task({"dataset": views.provenance}, lambda context: _run(config, views, context))
+
+
+def _run(config: TopologicalMapConfig, views: Views, context: Context) -> RunResult:
+    """Features once a view, homings of all candidates both ways, the map of those believed."""
+    folder = context.folder
+    features = extract_features(views, config.features, context)
     rng = np.random.default_rng(config.seed)
     half = map_candidates(features, config.map, rng, ordered=config.ordered)
     pairs = tuple(pair for a, b in half for pair in ((a, b), (b, a)))
     search = PairSearch(
         tuple(features), pairs, config.features.matching, config.homing_vector, config.seed
     )
-    found, failures = answer_pairs(search, jobs, progress, stopped)
+    found, failures = answer_pairs(search, context)
     answers: dict[Pair, Answer] = {(answer.a, answer.b): answer.found for answer in found}
     names, rows = views.names[: len(features)], inlier_rows(found)
     topology = map_of_answers(
@@ -103,11 +93,11 @@ def run_topological_map(
     )
     kilobytes = topology.save(folder / MAP_FILE)
     routes = [_route(topology, asked) for asked in config.routes]
-    located = _localised(config, features, answers, rows, names, progress, stopped)
-    whole = len(features) == len(views) and len(found) == len(pairs) and not stopped()
+    located = _localised(config, features, answers, rows, names, context)
+    whole = len(features) == len(views) and len(found) == len(pairs) and not context.stopped()
     numbers = _numbers(topology, views, answers, kilobytes) | _of_routes(routes)
     numbers |= {"localisation": localised_numbers(located)}
-    result = HomingResult(
+    result = RunResult(
         config,
         folder,
         "finished" if whole else "interrupted",
@@ -162,12 +152,11 @@ def _localised(
     answers: dict[Pair, Answer],
     rows: InlierRows,
     names: Sequence[str],
-    progress: Progress,
-    stopped: Stopped,
+    context: Context,
 ) -> Localised | None:
-    if not config.held_out_every or stopped():
+    if not config.held_out_every or context.stopped():
         return None
-    return localise(config, features, answers, rows, names, progress, stopped)
+    return localise(config, features, answers, rows, names, context)
 
 
 # --------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from fgslam.homing.third_view_consistency import InlierRows
 from fgslam.homing.topological_map import map_of_answers
 from fgslam.report.tables import write_csv
 from fgslam.runs.config_models import TopologicalMapConfig
-from fgslam.runs.homing_results import Progress, Stopped
+from fgslam.runs.engine import Context
 
 LOCALISATION_FILE = "localisation.csv"
 
@@ -54,8 +54,7 @@ def localise(
     answers: dict[Pair, Answer],
     rows: InlierRows,
     names: Sequence[str],
-    progress: Progress,
-    stopped: Stopped,
+    context: Context,
 ) -> Localised:
     """Holds out every so many views, maps the others, and walks through those held out.
 
@@ -92,14 +91,14 @@ def localise(
     words = VisualWords(nodes, config.map.retrieval, rng)
     localiser = Localiser(topology, words, linker, config.localisation)
     told = []
-    progress("localising", 0, len(out))
+    context.progress("localising", 0, len(out))
     for done, view in enumerate(out):
-        if stopped():
+        if context.stopped():
             break
         localiser.update(features[view])
         node, probability = localiser.best()
         told.append((names[view], names[kept[node]], probability, _next_to(view, kept, node)))
-        progress("localising", done + 1, len(out))
+        context.progress("localising", done + 1, len(out))
     return Localised(*zip(*told, strict=True)) if told else Localised((), (), (), ())
 
 

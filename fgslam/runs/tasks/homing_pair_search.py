@@ -19,9 +19,9 @@ from fgslam.core.homing import (
 from fgslam.frontend.features.omni_settings import OmniMatchingSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_views import pair_generator, vector_between
-from fgslam.runs.homing_results import Progress, Stopped
-from fgslam.runs.processes import WorkerEnded, run_apart
+from fgslam.runs.engine import Context
 from fgslam.runs.tasks.homing_pair_answers import PairAnswer
+from fgslam.runs.units import Stage, interleaved
 
 PLAIN_MATCHING = OmniMatchingSettings(
     ratio=0.8, root=False, max_colour_distance=1e9, planar_gates=False
@@ -76,22 +76,22 @@ def answer_pair(search: PairSearch, a: int, b: int) -> tuple[PairAnswer, Bearing
 
 
 def answer_pairs(
-    search: PairSearch, jobs: int, progress: Progress, stopped: Stopped, what: str = "pairs"
+    search: PairSearch, context: Context, what: str = "pairs"
 ) -> tuple[list[PairAnswer], list[str]]:
     """All pairs in their order (stopped early, those that are done), and what went wrong."""
-    pairs = search.pairs
-    blocks = [search_of(search, part) for part in _parts(pairs, _BLOCKS_A_JOB * jobs)]
-    answers: list[PairAnswer] = []
-    failures: list[str] = []
-    progress(what, 0, len(pairs))
-    for _, result in run_apart(_perform, blocks, jobs, stopped, single_threaded=True):
-        if isinstance(result, WorkerEnded):
-            failures.append(f"{len(result.argument.pairs)} pairs: {result.why}")
-        else:
-            answers += result
-        progress(what, len(answers), len(pairs))
-    place = {pair: k for k, pair in enumerate(pairs)}
-    return sorted(answers, key=lambda answer: place[answer.a, answer.b]), failures
+    stage = Stage(
+        # Their numbers depend on how many views there are: fewer where a run was stopped.
+        name=f"{what.replace(' ', '_')}_of_{len(search.features)}_views",
+        label=what,
+        count=len(search.pairs),
+        work=_perform,
+        argument=lambda units: search_of(search, [search.pairs[k] for k in units]),
+        kind=PairAnswer,
+        blocks=interleaved(_BLOCKS_A_JOB * context.jobs),
+    )
+    done = context.perform(stage)
+    failures = [f"{len(units)} pairs: {why}" for units, why in done.ended]
+    return list(done.results.values()), failures
 
 
 def inlier_rows(answers: Sequence[PairAnswer]) -> dict[tuple[int, int], IntArray]:
@@ -113,8 +113,3 @@ def _inlier_rows(found: TwoViewVector | Refusal, matches: BearingMatches) -> Int
 
 def _perform(search: PairSearch) -> list[PairAnswer]:
     return [answer_pair(search, a, b)[0] for a, b in search.pairs]
-
-
-def _parts(pairs: Sequence[tuple[int, int]], count: int) -> list[Sequence[tuple[int, int]]]:
-    """Pairs in at most so many parts; neighbours in different ones, as their work is alike."""
-    return [pairs[k::count] for k in range(count) if pairs[k::count]]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -14,16 +13,8 @@ from fgslam.report.figures.curves import claimed_against_true, sorted_errors
 from fgslam.report.figures.network import Links, network_figure
 from fgslam.report.figures.traces import Figure
 from fgslam.runs.config_models import HomingPairsConfig
-from fgslam.runs.folder import ExistingFolder
-from fgslam.runs.homing_results import (
-    HomingResult,
-    Progress,
-    Stopped,
-    begin,
-    jobs_of,
-    write_document,
-    write_page,
-)
+from fgslam.runs.documents import write_document, write_page
+from fgslam.runs.engine import Context, Opening, RunResult, Task
 from fgslam.runs.tasks.homing_pair_answers import (
     WRONG_DEG,
     PairAnswer,
@@ -51,31 +42,29 @@ _GOOD_DEG = 2.0
 _ROWS = ("all pairs", "same room", "different rooms")
 
 
-def run_homing_pairs(
-    config: HomingPairsConfig,
-    folder: Path,
-    existing: ExistingFolder,
-    progress: Progress,
-    stopped: Stopped,
-) -> HomingResult:
-    """Features once an image, then every pair; stopped early, the pairs that are done count."""
+def open_pairs(config: HomingPairsConfig, opening: Opening) -> Task[RunResult]:
+    """Opens the recording. Raises DatasetError."""
     views = open_views(config.dataset)
-    begin(config, folder, existing, {"dataset": views.provenance})
-    jobs = jobs_of(config)
-    features = extract_features(views, config.features, jobs, progress, stopped)
+    return Task({"dataset": views.provenance}, lambda context: _run(config, views, context))
+
+
+def _run(config: HomingPairsConfig, views: Views, context: Context) -> RunResult:
+    """Features once an image, then every pair; stopped early, the pairs that are done count."""
+    folder = context.folder
+    features = extract_features(views, config.features, context)
     every = tuple(pairs_of(len(features), both_ways=config.both_ways))
     search = PairSearch(
         tuple(features), every, config.features.matching, config.homing_vector, config.seed
     )
-    answers, failures = answer_pairs(search, jobs, progress, stopped)
+    answers, failures = answer_pairs(search, context)
     whole = len(features) == len(views) and len(answers) == len(every)
     write_pairs(folder / PAIRS_FILE, answers, views.names)
     errors = None if views.poses is None else pair_errors(answers, views.poses, views.rooms)
     numbers = answer_numbers(answers) | _judged(errors)
     numbers["images"] = len(features)
-    numbers["reference"] = _reference(config, views, folder, progress, stopped) if whole else None
-    whole = whole and not stopped()
-    result = HomingResult(
+    numbers["reference"] = _reference(config, views, context) if whole else None
+    whole = whole and not context.stopped()
+    result = RunResult(
         config,
         folder,
         "finished" if whole else "interrupted",
@@ -97,19 +86,18 @@ def run_homing_pairs(
 
 
 def _reference(
-    config: HomingPairsConfig, views: Views, folder: Path, progress: Progress, stopped: Stopped
+    config: HomingPairsConfig, views: Views, context: Context
 ) -> dict[str, JsonValue] | None:
     """The same pairs by plain SIFT and two-point RANSAC, for comparison; None where not asked."""
     if not config.reference:
         return None
-    jobs = jobs_of(config)
-    features = extract_features(views, None, jobs, progress, stopped)
+    features = extract_features(views, None, context)
     every = tuple(pairs_of(len(features), both_ways=config.both_ways))
     vector = never_refusing(config.homing_vector)
     search = PairSearch(tuple(features), every, PLAIN_MATCHING, vector, config.seed)
-    answers, _ = answer_pairs(search, jobs, progress, stopped, "plain pairs")
+    answers, _ = answer_pairs(search, context, "plain pairs")
     answers = [with_support(answer, PLAIN_INLIERS) for answer in answers]
-    write_pairs(folder / REFERENCE_FILE, answers, views.names)
+    write_pairs(context.folder / REFERENCE_FILE, answers, views.names)
     errors = None if views.poses is None else pair_errors(answers, views.poses, views.rooms)
     return answer_numbers(answers) | _judged(errors)
 

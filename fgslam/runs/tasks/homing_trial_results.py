@@ -16,7 +16,8 @@ from fgslam.report.figures.curves import sorted_errors
 from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.config_models import HomingTrialsConfig
-from fgslam.runs.homing_results import HomingResult, Status, write_document, write_page
+from fgslam.runs.documents import write_document, write_page
+from fgslam.runs.engine import RunResult, Status
 from fgslam.runs.tasks.homing_trial_data import HomingTrial
 
 TRIALS_FILE = "trials.csv"
@@ -46,7 +47,7 @@ def finish_trials(
     status: Status,
     trials: Sequence[HomingTrial],
     failures: Sequence[str],
-) -> HomingResult:
+) -> RunResult:
     """trials.csv, metrics.json and the page. Raises OutputError."""
     titles = [settings.title for settings in config.estimators]
     write_csv(folder / TRIALS_FILE, _COLUMNS, _rows(trials, titles))
@@ -55,7 +56,7 @@ def finish_trials(
     groups = {share: [t for t in trials if t.share == share] for share in config.outliers}
     found = {title: _of_estimator(groups, title) for title in titles}
     tables = tuple(_table(share, group, titles) for share, group in groups.items() if group)
-    result = HomingResult(config, folder, status, _verdict(groups, titles), tables, tuple(failures))
+    result = RunResult(config, folder, status, _verdict(groups, titles), tables, tuple(failures))
     refused = {f"{share:g}": sum(bool(t.refused) for t in group) for share, group in groups.items()}
     numbers: dict[str, JsonValue] = {
         "trials": config.trials,

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,48 +13,50 @@ from fgslam.core.homing import Refusal
 from fgslam.datasets.simulated_homing import open_simulated_homing
 from fgslam.evaluation.homing import homing_errors
 from fgslam.runs.config_models import HomingTrialsConfig
-from fgslam.runs.folder import ExistingFolder
+from fgslam.runs.engine import Context, Opening, RunResult, Status, Task
 from fgslam.runs.homing_logs import save_bearing_logs
 from fgslam.runs.homing_replay import replay_homing
-from fgslam.runs.homing_results import HomingResult, Progress, Stopped, begin, jobs_of
-from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.runs.tasks.homing_start import start_from_matches
 from fgslam.runs.tasks.homing_trial_data import HomingTrial, TriedEstimator
 from fgslam.runs.tasks.homing_trial_results import finish_trials
+from fgslam.runs.units import Stage, in_blocks
+
+Unit: TypeAlias = tuple[int, int]
+"""Number of the share of outliers, and of the trial."""
 
 _BLOCK = 20  # trials a process: starting one takes as long as some trials
 
 
-@dataclass(frozen=True, slots=True)
-class TrialBlock:
-    """Some trials for one process.
-
-    Attributes:
-        config: the experiment.
-        share: number of the share of outliers.
-        first, count: which trials.
-    """
-
-    config: HomingTrialsConfig
-    share: int
-    first: int
-    count: int
+def open_trials(config: HomingTrialsConfig, opening: Opening) -> Task[RunResult]:
+    """Simulated homings need no data."""
+    provenance = {"dataset": {"name": "simulated bearings"}}
+    return Task(provenance, lambda context: _run(config, context))
 
 
-def run_homing_trials(
-    config: HomingTrialsConfig,
-    folder: Path,
-    existing: ExistingFolder,
-    progress: Progress,
-    stopped: Stopped,
-) -> HomingResult:
+def _run(config: HomingTrialsConfig, context: Context) -> RunResult:
     """Runs all trials; stopped early, those finished count."""
-    begin(config, folder, existing, {"dataset": {"name": "simulated bearings"}})
-    trials, failures = _perform_all(_blocks(config), jobs_of(config), progress, stopped)
+    units = _units(config)
+    stage = Stage(
+        name="trials",
+        label="trials",
+        count=len(units),
+        work=perform_block,
+        argument=lambda block: (config, [units[k] for k in block]),
+        kind=HomingTrial,
+        blocks=in_blocks(_BLOCK),
+    )
+    done = context.perform(stage)
+    trials = sorted(done.results.values(), key=lambda trial: (trial.share, trial.trial))
+    failures = sorted(_failure([units[k] for k in block], why) for block, why in done.ended)
     logs = {trial_name(trial): trial.log for trial in trials if trial.log is not None}
-    save_bearing_logs(folder, logs)
-    done = len(trials) == config.trials * len(config.outliers)
-    return finish_trials(config, folder, "finished" if done else "interrupted", trials, failures)
+    save_bearing_logs(context.folder, logs)
+    status: Status = "finished" if len(trials) == len(units) else "interrupted"
+    return finish_trials(config, context.folder, status, trials, failures)
+
+
+def _failure(units: Sequence[Unit], why: str) -> str:
+    share, first = units[0]
+    return f"{len(units)} trials, from trial {first} of share {share} on: {why}"
 
 
 def trial_name(trial: HomingTrial) -> str:
@@ -63,10 +64,10 @@ def trial_name(trial: HomingTrial) -> str:
     return f"outliers_{100.0 * trial.share:02.0f}_trial_{trial.trial:04d}"
 
 
-def perform_block(block: TrialBlock) -> list[HomingTrial]:
+def perform_block(block: tuple[HomingTrialsConfig, Sequence[Unit]]) -> list[HomingTrial]:
     """Some trials, one after the other."""
-    numbers = range(block.first, block.first + block.count)
-    return [perform_trial(block.config, block.share, trial) for trial in numbers]
+    config, units = block
+    return [perform_trial(config, share, trial) for share, trial in units]
 
 
 def perform_trial(config: HomingTrialsConfig, share: int, trial: int) -> HomingTrial:
@@ -92,28 +93,11 @@ def perform_trial(config: HomingTrialsConfig, share: int, trial: int) -> HomingT
     return HomingTrial(part, trial, "", len(rows), wrong, tried, log)
 
 
-def _blocks(config: HomingTrialsConfig) -> list[TrialBlock]:
+def _units(config: HomingTrialsConfig) -> list[Unit]:
+    """All trials; those of one block are of one share, and the shares take turns."""
     return [
-        TrialBlock(config, share, first, min(_BLOCK, config.trials - first))
+        (share, trial)
         for first in range(0, config.trials, _BLOCK)
         for share in range(len(config.outliers))
+        for trial in range(first, min(first + _BLOCK, config.trials))
     ]
-
-
-def _perform_all(
-    blocks: Sequence[TrialBlock], jobs: int, progress: Progress, stopped: Callable[[], bool]
-) -> tuple[list[HomingTrial], list[str]]:
-    """Finished trials in order, and a line for each block that ended without a result."""
-    trials: list[HomingTrial] = []
-    failures: list[str] = []
-    total = sum(block.count for block in blocks)
-    progress("trials", 0, total)
-    for _, result in run_apart(perform_block, blocks, jobs, stopped, single_threaded=True):
-        if isinstance(result, WorkerEnded):
-            block = result.argument
-            last = block.first + block.count - 1
-            failures.append(f"trials {block.first} to {last}, share {block.share}: {result.why}")
-        else:
-            trials += result
-        progress("trials", len(trials), total)
-    return sorted(trials, key=lambda trial: (trial.share, trial.trial)), sorted(failures)

@@ -13,28 +13,22 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.atomic_files import make_subfolder
 from fgslam.datasets.omni.recording import OmniRecording
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
-from fgslam.frontend.homing.video_tracking import ReplenishedTracker, TrackedImage
+from fgslam.frontend.homing.video_tracking import ReplenishedTracker, TrackedImage, VideoState
 from fgslam.report.content import Column, Picture, TextTable
 from fgslam.report.figures.curves import Line, curve_figure
 from fgslam.report.pictures.view_tracks import draw_view_tracks
 from fgslam.report.tables import write_csv
 from fgslam.runs.config_models import OmniVideoConfig
-from fgslam.runs.folder import ExistingFolder
-from fgslam.runs.homing_results import (
-    HomingResult,
-    Progress,
-    Status,
-    Stopped,
-    begin,
-    write_document,
-    write_page,
-)
+from fgslam.runs.documents import write_document, write_page
+from fgslam.runs.engine import Context, Opening, RunResult, Status, Task
 from fgslam.runs.tasks.homing_mirror_check import open_checked
 
 FRAMES_FILE = "frames.csv"
 TRACKS_FILE = "tracks.csv"
 PICTURES = "pictures"
 _TRAIL = 15  # images
+_STATE = "state"
+_SAVE_EVERY_S = 2.0
 
 
 @dataclass(slots=True, eq=False)
@@ -49,9 +43,10 @@ class _Tracks:
     trails: dict[int, FloatArray] = field(default_factory=dict)
     pictures: list[Picture] = field(default_factory=list)
 
-    def note(self, name: str, time: float, before: int, found: TrackedImage) -> None:
+    def note(self, name: str, time: float, found: TrackedImage) -> None:
+        """Books a frame."""
         frame, ids = len(self.frames), found.tracked.ids.tolist()
-        lost = before - found.survivors
+        lost = (self.frames[-1][2] if self.frames else 0) - found.survivors
         self.frames.append((name, time, len(ids), len(found.added), lost))
         for identity in ids:
             self.first.setdefault(identity, frame)
@@ -70,25 +65,32 @@ class _Tracks:
         return np.array([self.last[i] - first + 1 for i, first in self.first.items()], np.int64)
 
 
-def run_omni_video(
-    config: OmniVideoConfig,
-    folder: Path,
-    existing: ExistingFolder,
-    progress: Progress,
-    stopped: Stopped,
-) -> HomingResult:
-    """Tracks from the first frame to the last; stopped early, the frames so far count."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Progress:
+    """What the run goes on from: the tracks so far, and the tracker after the last frame."""
+
+    tracks: _Tracks
+    tracker: VideoState
+
+
+def open_video(config: OmniVideoConfig, opening: Opening) -> Task[RunResult]:
+    """Opens the recording and checks its mirror. Raises DatasetError."""
     recording = open_checked(config.dataset)
-    provenance = {"name": recording.name, "identity": recording.identity}
-    begin(config, folder, existing, {"dataset": provenance})
-    tracks = _track(config, recording, folder, progress, stopped)
+    dataset = {"name": recording.name, "identity": recording.identity}
+    return Task({"dataset": dataset}, lambda context: _run(config, recording, context))
+
+
+def _run(config: OmniVideoConfig, recording: OmniRecording, context: Context) -> RunResult:
+    """Tracks from the first frame to the last; stopped early, the frames so far count."""
+    folder = context.folder
+    tracks = _track(config, recording, context)
     status: Status = "finished" if len(tracks.frames) == len(recording) else "interrupted"
     columns = ("frame", "time", "points", "added", "lost")
     write_csv(folder / FRAMES_FILE, columns, tracks.frames)
     rows = [(i, first, tracks.last[i]) for i, first in sorted(tracks.first.items())]
     write_csv(folder / TRACKS_FILE, ("id", "first_frame", "last_frame"), rows)
     numbers = _numbers(tracks)
-    result = HomingResult(
+    result = RunResult(
         config, folder, status, _verdict(numbers), (_table(numbers),), recording.notes
     )
     write_document(result, numbers)
@@ -103,39 +105,55 @@ def run_omni_video(
     return result
 
 
-def _track(
-    config: OmniVideoConfig,
-    recording: OmniRecording,
-    folder: Path,
-    progress: Progress,
-    stopped: Stopped,
-) -> _Tracks:
+def _track(config: OmniVideoConfig, recording: OmniRecording, context: Context) -> _Tracks:
+    """Goes on after the last frame that was saved."""
     tracker = ReplenishedTracker(
         recording.camera, config.tracking, config.least_points, config.most_points
     )
-    tracks, before = _Tracks(), 0
+    tracks = _Tracks()
+    if saved := context.store.load(_STATE, _Progress).get(0):
+        tracks = saved.tracks
+        tracker.restore(saved.tracker)
     shown = np.linspace(0, len(recording), config.output.pictures + 1).astype(int)[1:] - 1
-    for i in range(len(recording)):
-        if stopped():
+    last_saved = perf_counter()
+    for i in range(len(tracks.frames), len(recording)):
+        stopped = context.stopped()
+        if stopped or perf_counter() - last_saved >= _SAVE_EVERY_S:
+            context.store.add(_STATE, {0: _Progress(tracks, tracker.state())}, _Progress)
+            last_saved = perf_counter()
+        if stopped:
             break
-        start = perf_counter()
-        image = recording.image(i)
-        read = perf_counter()
-        time = float(recording.timestamps[i])
-        time = time if np.isfinite(time) else float(i)
-        found = tracker.take(image, time)
-        tracks.track_ms.append(1e3 * (perf_counter() - read))
-        tracks.read_ms.append(1e3 * (read - start))
-        tracks.note(recording.names[i], time, before, found)
-        before = len(found.tracked)
-        tracks.follow(found, tracker.pixels())
+        _take(tracks, tracker, recording, i)
         if i in shown:
-            told = f"{recording.names[i]}: {before} points, {len(found.added)} of them new"
-            path = make_subfolder(folder, PICTURES) / f"tracks_{i:06d}.png"
-            draw_view_tracks(path, tracker.view(image), list(tracks.trails.values()), told)
-            tracks.pictures.append(Picture(told, path.read_bytes()))
-        progress("tracking", i + 1, len(recording))
+            _draw(tracks, tracker, recording, context.folder)
+        context.progress("tracking", i + 1, len(recording))
     return tracks
+
+
+def _take(tracks: _Tracks, tracker: ReplenishedTracker, recording: OmniRecording, i: int) -> None:
+    """Tracks into frame i and books it."""
+    start = perf_counter()
+    image = recording.image(i)
+    read = perf_counter()
+    time = float(recording.timestamps[i])
+    found = tracker.take(image, time if np.isfinite(time) else float(i))
+    tracks.track_ms.append(1e3 * (perf_counter() - read))
+    tracks.read_ms.append(1e3 * (read - start))
+    tracks.note(recording.names[i], time if np.isfinite(time) else float(i), found)
+    tracks.follow(found, tracker.pixels())
+
+
+def _draw(
+    tracks: _Tracks, tracker: ReplenishedTracker, recording: OmniRecording, folder: Path
+) -> None:
+    """The last frame with the ways of its points."""
+    i = len(tracks.frames) - 1
+    name, _, points, added, _ = tracks.frames[i]
+    caption = f"{name}: {points} points, {added} of them new"
+    path = make_subfolder(folder, PICTURES) / f"tracks_{i:06d}.png"
+    view = tracker.view(recording.image(i))
+    draw_view_tracks(path, view, list(tracks.trails.values()), caption)
+    tracks.pictures.append(Picture(caption, path.read_bytes()))
 
 
 def _numbers(tracks: _Tracks) -> dict[str, JsonValue]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,9 +15,9 @@ from fgslam.frontend.features.column_segments import empty_segments
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
 from fgslam.frontend.homing.plain_sift import plain_sift
-from fgslam.runs.homing_results import Progress, Stopped
-from fgslam.runs.processes import WorkerEnded, run_apart
+from fgslam.runs.engine import Context
 from fgslam.runs.tasks.homing_mirror_check import open_checked
+from fgslam.runs.units import Stage, in_blocks
 
 _VIEWS_A_BLOCK = 4
 
@@ -72,46 +71,34 @@ def open_views(settings: OmniDatasetSettings) -> Views:
 
 
 def extract_features(
-    views: Views,
-    settings: OmniFeatureSettings | None,
-    jobs: int,
-    progress: Progress,
-    stopped: Stopped,
+    views: Views, settings: OmniFeatureSettings | None, context: Context
 ) -> list[OmniFeatures]:
     """Features of all views in their order; stopped early, of the first ones without a gap.
 
     Args:
         views: opened.
         settings: of the features; None for plain SIFT, the baseline.
-        jobs: processes at a time.
-        progress: told of each block of views.
-        stopped: True ends it.
+        context: of the run.
 
     Raises:
         DatasetError: a view cannot be read.
         OutputError: a process ended by itself, perhaps for lack of memory.
     """
-    every = range(len(views))
-    blocks = [
-        _Block(views.settings, settings, tuple(every[k : k + _VIEWS_A_BLOCK]))
-        for k in range(0, len(views), _VIEWS_A_BLOCK)
-    ]
-    found: dict[int, Sequence[OmniFeatures]] = {}
     what = "features" if settings is not None else "plain SIFT"
-    progress(what, 0, len(views))
-    for index, result in run_apart(_extract, blocks, jobs, stopped, single_threaded=True):
-        if isinstance(result, WorkerEnded):
-            if not stopped():
-                raise OutputError(f"features of {views.recording.name}: {result.why}")
-        else:
-            found[index] = result
-        progress(what, sum(map(len, found.values())), len(views))
-    out: list[OmniFeatures] = []
-    for index in range(len(blocks)):
-        if index not in found:
-            break
-        out += found[index]
-    return out
+    stage = Stage(
+        name=what.replace(" ", "_"),
+        label=what,
+        count=len(views),
+        work=_extract,
+        argument=lambda units: _Block(views.settings, settings, units),
+        kind=OmniFeatures,
+        blocks=in_blocks(_VIEWS_A_BLOCK),
+    )
+    done = context.perform(stage)
+    if done.ended and not context.stopped():
+        raise OutputError(f"features of {views.recording.name}: {done.ended[0][1]}")
+    gap = next((k for k in range(len(views)) if k not in done.results), len(views))
+    return [done.results[k] for k in range(gap)]
 
 
 def _extract(block: _Block) -> list[OmniFeatures]:

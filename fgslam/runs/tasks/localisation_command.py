@@ -20,14 +20,18 @@ from fgslam.runs.config import (
     make_experiment,
 )
 from fgslam.runs.config_models import LocalisationConfig
+from fgslam.runs.engine import Context
+from fgslam.runs.files import write_config
 from fgslam.runs.folder import ExistingFolder, create_run_folder, is_run_folder
-from fgslam.runs.tasks.localisation import answer, open_queries, write_run_config
+from fgslam.runs.tasks.localisation import open_queries, provenance_of
 from fgslam.runs.tasks.localisation_files import write_results
-from fgslam.runs.tasks.localisation_queries import Progress
-from fgslam.runs.tasks.localisation_results import LocalisationResult
+from fgslam.runs.tasks.localisation_queries import ask_all
+from fgslam.runs.tasks.localisation_results import LocalisationResult, details, result_of, told
 from fgslam.runs.tasks.slam_map_entry import GivenMap, open_map
+from fgslam.runs.units import Progress, UnitStore
 
 _YAML = (".yaml", ".yml")
+_NAME_WIDTH = 18
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -69,12 +73,24 @@ def localize(wanted: Wanted, progress: Progress, stopped: Callable[[], bool]) ->
     require_rig(given.saved, sequence.rig, str(given.path))
     if out is not None:
         create_run_folder(out, wanted.existing)
-        write_run_config(config, out, given, sequence)
-    result = answer(config, out, given, sequence, progress, stopped)
+        write_config(out, config, provenance_of(given, sequence))
+    context = Context(out or Path(), False, UnitStore(None), 1, progress, stopped)
+    asked = ask_all(config, given, sequence, context)
+    result = result_of(config, out, asked, sequence.notes)
     notes = (*_other_eyes(config, given), *result.notes)
     result = dataclasses.replace(result, notes=notes)
     write_results(result, given, f"{sequence.name}, in the map {given.path}")
-    return result
+    return _one_by_one(result)
+
+
+def _one_by_one(result: LocalisationResult) -> LocalisationResult:
+    """The result with a line for each query, or with a single one in full."""
+    attempts = result.asked.attempts
+    if len(attempts) == 1:
+        lines = tuple(f"{name:<{_NAME_WIDTH}}{value}" for name, value in details(attempts[0]))
+        return dataclasses.replace(result, lines=lines, tables=())
+    lines = tuple(told(attempt) for attempt in attempts)
+    return dataclasses.replace(result, lines=(*lines, *result.lines))
 
 
 def _config(wanted: Wanted, saved: SavedMap) -> LocalisationConfig:

@@ -11,13 +11,14 @@ from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.geometry import yaw_pitch_roll
 from fgslam.evaluation.localisation import Bounds, LocalisationScore, Spread
 from fgslam.evaluation.metrics import JsonValue
-from fgslam.report.content import Page
 from fgslam.report.figures.located import Located, located_figure
 from fgslam.report.figures.traces import Figure
-from fgslam.report.page import write_html
 from fgslam.report.pictures.on_paper import draw_figure
 from fgslam.report.tables import Cell, write_csv, write_json
+from fgslam.runs.documents import write_page
+from fgslam.runs.files import METRICS_FILE
 from fgslam.runs.tasks.localisation_results import (
+    LOCALISATION_FILE,
     LocalisationResult,
     Scored,
     bounds_of,
@@ -27,11 +28,7 @@ from fgslam.runs.tasks.localisation_results import (
     verdict_of,
 )
 from fgslam.runs.tasks.slam_map_entry import GivenMap
-from fgslam.runs.tasks.slam_outputs import versions
 
-LOCALISATION_FILE = "localisation.csv"
-METRICS_FILE = "metrics.json"
-REPORT_FILE = "report.html"
 TIMING_FILE = "timing.csv"
 _COLUMNS = (
     "frame",
@@ -64,7 +61,7 @@ _COLUMNS = (
 def write_results(result: LocalisationResult, given: GivenMap, subtitle: str) -> None:
     """All files of a run into its folder, which holds its config.yaml. Raises OutputError."""
     folder = result.folder
-    if folder is None:
+    if not result.written:
         return
     judged = scored(result.config, result.asked)
     rows = (row for one in judged for row in _rows(one))
@@ -79,18 +76,7 @@ def write_results(result: LocalisationResult, given: GivenMap, subtitle: str) ->
         pictures = make_subfolder(folder, "pictures")
         for frames, figure in figures.items():
             draw_figure(pictures / f"localisation_{frames}.png", figure, figure.heading)
-    if output.report:
-        page = Page(
-            title=result.config.name,
-            subtitle=subtitle,
-            headline=result.verdict,
-            tables=result.tables,
-            figures=tuple(figures.values()),
-            notes=result.notes,
-            config_yaml=(folder / "config.yaml").read_text(encoding="utf-8"),
-            versions=versions(),
-        )
-        write_html(folder / REPORT_FILE, page)
+    write_page(result, subtitle, figures=tuple(figures.values()))
 
 
 def _rows(judged: Scored) -> Iterator[tuple[Cell, ...]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,7 @@ from fgslam.core.saved_map import require_rig
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.runs.config_models import LocalisationConfig
+from fgslam.runs.engine import Context
 from fgslam.runs.tasks.localisation_sights import Sighted, TrueSights
 from fgslam.runs.tasks.localisation_submap import Window, submap_features
 from fgslam.runs.tasks.localisation_truth import TruthInMap, truth_in_map
@@ -26,10 +27,9 @@ from fgslam.runs.tasks.slam_map_entry import GivenMap, trusted
 from fgslam.slam.factory import make_relocaliser, make_stereo_matcher, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is under way, how much is done, and of how much."""
-
 _STREAM = 13  # of random numbers, beside those of the recording
+_STAGE = "queries"
+_SAVE_EVERY_S = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,6 +91,9 @@ def nothing_asked(why: str) -> Asked:
     """No query at all, and why."""
     nobody = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
     return Asked((), nobody, why, whole=False)
+
+
+_ANSWERS = tuple[Attempt, ...]
 
 
 class Asker:
@@ -171,13 +174,9 @@ class Asker:
 
 
 def ask_all(
-    config: LocalisationConfig,
-    given: GivenMap,
-    sequence: Sequence,
-    progress: Progress,
-    stopped: Callable[[], bool],
+    config: LocalisationConfig, given: GivenMap, sequence: Sequence, context: Context
 ) -> Asked:
-    """All queries of a configuration.
+    """All queries of a configuration; those of an earlier session are not asked again.
 
     Raises:
         MapError: the map cannot be used with these cameras, or is empty.
@@ -191,28 +190,53 @@ def ask_all(
         )
     asker = Asker(config, given, sequence)
     queries = len(range(max(wanted.frames) - 1, len(sequence), wanted.every))
-    attempts: list[Attempt] = []
-    done = 0
-    for found in _queries(config, sequence):
-        sighted = asker.sighted(found[-1].i)
-        attempts += [asker.ask(found[len(found) - n :], sighted) for n in wanted.frames]
-        done += 1
-        progress("localising", done, queries)
-        if stopped():
-            break
+    answered = _answered(asker, config, sequence, queries, context)
+    attempts = [attempt for answers in answered.values() for attempt in answers]
     attempts.sort(key=lambda one: (wanted.frames.index(one.frames), one.i))
-    return Asked(tuple(attempts), asker.landmarks, asker.truth.alignment, done == queries)
+    whole = len(answered) == queries
+    return Asked(tuple(attempts), asker.landmarks, asker.truth.alignment, whole)
 
 
-def _queries(config: LocalisationConfig, sequence: Sequence) -> Iterator[list[FeatureFrame]]:
-    """The frames of each query, the longest submap's; each frame's features are found once."""
+def _answered(
+    asker: Asker, config: LocalisationConfig, sequence: Sequence, queries: int, context: Context
+) -> dict[int, tuple[Attempt, ...]]:
+    """Answers by number of the query, in the order asked; kept in the run folder now and then."""
+    done: dict[int, tuple[Attempt, ...]] = context.store.load(_STAGE, _ANSWERS)
+    fresh: dict[int, tuple[Attempt, ...]] = {}
+    context.progress("localising", len(done), queries)
+    saved = time.perf_counter()
+    for k, found in _queries(config, sequence, first=len(done)):
+        sighted = asker.sighted(found[-1].i)
+        frames = config.localisation.frames
+        fresh[k] = tuple(asker.ask(found[len(found) - n :], sighted) for n in frames)
+        context.progress("localising", len(done) + len(fresh), queries)
+        stopped = context.stopped()
+        if stopped or k == queries - 1 or time.perf_counter() - saved >= _SAVE_EVERY_S:
+            done |= context.store.add(_STAGE, fresh, _ANSWERS)
+            fresh, saved = {}, time.perf_counter()
+        if stopped:
+            break
+    return done
+
+
+def _queries(
+    config: LocalisationConfig, sequence: Sequence, first: int
+) -> Iterator[tuple[int, list[FeatureFrame]]]:
+    """Number and frames of each query from the ``first`` on, the longest submap's.
+
+    Each frame's features are found once.
+    """
     longest, every = max(config.localisation.frames), config.localisation.every
     held: deque[FeatureFrame] = deque(maxlen=longest)
-    stream = make_stream(sequence, config.frontend)()
+    start = first * every
+    if start + longest > len(sequence):
+        return
+    stream = make_stream(sequence, config.frontend)(start=start)
     try:
         for found in stream:
             held.append(found)
-            if found.i >= longest - 1 and (found.i - longest + 1) % every == 0:
-                yield list(held)
+            k, rest = divmod(found.i - longest + 1, every)
+            if found.i >= start + longest - 1 and not rest:
+                yield k, list(held)
     finally:
         stream.close()

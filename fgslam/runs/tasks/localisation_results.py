@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -25,32 +24,19 @@ from fgslam.evaluation.localisation import (
 )
 from fgslam.report.content import Column, TextTable
 from fgslam.runs.config_models import LocalisationConfig
+from fgslam.runs.engine import RunResult
 from fgslam.runs.tasks.localisation_queries import Asked, Attempt
 
+LOCALISATION_FILE = "localisation.csv"
 _UNKNOWN = "-"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LocalisationResult:
-    """How a localisation run ended.
-
-    Attributes:
-        config: what was run.
-        folder: where its files are; None where none were wanted.
-        status: whether all queries were asked.
-        asked: all of them with their answers.
-        verdict: sentences for terminal and page.
-        tables: for both, too.
-        notes: what was tolerated, and how errors are to be read.
-    """
+class LocalisationResult(RunResult):
+    """How a localisation run ended; ``asked`` are all queries with their answers."""
 
     config: LocalisationConfig
-    folder: Path | None
-    status: Literal["finished", "interrupted"]
-    asked: Asked
-    verdict: tuple[str, ...]
-    tables: tuple[TextTable, ...]
-    notes: tuple[str, ...]
+    asked: Asked = field(kw_only=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,12 +120,14 @@ def result_of(
     tables = (_score_table(config, judged), _refusal_table(judged))
     return LocalisationResult(
         config=config,
-        folder=folder,
+        folder=folder or Path(),
         status="finished" if asked.whole else "interrupted",
-        asked=asked,
-        verdict=tuple(_sentence(config, one) for one in judged),
+        lines=tuple(_sentence(config, one) for one in judged),
         tables=tables,
         notes=(*notes, asked.alignment),
+        particulars=() if folder is None else (("queries", str(folder / LOCALISATION_FILE)),),
+        written=folder is not None,
+        asked=asked,
     )
 
 

@@ -5,29 +5,32 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from fgslam.core.errors import DatasetError
 from fgslam.core.features import StereoFeatures
 from fgslam.core.recordings import Sequence
-from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.report.comparison_table import write_comparison_csv
-from fgslam.runs.comparison import COMPARISON_FILE, Compared, replay_apart, tasks_of
+from fgslam.runs.comparison import Compared, replay_apart, tasks_of
+from fgslam.runs.comparison_tables import comparison_particulars, comparison_tables
 from fgslam.runs.config import ExperimentConfig
-from fgslam.runs.folder import ExistingFolder
+from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, run_task
+from fgslam.runs.files import COMPARISON_FILE
+from fgslam.runs.folder import ExistingFolder, is_run_folder
 from fgslam.runs.report import report_from_folder
 from fgslam.runs.tasks import slam_checkpoint as checkpoint
 from fgslam.runs.tasks import slam_map_entry as map_entry
 from fgslam.runs.tasks import slam_mapping as mapping
 from fgslam.runs.tasks.rendered_truth import TrueDepth
-from fgslam.runs.tasks.slam_beginning import BegunRun, OpenedRun, Progress, begin, open_run
+from fgslam.runs.tasks.slam_beginning import BegunRun, OpenedRun, begin, open_run
 from fgslam.runs.tasks.slam_outputs import RunOutputs
 from fgslam.runs.tasks.slam_pictures import draw_frame, draw_run, figures_of, frames_to_show
+from fgslam.runs.tasks.slam_tables import run_notes, summary_table
+from fgslam.runs.units import Progress
 from fgslam.slam.factory import make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
@@ -39,62 +42,53 @@ _PRECISION_PX = 1.5  # disparity error of a correct match; a SIFT match's noise 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RunResult:
-    """How a run ended."""
+class SlamResult(RunResult):
+    """How a run of SLAM ended.
 
-    folder: Path
-    status: Literal["finished", "interrupted"]
-    metrics: EstimatorMetrics
-    pictures: tuple[Path, ...]
-    outputs: RunOutputs
-    compared: Compared | None = None
-    about_map: str = ""
-
-
-@one_blas_thread()
-def run_experiment(
-    config: ExperimentConfig,
-    folder: Path,
-    existing: ExistingFolder = "refuse",
-    progress: Progress = lambda what, done, total: None,
-    stopped: Callable[[], bool] = lambda: False,
-) -> RunResult:
-    """Runs a configuration into a run folder.
-
-    Args:
-        config: the experiment.
-        folder: the run folder itself.
-        existing: what to do where it holds a run already.
-        progress: told after each frame.
-        stopped: asked after each frame; True ends the run early, resumable, with all files valid.
-
-    Raises:
-        FgslamError: of any kind, with a message for the user.
+    Attributes:
+        outputs: all that was computed.
+        live: numbers of the estimator that steered; after an interruption, of the frames so far.
+        pictures: drawn, if any.
+        compared: the estimators that replayed the run's log, beside the live one.
     """
-    run = open_run(config, folder, existing, progress)
-    ended = _drive_first(run, existing, progress, stopped)
-    if ended is not None:
+
+    outputs: RunOutputs = field(kw_only=True)
+    live: EstimatorMetrics = field(kw_only=True)
+    pictures: tuple[Path, ...] = ()
+    compared: Compared | None = None
+
+
+def open_slam(config: ExperimentConfig, opening: Opening) -> Task[SlamResult]:
+    """Opens recording and map. Raises FgslamError."""
+    opened = open_run(config, opening)
+    return Task(opened.provenance, lambda context: _run(opened, context))
+
+
+def _run(opened: OpenedRun, context: Context) -> SlamResult:
+    """The drive that makes the map, where the run asks for one, and the run itself."""
+    ended = drive_first(opened.config, context)
+    if ended is not None and ended.status == "interrupted":
         return ended
-    begun = begin(run, progress)
-    saved = _loop(begun.outputs, progress, stopped)
+    begun = begin(opened, context.progress)
+    saved = _loop(begun.outputs, context.progress, context.stopped)
     if saved is not None:
-        return RunResult(folder, "interrupted", saved, (), begun.outputs)
-    return _finish(begun, progress, stopped)
+        return _result(begun.outputs, "interrupted", saved)
+    return _finish(begun, context)
 
 
-def _drive_first(
-    run: OpenedRun, existing: ExistingFolder, progress: Progress, stopped: Callable[[], bool]
-) -> RunResult | None:
-    """Makes the run's own map, where it asks for that; how it ended if that was early."""
-    folder = run.folder / map_entry.FIRST_FOLDER
-    config = mapping.first_config(run.config, folder)
-    if config is None or (existing == "resume" and (folder / map_entry.MAP_FILE).is_file()):
+def drive_first(config: ExperimentConfig, context: Context) -> SlamResult | None:
+    """Makes the map of a run, where it asks for that, in its folder `first`; how that ended.
+
+    None where no map is to be made, or it is there already.
+    """
+    folder = context.folder / map_entry.FIRST_FOLDER
+    first = mapping.first_config(config, folder)
+    if first is None or (context.resumed and (folder / map_entry.MAP_FILE).is_file()):
         return None
-    resumable = existing == "resume" and checkpoint.exists(folder)
-    result = run_experiment(
-        config, folder, "resume" if resumable else "overwrite", progress, stopped
-    )
-    return result if result.status == "interrupted" else None
+    existing: ExistingFolder = "overwrite"
+    if context.resumed and is_run_folder(folder):
+        existing = "resume"
+    return run_task(open_slam, first, folder, existing, context.progress, context.stopped)
 
 
 def _loop(
@@ -161,36 +155,66 @@ def _advance(outputs: RunOutputs, found: FeatureFrame, wait_ms: float) -> FrameR
     )
 
 
-def _finish(begun: BegunRun, progress: Progress, stopped: Callable[[], bool]) -> RunResult:
+def _finish(begun: BegunRun, context: Context) -> SlamResult:
     outputs = begun.outputs
     pictures: tuple[Path, ...] = ()
-    metrics = outputs.write_results("finished")
+    live = outputs.write_results("finished")
     about_map = mapping.save(outputs, begun.given)
     if outputs.config.output.pictures:
         pictures = tuple(draw_run(outputs.folder, figures_of(outputs)))
-    checkpoint.remove(outputs.folder)
-    compared = _compare(outputs, metrics, progress, stopped)
+    compared = _compare(outputs, live, context)
+    status: Status = "finished"
+    if compared is not None and context.stopped():
+        status = "interrupted"  # the replays that are missing are for the next session
+    else:
+        checkpoint.remove(outputs.folder)
     if outputs.config.output.report:
         report_from_folder(outputs.folder)
-    return RunResult(outputs.folder, "finished", metrics, pictures, outputs, compared, about_map)
+    return _result(outputs, status, live, pictures, compared, about_map)
 
 
-def _compare(
-    outputs: RunOutputs,
-    live: EstimatorMetrics,
-    progress: Progress,
-    stopped: Callable[[], bool],
-) -> Compared | None:
+def _compare(outputs: RunOutputs, live: EstimatorMetrics, context: Context) -> Compared | None:
     """Replays the run's log through the other estimators that the configuration names."""
     config, folder = outputs.config, outputs.folder
     others = config.estimators[1:]
     if not others:
         return None
-    metrics = {outputs.title: live}
-    metrics |= replay_apart(tasks_of(config, folder, folder, others), 1, progress, stopped)
-    outputs.write_metrics(metrics, "finished")
+    metrics = {outputs.title: live} | replay_apart(
+        tasks_of(config, folder, folder, others), context
+    )
+    outputs.write_metrics(metrics, "interrupted" if context.stopped() else "finished")
     write_comparison_csv(folder / COMPARISON_FILE, [(config.name, metrics)])
     return Compared(config.name, folder, folder, len(outputs.recorder), metrics)
+
+
+def _result(
+    outputs: RunOutputs,
+    status: Status,
+    live: EstimatorMetrics,
+    pictures: tuple[Path, ...] = (),
+    compared: Compared | None = None,
+    about_map: str = "",
+) -> SlamResult:
+    """What is said of the run."""
+    own = outputs.folder / outputs.title
+    files = [("trajectory", str(own / "final.tum")), ("map", str(own / "map.ply"))]
+    files += [("saved map", about_map)] if about_map else []
+    files += [("pictures", f"{pictures[0].parent}/")] if pictures else []
+    others = () if compared is None else comparison_tables(compared)
+    more = () if compared is None else comparison_particulars(compared)
+    return SlamResult(
+        config=outputs.config,
+        folder=outputs.folder,
+        status=status,
+        tables=(summary_table(outputs, live), *others),
+        notes=run_notes(outputs, live),
+        particulars=(*files, *more),
+        reached=f"after {len(outputs.recorder)} frames",
+        outputs=outputs,
+        live=live,
+        pictures=pictures,
+        compared=compared,
+    )
 
 
 def _stereo_precision(sequence: Sequence, i: int, stereo: StereoFeatures) -> float:

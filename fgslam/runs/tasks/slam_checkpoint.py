@@ -9,11 +9,9 @@ from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import OutputError
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.runs.files import LOG_FILE, STATE_FILE
 from fgslam.slam.pipeline import SlamPipeline
 from fgslam.slam.recorder import RunRecorder
-
-STATE_FILE = "checkpoint.npz"
-LOG_FILE = "measurements.npz"
 
 
 def save(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
@@ -62,23 +60,13 @@ def exists(folder: Path) -> bool:
     return (folder / STATE_FILE).is_file()
 
 
-def require(folder: Path) -> None:
-    """Raises OutputError where there is nothing to continue from."""
-    if not exists(folder):
-        raise OutputError(
-            f"{folder}: nothing to resume (no {STATE_FILE}): the run has finished, or never got "
-            "to its first checkpoint; use --overwrite to run again"
-        )
-
-
 def load(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
     """Continues from a checkpoint.
 
     Raises:
-        OutputError: there is none, or state and log do not belong to each other or to this fgslam.
+        OutputError: state and log do not belong to each other or to this fgslam.
         MeasurementLogError: one of the two files cannot be read.
     """
-    require(folder)
     state = load_arrays(folder / STATE_FILE)
     log = MeasurementLog.load(folder / LOG_FILE)
     try:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,16 +23,16 @@ from fgslam.runs.compare import write_comparison
 from fgslam.runs.comparison import (
     GROUND_TRUTH_FILE,
     Compared,
-    Progress,
     remark_of,
     replay_apart,
     tasks_of,
 )
+from fgslam.runs.comparison_tables import comparison_particulars, comparison_tables
 from fgslam.runs.config import ExperimentConfig
+from fgslam.runs.engine import Context, Opening, RunResult, Status, Task
 from fgslam.runs.estimator_files import FRAMES_FILE, read_frames
-from fgslam.runs.folder import ExistingFolder, create_run_folder
+from fgslam.runs.files import write_config
 from fgslam.runs.tasks.slam_checkpoint import save_log
-from fgslam.runs.tasks.slam_outputs import write_config
 from fgslam.runs.tasks.slam_pictures import RunFigures, draw_run
 from fgslam.runs.tasks.slam_summary import spread
 from fgslam.slam.replay import ReplayRow
@@ -49,54 +50,62 @@ def open_measured(config: ExperimentConfig, seed: int | None = None) -> Measurem
     return open_measurements(config.dataset, seed, config.odometry)
 
 
-def run_measured(
-    config: ExperimentConfig,
-    folder: Path,
-    existing: ExistingFolder = "refuse",
-    progress: Progress = lambda what, done, total: None,
-    stopped: Callable[[], bool] = lambda: False,
-) -> Compared:
-    """Replays the recording through the configuration's estimators, into a run folder.
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredResult(RunResult):
+    """How a run on measurements ended; ``compared`` are its estimators."""
 
-    Args:
-        config: an experiment on measurements.
-        folder: the run folder itself.
-        existing: what to do where it holds a run already; `resume` is refused.
-        progress: told of each estimator that is done.
-        stopped: True ends the replays; what was finished is kept.
+    compared: Compared = field(kw_only=True)
 
-    Raises:
-        FgslamError: of any kind, with a message for the user.
-    """
-    if existing == "resume":
-        raise ConfigError(
-            f"{folder}: a run on measurements cannot be resumed, it starts anew in seconds; use "
-            "--overwrite"
-        )
-    if existing == "refuse" and folder.exists():
-        create_run_folder(folder, existing)  # refuses before anything is simulated
+
+def open_measurements_task(config: ExperimentConfig, opening: Opening) -> Task[MeasuredResult]:
+    """Opens or simulates the recording. Raises FgslamError."""
     recording = open_measured(config)
-    create_run_folder(folder, existing)
-    write_recording(folder, config, recording)
-    tasks = tasks_of(config, folder, folder, config.estimators)
-    metrics = replay_apart(tasks, 1, progress, stopped)
+    return Task(_provenance(recording), lambda context: _run(config, recording, context))
+
+
+def _run(
+    config: ExperimentConfig, recording: MeasurementRecording, context: Context
+) -> MeasuredResult:
+    """Replays the recording through the configuration's estimators."""
+    folder = context.folder
+    write_log_and_truth(folder, recording)
+    metrics = replay_apart(tasks_of(config, folder, folder, config.estimators), context)
+    status: Status = "interrupted" if context.stopped() else "finished"
     rows = _live_rows(folder, config)
     _write_times(folder, recording, rows)
-    about = _about(config, recording, rows, "interrupted" if stopped() else "finished")
     pictures: tuple[Path, ...] = ()
     if config.output.pictures and rows:
         pictures = tuple(draw_run(folder, _figures(folder, config, recording, rows)))
+    about = _about(config, recording, rows, status)
     write_comparison(folder, config, len(recording.log), metrics, about, folder)
-    notes = recording.notes
-    return Compared(config.name, folder, folder, len(recording.log), metrics, notes, pictures)
+    compared = Compared(
+        config.name, folder, folder, len(recording.log), metrics, recording.notes, pictures
+    )
+    return MeasuredResult(
+        config,
+        folder,
+        status,
+        tables=comparison_tables(compared),
+        particulars=comparison_particulars(compared),
+        failed=len(compared.failures) == len(metrics),
+        compared=compared,
+    )
+
+
+def _provenance(recording: MeasurementRecording) -> dict[str, Any]:
+    return {"dataset": {"name": recording.name, "identity": recording.identity}}
 
 
 def write_recording(
     folder: Path, config: ExperimentConfig, recording: MeasurementRecording
 ) -> None:
     """What every estimator's replay starts from: configuration, log, truth."""
-    provenance = {"dataset": {"name": recording.name, "identity": recording.identity}}
-    write_config(folder, config, provenance)
+    write_config(folder, config, _provenance(recording))
+    write_log_and_truth(folder, recording)
+
+
+def write_log_and_truth(folder: Path, recording: MeasurementRecording) -> None:
+    """The log, and what is known to be true. Raises OutputError."""
     save_log(folder, recording.log)
     if recording.ground_truth is not None:
         write_tum(folder / GROUND_TRUTH_FILE, recording.ground_truth)

@@ -4,30 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import yaml
 
-from fgslam.core.atomic_files import make_subfolder, write_text
+from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.estimates import Estimate, Trajectory
 from fgslam.core.recordings import Sequence
 from fgslam.core.trajectories import write_tum
-from fgslam.core.version import __version__
 from fgslam.evaluation.judging import Truth, closure_counts
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
 from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
 from fgslam.report.metrics import StageTime, write_metrics, write_timing
 from fgslam.runs.comparison import GROUND_TRUTH_FILE, load_truth, remark_of
 from fgslam.runs.config import ExperimentConfig
-from fgslam.runs.config_models import HomingExperiment, LocalisationConfig
 from fgslam.runs.estimator_files import write_estimate
-from fgslam.runs.folder import RUN_MARKER
 from fgslam.runs.maps import map_points
 from fgslam.runs.tasks.rendered_truth import rendered_landmark_truth
 from fgslam.runs.tasks.slam_checkpoint import save_log
@@ -36,8 +29,6 @@ from fgslam.runs.tasks.slam_summary import estimator_metrics, run_numbers
 from fgslam.slam.pipeline import SlamPipeline
 from fgslam.slam.recorder import STAGES, RunRecorder
 from fgslam.slam.session import Session
-
-_VERSIONS_OF = ("numpy", "scipy", "opencv-python-headless", "gtsam", "open3d")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,26 +143,3 @@ class RunOutputs:
             "remark": self.remark or None,
             "notes": [*self.sequence.notes, *self.notes],
         }
-
-
-def write_config(
-    folder: Path,
-    config: ExperimentConfig | HomingExperiment | LocalisationConfig,
-    provenance: dict[str, Any],
-) -> None:
-    """config.yaml: every default filled in, with the versions and where the data came from."""
-    values = config.as_values() | {"provenance": {"versions": versions()} | provenance}
-    write_text(folder / RUN_MARKER, yaml.safe_dump(values, sort_keys=False))
-
-
-def versions() -> dict[str, str | None]:
-    """Versions of this program, of Python and of the packages that shape the numbers."""
-    own = {"fgslam": __version__, "python": platform.python_version()}
-    return own | {name: _version(name) for name in _VERSIONS_OF}
-
-
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None

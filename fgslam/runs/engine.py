@@ -1,0 +1,220 @@
+"""Runs an experiment of any task: configuration in, run folder out; interruptible and resumable.
+
+What is the same for all tasks is done here once: the folder that is refused, replaced or resumed,
+the resolved configuration with versions and data, linear algebra on one thread, the units that are
+kept until the run has finished. What a task does is its own module in :mod:`fgslam.runs.tasks`.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, Literal, TypeAlias, TypeVar
+
+from fgslam.core.errors import ConfigError, DatasetError, OutputError
+from fgslam.core.threads import one_blas_thread
+from fgslam.report.content import TextTable
+from fgslam.runs.config import load_experiment
+from fgslam.runs.config_models import Experiment
+from fgslam.runs.files import METRICS_FILE, STATE_FILE, read_document, versions, write_config
+from fgslam.runs.folder import RUN_MARKER, ExistingFolder, create_run_folder
+from fgslam.runs.units import (
+    UNITS_FOLDER,
+    Argument,
+    Done,
+    Progress,
+    Result,
+    Stage,
+    Stopped,
+    UnitStore,
+    perform,
+)
+
+Status: TypeAlias = Literal["finished", "interrupted"]
+R_co = TypeVar("R_co", bound="RunResult", covariant=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunResult:
+    """How a run ended, and what is said of it: terminal and page show the same.
+
+    Attributes:
+        config: what was run.
+        folder: the run folder.
+        status: whether all of it was done; `fgslam run --resume` goes on with the rest.
+        lines: sentences.
+        tables: numbers as text.
+        notes: what was tolerated, or failed.
+        particulars: label and text of further lines: failures, remarks, files to look at.
+        failed: an estimator was asked for, and none gave an answer.
+        written: there is a folder with files.
+        reached: how far an interrupted run got, in words; may be empty.
+    """
+
+    config: Experiment
+    folder: Path
+    status: Status
+    lines: tuple[str, ...] = ()
+    tables: tuple[TextTable, ...] = ()
+    notes: tuple[str, ...] = ()
+    particulars: tuple[tuple[str, str], ...] = ()
+    failed: bool = False
+    written: bool = True
+    reached: str = ""
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """The document of metrics.json. Raises DatasetError where there is none."""
+        return read_document(self.folder / METRICS_FILE)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Context:
+    """What a task works with.
+
+    Attributes:
+        folder: the run folder; it holds the resolved configuration already.
+        resumed: it may hold results of an earlier session.
+        store: of finished units.
+        jobs: processes at a time.
+        progress, stopped: as of :func:`run_task`.
+    """
+
+    folder: Path
+    resumed: bool
+    store: UnitStore
+    jobs: int
+    progress: Progress
+    stopped: Stopped
+
+    def perform(self, stage: Stage[Argument, Result], single_threaded: bool = True) -> Done[Result]:
+        """Does what is missing of a stage; as :func:`fgslam.runs.units.perform`."""
+        return perform(stage, self.store, self.jobs, self.progress, self.stopped, single_threaded)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task(Generic[R_co]):
+    """An experiment whose data is open; nothing is done or written yet.
+
+    Attributes:
+        provenance: what config.yaml says of the data, beside the versions; its `dataset` has an
+            `identity` where the data can change.
+        run: does what is missing and writes all files of the run folder; raises FgslamError of
+            any kind, with a message for the user.
+    """
+
+    provenance: Mapping[str, Any]
+    run: Callable[[Context], R_co]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Opening:
+    """What a task is opened with.
+
+    Attributes:
+        folder: the run folder, which need not exist yet.
+        resumed: it holds results of an earlier session.
+        progress: as of :func:`run_task`.
+    """
+
+    folder: Path
+    resumed: bool
+    progress: Progress
+
+
+Opener: TypeAlias = Callable[[Any, Opening], Task[R_co]]
+"""Opens the data of a configuration, and refuses now, by a FgslamError, what could not work."""
+
+
+@one_blas_thread()
+def run_task(
+    opener: Opener[R_co],
+    config: Experiment,
+    folder: Path,
+    existing: ExistingFolder = "refuse",
+    progress: Progress = lambda what, done, total: None,
+    stopped: Stopped = lambda: False,
+    jobs: int | None = None,
+) -> R_co:
+    """Runs a configuration into a run folder by the task that ``opener`` opens.
+
+    Args:
+        opener: opens the task; may refuse.
+        config: the experiment.
+        folder: the run folder itself.
+        existing: what to do where it holds a run already.
+        progress: told of each step of the work.
+        stopped: asked after each step; True ends the run early, resumable, with all files valid.
+        jobs: processes at a time; None: as the configuration says, else one.
+
+    Raises:
+        FgslamError: of any kind, with a message for the user.
+    """
+    config = config.resolved()
+    if existing == "resume" or (existing == "refuse" and folder.exists()):
+        create_run_folder(folder, existing)  # refuses now, not after minutes of rendering
+    if existing == "resume":
+        require_unfinished(folder)
+        require_same(config, folder)
+    task = opener(config, Opening(folder, existing == "resume", progress))
+    create_run_folder(folder, existing)
+    if existing == "resume":
+        require_same_ground(task.provenance, folder)
+    else:
+        write_config(folder, config, dict(task.provenance))
+    store = UnitStore(folder)
+    jobs = jobs or getattr(config, "jobs", 1) or os.cpu_count() or 1
+    result = task.run(Context(folder, existing == "resume", store, jobs, progress, stopped))
+    if result.status == "finished":
+        store.remove()
+    return result
+
+
+def require_unfinished(folder: Path) -> None:
+    """Raises OutputError where there is nothing left to do."""
+    path = folder / METRICS_FILE
+    begun = (folder / UNITS_FOLDER).is_dir() or (folder / STATE_FILE).is_file()
+    if not begun and path.is_file() and read_document(path).get("status") == "finished":
+        raise OutputError(
+            f"{folder}: nothing to resume (no unfinished units): the run has finished; use "
+            "--overwrite to run again"
+        )
+
+
+def require_same(config: Experiment, folder: Path) -> None:
+    """A run resumes only with the configuration that it was started with."""
+    path = folder / RUN_MARKER
+    if load_experiment(path).as_values() != config.as_values():
+        raise ConfigError(
+            f"{path}: differs from the configuration given; resume with the same one "
+            f"({resume_command(folder)}) or start again with --overwrite"
+        )
+
+
+def require_same_ground(now: Mapping[str, Any], folder: Path) -> None:
+    """A run resumes to the same bytes only on its own recording and with its own packages."""
+    path = folder / RUN_MARKER
+    then = load_experiment(path).provenance or {}
+    dataset, before = now.get("dataset") or {}, then.get("dataset") or {}
+    if before.get("identity") != dataset.get("identity"):
+        raise DatasetError(
+            f"{dataset.get('name')}: the recording has changed since {path} was written; restore "
+            "it, or start again with --overwrite"
+        )
+    before, own = then.get("versions") or {}, versions()
+    differing = [name for name in own if name in before and before[name] != own[name]]
+    changed = [f"{name} {before[name]} -> {own[name]}" for name in differing]
+    if changed:
+        raise ConfigError(
+            f"{path}: started with other versions ({', '.join(changed)}), which would not give the "
+            "same bytes; restore them, or start again with --overwrite"
+        )
+
+
+def resume_command(folder: Path) -> str:
+    """What to type to continue the run in ``folder``, whatever overrides it was started with."""
+    run = shlex.quote(str(folder))
+    return f"fgslam run {shlex.quote(str(folder / RUN_MARKER))} --out {run} --resume"

@@ -1,0 +1,81 @@
+"""Runs an experiment of any task: what `fgslam run` does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fgslam.core.errors import ConfigError
+from fgslam.runs.config_models import (
+    DrivingConfig,
+    Experiment,
+    ExperimentConfig,
+    HomingPairsConfig,
+    HomingTrialsConfig,
+    LocalisationConfig,
+    OmniVideoConfig,
+    TopologicalMapConfig,
+)
+from fgslam.runs.engine import Opener, RunResult, run_task
+from fgslam.runs.folder import ExistingFolder
+from fgslam.runs.units import Progress, Stopped
+
+
+def run_experiment(
+    config: Experiment,
+    folder: Path,
+    existing: ExistingFolder = "refuse",
+    progress: Progress = lambda what, done, total: None,
+    stopped: Stopped = lambda: False,
+) -> RunResult:
+    """Runs a configuration into a run folder.
+
+    Args:
+        config: the experiment, of any task.
+        folder: the run folder itself.
+        existing: what to do where it holds a run already.
+        progress: told of each step of the work.
+        stopped: asked after each step; True ends the run early, resumable, with all files valid.
+
+    Raises:
+        FgslamError: of any kind, with a message for the user.
+    """
+    return run_task(opener_of(config), config, folder, existing, progress, stopped)
+
+
+def opener_of(config: Experiment) -> Opener[RunResult]:  # noqa: PLR0911 - one a task
+    """What opens the data of a configuration; each task is imported when it is run."""
+    match config:
+        case ExperimentConfig(on_measurements=True):
+            from fgslam.runs.tasks.slam_measurements import open_measurements_task
+
+            return open_measurements_task
+        case ExperimentConfig():
+            from fgslam.runs.tasks.slam import open_slam
+
+            return open_slam
+        case LocalisationConfig():
+            from fgslam.runs.tasks.localisation import open_localisation
+
+            return open_localisation
+        case HomingPairsConfig():
+            from fgslam.runs.tasks.homing_pairs import open_pairs
+
+            return open_pairs
+        case TopologicalMapConfig():
+            from fgslam.runs.tasks.homing_map import open_topological_map
+
+            return open_topological_map
+        case OmniVideoConfig():
+            from fgslam.runs.tasks.homing_video import open_video
+
+            return open_video
+        case HomingTrialsConfig():
+            from fgslam.runs.tasks.homing_trials import open_trials
+
+            return open_trials
+        case DrivingConfig():
+            from fgslam.runs.tasks.homing_drives import open_drives
+
+            return open_drives
+        case _:
+            raise ConfigError(f"task {config.task_name}: cannot be run")
