@@ -1,0 +1,273 @@
+"""A run of any task that is killed at any moment goes on to the bytes of an uninterrupted one.
+
+The kill is exact: the n-th file that is renamed into its place is the last thing that happens, once
+just before and once just after it. Units are done in this process, which changes nothing of them
+and makes a run fast.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image as PictureFile
+from recordings import experiment
+
+from fgslam.runs.config import parse_experiment
+from fgslam.runs.engine import RunResult
+from fgslam.runs.folder import ExistingFolder
+from fgslam.runs.run import run_experiment
+
+QUIET = {"pictures": False, "report": False, "checkpoint_seconds": 0.0}
+SILENT = {"pictures": 1, "report": False}
+VIEWS = 4
+TASKS = (
+    "slam",
+    "slam_compared",
+    "measurements",
+    "localisation",
+    "homing_pairs",
+    "topological_map",
+    "omni_video",
+    "homing_trials",
+    "homing",
+    "path_following",
+)
+HOUSE: dict[str, Any] = {
+    "name": "short",
+    "jobs": 1,
+    "trials": 2,
+    "dataset": {"path": {"legs": 1, "spacing_m": 2.0}},
+    "behaviour": {"loop": {"longest_s": 0.3}, "avoidance": {"method": "none"}},
+    "output": SILENT,
+}
+_TIMED_FILES = ("timing.csv", "trials_timing.csv", "report.html")
+_TIMED_VALUES = ("ms", "mb", "seconds", "second", "growth", "memory")
+
+
+class Killed(BaseException):
+    """Stands for the signal that cannot be caught."""
+
+
+@pytest.fixture(scope="module")
+def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Panoramas of one place, turned from one to the next."""
+    folder = tmp_path_factory.mktemp("views") / "panoramas"
+    folder.mkdir()
+    coarse = np.random.default_rng(1).integers(0, 255, (12, 24, 3), dtype=np.uint8)
+    whole = np.asarray(
+        PictureFile.fromarray(coarse).resize((192, 96), PictureFile.Resampling.BICUBIC)
+    )
+    for k in range(VIEWS):
+        PictureFile.fromarray(np.roll(whole, 3 * k, axis=1)).save(folder / f"view_{k}.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def values_of(recording: Path, views: Path) -> Callable[[str], dict[str, Any]]:
+    """A small experiment of each task."""
+    images = experiment(recording, output=QUIET)
+    panoramas = {"name": "x", "jobs": 1, "dataset": {"kind": "panoramas", "path": str(views)}}
+    known: dict[str, dict[str, Any]] = {
+        "slam": images,
+        "slam_compared": images | {"compare": ["odometry", "ekf"]},
+        "measurements": {
+            "name": "short_drive",
+            "dataset": {
+                "kind": "simulated_measurements",
+                "stop": 12,
+                "detection": {"features": 40},
+            },
+            "frontend": {"ego_motion": {"dof": 3}},
+            "compare": ["odometry", "ekf"],
+            "output": QUIET,
+        },
+        "localisation": {
+            **{k: v for k, v in images.items() if k not in ("compare", "map")},
+            "task": "localisation",
+            "map": {"made_from": {"dataset": images["dataset"]}},
+            "localisation": {"every": 3},
+        },
+        "homing_pairs": panoramas | {"task": "homing_pairs", "output": SILENT},
+        "topological_map": panoramas
+        | {"task": "topological_map", "held_out_every": 2, "routes": [[0, 3]], "output": SILENT},
+        "omni_video": panoramas | {"task": "omni_video", "least_points": 10, "most_points": 20},
+        "homing_trials": {
+            "task": "homing_trials",
+            "name": "few_trials",
+            "jobs": 1,
+            "trials": 2,
+            "outliers": [0.0, 0.2],
+            "estimator": {"kind": "homing_ekf"},
+            "compare": ["alv"],
+            "dataset": {"images_per_s": 2.0},
+            "output": {"logs": 1, "report": False},
+        },
+        "homing": HOUSE | {"task": "homing", "start_offset_m": 0.2},
+        "path_following": HOUSE | {"task": "path_following"},
+    }
+    return known.__getitem__
+
+
+@pytest.fixture(autouse=True)
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Units in this process, few in a block, and every state saved."""
+
+    def apart(
+        function: Callable[[Any], Any], arguments: Sequence[Any], *_: object
+    ) -> Iterator[tuple[int, Any]]:
+        for k, argument in enumerate(arguments):
+            yield k, function(argument)
+
+    monkeypatch.setattr("fgslam.runs.units.run_apart", apart)
+    monkeypatch.setattr("fgslam.runs.tasks.homing_views._VIEWS_A_BLOCK", 2)
+    monkeypatch.setattr("fgslam.runs.tasks.homing_trials._BLOCK", 1)
+    monkeypatch.setattr("fgslam.runs.tasks.homing_video._SAVE_EVERY_S", 0.0)
+    monkeypatch.setattr("fgslam.runs.tasks.localisation_queries._SAVE_EVERY_S", 0.0)
+
+
+def run(
+    values: dict[str, Any], folder: Path, existing: ExistingFolder = "refuse", **more: Any
+) -> RunResult:
+    return run_experiment(parse_experiment(values, "test"), folder, existing, **more)
+
+
+def renames(monkeypatch: pytest.MonkeyPatch, most: float, *, after: bool) -> list[Path]:
+    """Counts renamed files from now on; the one of number ``most`` kills, before or after it."""
+    seen: list[Path] = []
+    real = os.replace
+
+    def replace(source: Path, target: Path) -> None:
+        last = len(seen) >= most
+        if last and not after:
+            raise Killed
+        real(source, target)
+        seen.append(Path(target))
+        if last:
+            raise Killed
+
+    monkeypatch.setattr("fgslam.core.atomic_files.os.replace", replace)
+    return seen
+
+
+def untimed(value: Any) -> Any:
+    """A document without what was measured by a clock."""
+    if isinstance(value, dict):
+        kept = {k: v for k, v in value.items() if not set(k.split("_")) & set(_TIMED_VALUES)}
+        return {k: untimed(v) for k, v in kept.items()}
+    return [untimed(item) for item in value] if isinstance(value, list) else value
+
+
+def content_of(folder: Path) -> dict[str, object]:
+    """Every file that says nothing of time, by name."""
+    found: dict[str, object] = {}
+    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+        name = path.relative_to(folder).as_posix()
+        if path.name in _TIMED_FILES or (path.name == "frames.csv" and path.parent != folder):
+            found[name] = "timed"
+        elif path.name == "metrics.json":
+            found[name] = untimed(json.loads(path.read_text(encoding="utf-8")))
+        elif path.name == "comparison.csv":
+            rows = csv.DictReader(path.read_text(encoding="utf-8").splitlines())
+            found[name] = untimed(list(rows))
+        elif path.suffix == ".yaml":
+            found[name] = path.read_text(encoding="utf-8").replace(str(folder), "RUN")
+        else:
+            found[name] = path.read_bytes()
+    return found
+
+
+class Straight:
+    """Uninterrupted runs, each made once."""
+
+    def __init__(self, folder: Path, values_of: Callable[[str], dict[str, Any]]) -> None:
+        self._folder, self._values_of = folder, values_of
+        self._made: dict[str, tuple[dict[str, object], int]] = {}
+
+    def of(self, task: str, folder: Path) -> tuple[dict[str, object], int]:
+        """What a run into ``folder`` leaves there, and how many files it renames."""
+        if task not in self._made:
+            with pytest.MonkeyPatch.context() as patch:
+                count = len(self._count(task, folder, patch))
+            self._made[task] = content_of(folder), count
+            shutil.rmtree(folder)
+        return self._made[task]
+
+    def _count(self, task: str, folder: Path, patch: pytest.MonkeyPatch) -> list[Path]:
+        seen = renames(patch, float("inf"), after=False)
+        assert run(self._values_of(task), folder).status == "finished"
+        return seen
+
+
+@pytest.fixture(scope="module")
+def straight(
+    values_of: Callable[[str], dict[str, Any]], tmp_path_factory: pytest.TempPathFactory
+) -> Straight:
+    return Straight(tmp_path_factory.mktemp("straight"), values_of)
+
+
+def moments(task: str, files: int, count: int) -> list[tuple[int, bool]]:
+    """Seeded moments at which to kill: number of the file, and whether after it."""
+    rng = np.random.default_rng([TASKS.index(task), files])
+    chosen = rng.choice(np.arange(1, files), min(count, files - 1), replace=False)
+    return [(int(k), bool(rng.integers(2))) for k in chosen]
+
+
+def killed_and_resumed(
+    task: str,
+    count: int,
+    straight: Straight,
+    values_of: Callable[[str], dict[str, Any]],
+    tmp_path: Path,
+) -> None:
+    values = values_of(task)
+    expected, files = straight.of(task, tmp_path / "run")
+    for most, after in moments(task, files, count):
+        folder = tmp_path / "run"
+        with pytest.MonkeyPatch.context() as patch:
+            renames(patch, most, after=after)
+            with pytest.raises(Killed):
+                run(values, folder)
+        if not unfinished(folder):
+            shutil.rmtree(folder)
+            continue  # killed after its last file
+        assert run(values, folder, "resume").status == "finished"
+        found = content_of(folder)
+        assert found.keys() == expected.keys(), (most, after)
+        assert [n for n in found if found[n] != expected[n]] == [], (most, after)
+        shutil.rmtree(folder)
+
+
+def unfinished(folder: Path) -> bool:
+    """Whether there is anything left to do."""
+    metrics = folder / "metrics.json"
+    begun = (folder / "units").is_dir() or (folder / "checkpoint.npz").is_file()
+    return begun or not metrics.is_file() or '"finished"' not in metrics.read_text()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_killed_once_a_run_resumes_to_the_same_bytes(
+    task: str,
+    straight: Straight,
+    values_of: Callable[[str], dict[str, Any]],
+    tmp_path: Path,
+) -> None:
+    killed_and_resumed(task, 1, straight, values_of, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_killed_at_ten_moments_a_run_resumes_to_the_same_bytes(
+    task: str,
+    straight: Straight,
+    values_of: Callable[[str], dict[str, Any]],
+    tmp_path: Path,
+) -> None:
+    killed_and_resumed(task, 10, straight, values_of, tmp_path)
