@@ -58,8 +58,6 @@ def run(
     """
     from fgslam.core.errors import ConfigError
     from fgslam.runs.config import load_experiment
-    from fgslam.runs.engine import resume_command
-    from fgslam.runs.run import run_experiment
 
     if overwrite and resume:
         raise ConfigError("--overwrite and --resume exclude each other; give one of them")
@@ -68,6 +66,11 @@ def run(
     settings = load_experiment(config, [*(overrides or ()), *given])
     folder = out or Path("runs") / settings.name
     existing: ExistingFolder = "resume" if resume else "overwrite" if overwrite else "refuse"
+
+    # Not before: a wrong key is answered before any library of numbers is loaded.
+    from fgslam.runs.engine import resume_command
+    from fgslam.runs.run import run_experiment
+
     with _under_way() as (progress, stopped):
         result = run_experiment(settings, folder, existing, progress, stopped)
     _show([result], resume_command(folder))

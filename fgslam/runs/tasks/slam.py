@@ -163,13 +163,13 @@ def _finish(begun: BegunRun, context: Context) -> SlamResult:
     if outputs.config.output.pictures:
         pictures = tuple(draw_run(outputs.folder, figures_of(outputs)))
     compared = _compare(outputs, live, context)
+    if outputs.config.output.report:
+        report_from_folder(outputs.folder)
     status: Status = "finished"
     if compared is not None and context.stopped():
         status = "interrupted"  # the replays that are missing are for the next session
     else:
         checkpoint.remove(outputs.folder)
-    if outputs.config.output.report:
-        report_from_folder(outputs.folder)
     return _result(outputs, status, live, pictures, compared, about_map)
 
 
