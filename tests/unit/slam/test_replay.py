@@ -43,7 +43,7 @@ def faulty(monkeypatch: pytest.MonkeyPatch, **methods: Any) -> None:
         assert prior is None  # no saved map here
         return kind(rig, settings, factory.Prediction(np.eye(4), np.zeros((6, 6))))
 
-    monkeypatch.setattr(module, "make_estimator", make)
+    monkeypatch.setattr(module, "made_or_given", make)
 
 
 def run(log: MeasurementLog) -> Replay:
@@ -127,7 +127,7 @@ def test_a_fault_ends_the_replay_with_frame_and_reason(
 def replay_of(log: MeasurementLog, frames: int) -> Replay:
     """The first frames of the log through the sound estimator."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "make_estimator", factory.make_estimator)
+        patch.setattr(module, "made_or_given", factory.made_or_given)
         return run(MeasurementLog(log.rig, log.motion_model, log.increments[:frames]))
 
 
