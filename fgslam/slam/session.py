@@ -64,7 +64,7 @@ class Session:
 
         Args:
             rig: the rectified cameras, two or three.
-            estimator: the kind (`dead_reckoning`, `landmark_kalman`, `landmark_kalman_graph`,
+            estimator: the kind (`odometry`, `landmark_kalman`, `landmark_kalman_graph`,
                 `ekf`, `fixed_lag`, `isam2` or `batch`), settings of one, or an own object with the
                 members of :class:`fgslam.backend.protocol.Estimator`.
             frontend: settings of features, matching and tracking; None for the defaults.

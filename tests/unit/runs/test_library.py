@@ -1,0 +1,221 @@
+"""Recordings, replays and maps as the library offers them, and wrong use of each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recordings import write_recording
+
+import fgslam as fg
+from fgslam.errors import (
+    ConfigError,
+    DatasetError,
+    FgslamError,
+    MapError,
+    MeasurementLogError,
+    OutputError,
+)
+from fgslam.runs.live import SlamResult, override_texts
+
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording with images, odometry and truth, in our own layout."""
+    return write_recording(tmp_path_factory.mktemp("recording"), frames=FRAMES)
+
+
+@pytest.fixture(scope="module")
+def driven(folder: Path) -> tuple[fg.Slam, SlamResult]:
+    recording = fg.open_recording(folder)
+    with fg.Slam(recording.rig, "landmark_kalman") as slam:
+        for t, images, odometry in recording:
+            slam.track(t, images, odometry)
+    return slam, slam.result()
+
+
+# --------------------------------------------------------------------------------------------
+# Recordings
+
+
+def test_a_recording_gives_left_right_and_top_with_odometry(folder: Path) -> None:
+    recording = fg.open_recording(folder)
+    frames = list(recording)
+    assert len(frames) == len(recording) == FRAMES
+    t, images, odometry = frames[3]
+    assert t == recording.timestamps[3]
+    inside = recording.sequence.frame(3).images
+    assert images is not None
+    assert odometry is not None
+    for given, stored in zip(images, (inside[1], inside[0], inside[2]), strict=True):
+        np.testing.assert_array_equal(given, stored)
+    assert frames[0][2] is None
+    assert recording.ground_truth is not None
+    assert recording[-1][0] == frames[-1][0]
+
+
+def test_an_unreadable_frame_has_no_images_and_tracking_goes_on(folder: Path) -> None:
+    copy = write_recording(folder.parent / "damaged", frames=FRAMES)
+    (copy / "left" / "000002.png").write_bytes(b"")
+    recording = fg.open_recording(copy)
+    assert [images is None for _, images, _ in recording] == [k == 2 for k in range(FRAMES)]
+    slam = fg.Slam(recording.rig, "landmark_kalman")
+    steps = [slam.track(t, images, odometry).status.value for t, images, odometry in recording]
+    slam.close()
+    assert steps[2] == "no_image"
+    assert steps[3] == "ok"
+
+
+def test_overrides_choose_frames(folder: Path) -> None:
+    assert len(fg.open_recording(folder, {"dataset.start": 1, "dataset.stride": 2})) == 3
+    assert len(fg.open_recording(folder, ["dataset.stop=2"])) == 2
+
+
+# --------------------------------------------------------------------------------------------
+# Logs, replays, tables
+
+
+def test_a_replay_of_the_log_gives_the_live_result(
+    driven: tuple[fg.Slam, SlamResult], tmp_path: Path
+) -> None:
+    slam, live = driven
+    slam.log.save(tmp_path / "drive.npz")
+    replayed = fg.replay(fg.MeasurementLog.load(str(tmp_path / "drive.npz")), "landmark_kalman")
+    assert not replayed.failure
+    np.testing.assert_allclose(
+        replayed.estimate.trajectory.poses, live.trajectory.poses, rtol=0, atol=1e-12
+    )
+
+
+def test_live_and_replayed_results_stand_in_one_table(
+    driven: tuple[fg.Slam, SlamResult], folder: Path
+) -> None:
+    slam, live = driven
+    answers: dict[str, Any] = {"live": live, "isam2": fg.replay(slam.log, "isam2")}
+    table = fg.compare(answers, fg.open_recording(folder).ground_truth)
+    assert table.index.tolist() == ["live", "isam2"]
+    assert table["frames"].tolist() == [FRAMES, FRAMES]
+    assert (table["ate_m"] < 0.05).all()
+    assert (table["ms"] > 0.0).all()
+    figure = fg.plot(answers)
+    assert {"live", "isam2"} <= {trace.name for trace in figure.data}
+
+
+def test_an_estimator_brought_along_is_replayed_and_named(
+    driven: tuple[fg.Slam, SlamResult],
+) -> None:
+    from fgslam.slam.choosing import chosen_estimator
+    from fgslam.slam.factory import made_or_given
+
+    log = driven[0].log
+    own = made_or_given(log.rig, chosen_estimator("ekf"))
+    replayed, named = fg.replay(log, own), fg.replay(log, "ekf")
+    assert replayed.kind == replayed.title == "ekf"
+    np.testing.assert_array_equal(
+        replayed.estimate.trajectory.poses, named.estimate.trajectory.poses
+    )
+
+
+# --------------------------------------------------------------------------------------------
+# Results on disk
+
+
+def test_a_trajectory_survives_its_file(driven: tuple[fg.Slam, SlamResult], tmp_path: Path) -> None:
+    path = driven[1].trajectory
+    path.save(tmp_path / "path.tum")
+    again = fg.Trajectory.load(tmp_path / "path.tum")
+    np.testing.assert_allclose(again.poses, path.poses, rtol=0, atol=1e-9)
+    path.save(str(tmp_path / "path.kitti"))
+    assert len((tmp_path / "path.kitti").read_text().splitlines()) == FRAMES
+    with pytest.raises(OutputError, match=r"use \.tum or \.kitti"):
+        path.save(tmp_path / "path.csv")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".off"])
+def test_a_map_is_written_as_a_point_cloud(
+    driven: tuple[fg.Slam, SlamResult], tmp_path: Path, suffix: str
+) -> None:
+    place = driven[1].map
+    place.save(tmp_path / f"map{suffix}")
+    head = (tmp_path / f"map{suffix}").read_bytes()[:2000]
+    assert str(len(place)).encode() in head
+
+
+def test_a_saved_map_locates_a_frame_and_refuses_another_rig(
+    driven: tuple[fg.Slam, SlamResult], folder: Path, tmp_path: Path
+) -> None:
+    live = driven[1]
+    live.map.save(tmp_path / "place.fgmap")
+    place = fg.Map.load(tmp_path / "place.fgmap")
+    np.testing.assert_array_equal(place.positions, live.map.positions)
+    assert len(place.trajectory) == FRAMES
+    recording = fg.open_recording(folder)
+    images = recording[4][1]
+    assert images is not None
+    found, again = (place.locate(recording.rig, images) for _ in range(2))
+    assert found.found, found.why
+    np.testing.assert_allclose(found.wTc[:3, 3], live.trajectory.poses[4][:3, 3], rtol=0, atol=0.05)
+    np.testing.assert_array_equal(found.wTc, again.wTc)
+    assert np.linalg.eigvalsh(found.covariance).min() > 0.0
+    blank = tuple(np.zeros_like(image) for image in images)
+    refused = place.locate(recording.rig, blank)
+    assert not refused.found
+    assert refused.why
+    other = fg.StereoRig(width=320, height=240, fx=99, fy=99, cx=160, cy=120, baseline=0.1)
+    with pytest.raises(MapError, match="another rig"):
+        place.locate(other, images[:2])
+
+
+# --------------------------------------------------------------------------------------------
+# Overrides and wrong names
+
+
+def test_overrides_are_written_as_on_the_command_line() -> None:
+    given = {"seed": 3, "a.b": 1e-5, "c": None, "d": [1, 2], "e": "06", "f": np.float64(0.5)}
+    texts = override_texts(given)
+    assert texts == ["seed=3", "a.b=1.0e-05", "c=null", "d=[1, 2]", "e=06", "f=0.5"]
+    assert override_texts(["seed=3"]) == ["seed=3"]
+
+
+def test_a_session_is_configured_by_name_with_overrides(folder: Path) -> None:
+    rig = fg.open_recording(folder).rig
+    slam = fg.Slam.from_config(
+        "kitti06", {"estimator.kind": "ekf", "dataset.start": 5, "dataset.stride": 3}, rig=rig
+    )
+    assert slam.pipeline.estimator.kind == "ekf"
+    assert slam.numbering == (5, 3)
+    assert not slam.pipeline.motion.uses_odometry
+
+
+def wrong_uses() -> dict[str, tuple[type[FgslamError], str, Any]]:
+    return {
+        "experiment": (ConfigError, "comes with fgslam", lambda _: fg.run("lab_lop")),
+        "file": (ConfigError, "no such file", lambda _: fg.run("nowhere/x.yaml")),
+        "key": (ConfigError, "unknown key sed", lambda p: fg.run("lab_loop", p, {"sed": 1})),
+        "one text": (ConfigError, "is one text", lambda p: fg.run("lab_loop", p, "seed=1")),
+        "array": (ConfigError, "seed is a ndarray", lambda p: fg.run("x", p, {"seed": np.ones(2)})),
+        "folder": (DatasetError, "none of the known layouts", lambda p: fg.open_recording(p)),
+        "session": (ConfigError, "comes with fgslam", lambda _: fg.Slam.from_config("kiti06")),
+        "homing": (ConfigError, "homing", lambda _: fg.Slam.from_config("homing_lab")),
+        "map": (MapError, "no such file", lambda p: fg.Map.load(p / "no.fgmap")),
+        "log": (MeasurementLogError, "no such file", lambda p: fg.MeasurementLog.load(p / "x.npz")),
+        "path": (DatasetError, "check the path", lambda p: fg.Trajectory.load(p / "x.tum")),
+        "world": (ConfigError, "known: lab", lambda _: fg.rendered_recording("moon")),
+        "begins in a map": (
+            ConfigError,
+            r"use\s+fgslam\.run",
+            lambda _: fg.Slam.from_config("return_to_map"),
+        ),
+    }
+
+
+@pytest.mark.parametrize("name", wrong_uses())
+def test_wrong_use_is_answered_in_one_line(name: str, tmp_path: Path) -> None:
+    error, words, use = wrong_uses()[name]
+    with pytest.raises(error, match=words) as caught:
+        use(tmp_path)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,348 @@
+"""A session: frames pushed in, results at any time, wrong use refused without a trace."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from rings import on_ring, walls
+from simulated import RIG, FeatureWorld, assert_same_bits
+
+from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.settings import LandmarkKalmanSettings
+from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.errors import (
+    CalibrationError,
+    ConfigError,
+    EstimatorError,
+    FgslamError,
+    FrameError,
+    OdometryError,
+    SessionError,
+)
+from fgslam.core.estimates import EgoMotionStatus, Prediction
+from fgslam.core.features import Features
+from fgslam.core.measurements import Odometry
+from fgslam.datasets.odometry_settings import ConstantVelocitySettings
+from fgslam.slam.results import Result
+from fgslam.slam.session import Session
+
+FRAMES = 7
+RIGHT, LEFT, TOP = range(3)
+
+
+class Views:
+    """Images that only say which frame and camera they are, and the features seen in each.
+
+    So a session is driven by images, and finding features costs nothing.
+    """
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(5)
+        world = FeatureWorld(walls(rng), rng)
+        self.poses = [on_ring(0.4 * k) for k in range(FRAMES)]
+        self.seen = [world.features(wTc, 0.2) for wTc in self.poses]
+
+    def images(self, k: int) -> tuple[Image, ...]:
+        """Left, right, top."""
+        return tuple(self._image(k, camera) for camera in (LEFT, RIGHT, TOP))
+
+    def odometry(self, k: int) -> FloatArray:
+        step = g.inverse(self.poses[k - 1]) @ self.poses[k]
+        return np.asarray(RIG.bTc @ step @ g.inverse(RIG.bTc))
+
+    def find(self, image: Image) -> Features:
+        return self.seen[int(image[0, 0])][int(image[0, 1])]
+
+    @staticmethod
+    def _image(k: int, camera: int) -> Image:
+        image = np.zeros((RIG.height, RIG.width), np.uint8)
+        image[0, :2] = k, camera
+        return image
+
+
+@pytest.fixture(scope="module")
+def views() -> Views:
+    return Views()
+
+
+def session(views: Views, estimator: Any = "landmark_kalman", **more: Any) -> Session:
+    return Session(RIG, estimator, features=views.find, **more)
+
+
+def push(slam: Session, views: Views, frames: Iterator[int] | range) -> None:
+    for k in frames:
+        slam.track(0.5 * k, views.images(k), views.odometry(k) if k else None)
+
+
+def driven(views: Views, estimator: Any = "landmark_kalman") -> Session:
+    slam = session(views, estimator)
+    push(slam, views, range(FRAMES))
+    return slam
+
+
+def assert_same_result(first: Session, second: Session) -> None:
+    assert_same_bits(first.result().estimate, second.result().estimate)
+    assert_same_bits(first.log.to_arrays(), second.log.to_arrays())
+
+
+# --------------------------------------------------------------------------------------------
+# Frames and results
+
+
+def test_poses_follow_the_camera(views: Views) -> None:
+    result = driven(views).result()
+    truth = [g.inverse(views.poses[0]) @ wTc for wTc in views.poses]
+    off = result.trajectory.poses[:, :3, 3] - np.array(truth)[:, :3, 3]
+    assert np.linalg.norm(off, axis=1).max() < 0.05
+    assert len(result.estimate.landmarks) > 100
+    assert result.column("status").tolist() == ["first"] + ["ok"] * (FRAMES - 1)
+
+
+def test_a_step_says_what_was_matched(views: Views) -> None:
+    slam = session(views)
+    first = slam.track(0.0, views.images(0))
+    second = slam.track(0.5, views.images(1), views.odometry(1))
+    assert first.status is EgoMotionStatus.FIRST
+    assert (len(first.matches), len(first.inliers)) == (0, 0)
+    assert len(first.new) == first.landmarks > 0
+    assert (second.index, second.timestamp) == (1, 0.5)
+    assert len(second.matches) == len(second.inliers) > 20
+    assert second.covariance.shape == (6, 6)
+    assert np.isin(second.matches.ids, first.new.ids).all()
+
+
+@pytest.mark.parametrize("estimator", ["landmark_kalman", "ekf", "isam2", "batch", "fixed_lag"])
+def test_results_asked_for_between_frames_change_nothing(views: Views, estimator: str) -> None:
+    asked = session(views, estimator)
+    for k in range(FRAMES):
+        push(asked, views, range(k, k + 1))
+        assert len(asked.result().trajectory) == k + 1
+    assert_same_result(asked, driven(views, estimator))
+
+
+def test_sessions_side_by_side_do_not_disturb_each_other(views: Views) -> None:
+    together = [session(views, kind) for kind in ("isam2", "ekf", "isam2")]
+    for k in range(FRAMES):
+        for slam in together:
+            push(slam, views, range(k, k + 1))
+    for slam, kind in zip(together, ("isam2", "ekf", "isam2"), strict=True):
+        assert_same_result(slam, driven(views, kind))
+
+
+def test_sessions_in_threads_do_not_disturb_each_other(views: Views) -> None:
+    slams = [session(views, "ekf") for _ in range(2)]
+    threads = [threading.Thread(target=push, args=(s, views, range(FRAMES))) for s in slams]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    alone = driven(views, "ekf")
+    for slam in slams:
+        assert_same_result(slam, alone)
+
+
+def test_without_odometry_the_velocity_is_kept(views: Views) -> None:
+    slam = session(views)
+    for k in range(FRAMES):
+        slam.track(0.5 * k, views.images(k))
+    assert all(increment.odometry is None for increment in slam.log)
+    assert slam.result().column("status").tolist()[1:] == ["ok"] * (FRAMES - 1)
+
+
+def test_a_session_of_constant_velocity_ignores_odometry(views: Views) -> None:
+    settings = ConstantVelocitySettings()
+    without, given = (session(views, odometry=settings) for _ in range(2))
+    push(given, views, range(FRAMES))
+    for k in range(FRAMES):
+        without.track(0.5 * k, views.images(k))
+    assert_same_result(given, without)
+
+
+def test_a_bare_motion_gets_the_noise_of_the_settings(views: Views) -> None:
+    slam = session(views)
+    push(slam, views, range(2))
+    measured = slam.log.increments[1].odometry
+    assert measured is not None
+    sigma = np.sqrt(np.diag(measured.covariance))
+    assert sigma[:3] == pytest.approx(sigma[0])
+    assert 0.002 <= sigma[5] < 0.02  # at least the floor, at most 2 % of the step
+
+
+def test_odometry_with_its_own_covariance_is_used_as_it_is(views: Views) -> None:
+    slam = session(views)
+    slam.track(0.0, views.images(0))
+    stated = Odometry(views.odometry(1), np.diag([1e-4] * 3 + [4e-4] * 3))
+    slam.track(0.5, views.images(1), stated)
+    measured = slam.log.increments[1].odometry
+    assert measured is not None
+    assert np.trace(measured.covariance) == pytest.approx(3e-4 + 12e-4)
+
+
+def test_a_frame_without_images_is_placed_by_odometry(views: Views) -> None:
+    slam = session(views)
+    push(slam, views, range(3))
+    step = slam.track(1.5, None, views.odometry(3))
+    assert step.status is EgoMotionStatus.NO_IMAGE
+    expected = g.inverse(views.poses[0]) @ views.poses[3]
+    np.testing.assert_allclose(step.wTc[:3, 3], expected[:3, 3], rtol=0, atol=0.05)
+    assert slam.track(2.0, views.images(4), views.odometry(4)).status is EgoMotionStatus.OK
+
+
+def test_the_log_counts_frames_as_their_recording_does(views: Views) -> None:
+    slam = session(views)
+    slam.numbering = (10, 3)
+    push(slam, views, range(3))
+    assert [increment.index for increment in slam.log] == [10, 13, 16]
+
+
+# --------------------------------------------------------------------------------------------
+# Wrong use
+
+
+def turned(motion: FloatArray) -> FloatArray:
+    out = motion.copy()
+    out[:3, :3] *= 1.1
+    return out
+
+
+WRONG: dict[str, tuple[type[FgslamError], str, dict[str, Any]]] = {
+    "time stands still": (FrameError, "does not come after", {"t": 1.0}),
+    "time runs back": (FrameError, "order of their times", {"t": 0.4}),
+    "time is NaN": (FrameError, "not finite", {"t": float("nan")}),
+    "time is no number": (FrameError, "not a number", {"t": "now"}),
+    "one image": (FrameError, "1 images given", {"images": lambda v: v[:1]}),
+    "two images": (FrameError, "without vertical_baseline", {"images": lambda v: v[:2]}),
+    "half size": (FrameError, "160x120", {"images": lambda v: tuple(x[::2, ::2] for x in v)}),
+    "float images": (FrameError, "float64", {"images": lambda v: tuple(x / 255.0 for x in v)}),
+    "flat image": (FrameError, r"shape \(240,\)", {"images": lambda v: (v[0][:, 0], *v[1:])}),
+    "two channels": (FrameError, "red, green", {"images": lambda v: (np.dstack(v[:2]), *v[1:])}),
+    "odometry is NaN": (OdometryError, "not finite", {"odometry": np.full((4, 4), np.nan)}),
+    "odometry is flat": (OdometryError, r"shape \(3,\)", {"odometry": np.zeros(3)}),
+    "odometry is text": (OdometryError, "no array", {"odometry": "fast"}),
+    "odometry stretches": (OdometryError, "rigid", {"odometry": turned(np.eye(4))}),
+    "covariance is negative": (
+        OdometryError,
+        "symmetric and positive",
+        {"odometry": Odometry(np.eye(4), -np.eye(6))},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_refused_frame_leaves_the_session_as_it_was(views: Views, name: str) -> None:
+    error, words, given = WRONG[name]
+    slam = session(views)
+    push(slam, views, range(3))
+    spoil = given.get("images", lambda images: images)
+    with pytest.raises(error, match=words) as caught:
+        slam.track(
+            given.get("t", 1.5), spoil(views.images(3)), given.get("odometry", views.odometry(3))
+        )
+    assert "\n" not in str(caught.value)
+    push(slam, views, range(3, FRAMES))
+    assert_same_result(slam, driven(views))
+
+
+def test_a_closed_session_takes_no_frame_and_keeps_its_results(views: Views) -> None:
+    with session(views) as slam:
+        push(slam, views, range(3))
+    with pytest.raises(SessionError, match="closed; make a new one"):
+        push(slam, views, range(3, 4))
+    assert len(slam.result().trajectory) == 3
+    slam.close()
+
+
+def test_a_session_without_frames_has_no_result(views: Views) -> None:
+    with pytest.raises(SessionError, match="call track first"):
+        session(views).result()
+
+
+class Failing(LandmarkKalman):
+    """Fails in the fourth frame."""
+
+    def update(self, increment, tracking):  # type: ignore[no-untyped-def]
+        if increment.index == 3:
+            raise EstimatorError("no solution")
+        return super().update(increment, tracking)
+
+
+def test_after_a_failure_of_the_estimator_the_results_before_it_remain(views: Views) -> None:
+    start = Prediction(np.eye(4), np.zeros((6, 6)))
+    slam = session(views, Failing(RIG, LandmarkKalmanSettings(), start))
+    push(slam, views, range(3))
+    with pytest.raises(EstimatorError, match="no solution"):
+        push(slam, views, range(3, 4))
+    with pytest.raises(SessionError, match=r"failed at t = 1\.5.* s \(no solution\)"):
+        push(slam, views, range(4, 5))
+    result = slam.result()
+    assert isinstance(result, Result)
+    assert len(result.trajectory) == len(slam.log) == 3
+
+
+@pytest.mark.parametrize(
+    ("estimator", "words"),
+    [
+        ("isam", r"no kind 'isam'; did you mean isam2\?"),
+        ("gauss", "known: odometry, landmark_kalman"),
+        (object(), "object lacks kind, supports, predict"),
+    ],
+)
+def test_an_unknown_estimator_is_refused_with_what_is_known(estimator: Any, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        Session(RIG, estimator)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"baseline": 0.0}, "distance between the cameras"),
+        ({"baseline": -0.1}, "left and right are swapped"),
+        ({"fx": float("nan")}, "focal length in pixels"),
+        ({"width": 320.5}, "size in pixels"),
+        ({"cx": 1e6}, "principal point"),
+        ({"bTc": np.zeros((4, 4))}, "rigid motion"),
+    ],
+)
+def test_an_impossible_rig_is_refused(change: dict[str, Any], words: str) -> None:
+    with pytest.raises(CalibrationError, match=words):
+        Session(dataclasses.replace(RIG, **change))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda f: "features", "returned str"),
+        (
+            lambda f: dataclasses.replace(f, descriptors=f.descriptors[:, :64]),
+            r"descriptors has shape \(\d+, 64\)",
+        ),
+        (
+            lambda f: dataclasses.replace(f, descriptors=f.descriptors.astype(float)),
+            "give uint8",
+        ),
+        (lambda f: dataclasses.replace(f, xy=f.xy[:-1]), "xy has shape"),
+    ],
+)
+def test_features_of_another_form_are_refused_and_the_session_goes_on(
+    views: Views, change: Any, words: str
+) -> None:
+    broken = False
+
+    def find(image: Image) -> Any:
+        found = views.find(image)
+        return change(found) if broken else found
+
+    slam = Session(RIG, "landmark_kalman", features=find)
+    push(slam, views, range(3))
+    broken = True
+    with pytest.raises(ConfigError, match=words):
+        push(slam, views, range(3, 4))
+    broken = False
+    push(slam, views, range(3, FRAMES))
+    assert_same_result(slam, driven(views))
