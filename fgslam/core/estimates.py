@@ -8,6 +8,7 @@ from enum import Enum
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.brief import Brief
 from fgslam.core.rows import Rows
 from fgslam.core.trajectories import Trajectory
 
@@ -25,7 +26,7 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LandmarkMap(Rows):
     """Landmark positions of an estimator, ids ascending.
 
@@ -51,8 +52,8 @@ class LandmarkMap(Rows):
         return rows
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Prediction(Brief):
     """Pose expected before the frame's observations: ``wTc`` (4, 4) and its covariance (6, 6)."""
 
     wTc: FloatArray
@@ -80,8 +81,8 @@ class EgoMotionStatus(str, Enum):
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EgoMotion:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class EgoMotion(Brief):
     """Result of the least-squares pose (Se et al. 3.3).
 
     Attributes:
@@ -135,8 +136,8 @@ class Verdict(str, Enum):
     INACCURATE = "inaccurate"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Relocalisation:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Relocalisation(Brief):
     """The pose of a frame in a map, found without a prior, and why it is believed or refused.
 
     Attributes:
@@ -169,8 +170,8 @@ class Relocalisation:
         return self.verdict is Verdict.FOUND
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class UpdateStats:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class UpdateStats(Brief):
     """What an update did: pose afterwards and the numbers that tests of consistency need.
 
     Attributes:
@@ -190,8 +191,8 @@ class UpdateStats:
     closed: tuple[bool, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Estimate:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Estimate(Brief):
     """An estimator's whole answer.
 
     Attributes:

@@ -12,7 +12,7 @@ from fgslam.core.measurements import Observations
 from fgslam.core.rows import Rows
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Features(Rows):
     """SIFT features of one image.
 
@@ -29,7 +29,7 @@ class Features(Rows):
     descriptors: ByteArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class StereoFeatures(Rows):
     """Features matched over the rig: the paper's [r, c, s, o, d, X, Y, Z] (Se et al. 3).
 
@@ -82,7 +82,7 @@ Words = npt.NDArray[np.int16]
 """(v,) the cell of the vocabulary (``frontend.features.vocabulary``) of each descriptor."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LandmarkAppearances(Rows):
     """How landmarks look, one row a stored view; a landmark may have several (Se et al. 6.3).
 

@@ -28,6 +28,7 @@ from fgslam.core.array_files import (
     write_arrays,
 )
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
+from fgslam.core.brief import Brief
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
 from fgslam.core.sensors import CameraRig, RangeBearingSensor, Sensor
@@ -67,8 +68,8 @@ _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baselin
 _SENSOR_KEYS = {"stereo": _RIG, "range_bearing": ("max_range_m",)}
 
 
-@dataclass(slots=True, eq=False)
-class MeasurementLog:
+@dataclass(slots=True, eq=False, repr=False)
+class MeasurementLog(Brief):
     """Measurements of a run, frame by frame.
 
     Attributes:

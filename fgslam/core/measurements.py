@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.brief import Brief
 from fgslam.core.rows import Rows
 
 
@@ -18,8 +19,8 @@ class MeasurementType(str, Enum):
     LOOP = "loop"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Odometry:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Odometry(Brief):
     """Motion between two consecutive frames, with its uncertainty.
 
     Attributes:
@@ -34,7 +35,7 @@ class Odometry:
     measured: bool = True
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Observations(Rows):
     """Landmark observations of one frame, with their identity.
 
@@ -54,8 +55,8 @@ class Observations(Rows):
     is_new: BoolArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LoopClosure:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LoopClosure(Brief):
     """A place seen again: the frame sees landmarks of an earlier frame, under new identities.
 
     Attributes:
@@ -77,8 +78,8 @@ class LoopClosure:
     merged: IntArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Increment:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Increment(Brief):
     """Everything that one frame adds to the problem: what the log stores, what estimators consume.
 
     Attributes:

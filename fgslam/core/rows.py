@@ -9,9 +9,10 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, IntArray
+from fgslam.core.brief import Brief
 
 
-class Rows:
+class Rows(Brief):
     """Length, choice and concatenation of a frozen dataclass of arrays (n, ...).
 
     Fields may be rows themselves, or None where they are not known.

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from fgslam.core.arrays import FloatArray
+from fgslam.core.brief import Brief
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraRig:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class CameraRig(Brief):
     """Two or three rectified pinhole cameras with equal intrinsics; the right one is the reference.
 
     The left camera sits ``baseline`` metres along the reference camera's -x axis, the top camera
@@ -41,8 +42,8 @@ class CameraRig:
         return 2 if self.vertical_baseline is None else 3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RangeBearingSensor:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class RangeBearingSensor(Brief):
     """Measures (azimuth, elevation, range) of landmarks: radians, metres; axes as a camera's.
 
     ``azimuth = atan2(x, z)`` is positive to the right, ``elevation = atan2(-y, hypot(x, z))`` up.

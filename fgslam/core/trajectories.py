@@ -14,6 +14,7 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.atomic_files import write_text
+from fgslam.core.brief import Brief
 from fgslam.core.errors import DatasetError, OutputError
 from fgslam.core.geometry import pose, quaternion_from_rotation, rotation_from_quaternion
 
@@ -33,8 +34,8 @@ _COVARIANCE_HEADER = (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Trajectory(Brief):
     """Stamped poses of the reference camera.
 
     Attributes:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.brief import Brief
 from fgslam.core.estimates import Trajectory
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
@@ -22,8 +23,8 @@ OdometrySource: TypeAlias = Callable[[FloatArray], tuple[Odometry | None, ...]]
 """Body motions between consecutive stamps (n,): n - 1 of them, None where nothing was recorded."""
 
 
-@dataclass(frozen=True, eq=False)
-class Recording:
+@dataclass(frozen=True, eq=False, repr=False)
+class Recording(Brief):
     """Selected frames of a recording on disk; images are read when asked for.
 
     Attributes:

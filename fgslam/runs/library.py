@@ -39,7 +39,7 @@ _WORLDS = {"lab": "lab_loop"}
 """Worlds that are rendered, and the experiment that describes each."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RecordedFrames:
     """A recording as frames to track: ``for t, images, odometry in recording``.
 
@@ -48,6 +48,9 @@ class RecordedFrames:
     """
 
     sequence: Sequence
+
+    def __repr__(self) -> str:
+        return f"<recording {self.name}: {len(self)} frames, {self.rig}>"
 
     @property
     def name(self) -> str:

@@ -27,7 +27,7 @@ Overrides = Mapping[str, Any] | Iterable[str]
 """Settings by dotted key, {"seed": 3, "frontend.sift.scale_levels": 6}; or as texts "seed=3"."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SlamResult(Result):
     """A session's result with its map.
 

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.brief import Brief
 from fgslam.core.errors import MapError, OutputError
 from fgslam.core.estimates import LandmarkMap, Relocalisation, Trajectory
 from fgslam.core.saved_map import SavedMap, load_map, require_rig, save_map
@@ -26,8 +27,8 @@ _VALID_HITS = 3  # where the map does not say how many its run asked for (Se et 
 _SUFFIX = ".fgmap"
 
 
-@dataclass(frozen=True, eq=False)
-class Map:
+@dataclass(frozen=True, eq=False, repr=False)
+class Map(Brief):
     """Landmarks with their covariances and appearance: a session's, or one that was saved.
 
     Attributes:

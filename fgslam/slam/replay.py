@@ -17,6 +17,7 @@ import numpy.typing as npt
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.arrays import FloatArray
+from fgslam.core.brief import Brief
 from fgslam.core.errors import ConfigError, FgslamError, MeasurementLogError
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
@@ -57,8 +58,8 @@ class ReplayRow(NamedTuple):
     solve_ms: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Replay:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Replay(Brief):
     """What an estimator made of a log.
 
     Attributes:

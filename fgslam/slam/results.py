@@ -10,14 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.brief import Brief
 from fgslam.core.estimates import EgoMotionStatus, Estimate, Trajectory
 from fgslam.core.measurements import Observations
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.recorder import STAGES, RunRecorder
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Step:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Step(Brief):
     """One frame tracked.
 
     Attributes:
@@ -66,8 +67,8 @@ class Step:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Result:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Result(Brief):
     """Everything that a session knows at one moment.
 
     Attributes:
