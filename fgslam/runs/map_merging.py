@@ -11,7 +11,6 @@ from fgslam.core.geometry import so3_log
 from fgslam.core.saved_map import load_map, require_rig, save_map
 from fgslam.frontend.places.map_alignment import align_maps
 from fgslam.frontend.places.map_fusion import merge_maps
-from fgslam.frontend.places.settings import MergeSettings
 
 _SEED = 0  # the same maps give the same bytes
 
@@ -29,7 +28,7 @@ def merge_files(first: Path, second: Path, out: Path, overwrite: bool = False) -
     a, b = load_map(first), load_map(second)
     require_rig(b, a.rig, str(second))
     rng = np.random.default_rng(_SEED)
-    found = align_maps(a, b, MergeSettings(), rng, f"{first} and {second}")
+    found = align_maps(a, b, rng, f"{first} and {second}")
     merged = merge_maps(a, b, found)
     size = save_map(merged, out)
     x, y, z = found.aTb[:3, 3]

@@ -1,8 +1,8 @@
 """Lays one map onto another by what their landmarks look like and where they are.
 
 Tentative matches by appearance, RANSAC over triples, least squares weighted by both covariances,
-then every landmark that the alignment brings near one that looks like it. The verdict refuses
-rather than guesses. docs/derivations/map_alignment.md.
+then every landmark that the alignment brings near one that looks like it. It refuses rather
+than guesses. docs/derivations/map_alignment.md.
 """
 
 from __future__ import annotations
@@ -26,12 +26,24 @@ from fgslam.core.rows import Rows
 from fgslam.core.saved_map import SavedMap
 from fgslam.frontend.places.relocalisation.alignment import align_in_space
 from fgslam.frontend.places.relocalisation.appearance_index import AppearanceIndex
-from fgslam.frontend.places.settings import MergeSettings
 
 _NEIGHBOURS = 6  # views asked for: enough to pass over a place's own and reach the next
 _HYPOTHESES = 400  # rigid triples that are scored
-_RIVALS = 8  # of the hypotheses elsewhere that are refined: the best ones
-_LEAST_SPREAD_M = 0.3  # smaller triangles turn the map by more than least squares mends
+_MAX_DISTANCE = 250.0  # of descriptors, whose norm is 512
+_RATIO = 0.8  # nearest place's distance over the next one's, at most
+_SAME_PLACE_M = 0.3  # landmarks this near to one another are one place
+_SIZE_RATIO = 1.6  # of two landmarks' physical sizes, at most
+_SLACK_M = 0.03  # by how much maps bend, per axis: their covariances do not know it
+_GATE_SIGMAS = 3.4  # largest normalised distance of two observations of a landmark
+_SAMPLES = 60_000  # triples of matches drawn
+_MIN_PAIRS = 20  # fewer landmarks in common are no overlap
+_ELSEWHERE_M = 0.5  # alignments farther apart than this, or turned by more, are different ones
+_ELSEWHERE_DEG = 15.0
+_AMBIGUOUS_SHARE = 0.5  # of the best alignment's matches: the second-best must have fewer
+_OVERLAP_SHARE = 0.15  # of the landmarks among the other map's, least share that is found there:
+# one poster in common does not make two places one
+_COMPETING = 8  # hypotheses elsewhere that are refined: the best ones
+_LEAST_SPREAD_M = 0.3  # smaller triangles turn the map by more than least squares corrects
 _ROUNDS = 8  # of least squares and choosing anew
 _AT_ONCE = 8192  # pairs of views compared together; their bytes stay in the cache
 _AMONG_M = 0.5  # a landmark this near to one of the other map's lies among them
@@ -65,53 +77,50 @@ class Alignment:
     found: int
 
 
-def align_maps(
-    a: SavedMap, b: SavedMap, settings: MergeSettings, rng: np.random.Generator, names: str
-) -> Alignment:
+def align_maps(a: SavedMap, b: SavedMap, rng: np.random.Generator, names: str) -> Alignment:
     """Where ``b`` lies in ``a``.
 
     Args:
         a: the map whose world it shall be.
         b: the other one.
-        settings: gates and bounds.
         rng: draws the samples.
         names: of both maps, for messages.
 
     Raises:
         MapError: they do not overlap, or there are several ways to lay them onto each other.
     """
-    tentative = tentative_pairs(a, b, settings)
+    tentative = tentative_pairs(a, b)
     n = len(tentative)
-    if n < settings.min_pairs:
+    if n < _MIN_PAIRS:
         raise MapError(
-            f"{names}: only {n} landmarks look alike, {settings.min_pairs} are needed; the maps do "
+            f"{names}: only {n} landmarks look alike, {_MIN_PAIRS} are needed; the maps do "
             "not overlap"
         )
-    problem = _Points.of(a, b, tentative, settings.slack_m)
-    poses = _hypotheses(problem, settings, rng)
-    counts = np.array([int(problem.within(aTb, settings.gate_sigmas).sum()) for aTb in poses])
-    if not len(counts) or counts.max() < settings.min_pairs // 2:
+    problem = _Points.of(a, b, tentative, _SLACK_M)
+    poses = _hypotheses(problem, rng)
+    counts = np.array([int(problem.within(aTb, _GATE_SIGMAS).sum()) for aTb in poses])
+    if not len(counts) or counts.max() < _MIN_PAIRS // 2:
         most = int(counts.max()) if len(counts) else 0
         raise MapError(
             f"{names}: {n} landmarks look alike, but at most {most} of them lie alike; the maps "
             "do not overlap, or too little"
         )
-    best, _ = _refined(problem, poses[int(np.argmax(counts))], settings.gate_sigmas)
-    agreeing = int(problem.within(best, settings.gate_sigmas).sum())
-    second = _second(problem, best, poses[np.argsort(-counts, kind="stable")], settings)
-    if second >= settings.ambiguous_share * agreeing:
+    best, _ = _refined(problem, poses[int(np.argmax(counts))], _GATE_SIGMAS)
+    agreeing = int(problem.within(best, _GATE_SIGMAS).sum())
+    second = _second(problem, best, poses[np.argsort(-counts, kind="stable")])
+    if second >= _AMBIGUOUS_SHARE * agreeing:
         raise MapError(
             f"{names}: ambiguous: {agreeing} landmarks agree with one alignment, {second} with "
             "another one; drive through the place that both share once more"
         )
-    return _completed(a, b, best, (n, agreeing, second), settings, names)
+    return _completed(a, b, best, (n, agreeing, second), names)
 
 
 # --------------------------------------------------------------------------------------------
 # By appearance
 
 
-def tentative_pairs(a: SavedMap, b: SavedMap, settings: MergeSettings) -> IntArray:
+def tentative_pairs(a: SavedMap, b: SavedMap) -> IntArray:
     """Rows (k, 2) of confirmed landmarks that look alike and like no other place; b's ascending."""
     mine, yours = _trusted_views(a), _trusted_views(b)
     if not len(mine) or not len(yours):
@@ -122,12 +131,12 @@ def tentative_pairs(a: SavedMap, b: SavedMap, settings: MergeSettings) -> IntArr
     views = mine[np.where(known, found.rows, 0)]
     owners = a.landmarks.rows(a.appearances.ids[views].ravel()).reshape(views.shape)
     places = a.landmarks.positions[owners]
-    other = known & (np.linalg.norm(places - places[:, :1], axis=2) > settings.same_place_m)
+    other = known & (np.linalg.norm(places - places[:, :1], axis=2) > _SAME_PLACE_M)
     next_place = np.where(other, found.distances, np.inf).min(axis=1)
     near = found.distances[:, 0]
     size = np.log(a.appearances.size[views[:, 0]] / b.appearances.size[yours])
-    keep = known[:, 0] & (near <= settings.max_distance) & (near <= settings.ratio * next_place)
-    keep &= np.abs(size) <= np.log(settings.size_ratio)
+    keep = known[:, 0] & (near <= _MAX_DISTANCE) & (near <= _RATIO * next_place)
+    keep &= np.abs(size) <= np.log(_SIZE_RATIO)
     rows = b.landmarks.rows(b.appearances.ids[yours[keep]])
     return _nearest_of_each(rows, owners[keep, 0], near[keep])
 
@@ -184,9 +193,9 @@ class _Points(Rows):
         return np.asarray(self.squared(aTb) <= gate**2)
 
 
-def _hypotheses(problem: _Points, settings: MergeSettings, rng: np.random.Generator) -> FloatArray:
+def _hypotheses(problem: _Points, rng: np.random.Generator) -> FloatArray:
     """Alignments (h, 4, 4) from triples whose sides are as long in both maps."""
-    triples = rng.integers(0, len(problem.a), (settings.samples, 3))
+    triples = rng.integers(0, len(problem.a), (_SAMPLES, 3))
     mine, yours = problem.a[triples], problem.b[triples]
     variance = np.trace(problem.a_covariance + problem.b_covariance, axis1=1, axis2=2) / 3.0
     keep = np.ones(len(triples), np.bool_)
@@ -194,7 +203,7 @@ def _hypotheses(problem: _Points, settings: MergeSettings, rng: np.random.Genera
         own = np.linalg.norm(mine[:, i] - mine[:, j], axis=1)
         other = np.linalg.norm(yours[:, i] - yours[:, j], axis=1)
         sigma = np.sqrt(variance[triples[:, i]] + variance[triples[:, j]])
-        keep &= np.abs(own - other) <= settings.gate_sigmas * sigma
+        keep &= np.abs(own - other) <= _GATE_SIGMAS * sigma
     area = np.linalg.norm(np.cross(mine[:, 1] - mine[:, 0], mine[:, 2] - mine[:, 0]), axis=1)
     chosen = np.flatnonzero(keep & (area >= _LEAST_SPREAD_M**2))[:_HYPOTHESES]
     return align_in_space(yours[chosen], mine[chosen])
@@ -218,30 +227,28 @@ def _refined(problem: _Points, aTb: FloatArray, gate: float) -> tuple[FloatArray
     return aTb, np.asarray(np.linalg.inv(information))
 
 
-def _second(problem: _Points, best: FloatArray, poses: FloatArray, settings: MergeSettings) -> int:
+def _second(problem: _Points, best: FloatArray, poses: FloatArray) -> int:
     """Matches that agree with the best alignment elsewhere; ``poses`` with the best ones first."""
     centre, most = problem.b.mean(axis=0), 0
-    for pose in poses[_apart(poses, best, centre, settings)][:_RIVALS]:
+    for pose in poses[_apart(poses, best, centre)][:_COMPETING]:
         # What merely starts elsewhere comes to the best one itself.
-        rival, _ = _refined(problem, pose, settings.gate_sigmas)
-        if _apart(rival[None], best, centre, settings)[0]:
-            most = max(most, int(problem.within(rival, settings.gate_sigmas).sum()))
+        competing, _ = _refined(problem, pose, _GATE_SIGMAS)
+        if _apart(competing[None], best, centre)[0]:
+            most = max(most, int(problem.within(competing, _GATE_SIGMAS).sum()))
     return most
 
 
-def _apart(
-    poses: FloatArray, best: FloatArray, centre: FloatArray, settings: MergeSettings
-) -> BoolArray:
+def _apart(poses: FloatArray, best: FloatArray, centre: FloatArray) -> BoolArray:
     """Which alignments put the second map's centre, or its heading, elsewhere than the best."""
     here = transform_to_world(best, centre[None])[0]
     shift = poses[:, :3, :3] @ centre + poses[:, :3, 3] - here
     turns = np.array([np.linalg.norm(so3_log(best[:3, :3].T @ pose[:3, :3])) for pose in poses])
-    far = np.linalg.norm(shift, axis=1) > settings.elsewhere_m
-    return np.asarray(far | (turns > np.deg2rad(settings.elsewhere_deg)))
+    far = np.linalg.norm(shift, axis=1) > _ELSEWHERE_M
+    return np.asarray(far | (turns > np.deg2rad(_ELSEWHERE_DEG)))
 
 
 # --------------------------------------------------------------------------------------------
-# All landmarks, and the verdict
+# All landmarks, and the decision
 
 
 def _completed(
@@ -249,23 +256,22 @@ def _completed(
     b: SavedMap,
     aTb: FloatArray,
     matches: tuple[int, int, int],
-    settings: MergeSettings,
     names: str,
 ) -> Alignment:
     """The alignment over all landmarks that it brings together; refused where most stay alone."""
     for _ in range(2):
-        pairs = _same(a, b, aTb, settings)
-        problem = _Points.of(a, b, pairs, settings.slack_m)
-        aTb, covariance = _refined(problem, aTb, settings.gate_sigmas)
-    pairs = _same(a, b, aTb, settings)
-    problem = _Points.of(a, b, pairs, settings.slack_m)
+        pairs = _same(a, b, aTb)
+        problem = _Points.of(a, b, pairs, _SLACK_M)
+        aTb, covariance = _refined(problem, aTb, _GATE_SIGMAS)
+    pairs = _same(a, b, aTb)
+    problem = _Points.of(a, b, pairs, _SLACK_M)
     trusted = b.permanent | (b.hits >= 3)
     tree = cKDTree(a.landmarks.positions[a.permanent | (a.hits >= 3)])
     near, _ = tree.query(transform_to_world(aTb, b.landmarks.positions))
     among = trusted & (near <= _AMONG_M)
     found = among & np.isin(np.arange(len(b)), pairs[:, 1])
     counts = (int(among.sum()), int(found.sum()))
-    if len(pairs) < settings.min_pairs or counts[1] < settings.overlap_share * counts[0]:
+    if len(pairs) < _MIN_PAIRS or counts[1] < _OVERLAP_SHARE * counts[0]:
         raise MapError(
             f"{names}: {len(pairs)} landmarks agree with the best alignment, but of {counts[0]} "
             f"that then lie among the other map's only {counts[1]} are found there; the maps do "
@@ -286,21 +292,21 @@ def _completed(
     )
 
 
-def _same(a: SavedMap, b: SavedMap, aTb: FloatArray, settings: MergeSettings) -> IntArray:
+def _same(a: SavedMap, b: SavedMap, aTb: FloatArray) -> IntArray:
     """Rows (k, 2) of landmarks that lie in the same place and look alike, each in one pair."""
     points = transform_to_world(aTb, b.landmarks.positions)
-    reach = settings.gate_sigmas * np.sqrt(
-        settings.slack_m**2 + np.trace(b.landmarks.covariances, axis1=1, axis2=2)
+    reach = _GATE_SIGMAS * np.sqrt(
+        _SLACK_M**2 + np.trace(b.landmarks.covariances, axis1=1, axis2=2)
     )
     near = cKDTree(a.landmarks.positions).query_ball_point(points, np.minimum(reach, _AMONG_M))
     counts = np.array([len(rows) for rows in near])
     yours = np.repeat(np.arange(len(b)), counts)
     mine = np.concatenate([np.empty(0, np.int64), *(np.sort(rows) for rows in near)]).astype(int)
     pairs = np.column_stack([mine, yours])
-    keep = _Points.of(a, b, pairs, settings.slack_m).within(aTb, settings.gate_sigmas)
+    keep = _Points.of(a, b, pairs, _SLACK_M).within(aTb, _GATE_SIGMAS)
     pairs = pairs[keep]
     distance = _descriptor_distances(a, b, pairs)
-    keep = distance <= settings.max_distance
+    keep = distance <= _MAX_DISTANCE
     return _one_to_one(pairs[keep], distance[keep])
 
 

@@ -55,23 +55,6 @@ class LoopSettings:
             description="frames in a row that must find the same offset between map and estimate",
         ),
     ] = 3
-    agreement_m: Annotated[
-        float, Field(gt=0.0, description="largest difference of those offsets, metres")
-    ] = 0.15
-    agreement_deg: Annotated[
-        float, Field(gt=0.0, le=180.0, description="largest difference of those offsets, degrees")
-    ] = 2.0
-    least_offset_m: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="an offset below this and below least_offset_deg is no drift worth a "
-            "closure: the tracker finds the old landmarks by itself",
-        ),
-    ] = 0.03
-    least_offset_deg: Annotated[
-        float, Field(ge=0.0, description="see least_offset_m; 0.3 degrees are 1.5 pixels")
-    ] = 0.3
     max_drift_m: Annotated[
         float, Field(gt=0.0, description="drift that needs no way to have come about, metres")
     ] = 0.5
@@ -111,59 +94,3 @@ class LoopSettings:
             "other become one; 0 leaves them",
         ),
     ] = 0.10
-
-
-@dataclass(frozen=True, config=STRICT)
-class MergeSettings:
-    """How two maps are laid onto each other, and when they are refused."""
-
-    max_distance: Annotated[
-        float, Field(gt=0.0, description="largest distance of descriptors, of norm 512")
-    ] = 250.0
-    ratio: Annotated[
-        float,
-        Field(gt=0.0, le=1.0, description="nearest place's distance over the next one's, at most"),
-    ] = 0.8
-    same_place_m: Annotated[
-        float, Field(gt=0.0, description="landmarks this near to one another are one place")
-    ] = 0.3
-    size_ratio: Annotated[
-        float, Field(gt=1.0, description="largest ratio of two landmarks' physical sizes")
-    ] = 1.6
-    slack_m: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="by how much maps bend, per axis: their covariances do not know it",
-        ),
-    ] = 0.03
-    gate_sigmas: Annotated[
-        float, Field(gt=0.0, description="largest normalised distance of two sights of a landmark")
-    ] = 3.4
-    samples: Annotated[int, Field(ge=100, description="triples of matches drawn")] = 60_000
-    min_pairs: Annotated[
-        int, Field(ge=4, description="fewer landmarks in common are no overlap")
-    ] = 20
-    elsewhere_m: Annotated[
-        float, Field(gt=0.0, description="alignments farther apart than this are different ones")
-    ] = 0.5
-    elsewhere_deg: Annotated[
-        float, Field(gt=0.0, description="alignments turned by more than this are different ones")
-    ] = 15.0
-    ambiguous_share: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            le=1.0,
-            description="the second-best alignment may have this share of the best one's matches",
-        ),
-    ] = 0.5
-    overlap_share: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            le=1.0,
-            description="of the second map's landmarks that lie among the first one's, at least "
-            "this share must be found there: one poster in common does not make a place one",
-        ),
-    ] = 0.15

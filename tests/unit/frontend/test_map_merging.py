@@ -18,7 +18,6 @@ from fgslam.core.sensors import CameraRig
 from fgslam.frontend.places import map_alignment
 from fgslam.frontend.places.map_alignment import Alignment, align_maps, tentative_pairs
 from fgslam.frontend.places.map_fusion import merge_maps
-from fgslam.frontend.places.settings import MergeSettings
 from fgslam.runs.map_merging import merge_files
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
@@ -70,7 +69,7 @@ def world(rng: np.random.Generator) -> World:
 
 
 def align(a: SavedMap, b: SavedMap, seed: int = 0) -> Alignment:
-    return align_maps(a, b, MergeSettings(), np.random.default_rng(seed), "a and b")
+    return align_maps(a, b, np.random.default_rng(seed), "a and b")
 
 
 def test_two_overlapping_maps_are_aligned_within_their_noise(world: World) -> None:
@@ -160,9 +159,9 @@ def test_all_landmarks_on_one_line_fix_no_alignment(world: World) -> None:
 
 def test_unconfirmed_landmarks_propose_nothing(world: World) -> None:
     a, b = world.seen(np.arange(200), np.eye(4)), world.seen(np.arange(200), BTA)
-    assert len(tentative_pairs(a, b, MergeSettings())) > 150
+    assert len(tentative_pairs(a, b)) > 150
     seldom = replace(b, hits=np.ones(200, np.int64), permanent=np.zeros(200, np.bool_))
-    assert len(tentative_pairs(a, seldom, MergeSettings())) == 0
+    assert len(tentative_pairs(a, seldom)) == 0
 
 
 # --------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""When a recognised place is believed: it agrees with itself, and with how far one can drift.
+"""Confirmation of a recognised place: over several frames, and by the drift that is possible.
 
 Corridors that look alike match as well as a true return does. But the offset between map and
 estimate that a true return shows stays the same from frame to frame, and is no larger than drift.
@@ -11,6 +11,9 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import inverse, se3_log
 from fgslam.frontend.places.settings import LoopSettings
+
+_AGREEMENT = 0.15, 2.0  # metres and degrees by which the offsets of two frames may differ
+_WORTH = 0.03, 0.3  # metres and degrees: below both the tracker finds the old landmarks by itself
 
 
 class Confirmation:
@@ -49,7 +52,7 @@ class Confirmation:
         """Whether the last offset leads to this pose, too."""
         expected = self.offset @ estimated
         metres, degrees = difference(expected, recognised)
-        return metres <= self._settings.agreement_m and degrees <= self._settings.agreement_deg
+        return metres <= _AGREEMENT[0] and degrees <= _AGREEMENT[1]
 
 
 def difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
@@ -64,9 +67,9 @@ def difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
 def drift_allows(
     recognised: FloatArray, estimated: FloatArray, way_m: float, settings: LoopSettings
 ) -> bool:
-    """Whether the offset is that of a drift: worth mending, and possible after ``way_m`` metres."""
+    """Whether the offset is that of a drift: worth a correction, and possible after ``way_m`` metres."""
     metres, degrees = difference(estimated, recognised)
-    worth = metres > settings.least_offset_m or degrees > settings.least_offset_deg
+    worth = metres > _WORTH[0] or degrees > _WORTH[1]
     return worth and (
         metres <= settings.max_drift_m + settings.max_drift_share * way_m
         and degrees <= settings.max_drift_deg + settings.max_drift_deg_m * way_m

@@ -14,19 +14,21 @@ from fgslam.core.floor import Floor
 from fgslam.frontend.places.relocalisation.alignment import align_planar, floor_axes
 from fgslam.frontend.places.relocalisation.least_squares import refine
 from fgslam.frontend.places.relocalisation.proposals import Evidence, Proposals
-from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
 
+_BIN_M = 0.3  # side of a bin
+_BIN_DEG = 5.0  # width of a bin of heading
+_BINS = 16  # fullest ones whose matches are solved for a pose
 _POLISH = 6  # Newton steps from a bin's mean to the least squares of its matches
 _KERNEL_WIDTH = 3.0
 _MOST_BINS = 16_000_000  # the accumulator's; larger maps get wider bins
 
 
-def propose(evidence: Evidence, floor: Floor, settings: RelocalisationSettings) -> Proposals:
+def propose(evidence: Evidence, floor: Floor) -> Proposals:
     """Poses of the fullest bins after least squares over their matches, best first."""
     if len(evidence.pairs) < 2:
         return Proposals.none()
-    grid = _Grid(evidence, floor, settings)
-    peaks = grid.peaks(settings.bins)
+    grid = _Grid(evidence, floor)
+    peaks = grid.peaks(_BINS)
     members = [grid.members(peak) for peak in peaks]
     members = [group for group in members if len(group) >= 2]
     if not members:
@@ -51,10 +53,10 @@ def _aligned(evidence: Evidence, group: IntArray, floor: Floor) -> FloatArray:
 class _Grid:
     """The accumulator: every feature has one vote a bin, however many landmarks it resembles."""
 
-    def __init__(self, evidence: Evidence, floor: Floor, settings: RelocalisationSettings) -> None:
+    def __init__(self, evidence: Evidence, floor: Floor) -> None:
         axes = floor_axes(floor)
         self._features = evidence.tentative.features
-        self._headings = max(4, round(360.0 / settings.bin_deg))
+        self._headings = max(4, round(360.0 / _BIN_DEG))
         angles = np.arange(self._headings) * (2.0 * np.pi / self._headings)
         here, there = evidence.pairs.seen.position @ axes, evidence.pairs.points @ axes
         turn = np.stack([np.cos(angles), np.sin(angles)])
@@ -68,8 +70,8 @@ class _Grid:
         positions = there[:, None, :] - turned  # (k, headings, 2)
         low = positions.min(axis=(0, 1))
         extent = positions.max(axis=(0, 1)) - low
-        area = float(np.prod(extent + 4.0 * settings.bin_m))
-        self._side = max(settings.bin_m, float(np.sqrt(area * self._headings / _MOST_BINS)))
+        area = float(np.prod(extent + 4.0 * _BIN_M))
+        self._side = max(_BIN_M, float(np.sqrt(area * self._headings / _MOST_BINS)))
         # Each vote goes to the two nearest bins of either coordinate (Lowe 1999).
         self._corner = np.floor((positions - low) / self._side - 0.5).astype(np.int64) + 1
         self._shape = (*(np.floor(extent / self._side).astype(np.int64) + 4), self._headings)

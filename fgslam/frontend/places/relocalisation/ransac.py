@@ -12,6 +12,9 @@ from fgslam.frontend.places.relocalisation.proposals import Evidence, Proposals
 from fgslam.frontend.places.relocalisation.residuals import Pairs
 from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
 
+_HYPOTHESES = 64  # poses scored at a time, from the rigid samples
+_ROUNDS = 6  # times that samples are drawn at most
+_CONFIDENCE = 0.999  # that one sample was free of mistakes, at which the search ends
 _POLISH = 3  # Newton steps of a sample: from the closed form to the image's metric
 
 
@@ -27,15 +30,15 @@ def propose(
     if len(np.unique(evidence.tentative.features)) < size:
         return found
     odds = _odds(evidence)
-    for _ in range(settings.rounds):
+    for _ in range(_ROUNDS):
         samples = _draw(evidence, odds, size, settings.samples, rng)
         rigid_ones = samples[_rigid(evidence, samples, floor)]
-        used = rigid_ones[: settings.hypotheses]
+        used = rigid_ones[:_HYPOTHESES]
         share = 1.0 if len(rigid_ones) <= len(used) else len(used) / len(rigid_ones)
         drawn += int(len(samples) * share)
         if len(used):
             found = found.join(_poses(evidence, used, floor))
-        if len(found) and drawn >= _needed(evidence, found, odds, size, settings.confidence):
+        if len(found) and drawn >= _needed(evidence, found, odds, size, _CONFIDENCE):
             break
     return found
 

@@ -20,8 +20,11 @@ from fgslam.frontend.places.relocalisation.residuals import (
     squared_distances,
 )
 from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
-from fgslam.frontend.places.relocalisation.tentative import gated
+from fgslam.frontend.places.relocalisation.tentative import MAX_DISTANCE, gated
 
+PIECE_M = 0.5  # landmarks in a cube of this side drift together and may be one object, moved as one
+_GATE_SIGMAS = 4.0  # largest normalised residual (three numbers) of an inlier
+_VIEW_RAD = float(np.deg2rad(20.0))  # a landmark is expected to be seen this near to a stored view
 _ROUNDS = 4  # of choosing matches and solving; the choice rests after two or three
 _STEPS = 6
 _KERNEL_WIDTH = 2.0  # as the tracker's
@@ -150,7 +153,7 @@ class Refiner:
         i, j, cost = search.candidates
         pairs = Pairs.of(self.seen, i, self.known.landmarks, j)
         squared = squared_distances(residuals(self.rig, search.wTc, pairs), search.covariance)
-        near = squared <= self.settings.gate_sigmas**2
+        near = squared <= _GATE_SIGMAS**2
         cost = cost if self.settings.descriptors else squared
         return _one_to_one(i[near], j[near], cost[near])
 
@@ -168,10 +171,10 @@ class Refiner:
             distance = _distances(self.features.descriptors, self.known.views.descriptors[views])
         else:
             distance = np.zeros((len(self.features), len(views)))
-        i, column = np.nonzero(distance <= self.settings.max_distance)
+        i, column = np.nonzero(distance <= MAX_DISTANCE)
         cost, v = distance[i, column], views[column]
         looks = (self.known.views, self.known.owners)
-        keep = gated(self.features, (i, v), self.known.landmarks, looks, self.floor, self.settings)
+        keep = gated(self.features, (i, v), self.known.landmarks, looks, self.floor)
         found = i[keep], self.known.owners[v[keep]], cost[keep]
         first = self._proposed()
         return (
@@ -189,7 +192,7 @@ class Refiner:
         counts = [len(one.chosen[0]) for one in searches]
         rows = np.repeat(np.arange(len(searches)), counts)
         sides = np.split(pairs.points, np.cumsum(counts)[:-1])
-        others = np.concatenate([crowd(points, self.settings.piece_m) for points in sides]) - 1
+        others = np.concatenate([crowd(points, PIECE_M) for points in sides]) - 1
         drift = others[:, None, None] * self.settings.map_sigma_m**2 * np.eye(3)
         pairs = replace(pairs, point_covariances=pairs.point_covariances + drift)
         start = np.array([one.wTc for one in searches])
@@ -204,10 +207,10 @@ class Refiner:
         image = found.residual[pairs.seen.in_image][:, :2]
         rms = float(np.sqrt(np.mean(np.sum(image**2, axis=1)))) if len(image) else float("nan")
         sizes = float(self.features.scale.min()), float(self.features.scale.max())
-        expected = self.known.recognisable(self.rig, wTc, self._view_angle, sizes)
+        expected = self.known.recognisable(self.rig, wTc, _VIEW_RAD, sizes)
         tentative = np.unique(self.evidence.tentative.features)
         proposed = int(np.isin(tentative, chosen[0]).sum())
-        positions, side = self.known.landmarks.positions, self.settings.piece_m
+        positions, side = self.known.landmarks.positions, PIECE_M
         return Refined(
             wTc=wTc,
             covariance=covariance,
@@ -221,10 +224,6 @@ class Refiner:
             covered=covered(positions[expected], np.isin(expected, chosen[1]), side),
             explained=explained(self.features.position, chosen[0]),
         )
-
-    @property
-    def _view_angle(self) -> float:
-        return float(np.deg2rad(self.settings.view_deg))
 
 
 def pieces(positions: FloatArray, side: float) -> IntArray:

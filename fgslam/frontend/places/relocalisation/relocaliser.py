@@ -18,6 +18,10 @@ from fgslam.frontend.places.relocalisation.settings import RelocalisationSetting
 from fgslam.frontend.places.relocalisation.tentative import Tentative, gated, specific, unspecific
 from fgslam.frontend.places.relocalisation.verdict import judge
 
+_NEIGHBOURS = 12  # stored views asked of the index for each feature
+_REFINED = 4  # distinct best poses that are refined and compared
+_ELSEWHERE_M = 0.5  # poses farther apart than this are different places
+_ELSEWHERE_RAD = float(np.deg2rad(15.0))  # and so are poses turned by more than this
 _MAX_DISPARITY_PX = 40.0  # of mistakes, spread evenly; the scores hardly depend on it
 
 
@@ -66,7 +70,7 @@ class Relocaliser:
         seen = SeenPoints.of(features, self._rig, self._settings.view_sigma_px)
         evidence = self._evidence(seen, tentative)
         if self._settings.method == "hough":
-            proposals = hough.propose(evidence, self._floor, self._settings)
+            proposals = hough.propose(evidence, self._floor)
         else:
             proposals = ransac.propose(evidence, self._floor, self._settings, rng)
         refined = self._refine(features, seen, evidence, proposals)
@@ -74,16 +78,16 @@ class Relocaliser:
 
     def tentative(self, features: StereoFeatures) -> Tentative:
         """Matches of the features with landmarks anywhere in the map."""
-        known, settings = self._known, self._settings
+        known = self._known
         looks = (known.views, known.owners)
-        if not settings.descriptors:
-            return unspecific(features, known.landmarks, looks, self._floor, settings)
-        found = known.index.query(features.descriptors, settings.neighbours)
+        if not self._settings.descriptors:
+            return unspecific(features, known.landmarks, looks, self._floor)
+        found = known.index.query(features.descriptors, _NEIGHBOURS)
         i, k = np.nonzero(found.rows >= 0)
         pairs = (i, found.rows[i, k])
         keep = np.zeros(found.rows.shape, np.bool_)
-        keep[i, k] = gated(features, pairs, known.landmarks, looks, self._floor, settings)
-        return specific(found, keep, known.owners, known.landmarks, settings)
+        keep[i, k] = gated(features, pairs, known.landmarks, looks, self._floor)
+        return specific(found, keep, known.owners, known.landmarks)
 
     def _evidence(self, seen: SeenPoints, tentative: Tentative) -> Evidence:
         landmarks = self._known.landmarks
@@ -99,10 +103,11 @@ class Relocaliser:
         proposals: Proposals,
     ) -> list[Refined]:
         """The best distinct poses refined, that with most witnesses first."""
-        settings = self._settings
-        limits = settings.elsewhere_m, float(np.deg2rad(settings.elsewhere_deg))
-        refiner = Refiner(self._rig, self._floor, self._known, features, seen, evidence, settings)
-        out = refiner.refine(distinct(proposals, settings.refined, *limits))
+        limits = _ELSEWHERE_M, _ELSEWHERE_RAD
+        refiner = Refiner(
+            self._rig, self._floor, self._known, features, seen, evidence, self._settings
+        )
+        out = refiner.refine(distinct(proposals, _REFINED, *limits))
         out.sort(key=lambda found: (-found.witnesses, -len(found)))
         first: list[Refined] = []
         for candidate in out:

@@ -13,8 +13,14 @@ from fgslam.core.floor import Floor
 from fgslam.core.geometry import wrap_angle
 from fgslam.frontend.features.candidates import pairs_within
 from fgslam.frontend.places.relocalisation.appearance_index import Neighbours
-from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
 
+MAX_DISTANCE = 400.0  # of descriptors, whose norm is 512
+_RATIO = 0.85  # a gap: the next place is farther than its predecessor by this ratio
+_MOST_PLACES = 3  # that may share a feature before it says nothing
+_SAME_PLACE_M = 0.3  # landmarks this near to one another are one place
+_SIZE_RATIO = 1.6  # of a feature's physical size to a landmark's, at most
+_ORIENTATION_DEG = 30.0  # on a level floor, largest difference
+_HEIGHT_M = 0.05  # on a level floor, largest difference beyond what the covariances allow
 _GATE_SIGMAS = 3.0  # of sizes and heights; what their covariances allow
 
 
@@ -44,7 +50,6 @@ def gated(
     landmarks: LandmarkMap,
     looks: tuple[LandmarkAppearances, IntArray],
     floor: Floor,
-    settings: RelocalisationSettings,
 ) -> BoolArray:
     """Which pairs (feature, view) agree in size and, on a level floor, in height and orientation.
 
@@ -54,18 +59,17 @@ def gated(
         landmarks: the map.
         looks: stored views and the map's row of each view's landmark.
         floor: decides whether the camera is upright and at one height.
-        settings: the gates.
     """
     (i, v), (views, owners) = pairs, looks
     depth = np.abs(features.position[i, 2])
     sigma = np.sqrt(features.position_covariance[i, 2, 2]) / np.maximum(depth, 1e-6)
     ratio = np.abs(np.log(features.scale[i] * depth / np.maximum(views.size[v], 1e-9)))
-    keep = ratio <= np.log(settings.size_ratio) + _GATE_SIGMAS * sigma
+    keep = ratio <= np.log(_SIZE_RATIO) + _GATE_SIGMAS * sigma
     if floor.rigid_dof != 3:
         return np.asarray(keep)
     turn = np.abs(wrap_angle(features.orientation[i] - views.orientation[v]))
-    keep &= turn <= np.deg2rad(settings.orientation_deg)
-    return np.asarray(keep & _heights_agree(features, i, landmarks, owners[v], floor, settings))
+    keep &= turn <= np.deg2rad(_ORIENTATION_DEG)
+    return np.asarray(keep & _heights_agree(features, i, landmarks, owners[v], floor))
 
 
 def _heights_agree(
@@ -74,14 +78,13 @@ def _heights_agree(
     landmarks: LandmarkMap,
     rows: IntArray,
     floor: Floor,
-    settings: RelocalisationSettings,
 ) -> BoolArray:
     """Motion on a level floor leaves heights as they are."""
     down = floor.down
     difference = np.abs(features.position[i] @ down - landmarks.positions[rows] @ down)
     variance = np.einsum("i,kij,j->k", down, features.position_covariance[i], down)
     variance += np.einsum("i,kij,j->k", down, landmarks.covariances[rows], down)
-    return np.asarray(difference <= settings.height_m + _GATE_SIGMAS * np.sqrt(variance))
+    return np.asarray(difference <= _HEIGHT_M + _GATE_SIGMAS * np.sqrt(variance))
 
 
 def specific(
@@ -89,28 +92,26 @@ def specific(
     keep: BoolArray,
     owners: IntArray,
     landmarks: LandmarkMap,
-    settings: RelocalisationSettings,
 ) -> Tentative:
     """Candidates of each feature, up to the first clear gap of distances between places.
 
     A feature that looks like a few places keeps them all, as repeated texture must; one that looks
-    like many (no gap within ``candidates`` places) keeps none.
+    like many (no gap within three places) keeps none.
 
     Args:
         neighbours: (q, k) nearest views of each feature.
         keep: (q, k) of which passed the gates.
         owners: the map's row of each view's landmark.
         landmarks: the map.
-        settings: distances and ratio.
     """
     features, rows, distances, places = [], [], [], []
     limits = np.where(keep, neighbours.distances, np.inf)
-    for i in np.flatnonzero((limits <= settings.max_distance).any(axis=1)):
+    for i in np.flatnonzero((limits <= MAX_DISTANCE).any(axis=1)):
         order = np.flatnonzero(keep[i])
         own, far = owners[neighbours.rows[i, order]], limits[i, order]
-        place = _places(landmarks.positions[own], settings.same_place_m)
-        end, count = _gap(place, far, settings)
-        first = _first_views(own[:end], far[:end], settings.max_distance)
+        place = _places(landmarks.positions[own], _SAME_PLACE_M)
+        end, count = _gap(place, far)
+        first = _first_views(own[:end], far[:end], MAX_DISTANCE)
         features.append(np.full(len(first), i))
         rows.append(own[first])
         distances.append(far[first])
@@ -123,7 +124,6 @@ def unspecific(
     landmarks: LandmarkMap,
     looks: tuple[LandmarkAppearances, IntArray],
     floor: Floor,
-    settings: RelocalisationSettings,
 ) -> Tentative:
     """Every landmark that agrees in size (on a level floor in height and orientation, too).
 
@@ -133,9 +133,9 @@ def unspecific(
     depth = np.maximum(np.abs(features.position[:, 2]), 1e-6)
     sigma = np.sqrt(features.position_covariance[:, 2, 2]) / depth
     size = np.log(np.maximum(features.scale * depth, 1e-9))
-    reach = np.log(settings.size_ratio) + _GATE_SIGMAS * sigma
+    reach = np.log(_SIZE_RATIO) + _GATE_SIGMAS * sigma
     i, v = pairs_within(size, reach, np.log(np.maximum(views.size, 1e-9)))
-    keep = gated(features, (i, v), landmarks, looks, floor, settings)
+    keep = gated(features, (i, v), landmarks, looks, floor)
     pairs = np.unique(np.column_stack([i[keep], owners[v[keep]]]), axis=0)
     counts = np.bincount(pairs[:, 0], minlength=len(features))
     return Tentative(pairs[:, 0], pairs[:, 1], np.zeros(len(pairs)), counts[pairs[:, 0]])
@@ -155,15 +155,15 @@ def _first_views(own: IntArray, far: FloatArray, limit: float) -> IntArray:
     return np.array(sorted(first.values(), key=lambda k: (far[k], own[k])), np.int64)
 
 
-def _gap(place: IntArray, far: FloatArray, settings: RelocalisationSettings) -> tuple[int, int]:
+def _gap(place: IntArray, far: FloatArray) -> tuple[int, int]:
     """Number of leading candidates before the first gap, and of their places; 0 without a gap."""
     seen: list[int] = []
     for k, p in enumerate(place):
         if p in seen:
             continue
-        if seen and _last(far, place, seen, k) <= settings.ratio * far[k]:
+        if seen and _last(far, place, seen, k) <= _RATIO * far[k]:
             return k, len(seen)
-        if len(seen) == settings.candidates:
+        if len(seen) == _MOST_PLACES:
             return 0, 0
         seen.append(int(p))
     return len(place), len(seen)

@@ -5,9 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core.estimates import LandmarkMap, Relocalisation, Verdict
-from fgslam.frontend.places.relocalisation.refinement import Refined
+from fgslam.frontend.places.relocalisation.refinement import PIECE_M, Refined
 from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
 from fgslam.frontend.places.relocalisation.tentative import Tentative
+
+_ENOUGH = 36  # independent inliers that only another hypothesis can call in question
+_MAX_MISFIT = 1.2  # mean squared normalised residual of fewer inliers; 1 where as modelled
+_LEAST_AGREEMENT = 0.57  # of frame and map, with fewer inliers
+_LEAST_COVERED = 0.5  # share of the pieces in view, or of the directions, in which something agrees
+_AMBIGUOUS_SHARE = 0.5  # of the best pose's independent inliers that another one has, too
+_AMBIGUOUS_OWN = 0.2  # features that only the other explains, for each that only the best explains
 
 
 def judge(
@@ -37,7 +44,7 @@ def judge(
         )
     best = refined[0]
     rivals = [
-        (other.unshared(best, landmarks.positions, settings.piece_m), other)
+        (other.unshared(best, landmarks.positions, PIECE_M), other)
         for other in refined[1:]
         if _rivals(other, best, settings)
     ]
@@ -72,7 +79,7 @@ def _verdict(
     )
     if best.witnesses < settings.min_inliers:
         return Verdict.TOO_FEW_INLIERS, f"{said}; {settings.min_inliers} witnesses are needed"
-    if rival >= settings.ambiguous_share * best.witnesses:
+    if rival >= _AMBIGUOUS_SHARE * best.witnesses:
         return Verdict.AMBIGUOUS, f"{said}; another place explains the frame nearly as well"
     if _contradicted(best, matched, settings):
         return (
@@ -92,12 +99,12 @@ def _contradicted(pose: Refined, matched: int, settings: RelocalisationSettings)
     be seen is missing. Of a thing that was carried off, all that looks like a landmark agrees; but
     what surrounded it is missing, and what surrounds it is unknown.
     """
-    if pose.witnesses >= settings.enough_witnesses:
+    if pose.witnesses >= _ENOUGH:
         return False
     agreement = (2.0 * pose.proposed / max(matched, 1) + pose.covered) / 3.0
-    amid_strangers = max(pose.covered, pose.explained) < settings.least_covered
-    misfits = pose.misfit > settings.max_misfit
-    return misfits or agreement < settings.least_agreement or amid_strangers
+    amid_strangers = max(pose.covered, pose.explained) < _LEAST_COVERED
+    misfits = pose.misfit > _MAX_MISFIT
+    return misfits or agreement < _LEAST_AGREEMENT or amid_strangers
 
 
 def _rivals(other: Refined, best: Refined, settings: RelocalisationSettings) -> bool:
@@ -108,11 +115,11 @@ def _rivals(other: Refined, best: Refined, settings: RelocalisationSettings) -> 
     beside the things that both places have. (A twin explains more than half, even where a third of
     its landmarks are missing.)
     """
-    refuted = other.misfit > settings.max_misfit or other.covered < settings.least_covered
-    if refuted and other.witnesses < settings.enough_witnesses:
+    refuted = other.misfit > _MAX_MISFIT or other.covered < _LEAST_COVERED
+    if refuted and other.witnesses < _ENOUGH:
         return False
     lost, own = best.explains_beside(other), other.explains_beside(best)
-    return 2 * lost <= len(best) or own >= settings.ambiguous_own * lost
+    return 2 * lost <= len(best) or own >= _AMBIGUOUS_OWN * lost
 
 
 def _nothing(verdict: Verdict, candidates: int, why: str) -> Relocalisation:
