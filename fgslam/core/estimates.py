@@ -19,9 +19,9 @@ __all__ = [
     "LandmarkMap",
     "Prediction",
     "Relocalisation",
+    "RelocalisationStatus",
     "Trajectory",
     "UpdateStats",
-    "Verdict",
     "correlation",
 ]
 
@@ -125,7 +125,7 @@ def correlation(covariance: FloatArray) -> FloatArray:
     return np.asarray(covariance * scale[..., :, None] * scale[..., None, :])
 
 
-class Verdict(str, Enum):
+class RelocalisationStatus(str, Enum):
     """How a search for a pose without a prior ended."""
 
     FOUND = "found"
@@ -141,7 +141,7 @@ class Relocalisation(Brief):
     """The pose of a frame in a map, found without a prior, and why it is believed or refused.
 
     Attributes:
-        verdict: FOUND, or why the best pose is refused.
+        status: FOUND, or why the best pose is refused.
         wTc: (4, 4) best pose; the identity where there is none.
         covariance: (6, 6) of it, in the tangent space at ``wTc``; NaN where there is none.
         features: (k,) indices of the frame's features that agree with the pose.
@@ -150,10 +150,10 @@ class Relocalisation(Brief):
         expected: landmarks that the pose should see.
         residual_px: root mean square image residual of the inliers; NaN where there are none.
         second: inliers of the second-best pose elsewhere in the map, 0 where there is none.
-        why: the verdict in words with its numbers.
+        why: the status in words with its numbers.
     """
 
-    verdict: Verdict
+    status: RelocalisationStatus
     wTc: FloatArray
     covariance: FloatArray
     features: IntArray
@@ -167,7 +167,7 @@ class Relocalisation(Brief):
     @property
     def found(self) -> bool:
         """Whether the pose is to be believed."""
-        return self.verdict is Verdict.FOUND
+        return self.status is RelocalisationStatus.FOUND
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

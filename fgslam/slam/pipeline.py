@@ -140,7 +140,7 @@ class SlamPipeline:
             relocalised = anew.ego_motion.status.measured
             tracked = anew if relocalised else tracked
         elif self.places is not None and found.i > 0:
-            tracked = self.places.mended(tracked, prediction, landmarks, stereo)
+            tracked = self.places.placed_by_recent(tracked, prediction, landmarks, stereo)
             tracked, relocalised = self.places.recover(tracked, landmarks, stereo)
             maps_on = self.places.maps_on
         image = found.frame.images[0]

@@ -38,7 +38,7 @@ class LoopSettings:
 
     every: Annotated[
         int,
-        Field(ge=1, description="frames between looks; a hopeful look is repeated at each frame"),
+        Field(ge=1, description="frames between looks; after a place was recognised, every frame"),
     ] = 4
     forgotten_after: Annotated[
         int,

@@ -95,7 +95,7 @@ def _rows(judged: Scored) -> Iterator[tuple[Cell, ...]]:
         yield (
             attempt.frame,
             attempt.frames,
-            found.verdict.value,
+            found.status.value,
             *(pose if posed else [None] * len(pose)),
             attempt.features,
             found.candidates,

@@ -210,7 +210,7 @@ def _refusal_table(judged: Sequence[Scored]) -> TextTable:
 
 def verdict_of(attempt: Attempt) -> str:
     """The verdict's name; ``no_image`` of a frame that could not be read."""
-    return "no_image" if attempt.found is None else attempt.found.verdict.value
+    return "no_image" if attempt.found is None else attempt.found.status.value
 
 
 def _percent(share: float | None) -> str:

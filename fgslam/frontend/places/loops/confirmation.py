@@ -26,7 +26,7 @@ class Confirmation:
         self.offset: FloatArray = np.eye(4)
 
     @property
-    def hopeful(self) -> bool:
+    def begun(self) -> bool:
         """Whether a place was recognised by the last look: the next frame shall look again."""
         return self.count > 0
 
@@ -37,7 +37,7 @@ class Confirmation:
             recognised: (4, 4) ``wTc`` by the landmarks of the place.
             estimated: (4, 4) ``wTc`` as estimated along the way.
         """
-        if self.hopeful and self._agrees(recognised, estimated):
+        if self.begun and self._agrees(recognised, estimated):
             self.count += 1
         else:
             self.count = 1
@@ -67,7 +67,7 @@ def difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
 def drift_allows(
     recognised: FloatArray, estimated: FloatArray, way_m: float, settings: LoopSettings
 ) -> bool:
-    """Whether the offset is that of a drift: worth a correction, and possible after ``way_m`` metres."""
+    """True if the offset is worth a correction, and a drift that ``way_m`` metres allow."""
     metres, degrees = difference(estimated, recognised)
     worth = metres > _WORTH[0] or degrees > _WORTH[1]
     return worth and (

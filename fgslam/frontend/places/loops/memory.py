@@ -160,9 +160,9 @@ class SightingMemory:
         self._seen, self._newest, self._returns, self._ties = [], [], [], []
         self._given, self._on_map = int(state["given"]), False
         self._last_seen = np.full(self._given + 1, -1)
-        verdicts, self.taken = iter(state["taken"].tolist()), []
+        accepted, self.taken = iter(state["taken"].tolist()), []
         for increment in log:
-            self._book(increment, tuple(itertools.islice(verdicts, len(increment.loops))))
+            self._book(increment, tuple(itertools.islice(accepted, len(increment.loops))))
         self._way = state["way"].tolist()
 
     def _book(self, increment: Increment, closed: tuple[bool, ...]) -> None:

@@ -124,19 +124,19 @@ class PlaceRecognition:
 
     # -- loops -------------------------------------------------------------------------------
 
-    def mended(
+    def placed_by_recent(
         self,
         tracked: Tracked,
         prediction: Prediction,
         landmarks: LandmarkMap,
         features: StereoFeatures,
     ) -> Tracked:
-        """The frame as tracked; torn between two places, as placed by recent landmarks alone.
+        """Tracking of a frame; of two hypotheses with similar support, that of recent landmarks.
 
-        Back at a place from which a drift has moved the estimate a little, old landmarks are found
-        among those of the way, and contradict them. Until a closure has moved the map the frame
-        belongs to the way: half way between them it would fit neither, and what it begins would
-        be misplaced.
+        Back at a place from which a drift has moved the estimate a little, old landmarks are
+        matched beside recent ones and contradict them. Until a closure has corrected the map the frame is
+        placed by the recent ones: between both it would fit neither, and the landmarks that it
+        starts would be misplaced.
 
         Args:
             tracked: the frame, placed by all landmarks.
@@ -162,7 +162,7 @@ class PlaceRecognition:
         """Looks for a return, where it is time to; the closure once it is confirmed.
 
         Whatever the estimator makes of it, a rest follows: the same place would be offered at every
-        look. What a closure means for map and memory waits for its verdict (:meth:`remember`).
+        look. What a closure means for map and memory waits for its acceptance (:meth:`remember`).
 
         Args:
             wTc: (4, 4) the frame's pose as tracked.
@@ -224,7 +224,7 @@ class PlaceRecognition:
         Args:
             increment: its measurements.
             tracked: (4, 4) its pose before any loop was closed in it.
-            stats: the estimator's pose and verdicts.
+            stats: the estimator's pose, and which closures it took.
         """
         taken = [loop for loop, so in zip(increment.loops, stats.closed, strict=True) if so]
         if taken:
@@ -279,7 +279,7 @@ class PlaceRecognition:
         frame = len(self._memory)
         if self._astray or (self._offered >= 0 and frame - self._offered <= loops.rest):
             return False
-        return confirmation.hopeful or frame % loops.every == 0
+        return confirmation.begun or frame % loops.every == 0
 
     def _old_place(
         self, loops: LoopSettings, landmarks: LandmarkMap, features: StereoFeatures

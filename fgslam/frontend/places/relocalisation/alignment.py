@@ -8,7 +8,7 @@ from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.floor import Floor
 
 _RIGID_SIGMAS = 3.0
-_LEAST_SPREAD_M = 0.15  # shorter samples turn the pose by more than any measurement mends
+_LEAST_SPREAD_M = 0.15  # shorter samples turn the pose by more than any measurement corrects
 
 
 def sample_size(floor: Floor) -> int:

@@ -48,8 +48,8 @@ class Refined:
         misfit: mean squared normalised residual over its three numbers; 1 where as modelled.
         proposed: how many of the frame's tentatively matched features agree.
         expected: (m,) rows of landmarks that the pose should see.
-        witnesses: what the matches weigh: of one piece of the map at most four count, for a thing
-            that stands elsewhere, too, would match as a whole.
+        independent: independent inliers: at most four count of one piece of the map, since an
+            object that stands elsewhere, too, matches as a whole.
         covered: share of the map's pieces expected in view of which something is seen.
         explained: share of the directions in which the frame sees things in which one agrees.
     """
@@ -62,7 +62,7 @@ class Refined:
     misfit: float
     proposed: int
     expected: IntArray
-    witnesses: int
+    independent: int
     covered: float
     explained: float
 
@@ -70,11 +70,11 @@ class Refined:
         return len(self.features)
 
     def unshared(self, other: Refined, positions: FloatArray, side: float) -> int:
-        """Witnesses for this pose among the matches that the other does not have."""
+        """Independent inliers of this pose among the matches that the other does not have."""
         count = int(max(self.landmarks.max(), other.landmarks.max())) + 1
         own = self.features * count + self.landmarks
         rest = ~np.isin(own, other.features * count + other.landmarks)
-        return witnesses(positions[self.landmarks[rest]], side)
+        return independent_inliers(positions[self.landmarks[rest]], side)
 
     def explains_beside(self, other: Refined) -> int:
         """Features that have a landmark at this pose, and none at the other."""
@@ -184,7 +184,7 @@ class Refiner:
         )
 
     def _solve(self, searches: list[_Search]) -> None:
-        """Least squares; landmarks of one piece of the map err together and share their say."""
+        """Least squares; landmarks of one piece of the map err together and share their weight."""
         if not searches:
             return
         features, landmarks = (np.concatenate([one.chosen[k] for one in searches]) for k in (0, 1))
@@ -220,7 +220,7 @@ class Refiner:
             misfit=float(np.mean(squared_distances(found))) / 3.0,
             proposed=proposed,
             expected=expected,
-            witnesses=witnesses(positions[chosen[1]], side),
+            independent=independent_inliers(positions[chosen[1]], side),
             covered=covered(positions[expected], np.isin(expected, chosen[1]), side),
             explained=explained(self.features.position, chosen[0]),
         )
@@ -232,8 +232,8 @@ def pieces(positions: FloatArray, side: float) -> IntArray:
     return np.asarray(np.unique(cubes, axis=0, return_inverse=True)[1].ravel())
 
 
-def witnesses(positions: FloatArray, side: float) -> int:
-    """How many of the positions (n, 3) count where each cube has at most four votes."""
+def independent_inliers(positions: FloatArray, side: float) -> int:
+    """Number of the positions (n, 3), of which at most four count in each cube."""
     return (
         int(np.minimum(np.bincount(pieces(positions, side)), _VOTES).sum()) if len(positions) else 0
     )

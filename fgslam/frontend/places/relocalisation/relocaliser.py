@@ -10,13 +10,13 @@ from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.floor import Floor
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.places.relocalisation import hough, ransac
+from fgslam.frontend.places.relocalisation.acceptance import accept
 from fgslam.frontend.places.relocalisation.known_map import KnownMap
 from fgslam.frontend.places.relocalisation.proposals import Evidence, Proposals, apart, distinct
 from fgslam.frontend.places.relocalisation.refinement import Refined, Refiner
 from fgslam.frontend.places.relocalisation.residuals import Pairs, SeenPoints, log_uniform
 from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
 from fgslam.frontend.places.relocalisation.tentative import Tentative, gated, specific, unspecific
-from fgslam.frontend.places.relocalisation.verdict import judge
 
 _NEIGHBOURS = 12  # stored views asked of the index for each feature
 _REFINED = 4  # distinct best poses that are refined and compared
@@ -74,7 +74,7 @@ class Relocaliser:
         else:
             proposals = ransac.propose(evidence, self._floor, self._settings, rng)
         refined = self._refine(features, seen, evidence, proposals)
-        return judge(tentative, refined, self._known.landmarks, self._settings)
+        return accept(tentative, refined, self._known.landmarks, self._settings)
 
     def tentative(self, features: StereoFeatures) -> Tentative:
         """Matches of the features with landmarks anywhere in the map."""
@@ -102,13 +102,13 @@ class Relocaliser:
         evidence: Evidence,
         proposals: Proposals,
     ) -> list[Refined]:
-        """The best distinct poses refined, that with most witnesses first."""
+        """The best distinct poses refined, that with most independent inliers first."""
         limits = _ELSEWHERE_M, _ELSEWHERE_RAD
         refiner = Refiner(
             self._rig, self._floor, self._known, features, seen, evidence, self._settings
         )
         out = refiner.refine(distinct(proposals, _REFINED, *limits))
-        out.sort(key=lambda found: (-found.witnesses, -len(found)))
+        out.sort(key=lambda found: (-found.independent, -len(found)))
         first: list[Refined] = []
         for candidate in out:
             if all(apart(candidate.wTc[None], other.wTc, *limits)[0] for other in first):

@@ -47,8 +47,8 @@ class RelocalisationSettings:
         int,
         Field(
             ge=3,
-            description="fewer independent inliers are no pose; of one piece of the map at most four "
-            "count, since they may be one object",
+            description="fewer independent inliers are no pose; at most four count of one piece "
+            "of the map, which may be one object",
         ),
     ] = 8
     max_sigma_m: Annotated[

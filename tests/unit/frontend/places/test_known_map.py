@@ -37,7 +37,9 @@ def known(rng: np.random.Generator) -> KnownMap:
     )
 
 
-def test_what_has_no_look_and_what_has_no_landmark_are_left_out(rng: np.random.Generator) -> None:
+def test_landmarks_without_views_and_views_without_landmark_are_left_out(
+    rng: np.random.Generator,
+) -> None:
     ids, viewed = np.array([2, 4, 6, 9]), np.array([1, 2, 2, 6, 7, 9, 9, 9, 12])
     landmarks, views = _landmarks(ids, rng.standard_normal((4, 3))), _views(viewed, rng)
     known = KnownMap.of(landmarks, views, SIGMA_M)

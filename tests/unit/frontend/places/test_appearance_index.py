@@ -48,7 +48,7 @@ def test_every_cell_searched_finds_what_a_full_search_does(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, chunk: int
 ) -> None:
     held, asked = looks(rng, 900), looks(rng, 40)
-    held[450:600] = held[300:450]  # twins: ties, at the last of the asked neighbours as well
+    held[450:600] = held[300:450]  # ties, at the last of the asked neighbours as well
     monkeypatch.setattr(appearance_index, "_CHUNK", chunk)
     in_full = AppearanceIndex(held).query(asked, 7)
     monkeypatch.setattr(appearance_index, "_EXACT", 0)
@@ -82,7 +82,7 @@ def test_queries_are_answered_one_by_one(
 
 
 @pytest.mark.parametrize("exact", [0, 10_000])
-def test_twins_come_in_the_order_of_their_rows_and_none_too_many(
+def test_ties_come_in_the_order_of_their_rows_and_none_too_many(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
 ) -> None:
     monkeypatch.setattr(appearance_index, "_EXACT", exact)

@@ -9,7 +9,7 @@ import pytest
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.core.estimates import Relocalisation, Verdict
+from fgslam.core.estimates import Relocalisation, RelocalisationStatus
 from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import pose, so3_exp
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
@@ -31,11 +31,11 @@ def _relocaliser(
 def _same(a: Relocalisation, b: Relocalisation) -> bool:
     arrays = ("wTc", "covariance", "features", "ids")
     equal = all(np.array_equal(getattr(a, n), getattr(b, n), equal_nan=True) for n in arrays)
-    return equal and a.why == b.why and a.verdict == b.verdict
+    return equal and a.why == b.why and a.status == b.status
 
 
 @pytest.mark.parametrize("settings", [DEFAULTS, HOUGH])
-def test_is_found_on_the_floor_without_a_prior(
+def test_pose_on_the_floor_is_found_without_a_prior(
     rng: np.random.Generator, settings: RelocalisationSettings
 ) -> None:
     place, truth = room(rng), planar(1.2, -0.7, 2.1)
@@ -52,7 +52,7 @@ def test_is_found_on_the_floor_without_a_prior(
 
 
 @pytest.mark.parametrize("dof", [5, 6])
-def test_is_found_in_space_however_it_is_held(rng: np.random.Generator, dof: int) -> None:
+def test_pose_in_space_is_found_in_any_orientation(rng: np.random.Generator, dof: int) -> None:
     place = things(rng, np.array([-4.0, -1.5, -4.0]), np.array([4.0, 1.0, 4.0]), 2500)
     height = 0.0 if dof == 5 else -0.4
     truth = pose(so3_exp(np.array([0.3, 1.9, -0.5])), np.array([0.5, height, 1.0]))
@@ -94,15 +94,15 @@ def _two_posters(rng: np.random.Generator) -> tuple[Place, Place]:
     return poster, poster.moved(np.array([6.0, 0.0, 0.0]))
 
 
-def test_twins_that_fill_the_view_are_ambiguous(rng: np.random.Generator) -> None:
+def test_alike_places_that_fill_the_view_are_ambiguous(rng: np.random.Generator) -> None:
     west, east = _two_posters(rng)
     for truth in (planar(-3.0, 3.0, 0.0), planar(3.0, 3.0, 0.0)):
         found = _relocaliser(west.join(east)).locate(seen(west.join(east), truth, rng), rng)
-        assert found.verdict is Verdict.AMBIGUOUS, found.why
+        assert found.status is RelocalisationStatus.AMBIGUOUS, found.why
         assert found.second > 20
 
 
-def test_twins_are_told_apart_by_what_hangs_around_them(rng: np.random.Generator) -> None:
+def test_alike_places_are_told_apart_by_their_surroundings(rng: np.random.Generator) -> None:
     west, east = _two_posters(rng)
     place = west.join(east).join(room(rng, 900))
     made = _relocaliser(place)
@@ -112,7 +112,7 @@ def test_twins_are_told_apart_by_what_hangs_around_them(rng: np.random.Generator
         assert error(found.wTc, truth)[0] < 0.1
 
 
-def test_a_poster_carried_elsewhere_does_not_convince(rng: np.random.Generator) -> None:
+def test_a_poster_carried_elsewhere_is_refused(rng: np.random.Generator) -> None:
     """The map knows the poster and its wall; the frame shows the poster on a wall unknown."""
     poster, elsewhere = _two_posters(rng)
     wall = things(rng, np.array([-5.0, -1.5, 4.9]), np.array([-1.0, 1.0, 5.1]), 200)
@@ -120,18 +120,20 @@ def test_a_poster_carried_elsewhere_does_not_convince(rng: np.random.Generator) 
     view = seen(elsewhere.select(np.arange(0, 60, 2)), planar(3.0, 1.0, 0.0), rng, clutter=80)
     vague = replace(DEFAULTS, max_sigma_m=1.0, max_sigma_deg=20.0)  # its covariance shall not help
     found = _relocaliser(small.join(wall), settings=vague).locate(view, rng)
-    assert found.verdict is Verdict.CONTRADICTED, found.why
+    assert found.status is RelocalisationStatus.CONTRADICTED, found.why
 
 
 @pytest.mark.parametrize("kept", [0.95, 0.7])
-def test_of_twins_the_better_known_one_does_not_win(rng: np.random.Generator, kept: float) -> None:
+def test_alike_places_stay_ambiguous_where_one_is_better_mapped(
+    rng: np.random.Generator, kept: float
+) -> None:
     """The map lost some landmarks of either."""
     west, east = _two_posters(rng)
     parts = (thing.select(np.flatnonzero(rng.random(60) < kept)) for thing in (west, east))
     made = _relocaliser(next(parts).join(next(parts)))
     for thing, x in ((west, -3.0), (east, 3.0)):
         found = made.locate(seen(thing, planar(x, 2.5, 0.0), rng), rng)
-        assert found.verdict is Verdict.AMBIGUOUS, found.why
+        assert found.status is RelocalisationStatus.AMBIGUOUS, found.why
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3])
@@ -144,7 +146,10 @@ def test_few_features_are_too_few(
     view = seen(place, planar(0.0, 0.0, 0.0), rng)
     settings = replace(DEFAULTS, descriptors=descriptors)
     found = _relocaliser(place, dof, settings).locate(_first(view, count), rng)
-    assert found.verdict in (Verdict.TOO_FEW_MATCHES, Verdict.TOO_FEW_INLIERS)
+    assert found.status in (
+        RelocalisationStatus.TOO_FEW_MATCHES,
+        RelocalisationStatus.TOO_FEW_INLIERS,
+    )
     assert str(DEFAULTS.min_inliers) in found.why
 
 
@@ -152,7 +157,7 @@ def test_an_empty_map_finds_nothing(rng: np.random.Generator) -> None:
     view = seen(room(rng), planar(0.0, 0.0, 0.0), rng)
     empty = Relocaliser(RIG, floor(3), DEFAULTS)
     found = empty.locate(view, rng)
-    assert found.verdict is Verdict.TOO_FEW_MATCHES
+    assert found.status is RelocalisationStatus.TOO_FEW_MATCHES
     assert np.isnan(found.covariance).all()
     assert not len(found.ids)
 
@@ -174,7 +179,7 @@ def test_one_plane_is_enough(rng: np.random.Generator) -> None:
         assert error(found.wTc, truth)[0] < 0.05
 
 
-def test_what_looks_unlike_anything_may_still_be_found_by_shape(rng: np.random.Generator) -> None:
+def test_pose_is_found_without_descriptors_by_votes(rng: np.random.Generator) -> None:
     """Without descriptors, by votes over size, height and orientation alone."""
     place, truth = room(rng, 300), planar(0.5, -1.0, 1.0)
     settings = replace(HOUGH, descriptors=False)

@@ -10,7 +10,7 @@ from simulated import RIG, assert_same_bits
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Relocalisation, Verdict
+from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Relocalisation, RelocalisationStatus
 from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, LoopClosure, Observations
@@ -89,7 +89,7 @@ def test_memory_tells_what_was_not_seen_for_long_and_where_it_was_seen_best() ->
 
 
 def test_landmarks_of_the_map_that_a_run_begins_in_are_older_than_all_it_sees() -> None:
-    """Seen or not: none of them may end as the double of another."""
+    """Seen or not: none of them may end as the duplicate of another."""
     memory = remembered([[3, 4], [4, 5], [5, 21]], given=20)
     asked = np.array([4, 6, 20, 21, 22])
     np.testing.assert_array_equal(memory.made_after(0, asked), asked > 20)
@@ -108,7 +108,7 @@ def left_and_back() -> SightingMemory:
     return remembered([[0, 1]] + 4 * [HERE] + outside + 2 * [list(range(20, 32))], given=59)
 
 
-def test_what_a_run_has_not_seen_of_its_map_is_old() -> None:
+def test_landmarks_of_the_map_not_yet_seen_count_as_old() -> None:
     memory = remembered([[0, 1, 60], HERE, [61]], given=59)
     np.testing.assert_array_equal(memory.unseen_for(30, np.arange(70)), range(20, 60))
     mostly = remembered([HERE, [*HERE, *range(60, 90)]], given=59)
@@ -120,7 +120,7 @@ def test_what_a_run_has_not_seen_of_its_map_is_old() -> None:
     np.testing.assert_array_equal(memory.of_given(np.array([59, 60])), [True, False])
 
 
-def test_what_nobody_saw_of_the_map_was_seen_where_the_run_entered_it() -> None:
+def test_unseen_landmarks_of_the_map_count_as_seen_where_the_run_entered_it() -> None:
     memory, unseen = left_and_back(), np.arange(40, 60)
     held = _map(np.arange(600), np.zeros((600, 3)))
     assert memory.best_view_of(unseen, held) == 1, "frame 0 saw too little of the map"
@@ -154,7 +154,7 @@ def test_a_map_bounds_the_drift_as_long_as_it_is_seen() -> None:
     assert other.way_since(0) == pytest.approx(4.5, abs=1e-3), "without a map since that frame"
 
 
-def test_doubles_of_the_map_were_made_since_it_was_left() -> None:
+def test_duplicates_of_map_landmarks_are_those_made_since_it_was_left() -> None:
     memory = left_and_back()
     assert memory.last_seen(np.array([50])) == 4, "not in the frames of the return"
     assert memory.last_seen(np.array([50, 300])) == 4, "nor later, whatever else is seen"
@@ -268,7 +268,7 @@ def test_a_look_that_fails_begins_the_count_anew() -> None:
     confirmation = Confirmation(dataclasses.replace(LOOPS, confirm=2))
     assert not confirmation.offer(np.eye(4), np.eye(4))
     confirmation.forget()
-    assert not confirmation.hopeful
+    assert not confirmation.begun
     assert not confirmation.offer(np.eye(4), np.eye(4))
     assert confirmation.offer(np.eye(4), np.eye(4))
 
@@ -287,7 +287,7 @@ def test_a_look_that_fails_begins_the_count_anew() -> None:
         (turned(20.0), 50.0, True),
     ],
 )
-def test_drift_is_worth_mending_and_bounded_by_the_way(
+def test_drift_is_worth_a_correction_and_bounded_by_the_way(
     recognised: FloatArray, way: float, allowed: bool
 ) -> None:
     assert drift_allows(recognised, np.eye(4), way, LOOPS) is allowed
@@ -363,7 +363,9 @@ def test_closure_measures_the_relative_pose_whatever_the_drift() -> None:
     true = turned(6.0, x=0.2, z=0.3)
     features = features_of(sight(true, points, ids, rng))
     partners = np.where(ids < 20, ids + 100, -1)
-    found = Relocalisation(Verdict.FOUND, true, np.eye(6), ids, ids, 50, 50, 0.3, 0, "for the test")
+    found = Relocalisation(
+        RelocalisationStatus.FOUND, true, np.eye(6), ids, ids, 50, 50, 0.3, 0, "for the test"
+    )
     drifted = turned(30.0, x=5.0, z=-3.0)  # the map as a whole may lie anywhere on the floor
     landmarks = _map(ids, g.transform_to_world(drifted, points))
     resection = Resection(EgoMotionSolver(RIG, EgoMotionSettings(dof=3)))
@@ -384,7 +386,7 @@ def test_closure_measures_the_relative_pose_whatever_the_drift() -> None:
 # -- landmarks found twice -------------------------------------------------------------------
 
 
-def test_doubles_are_near_and_look_alike() -> None:
+def test_duplicates_are_near_and_look_alike() -> None:
     rng = np.random.default_rng(7)
     looks = rng.integers(0, 90, (4, 128)).astype(np.uint8)
     old = rng.uniform(-5.0, 5.0, (4, 3))

@@ -54,7 +54,7 @@ def ring(refusing: bool = False) -> tuple[SlamPipeline, list[FrameReport]]:
     return pipeline, drive(pipeline, seen(RING, DARK))
 
 
-def test_the_return_is_recognised_and_the_drift_mended() -> None:
+def test_return_is_recognised_and_the_drift_corrected() -> None:
     _, reports = ring()
     closed = closings(reports)
     assert closed
@@ -65,23 +65,23 @@ def test_the_return_is_recognised_and_the_drift_mended() -> None:
     assert max(error_m(reports[k], RING[k]) for k in range(first, len(RING))) < 0.15
 
 
-def test_no_frame_is_torn_between_a_place_and_its_drifted_self(
+def test_frame_with_two_hypotheses_is_placed_by_recent_landmarks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Back near the start, 0.24 m off: old landmarks and new ones, found in the same frames."""
     late = dataclasses.replace(SETTINGS.loops, confirm=18)  # long after old landmarks are found
     settings = dataclasses.replace(SETTINGS, lost=None, loops=late)
 
-    def torn() -> tuple[list[int], list[int]]:
+    def driven() -> tuple[list[int], list[int]]:
         reports = drive(pipeline_of(RING, 0.2, settings), seen(RING, DARK))
         apart = [k for k, report in enumerate(reports) if not report.tracking.coherent]
         return apart, closings(reports)
 
-    apart, closed = torn()
+    apart, closed = driven()
     assert apart == []
     assert closed
-    monkeypatch.setattr(PlaceRecognition, "mended", lambda self, tracked, *_: tracked)
-    apart, closed = torn()
+    monkeypatch.setattr(PlaceRecognition, "placed_by_recent", lambda self, tracked, *_: tracked)
+    apart, closed = driven()
     assert len(apart) > 5
     assert not closed  # nor do such frames agree on where the place lies
 
@@ -170,8 +170,8 @@ def test_only_a_closure_that_was_taken_bounds_later_drift() -> None:
     assert way[True] > 10.0
 
 
-def test_the_estimators_of_a_comparison_judge_for_themselves() -> None:
-    """What the live one refused another one takes; its map holds both of what is one, mended."""
+def test_each_estimator_of_a_comparison_accepts_or_refuses_a_closure_itself() -> None:
+    """What the live one refused another one takes; its map keeps both landmarks."""
     _, reports = ring(refusing=True)
     estimator = make_estimator(RIG, LandmarkKalmanSettings(), SETTINGS.ego_motion)
     solver, motion = EgoMotionSolver(RIG, SETTINGS.ego_motion), RingMotion(RING, 0.9)
@@ -236,7 +236,7 @@ def carried() -> list[FloatArray]:
     return [on_ring(k) for k in range(40)] + [on_ring(k) for k in range(10, 25)]
 
 
-def test_carried_off_it_finds_itself_in_its_own_map() -> None:
+def test_kidnapped_robot_is_relocalised_in_its_own_map() -> None:
     poses = carried()
     reports = drive(pipeline_of(poses, 0.1), seen(poses))
     found = [k for k, r in enumerate(reports) if r.increment.relocalised]
@@ -248,7 +248,7 @@ def test_carried_off_it_finds_itself_in_its_own_map() -> None:
     assert sum(int(r.increment.observations.is_new.sum()) for r in lost) == 0, "not while lost"
 
 
-def test_without_it_the_robot_stays_lost() -> None:
+def test_kidnapped_robot_stays_lost_without_relocalisation() -> None:
     poses = carried()
     settings = dataclasses.replace(SETTINGS, lost=None, loops=None)
     reports = drive(pipeline_of(poses, 0.1, settings), seen(poses))
@@ -266,7 +266,7 @@ def test_a_relocalised_frame_is_replayed_to_the_bit() -> None:
         np.testing.assert_array_equal(stats.wTc, report.stats.wTc)
 
 
-def test_where_nothing_is_known_it_gives_up_and_maps_on() -> None:
+def test_lost_in_unmapped_surroundings_it_gives_up_and_maps_on() -> None:
     poses = [on_ring(k) for k in range(12)] + [on_ring(k) for k in range(36, 64)]
     settings = dataclasses.replace(
         SETTINGS, lost=LostSettings(after=2, give_up_after=6), loops=None
@@ -278,7 +278,7 @@ def test_where_nothing_is_known_it_gives_up_and_maps_on() -> None:
     assert reports[-1].tracking.status is EgoMotionStatus.OK
 
 
-def test_who_begins_in_the_dark_maps_as_soon_as_there_is_light() -> None:
+def test_a_run_that_begins_in_the_dark_maps_as_soon_as_there_is_light() -> None:
     """Without a landmark there is nothing to be lost in, and nothing to wait for."""
     poses = RING[:6]
     reports = drive(pipeline_of(poses, 0.1), seen(poses, range(2)))

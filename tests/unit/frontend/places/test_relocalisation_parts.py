@@ -13,7 +13,12 @@ from fgslam.frontend.places.relocalisation.appearance_index import Neighbours
 from fgslam.frontend.places.relocalisation.known_map import KnownMap
 from fgslam.frontend.places.relocalisation.least_squares import refine
 from fgslam.frontend.places.relocalisation.proposals import Evidence, Proposals, distinct
-from fgslam.frontend.places.relocalisation.refinement import Refiner, covered, crowd, witnesses
+from fgslam.frontend.places.relocalisation.refinement import (
+    Refiner,
+    covered,
+    crowd,
+    independent_inliers,
+)
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 from fgslam.frontend.places.relocalisation.residuals import (
     Pairs,
@@ -106,7 +111,7 @@ def test_least_squares_returns_to_truth_from_many_starts(
     assert np.linalg.matrix_rank(covariances[0], tol=1e-12) == dof
 
 
-def test_what_fixes_no_pose_has_an_infinite_covariance(rng: np.random.Generator) -> None:
+def test_degenerate_pairs_have_an_infinite_covariance(rng: np.random.Generator) -> None:
     pairs = _pairs(rng, planar(0.0, 0.0, 0.0), False).select(np.array([0]))
     start = planar(0.0, 0.0, 0.1)
     poses, covariances = refine(RIG, floor(6), start[None], pairs, np.zeros(1, np.int64), 4)
@@ -142,28 +147,25 @@ def test_the_best_of_each_neighbourhood_is_kept() -> None:
     assert kept.scores.tolist() == [9.0, 7.0]
 
 
-def test_pieces_weigh_things_not_texture() -> None:
+def test_pieces_count_objects_not_texture() -> None:
     poster = np.full((40, 3), 0.1)
     spread = np.column_stack([np.arange(10.0), np.zeros(10), np.zeros(10)])
-    assert witnesses(poster, 0.5) == 4
-    assert witnesses(np.vstack([poster, spread + 2.0]), 0.5) == 14
-    assert witnesses(np.empty((0, 3)), 0.5) == 0
+    assert independent_inliers(poster, 0.5) == 4
+    assert independent_inliers(np.vstack([poster, spread + 2.0]), 0.5) == 14
+    assert independent_inliers(np.empty((0, 3)), 0.5) == 0
     assert crowd(np.vstack([poster[:3], spread[5:6]]), 0.5).tolist() == [3, 3, 3, 1]
     pieces = np.repeat(spread[:4], 4, axis=0)
     assert covered(pieces, np.arange(16) < 5, 0.5) == 0.5
     assert covered(spread, np.zeros(10, np.bool_), 0.5) == 1.0
 
 
-def _specific(distances: list[float], places: list[float], **changes: float) -> list[int]:
+def _specific(distances: list[float], places: list[float]) -> list[int]:
     """Landmarks kept of one feature whose candidates stand at the given places on a line."""
     count = len(places)
     positions = np.column_stack([places, np.zeros(count), np.zeros(count)])
     landmarks = LandmarkMap(np.arange(count), positions, np.zeros((count, 3, 3)))
     neighbours = Neighbours(np.arange(count)[None], np.array([distances]))
-    settings = RelocalisationSettings(**changes)
-    kept = specific(
-        neighbours, np.ones((1, count), np.bool_), np.arange(count), landmarks, settings
-    )
+    kept = specific(neighbours, np.ones((1, count), np.bool_), np.arange(count), landmarks)
     assert (kept.places == len({round(places[k]) for k in kept.landmarks})).all()
     return kept.landmarks.tolist()
 
@@ -178,7 +180,7 @@ def test_candidates_end_at_the_first_gap() -> None:
 
 
 @pytest.mark.parametrize("dof", [3, 6])
-def test_rivals_refined_together_end_where_each_would_alone(
+def test_hypotheses_refined_together_end_where_each_would_alone(
     rng: np.random.Generator, dof: int
 ) -> None:
     truth = planar(0.5, -0.4, 0.3)
