@@ -134,9 +134,9 @@ class PlaceRecognition:
         """Tracking of a frame; of two hypotheses with similar support, that of recent landmarks.
 
         Back at a place from which a drift has moved the estimate a little, old landmarks are
-        matched beside recent ones and contradict them. Until a closure has corrected the map the frame is
-        placed by the recent ones: between both it would fit neither, and the landmarks that it
-        starts would be misplaced.
+        matched beside recent ones and contradict them. Until a closure has corrected the map the
+        frame is placed by the recent ones: between both it would fit neither, and the landmarks
+        that it starts would be misplaced.
 
         Args:
             tracked: the frame, placed by all landmarks.
