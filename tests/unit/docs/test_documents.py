@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+import fgslam
+
 ROOT = Path(__file__).parents[3]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
 EVERY = [*PAGES, *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"))]
@@ -71,3 +73,9 @@ def test_every_file_of_the_architecture_s_table_exists() -> None:
         for name in (first, *rest):
             path = name if "/" in name or name == first else str(folder / name)
             assert (ROOT / "fgslam" / path).is_file(), path
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    page = (ROOT / "docs/reference/api.md").read_text(encoding="utf-8")
+    shown = set(re.findall(r"^::: fgslam\.(\w+)$", page, flags=re.MULTILINE))
+    assert shown == set(fgslam.__all__) - {"__version__", "errors"}
