@@ -86,7 +86,7 @@ class Browser:
         WebDriverWait(self.driver, 60.0, 0.05).until(lambda _: self.js(condition))
 
     def complaints(self) -> list[str]:
-        """Errors in the console, of scripts and of the page's policy; told once each."""
+        """Errors in the console, of scripts and of the page's policy; reported once each."""
         return [
             entry["message"]
             for entry in self.driver.get_log("browser")  # type: ignore[no-untyped-call]

@@ -1,1 +1,1 @@
-"""Trajectory error and consistency."""
+"""Errors against the truth, consistency, time: of trajectories, landmarks, closures, homings."""

@@ -1,4 +1,4 @@
-"""Judges the returns that a run recognised: were they any, and what did closing them mend?"""
+"""Loop closures against the truth: whether the place was the same, and what closing corrected."""
 
 from __future__ import annotations
 

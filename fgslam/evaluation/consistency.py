@@ -1,11 +1,11 @@
-"""Consistency: does an estimator's covariance tell the truth about its error?
+"""Consistency: whether an estimator's covariances are as large as its errors (NEES).
 
 The normalised estimation error squared (NEES) of a consistent estimator is chi-square with as
 many degrees of freedom as the error has (Bar-Shalom, Li and Kirubarajan 2001, 5.4). Here it is
 given per degree of freedom, so that 1 is right, more is overconfident, less is conservative.
 
 Covariances may be singular: the first pose is known exactly, a planar robot has three degrees
-of freedom, one of fixed height five. Such errors are judged on the subspace that the covariance
+of freedom, one of fixed height five. Such errors are evaluated on the subspace that the covariance
 supports, and only its dimensions are counted.
 """
 
@@ -21,7 +21,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.geometry import inverse, se3_log
 from fgslam.core.quantiles import chi_square_quantile
 
-Verdict: TypeAlias = Literal["consistent", "overconfident", "conservative"]
+ConsistencyVerdict: TypeAlias = Literal["consistent", "overconfident", "conservative"]
 
 # Directions whose variance is this much below the largest one (of radians and metres, which are
 # of like size here) are constraints, not knowledge: a ratio of 1e5 in standard deviation.
@@ -60,7 +60,7 @@ class Consistency:
         probability: of the band.
         items: how many errors were averaged.
         independent: how many of them the band took as independent.
-        verdict: in a word.
+        verdict: `consistent`, `overconfident` or `conservative`.
     """
 
     per_dof: float
@@ -69,7 +69,7 @@ class Consistency:
     probability: float
     items: int
     independent: int
-    verdict: Verdict
+    verdict: ConsistencyVerdict
 
 
 def nees(errors: FloatArray, covariances: FloatArray) -> Nees:
@@ -133,12 +133,13 @@ def chi_square_band(dof: float, probability: float = 0.95) -> tuple[float, float
 def judge(
     runs: Sequence[Nees], probability: float = 0.95, *, items_independent: bool = False
 ) -> Consistency | None:
-    """Verdict on one or more runs.
+    """NEES of one or more runs beside its chi-square band, and whether it lies inside.
 
-    The errors within one run hang together (each pose starts from the one before, all landmarks
+    The errors within one run are correlated (each pose starts from the one before, all landmarks
     are seen from the same poses), so their mean scatters far more than that many independent
     ones would. By default each *run* counts as a single independent item of average dimension,
-    which never condemns an estimator unjustly; many runs make the band narrow.
+    which calls no consistent estimator inconsistent more often than the band says; many runs make
+    the band narrow.
 
     Args:
         runs: NEES of independent runs (different seeds).
@@ -147,7 +148,7 @@ def judge(
             one frame of many runs).
 
     Returns:
-        The verdict, or None when no run has a degree of freedom.
+        The comparison, or None when no run has a degree of freedom.
     """
     values = np.concatenate([run.values for run in runs]) if runs else np.empty(0)
     dof = np.concatenate([run.dof for run in runs]) if runs else np.empty(0, np.int64)
@@ -164,7 +165,7 @@ def judge(
     )
 
 
-def _verdict(per_dof: float, lower: float, upper: float) -> Verdict:
+def _verdict(per_dof: float, lower: float, upper: float) -> ConsistencyVerdict:
     if per_dof > upper:
         return "overconfident"
     return "conservative" if per_dof < lower else "consistent"

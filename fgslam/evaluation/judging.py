@@ -27,7 +27,7 @@ from fgslam.evaluation.trajectory import (
 )
 
 LEAST_SIGHTINGS = 3
-"""Landmarks are judged that were seen so often: `valid` of Se et al. (6.1), for all estimators."""
+"""Landmarks are compared with the truth that were seen so often: `valid` of Se et al. (6.1)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +46,7 @@ class Truth:
 
 
 class Replayed(Protocol):
-    """What is judged of a replayed measurement log, as ``fgslam.slam.replay.Replay`` has it."""
+    """What is evaluated of a replayed measurement log, as ``fgslam.slam.replay.Replay`` has it."""
 
     @property
     def kind(self) -> str:
@@ -302,7 +302,7 @@ def _growth(update_ms: FloatArray) -> JsonValue:
 
 
 def _last_pose_sigma(estimate: Estimate) -> JsonValue:
-    """How well the estimator thinks to know the last pose: root of the traces."""
+    """Standard deviations of the last pose as claimed: roots of the traces of its two blocks."""
     if not len(estimate.covariances) or not np.isfinite(estimate.covariances[-1]).all():
         return None
     variances = np.maximum(np.diagonal(estimate.covariances[-1]), 0.0)
@@ -313,6 +313,6 @@ def _last_pose_sigma(estimate: Estimate) -> JsonValue:
 
 
 def _end_against_start(trajectory: Trajectory) -> JsonValue:
-    """Last pose in the frame of the first: what the paper judges its loop by."""
+    """Last pose in the frame of the first: Se et al. (5) measure by it how well a loop closes."""
     found = end_pose(trajectory)
     return None if found is None else asdict(found)

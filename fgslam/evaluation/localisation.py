@@ -1,4 +1,4 @@
-"""How right poses are that were found in a map without a prior: errors, counts, covariances."""
+"""Errors, counts and consistency of poses found in a map without a prior."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Bounds:
     Attributes:
         within_m, within_rad: largest errors of a right pose.
         wrong_m, wrong_rad: a pose farther off than either is false.
-        least_visible: poses from which fewer landmarks are visible are told apart.
+        least_visible: poses from which fewer landmarks are visible are counted apart.
     """
 
     within_m: float

@@ -1,4 +1,4 @@
-"""Is one estimator better than another, over the same worlds of noise?"""
+"""Paired tests of two estimators over trials with the same noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How an estimator's time a frame grows along a drive."""
+"""Growth of an estimator's time a frame along a drive."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 
-_LEAST_FRAMES = 25  # five a fifth: fewer make no median worth the name
+_LEAST_FRAMES = 25  # five a fifth: the median of fewer is noise
 
 
 @dataclass(frozen=True, slots=True)

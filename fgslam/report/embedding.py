@@ -50,7 +50,7 @@ def embed(pictures: Sequence[Picture]) -> tuple[list[Embedded], list[str]]:
 def _embed(picture: Picture) -> Embedded | None:
     try:
         with Image.open(io.BytesIO(picture.content)) as opened:
-            opened.load()  # a torn file shows only now
+            opened.load()  # a truncated file is found only now
             width, height = opened.size
             if len(picture.content) <= _KEPT_AS_IT_IS and opened.format in ("PNG", "JPEG", "WEBP"):
                 mime, content = f"image/{opened.format.lower()}", picture.content

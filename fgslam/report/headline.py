@@ -1,4 +1,4 @@
-"""The headline in plain sentences: who is best and by how much, and whose claims hold."""
+"""Sentences on the most accurate estimator, its lead, and whose covariances hold."""
 
 from __future__ import annotations
 

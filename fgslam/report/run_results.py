@@ -46,7 +46,7 @@ class EstimatorReport:
         ate_m: absolute trajectory error of the final path, as ``ReportData.alignment`` says.
         nees_per_dof: mean NEES of the run per degree of freedom.
         verdict: `consistent`, `overconfident` or `conservative`; None where not known.
-        remarks: what the estimator had to mend or leave out, in words.
+        remarks: what the estimator had to correct or leave out, in words.
         failure: why it ended early, with what it had until then, or gave nothing; else empty.
     """
 
@@ -115,7 +115,7 @@ class EstimatorReport:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReportData:
-    """All that one page shows.
+    """Results of one run with what a page or a viewer says about it.
 
     Attributes:
         title, subtitle: headings.

@@ -41,7 +41,7 @@ def metrics_of(folder: Path) -> dict[str, object]:
     return json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
 
 
-def test_it_tells_what_the_files_say(finished: Finished) -> None:
+def test_page_shows_what_the_files_hold(finished: Finished) -> None:
     data = load_report(finished.folder)
     (estimator,) = data.estimators
     metrics = metrics_of(finished.folder)["estimators"][KIND]  # type: ignore[index]
@@ -148,12 +148,12 @@ def test_a_comparison_s_folder_borrows_from_the_run_above(run: Path) -> None:
 def test_an_estimator_that_ended_early_shows_what_it_had(run: Path) -> None:
     metrics = metrics_of(run)
     values = metrics["estimators"][KIND]  # type: ignore[index]
-    values |= {"failure": "frame 9: diverged", "remarks": ["mended a landmark"]}
+    values |= {"failure": "frame 9: diverged", "remarks": ["left out a landmark"]}
     (run / "metrics.json").write_text(json.dumps(metrics), encoding="utf-8")
     text = report_from_folder(run).read_text(encoding="utf-8")
     assert f"{KIND} (failed)" in text
     assert f"{KIND} failed: frame 9: diverged" in text
-    assert f"{KIND}: mended a landmark" in text
+    assert f"{KIND}: left out a landmark" in text
     assert len(only(run)) == 12
 
 

@@ -19,7 +19,7 @@ class Line:
     """A curve: its name, the number of its series (colour), and its points.
 
     Attributes:
-        name: told at the pointer.
+        name: shown at the pointer.
         series: number of the series that it belongs to.
         x, y: (n,).
         dash: `solid`, `dash` or `dot`.

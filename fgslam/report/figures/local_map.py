@@ -15,7 +15,7 @@ from fgslam.report.figures.traces import Figure, Owner, Switch, Trace, joined, t
 MAX_MOMENTS = 60
 _HEADING = 0.12  # length of the tick that points ahead, legs
 _BULK = (2.0, 98.0)
-_TOLD = "<b>%{fullData.name}</b><br>%{y:.3f} legs ahead, %{x:.3f} legs right<extra></extra>"
+_HOVER = "<b>%{fullData.name}</b><br>%{y:.3f} legs ahead, %{x:.3f} legs right<extra></extra>"
 
 
 def local_map_figure(
@@ -95,7 +95,7 @@ def _place(
     line: dict[str, Any] = {"line": {"width": 2}, "hoverinfo": "skip"}
     yield trace(owner, upwards(np.array([pose[:2], ahead])), mode="lines", **line)
     marker = {"symbol": "square", "size": 13}
-    yield trace(owner, upwards(pose[:2]), mode="markers", marker=marker, hovertemplate=_TOLD)
+    yield trace(owner, upwards(pose[:2]), mode="markers", marker=marker, hovertemplate=_HOVER)
     if np.isfinite(covariance).all():
         outline = outlines(pose[None, :2], covariance[None])[0]
         claimed = Owner(f"{name}, {SIGMAS:.0f} sigma", when=("ellipses",), colour=number, step=step)
@@ -113,7 +113,7 @@ def _features(estimates: Sequence[HomingEstimate], row: int, step: int) -> Itera
         text=names,
         textposition="top right",
         textfont={"size": 9},
-        hovertemplate=_TOLD,
+        hovertemplate=_HOVER,
     )
     lost = _lost(estimates, row)
     if len(lost):
@@ -146,7 +146,7 @@ def _dots(
 ) -> Trace:
     owner = Owner(name, paint=paint, when=when, step=step)
     marker = {"symbol": symbol, "size": size}
-    return trace(owner, upwards(points), mode="markers", marker=marker, hovertemplate=_TOLD)
+    return trace(owner, upwards(points), mode="markers", marker=marker, hovertemplate=_HOVER)
 
 
 def _true_path(truth: HomingTruth | None) -> Iterator[Trace]:

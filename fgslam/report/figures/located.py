@@ -29,7 +29,7 @@ from fgslam.report.figures.trajectory import bulk_limits, level_axes
 
 MAX_LANDMARKS = 6_000
 _HEADING = 0.025  # length of a heading, as a share of the picture
-_TOLD = "<b>%{fullData.name}</b><br>%{x:.2f} m right, %{y:.2f} m ahead<extra></extra>"
+_HOVER = "<b>%{fullData.name}</b><br>%{x:.2f} m right, %{y:.2f} m ahead<extra></extra>"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,7 +116,7 @@ def _answers(
 
 def _dots(owner: Owner, points: FloatArray, marker: dict[str, object]) -> Trace:
     axes = {"x": points[:, 0], "y": points[:, 1]}
-    return trace(owner, axes, mode="markers", marker=marker, hovertemplate=_TOLD)
+    return trace(owner, axes, mode="markers", marker=marker, hovertemplate=_HOVER)
 
 
 def _line(owner: Owner, polylines: FloatArray, width: float) -> Trace:

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 from fgslam.core.arrays import FloatArray
 from fgslam.report.figures.traces import Figure, Owner, Switch, Trace, joined, plain_texts, trace
 
-_TOLD = "%{text}<extra></extra>"
+_HOVER = "%{text}<extra></extra>"
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,14 +22,14 @@ class Links:
         name: of the kind.
         colour: number of its colour.
         pairs: numbers of the nodes.
-        told: what the pointer says of each.
+        texts: shown at the pointer, one each.
         shown: at first; there is a switch for each kind.
     """
 
     name: str
     colour: int
     pairs: tuple[tuple[int, int], ...]
-    told: tuple[str, ...]
+    texts: tuple[str, ...]
     shown: bool = True
 
 
@@ -58,7 +58,7 @@ def network_figure(
         marker={"symbol": "square", "size": 9},
         text=plain_texts(names),
         textposition="top center",
-        hovertemplate=_TOLD,
+        hovertemplate=_HOVER,
     )
     key, heading, description = words
     blank = {"showticklabels": False} if not any(axes) else {}
@@ -77,7 +77,7 @@ def network_figure(
 def unfolded(count: int, pairs: Sequence[tuple[int, int]]) -> FloatArray:
     """(count, 2) places such that distances are as those along the links (classical scaling).
 
-    Parts of the graph that hang together nowhere are set beside each other.
+    Parts of the graph without a link between them are set beside each other.
     """
     weights = np.zeros((count, count))
     for a, b in pairs:
@@ -97,18 +97,18 @@ def unfolded(count: int, pairs: Sequence[tuple[int, int]]) -> FloatArray:
 
 
 def _lines(kind: Links, places: FloatArray, key: str) -> list[Trace]:
-    """The lines, and a mark in the middle of each that tells about it."""
+    """The lines, and a mark in the middle of each with its text."""
     ends = places[np.array(kind.pairs, dtype=np.int64).reshape(-1, 2)]
     owner = Owner(kind.name, when=(key,), colour=kind.colour)
     x, y = joined(ends).T
     middle = ends.mean(axis=1)
     line = trace(owner, {"x": x, "y": y}, mode="lines", line={"width": 1.4}, hoverinfo="skip")
-    told = trace(
+    marks = trace(
         owner,
         {"x": middle[:, 0], "y": middle[:, 1]},
         mode="markers",
         marker={"size": 4},
-        text=plain_texts(kind.told),
-        hovertemplate=_TOLD,
+        text=plain_texts(kind.texts),
+        hovertemplate=_HOVER,
     )
-    return [line, told]
+    return [line, marks]

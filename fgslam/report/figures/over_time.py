@@ -41,12 +41,12 @@ def error_over_time(data: ReportData) -> Figure:
     """Distance from the true position, final and online, beside what the estimator claims."""
     traces: list[Trace] = []
     for i, estimator in enumerate(data.estimators):
-        for key, values, told, style in (
+        for key, values, words, style in (
             ("claimed", SIGMAS * position_sigma(estimator), "3 sigma", _CLAIMED),
             ("online", estimator.online_error_m, "as first estimated", _ONLINE),
             ("final", estimator.final_error_m, "final", _FINAL),
         ):
-            owner = Owner(f"{estimator.title}, {told}", i, (key,))
+            owner = Owner(f"{estimator.title}, {words}", i, (key,))
             traces += _curve(owner, data, estimator, values, style, "%{y:.4f} m")
     known = any(np.isfinite(e.final_error_m).any() for e in data.estimators)
     return Figure(
@@ -138,8 +138,8 @@ def _error_with_band(
         band = replace(owner, name="3 sigma", paint="band")
         style: dict[str, Any] = {"fill": "toself", "line": {"width": 0}, "hoverinfo": "skip"}
         yield trace(band, corners, mode="lines", **style, **axis)
-    axes, told = {"x": seconds, "y": error}, "%{y:.3g}"
-    yield trace(owner, axes, mode="lines", line={"width": 1.8}, hovertemplate=told, **axis)
+    axes, hover = {"x": seconds, "y": error}, "%{y:.3g}"
+    yield trace(owner, axes, mode="lines", line={"width": 1.8}, hovertemplate=hover, **axis)
 
 
 def matches_over_time(
@@ -181,13 +181,13 @@ def nees_over_time(data: ReportData) -> Figure:
         values = np.where(estimator.nees > _LEAST_NEES, estimator.nees, np.nan)
         owner = Owner(estimator.title, i)
         traces += _curve(owner, data, estimator, values, {"width": 1.6}, "%{y:.3g}")
-    told = " and ".join(f"{low:.2f} to {high:.2f}" for low, high in bands) or "not known"
+    known = " and ".join(f"{low:.2f} to {high:.2f}" for low, high in bands) or "not known"
     return Figure(
         "nees",
         "Consistency over time (NEES)",
         "Squared error of each final pose in units of its own claimed covariance, per degree of "
         "freedom: 1 is right on average, more is overconfident, less is conservative. Band: 95 % "
-        f"of the values of a consistent estimator, frame by frame ({told}).",
+        f"of the values of a consistent estimator, frame by frame ({known}).",
         tuple(traces),
         _layout({"title": {"text": "NEES per degree of freedom"}, "type": "log"}),
         missing=_missing(data),
@@ -224,14 +224,14 @@ def _curve(
     estimator: EstimatorReport,
     values: FloatArray,
     style: Mapping[str, Any],
-    told: str,
+    hover: str,
 ) -> Iterator[Trace]:
     """A line of the values (n,), or nothing where none is known."""
     if not np.isfinite(values).any():
         return
     rows = peaks(values, MAX_POINTS)
     axes = {"x": (estimator.timestamps - data.start)[rows], "y": values[rows]}
-    template = f"{told} at %{{x:.2f}} s"
+    template = f"{hover} at %{{x:.2f}} s"
     yield trace(owner, axes, mode="lines", line=dict(style), hovertemplate=template)
 
 

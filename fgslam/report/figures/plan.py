@@ -25,7 +25,7 @@ MAX_POSES = 4_000
 PASS_RADIUS_M = 0.2
 _HEADING_M = 0.3
 _CORNERS = 25
-_TOLD = "<b>%{fullData.name}</b><br>%{x:.2f}, %{y:.2f} m<extra></extra>"
+_HOVER = "<b>%{fullData.name}</b><br>%{x:.2f}, %{y:.2f} m<extra></extra>"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,14 +69,14 @@ def drive_figure(
 
 
 def catchment_figure(
-    offsets: FloatArray, succeeded: BoolArray, told: Sequence[str], key: str = "catchment"
+    offsets: FloatArray, succeeded: BoolArray, labels: Sequence[str], key: str = "catchment"
 ) -> Figure:
     """From where homing arrives.
 
     Args:
         offsets: (n, 2) starts relative to the target, metres, target's heading up the page.
         succeeded: (n,) whether it arrived.
-        told: what the pointer says of each.
+        labels: shown at the pointer, one each.
         key: unique in the page.
     """
     traces = []
@@ -85,7 +85,7 @@ def catchment_figure(
         (1, "did not arrive", ~succeeded, "x-thin-open"),
     ):
         if which.any():
-            texts = [text for text, shown in zip(told, which, strict=True) if shown]
+            texts = [text for text, shown in zip(labels, which, strict=True) if shown]
             traces.append(
                 trace(
                     Owner(name, colour=series),
@@ -121,7 +121,7 @@ def _paths(drive: Drive) -> Iterator[Trace]:
         last = min(inside[-1] + 1, len(rows) - 1)
         own = drive.poses[rows[inside[0] : last + 1], :2]
         owner = Owner(f"leg {leg + 1}", colour=leg)
-        yield trace(owner, _xy(own), mode="lines", line={"width": 2}, hovertemplate=_TOLD)
+        yield trace(owner, _xy(own), mode="lines", line={"width": 2}, hovertemplate=_HOVER)
 
 
 def _robot(drive: Drive, row: int, step: int) -> Iterator[Trace]:
@@ -130,7 +130,7 @@ def _robot(drive: Drive, row: int, step: int) -> Iterator[Trace]:
     ahead = np.array([pose[:2], pose[:2] + _HEADING_M * _unit(pose[2])])
     yield trace(owner, _xy(ahead), mode="lines", line={"width": 4}, hoverinfo="skip")
     marker = {"symbol": "circle", "size": 12}
-    yield trace(owner, _xy(pose[None, :2]), mode="markers", marker=marker, hovertemplate=_TOLD)
+    yield trace(owner, _xy(pose[None, :2]), mode="markers", marker=marker, hovertemplate=_HOVER)
     if np.isfinite(drive.headings[row]):
         arrow = np.array([pose[:2], pose[:2] + 2.0 * _HEADING_M * _unit(drive.headings[row])])
         home = Owner("direction of home", colour=leg, step=step)
@@ -156,7 +156,7 @@ def _targets(drive: Drive) -> Iterator[Trace]:
         marker={"symbol": "square-open", "size": 10},
         text=[str(i + 1) for i in range(len(drive.targets))],
         textposition="top right",
-        hovertemplate=_TOLD,
+        hovertemplate=_HOVER,
     )
 
 

@@ -35,7 +35,7 @@ class Owner:
     """Who a trace belongs to, and when it is seen.
 
     Attributes:
-        name: told where the pointer rests.
+        name: shown at the pointer.
         estimator: its number in the report; None of what belongs to no estimator.
         when: switches of the figure that must all be on.
         unless: switches that must all be off.
@@ -125,7 +125,7 @@ class Figure:
 
 
 def trace(owner: Owner, axes: Mapping[str, FloatArray], **more: Any) -> Trace:
-    """A trace; ``axes`` are its coordinates (`x`, `y`, `z`) and values told at the pointer."""
+    """A trace; ``axes`` are its coordinates (`x`, `y`, `z`) and values shown at the pointer."""
     return {
         "type": "scatter3d" if "z" in axes else "scatter",
         # Plotly reads a little HTML in names; a title is never meant as such.

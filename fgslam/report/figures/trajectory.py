@@ -39,15 +39,15 @@ _DENSE = 3_000  # dots; finer ones keep the paths in sight
 # Dead reckoning beside smoothers: enlarged as these need it, its ellipses would cover everything.
 _FLOOD = 0.25
 _BULK = (1.5, 98.5)
-_TOLD = (
+_HOVER = (
     "<b>%{fullData.name}</b><br>%{x:.3f} m right, %{y:.3f} m ahead"
     "<br>%{customdata:.2f} s<extra></extra>"
 )
-_TOLD_3D = (
+_HOVER_3D = (
     "<b>%{fullData.name}</b><br>%{x:.3f} m right, %{y:.3f} m ahead, %{z:.3f} m up"
     "<br>%{customdata:.2f} s<extra></extra>"
 )
-_TOLD_DOT = "%{fullData.name}<br>%{x:.2f} m right, %{y:.2f} m ahead, %{z:.2f} m up<extra></extra>"
+_HOVER_DOT = "%{fullData.name}<br>%{x:.2f} m right, %{y:.2f} m ahead, %{z:.2f} m up<extra></extra>"
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,8 +257,8 @@ def _path(
     if solid:  # lines in space are drawn thinner than those of a plane
         style = style | {"width": 2 * style["width"]}
     axes = dict(zip("xyz", points.T, strict=False)) | {"customdata": times}
-    told = _TOLD_3D if solid else _TOLD
-    return trace(owner, axes, mode="lines", line=style, hovertemplate=told)
+    hover = _HOVER_3D if solid else _HOVER
+    return trace(owner, axes, mode="lines", line=style, hovertemplate=hover)
 
 
 def _uncertainty(data: ReportData, level: FloatArray) -> tuple[list[Trace], list[Switch]]:
@@ -382,7 +382,7 @@ def _dots_in_space(
             **_by_height(points[:, 2], float(low[2]), float(high[2])),
         }
         owner, axes = _map_of(i, estimator, "own"), dict(zip("xyz", points.T, strict=True))
-        yield trace(owner, axes, mode="markers", marker=marker, hovertemplate=_TOLD_DOT)
+        yield trace(owner, axes, mode="markers", marker=marker, hovertemplate=_HOVER_DOT)
 
 
 def _dots(estimator: EstimatorReport, limit: int) -> FloatArray:

@@ -22,12 +22,9 @@ from fgslam.core.atomic_files import replacing
 # Okabe and Ito's colours, which the colour-blind can tell apart.
 ORANGE = "#E69F00"
 SKY = "#56B4E9"
-GREEN = "#009E73"
 YELLOW = "#F0E442"
-BLUE = "#0072B2"
 VERMILLION = "#D55E00"
 INK = "#222222"
-GREY = "#8A8A8A"
 FAINT = "#DDDDDD"
 
 MAP_COLOURS = "viridis"
@@ -133,8 +130,3 @@ def add_segments(axes: Axes, segments: FloatArray, width: float, **colours: Any)
     lines.set_joinstyle("round")
     axes.add_collection(lines, autolim=False)
     return lines
-
-
-def white_rim(linewidth: float) -> list[AbstractPathEffect]:
-    """Effect that lifts a dark line off the dots under it."""
-    return [withStroke(linewidth=linewidth + 2.0, foreground="white", alpha=0.85)]

@@ -1,4 +1,4 @@
-"""Closed loops judged by the truth, and their way to file and report."""
+"""Loop closures against the truth, and their way to file and report."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def drifted(poses: FloatArray) -> FloatArray:
     return out
 
 
-def test_a_true_closure_is_told_by_what_it_mends() -> None:
+def test_error_before_and_after_a_true_closure_is_reported() -> None:
     true, before = circle(), drifted(circle())
     online = before.copy()
     online[-1] = true[-1]
@@ -79,7 +79,7 @@ def test_a_true_closure_is_told_by_what_it_mends() -> None:
     assert found[0].merged == 1
 
 
-def test_a_refused_closure_mends_nothing() -> None:
+def test_a_refused_closure_corrects_nothing() -> None:
     true, before = circle(), drifted(circle())
     stamps = np.arange(COUNT, dtype=np.float64)
     offered = [(COUNT - 1, closure(0, g.inverse(true[0]) @ true[-1]), False)]

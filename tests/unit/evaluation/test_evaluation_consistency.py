@@ -1,4 +1,4 @@
-"""Consistency: NEES follows its distribution, and the verdict notices when it does not."""
+"""Consistency: NEES follows its distribution; wrong covariances are recognised."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def simulated_run(seed: int, inflation: float) -> Nees:
 @pytest.mark.parametrize(
     ("inflation", "verdict"), [(1.0, "consistent"), (0.25, "overconfident"), (4.0, "conservative")]
 )
-def test_verdict_over_many_runs(inflation: float, verdict: str) -> None:
+def test_wrong_covariances_are_recognised_over_many_runs(inflation: float, verdict: str) -> None:
     runs = [simulated_run(seed, inflation) for seed in range(10)]
     for independent in (False, True):
         result = judge(runs, items_independent=independent)
@@ -107,7 +107,7 @@ def test_band_holds_the_stated_share_of_consistent_runs() -> None:
     assert chi2.cdf(18.0 * lower, 18) == pytest.approx(0.05)
 
 
-def test_nothing_to_judge() -> None:
+def test_without_degrees_of_freedom_consistency_is_not_known() -> None:
     empty = Nees(np.empty(0), np.empty(0, np.int64))
     assert judge([]) is None
     assert judge([empty]) is None

@@ -103,7 +103,7 @@ def test_consistent_estimates_are_found_consistent_and_divergence_is_counted() -
 
 
 def test_estimates_without_a_covariance_are_counted() -> None:
-    """No NEES can tell of them; a verdict over the others must not pass for one over all."""
+    """They have no NEES; the consistency of the others must not pass for that of all."""
     one = HomingTruth(TRUTH.target, TRUTH.robots[:1], TRUTH.landmarks)
     exact = in_legs(TRUTH.robots[0]), in_legs(TRUTH.target)
     known, unknown = estimate(*exact, np.eye(6)), estimate(*exact, np.full((6, 6), np.nan))

@@ -1,4 +1,4 @@
-"""Poses found without a prior, judged: right, less exact, false, refused, unknown."""
+"""Poses found without a prior are counted: right, less exact, false, refused, unknown."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_refused_and_unknown_ones_have_no_error() -> None:
     assert errors.nees[0] == pytest.approx((0.1 / 0.02) ** 2)
 
 
-def test_the_covariance_is_judged_by_the_share_that_it_holds() -> None:
+def test_share_of_errors_inside_the_claimed_95_percent_region() -> None:
     found = score(answers([moved(0.0), moved(0.02), moved(0.2)], [True] * 3, [True] * 3), BOUNDS)
     assert found.held == pytest.approx(2 / 3)
     assert found.nees_per_dof == pytest.approx((0 + 1 + 100) / 18)

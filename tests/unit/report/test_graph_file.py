@@ -180,7 +180,7 @@ def test_an_empty_log_has_a_graph(tmp_path: Path, rng: np.random.Generator) -> N
     assert parse(tmp_path / "empty.g2o").keys() == {"PARAMS_SE3OFFSET"}
 
 
-def test_refusals_name_the_mend(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_refusals_name_the_fix(tmp_path: Path, rng: np.random.Generator) -> None:
     graph, _, _ = exact_graph(rng)
     with pytest.raises(OutputError, match=r"unknown graph format '\.txt'; use \.g2o"):
         write_g2o(tmp_path / "graph.txt", graph)

@@ -93,7 +93,7 @@ def test_the_drive_has_its_legs_targets_and_walls() -> None:
     assert len(at_step(figure, "direction of home", 20)) == 1
 
 
-def test_catchment_tells_both_outcomes() -> None:
+def test_catchment_shows_both_outcomes() -> None:
     figure = catchment_figure(np.eye(2), np.array([True, False]), ["one", "two"])
     found = {t["name"]: t for t in figure.traces}
     np.testing.assert_allclose(points(found["arrived"]), [[0.0, 1.0]])

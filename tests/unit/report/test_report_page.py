@@ -82,7 +82,7 @@ def with_values(data: ReportData, **values: Any) -> ReportData:
 # Sentences
 
 
-def told(*estimators: tuple[str, float | None, float | None, str | None]) -> tuple[str, ...]:
+def sentences(*estimators: tuple[str, float | None, float | None, str | None]) -> tuple[str, ...]:
     rng, truth = np.random.default_rng(0), loop(5)
     reports = tuple(
         dataclasses.replace(
@@ -94,7 +94,7 @@ def told(*estimators: tuple[str, float | None, float | None, str | None]) -> tup
 
 
 def test_the_best_is_named_with_its_lead() -> None:
-    lines = told(
+    lines = sentences(
         ("filter", 0.03, 5000.0, "overconfident"),
         ("isam2", 0.012, 1.1, "consistent"),
         ("odometry", 2.5, 0.2, "conservative"),
@@ -109,15 +109,15 @@ def test_the_best_is_named_with_its_lead() -> None:
 
 
 def test_near_ties_are_ties() -> None:
-    lines = told(("a", 0.0100, 1.0, None), ("b", 0.0102, 1.0, None), ("c", 0.02, 1.0, None))
+    lines = sentences(("a", 0.0100, 1.0, None), ("b", 0.0102, 1.0, None), ("c", 0.02, 1.0, None))
     assert lines[0].startswith("a and b are about equally accurate: 1.00 cm")
     assert lines[-1] == "Whether the covariances of a, b and c can be believed is not known."
 
 
 def test_a_perfect_path_divides_by_nothing() -> None:
-    two = told(("a", 0.0, None, None), ("b", 0.1, None, None))[0]
+    two = sentences(("a", 0.0, None, None), ("b", 0.1, None, None))[0]
     assert two.endswith("The next, b, is off by 10.00 cm.")
-    assert told(("a", 0.0, None, None))[0].startswith("a is off by 0.00 cm")
+    assert sentences(("a", 0.0, None, None))[0].startswith("a is off by 0.00 cm")
 
 
 def test_what_is_not_known_is_said() -> None:
