@@ -35,7 +35,7 @@ from fgslam.homing.front_end import Sighting
 from fgslam.homing.path_following import HomingChain
 from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import Steering
-from fgslam.runs.tasks.homing_start import start_from_matches
+from fgslam.runs.tasks.homing_trials import start_from_matches
 
 DARK = np.zeros((1, 1, 3), dtype=np.uint8)
 

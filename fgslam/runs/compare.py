@@ -30,7 +30,7 @@ from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, run_ta
 from fgslam.runs.files import COMPARISON_FILE, METRICS_FILE
 from fgslam.runs.folder import RUN_MARKER, ExistingFolder, is_run_folder
 from fgslam.runs.homing_compare import open_homing_comparison
-from fgslam.runs.homing_logs import load_bearing_logs
+from fgslam.runs.homing_replay import load_bearing_logs
 from fgslam.runs.report import report_from_folder
 from fgslam.runs.units import Progress, Stopped
 

@@ -1,18 +1,47 @@
-"""Gives the bearings of one homing to one estimator, and keeps what it says after each image."""
+"""Bearing logs of a run folder, and what an estimator makes of one of them."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.backend.homing.settings import HomingEstimatorSettings
 from fgslam.core.arrays import FloatArray
-from fgslam.core.errors import EstimatorError
+from fgslam.core.atomic_files import make_subfolder
+from fgslam.core.bearing_log import BearingLog
+from fgslam.core.errors import DatasetError, EstimatorError
 from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings
+
+LOG_FOLDER = "logs"
+
+
+def save_bearing_logs(run: Path, logs: Mapping[str, BearingLog]) -> None:
+    """Writes logs by their names, each atomically. Raises OutputError."""
+    if logs:
+        folder = make_subfolder(run, LOG_FOLDER)
+        for name, log in logs.items():
+            log.save(folder / f"{name}.npz")
+
+
+def load_bearing_logs(run: Path) -> dict[str, BearingLog]:
+    """All logs of a run folder by their names, in order.
+
+    Raises:
+        DatasetError: there are none.
+        MeasurementLogError: one is damaged.
+    """
+    files = sorted((run / LOG_FOLDER).glob("*.npz"))
+    if not files:
+        raise DatasetError(
+            f"{run}: has no bearing logs ({LOG_FOLDER}/*.npz) to compare estimators on; run a "
+            "homing, path_following or homing_trials experiment with output.logs above 0"
+        )
+    return {file.stem: BearingLog.load(file) for file in files}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

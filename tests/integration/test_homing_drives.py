@@ -25,12 +25,10 @@ from fgslam.homing.steering import Steering
 from fgslam.runs.config import parse_homing
 from fgslam.runs.config_models import HomingConfig, PathFollowingConfig
 from fgslam.runs.files import write_config
-from fgslam.runs.homing_logs import load_bearing_logs
-from fgslam.runs.homing_replay import replay_homing
-from fgslam.runs.tasks.homing_drive_files import bearing_log, drive_of
+from fgslam.runs.homing_replay import load_bearing_logs, replay_homing
+from fgslam.runs.tasks.homing_drive_files import DrivenSeed, bearing_log, drive_of
 from fgslam.runs.tasks.homing_drive_pictures import DriveWatcher, Unwrapping, draw_leg_views
 from fgslam.runs.tasks.homing_drive_results import drive_numbers, finish_drives
-from fgslam.runs.tasks.homing_driven import DrivenSeed
 from fgslam.runs.tasks.homing_drives import _displaced
 
 EKF = {"kind": "homing_ekf"}

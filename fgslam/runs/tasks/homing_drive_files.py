@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,11 @@ from fgslam.core.planar import between, wrap
 from fgslam.homing.command import HomingState
 from fgslam.homing.drive_record import DriveRecord, HomingLog
 from fgslam.homing.drive_scores import cross_track, pass_distances
+from fgslam.homing.path_memory import PathMemory
 from fgslam.report.figures.plan import Drive
 from fgslam.report.tables import Cell, write_csv
-from fgslam.runs.homing_logs import save_bearing_logs
+from fgslam.runs.homing_replay import save_bearing_logs
+from fgslam.runs.tasks.homing_drive_pictures import LegView
 
 LEGS_FILE = "legs.csv"
 COMMANDS_FILE = "commands.csv"
@@ -144,3 +147,24 @@ def _poses(seed: int, record: DriveRecord) -> Iterator[list[Cell]]:
     for k, (x, y, heading) in enumerate(record.truth.tolist()):
         time, target = float(record.time[k]), int(record.target[k]) + 1
         yield [seed, time, x, y, float(np.rad2deg(heading)), target]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrivenSeed:
+    """One drive.
+
+    Attributes:
+        seed: of world and chance.
+        record: of the drive.
+        memory: the path as it is remembered.
+        outlines: of the world.
+        leg_m: true length of the first leg as driven: start to target.
+        views: what the camera saw at the legs' ends; of the first seed alone.
+    """
+
+    seed: int
+    record: DriveRecord
+    memory: PathMemory
+    outlines: tuple[FloatArray, ...]
+    leg_m: float
+    views: tuple[LegView, ...] = ()

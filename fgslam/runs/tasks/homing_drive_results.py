@@ -32,6 +32,7 @@ from fgslam.runs.documents import write_document, write_page
 from fgslam.runs.engine import RunResult, Status
 from fgslam.runs.homing_replay import replay_homing
 from fgslam.runs.tasks.homing_drive_files import (
+    DrivenSeed,
     bearing_log,
     drive_of,
     write_drive,
@@ -39,7 +40,6 @@ from fgslam.runs.tasks.homing_drive_files import (
     write_logs,
 )
 from fgslam.runs.tasks.homing_drive_pictures import draw_leg_views
-from fgslam.runs.tasks.homing_driven import DrivenSeed
 
 MEMORY_FILE = "path_memory.npz"
 _UNKNOWN = "-"

@@ -21,9 +21,9 @@ from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.steering import Steering
 from fgslam.runs.config_models import DrivingConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task
+from fgslam.runs.tasks.homing_drive_files import DrivenSeed
 from fgslam.runs.tasks.homing_drive_pictures import DriveWatcher, Unwrapping
 from fgslam.runs.tasks.homing_drive_results import finish_drives
-from fgslam.runs.tasks.homing_driven import DrivenSeed
 from fgslam.runs.units import Stage, one_by_one
 
 _TRIES = 50  # places drawn for a start that is free

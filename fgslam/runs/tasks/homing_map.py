@@ -29,8 +29,7 @@ from fgslam.runs.tasks.homing_map_localising import (
     write_localised,
 )
 from fgslam.runs.tasks.homing_pair_answers import PairAnswer
-from fgslam.runs.tasks.homing_pair_pictures import draw_pair
-from fgslam.runs.tasks.homing_pair_search import PairSearch, answer_pairs, inlier_rows
+from fgslam.runs.tasks.homing_pair_search import PairSearch, answer_pairs, draw_pair, inlier_rows
 from fgslam.runs.tasks.homing_views import Views, extract_features, open_views
 
 MAP_FILE = "map.npz"

@@ -25,12 +25,12 @@ from fgslam.runs.tasks.homing_pair_answers import (
     with_support,
     write_pairs,
 )
-from fgslam.runs.tasks.homing_pair_pictures import draw_pairs
 from fgslam.runs.tasks.homing_pair_search import (
     PLAIN_INLIERS,
     PLAIN_MATCHING,
     PairSearch,
     answer_pairs,
+    draw_pairs,
     never_refusing,
     pairs_of,
 )

@@ -8,17 +8,18 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fgslam.core.arrays import IntArray
 from fgslam.core.bearing_log import BearingLog
-from fgslam.core.homing import Refusal
+from fgslam.core.homing import BearingMatches, HomingStart, Refusal
 from fgslam.datasets.simulated_homing import open_simulated_homing
 from fgslam.evaluation.homing import homing_errors
+from fgslam.frontend.homing.local_map import make_local_map
+from fgslam.frontend.homing.ransac import estimate_homing_vector
+from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.runs.config_models import HomingTrialsConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task
-from fgslam.runs.homing_logs import save_bearing_logs
-from fgslam.runs.homing_replay import replay_homing
-from fgslam.runs.tasks.homing_start import start_from_matches
-from fgslam.runs.tasks.homing_trial_data import HomingTrial, TriedEstimator
-from fgslam.runs.tasks.homing_trial_results import finish_trials
+from fgslam.runs.homing_replay import replay_homing, save_bearing_logs
+from fgslam.runs.tasks.homing_trial_results import HomingTrial, TriedEstimator, finish_trials
 from fgslam.runs.units import Stage, in_blocks
 
 Unit: TypeAlias = tuple[int, int]
@@ -101,3 +102,24 @@ def _units(config: HomingTrialsConfig) -> list[Unit]:
         for share in range(len(config.outliers))
         for trial in range(first, min(first + _BLOCK, config.trials))
     ]
+
+
+def start_from_matches(
+    time: float,
+    matches: BearingMatches,
+    settings: HomingVectorSettings,
+    rng: np.random.Generator,
+) -> tuple[HomingStart, IntArray] | Refusal:
+    """Homing vector and local map of the matches that support it.
+
+    Returns:
+        The start, whose features are numbered from 0, and the rows (n,) of ``matches`` that they
+        were; or why there is none.
+    """
+    vector = estimate_homing_vector(matches, settings, rng)
+    if isinstance(vector, Refusal):
+        return vector
+    rows = np.flatnonzero(vector.inliers)
+    kept = matches.select(rows)
+    of_kept = dataclasses.replace(vector, inliers=np.ones(len(rows), np.bool_))
+    return HomingStart(time, of_kept, make_local_map(of_kept, kept), kept), rows

@@ -21,7 +21,7 @@ from fgslam.report.tables import write_csv
 from fgslam.runs.config_models import OmniVideoConfig
 from fgslam.runs.documents import write_document, write_page
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task
-from fgslam.runs.tasks.homing_mirror_check import open_checked
+from fgslam.runs.tasks.homing_views import open_checked
 
 FRAMES_FILE = "frames.csv"
 TRACKS_FILE = "tracks.csv"

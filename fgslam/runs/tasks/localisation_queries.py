@@ -20,9 +20,9 @@ from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 from fgslam.frontend.stereo.matching import StereoMatcher
 from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.engine import Context
-from fgslam.runs.tasks.localisation_sights import Sighted, TrueSights
 from fgslam.runs.tasks.localisation_submap import Window, submap_features
 from fgslam.runs.tasks.localisation_truth import TruthInMap, truth_in_map
+from fgslam.runs.tasks.rendered_truth import Sighted, TrueSights
 from fgslam.runs.tasks.slam_map_entry import GivenMap, trusted
 from fgslam.slam.factory import make_relocaliser, make_stereo_matcher, make_stream
 from fgslam.slam.feature_stream import FeatureFrame

@@ -27,9 +27,8 @@ from fgslam.runs.tasks import slam_map_entry as map_entry
 from fgslam.runs.tasks import slam_mapping as mapping
 from fgslam.runs.tasks.rendered_truth import TrueDepth
 from fgslam.runs.tasks.slam_beginning import BegunRun, OpenedRun, begin, open_run
-from fgslam.runs.tasks.slam_outputs import RunOutputs
+from fgslam.runs.tasks.slam_outputs import RunOutputs, run_notes, summary_table
 from fgslam.runs.tasks.slam_pictures import draw_frame, draw_run, figures_of, frames_to_show
-from fgslam.runs.tasks.slam_tables import run_notes, summary_table
 from fgslam.runs.units import Progress
 from fgslam.slam.factory import make_stream
 from fgslam.slam.feature_stream import FeatureFrame

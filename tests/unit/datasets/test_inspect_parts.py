@@ -30,8 +30,7 @@ from fgslam.datasets.layouts import kitti_drives, recognise_layout
 from fgslam.datasets.odometry_settings import RecordedOdometrySettings
 from fgslam.datasets.settings import ImageFolderSettings
 from fgslam.frontend.features.descriptor_matching import mutual_nearest
-from fgslam.runs.inspection import inspect_recording
-from fgslam.runs.inspection_report import render_report
+from fgslam.runs.inspection import inspect_recording, render_report
 
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 

@@ -14,7 +14,7 @@ from fgslam.cameras.omni.radial import MirrorFrame
 from fgslam.cameras.omni.settings import EquirectangularSettings, HyperbolicMirrorSettings
 from fgslam.core.arrays import Image
 from fgslam.datasets.omni.settings import OmniPathSettings
-from fgslam.runs.tasks.homing_mirror_check import open_checked
+from fgslam.runs.tasks.homing_views import open_checked
 
 SIZE = (320, 240)
 CENTRE = (162.0, 118.0)
