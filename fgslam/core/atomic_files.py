@@ -14,7 +14,7 @@ from pathlib import Path
 
 from fgslam.core.errors import OutputError
 
-_MENDS = {
+_REMEDIES = {
     errno.ENOSPC: "the disk is full; free some space or choose another folder",
     errno.EDQUOT: "the disk quota is used up; free some space or choose another folder",
     errno.EACCES: "permission denied; choose a folder that you may write to",
@@ -30,13 +30,13 @@ _MENDS = {
 
 @contextmanager
 def clear_output_errors(path: Path) -> Iterator[None]:
-    """Turn an OSError about ``path`` into an OutputError of one line with its mend."""
+    """Turn an OSError about ``path`` into an OutputError of one line that says what to do."""
     try:
         yield
     except OSError as error:
         cause = error.strerror or str(error)
-        mend = _MENDS.get(error.errno or 0, f"{cause}; choose another folder")
-        raise OutputError(f"cannot write {path}: {mend}") from error
+        remedy = _REMEDIES.get(error.errno or 0, f"{cause}; choose another folder")
+        raise OutputError(f"cannot write {path}: {remedy}") from error
 
 
 @contextmanager
@@ -47,7 +47,7 @@ def replacing(path: Path) -> Iterator[Path]:
         path: the file to write; its folder must exist.
 
     Yields:
-        The temporary path, with the same suffix, so that writers which look at it are content.
+        The temporary path, with the same suffix, for writers that choose the format by it.
 
     Raises:
         OutputError: the folder cannot be written to, or the disk is full.
@@ -58,7 +58,7 @@ def replacing(path: Path) -> Iterator[Path]:
             yield partial
             os.replace(partial, path)
         finally:
-            # Still there only when something failed; what failed is what the user must hear of.
+            # Still there only when something failed: that error must not be hidden by another.
             _remove_quietly(partial)
 
 

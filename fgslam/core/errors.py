@@ -1,7 +1,7 @@
 """Errors that fgslam raises on purpose.
 
 Every error a user can cause descends from :class:`FgslamError`. Its message is one line: what is
-wrong, where, and the mend. The command line catches the root once and exits with status 2.
+wrong, where, and how to correct it. The command line catches the root once and exits with status 2.
 """
 
 from __future__ import annotations

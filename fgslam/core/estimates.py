@@ -199,7 +199,7 @@ class Estimate(Brief):
         trajectory: all poses as known now.
         covariances: (n, 6, 6) their marginals; NaN where one cannot be had.
         landmarks: the map, with marginal covariances.
-        remarks: what the estimator had to mend or leave out, in words.
+        remarks: what the estimator had to correct or leave out, in words.
     """
 
     trajectory: Trajectory

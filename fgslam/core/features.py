@@ -1,4 +1,4 @@
-"""Features of images, matched over the rig, and how the landmarks made of them look."""
+"""Features of images, features matched over the rig, and appearances of landmarks."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ Words = npt.NDArray[np.int16]
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LandmarkAppearances(Rows):
-    """How landmarks look, one row a stored view; a landmark may have several (Se et al. 6.3).
+    """Appearances of landmarks, one row a stored view; there may be several (Se et al. 6.3).
 
     Attributes:
         ids: (v,) identity of the landmark that each view belongs to, ascending.

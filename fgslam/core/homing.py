@@ -1,4 +1,4 @@
-"""Values that cross the border between two stages of visual homing (Goedemé et al. 2005).
+"""Values of visual homing: features, matches, homing vectors, tracks (Goedemé et al. 2005).
 
 Frames: the robot's axes are x forward, y left, z up. Bearings are counter-clockwise from the
 robot's heading, elevations up, both in radians. The *start* is the robot's pose when a homing
@@ -121,7 +121,7 @@ class BearingMatches(Rows):
 class TwoViewVector:
     """(R, theta, psi) with R = 1: where the target lies and how it is turned (III-B).
 
-    It is true where a :class:`Refusal` is false, so that ``if answer:`` tells them apart.
+    It is true where a :class:`Refusal` is false, so that ``if answer:`` distinguishes them.
 
     Attributes:
         direction: theta, of the target as seen from the present pose, radians.
@@ -201,7 +201,7 @@ class LocalMap(Rows):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HomingStart:
-    """All that a homing estimator is told once: the two views' measurements and first guesses.
+    """What a homing estimator is made with: the two views' measurements and first guesses.
 
     Attributes:
         time: of the start image, seconds.
@@ -222,7 +222,7 @@ class HomingStart:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedBearings(Rows):
-    """What one image on the way says: eq. 6. A feature that is absent is lost for good.
+    """Bearings of the tracked features in one image on the way (eq. 6); an absent one is lost.
 
     Attributes:
         time: seconds.

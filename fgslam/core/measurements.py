@@ -93,7 +93,7 @@ class Increment(Brief):
         pruned_ids: landmarks that the database dropped after this frame; those merged into others
             because of the last frame's loop closure among them.
         loops: places recognised in this frame, verified; each estimator judges them for itself.
-        relocalised: placed by its landmarks alone, without a prior; its odometry tells nothing.
+        relocalised: placed by its landmarks alone, without a prior; its odometry is meaningless.
     """
 
     index: int

@@ -1,4 +1,4 @@
-"""The saved map: landmarks with their looks and counts, the drive that made them, one file.
+"""The saved map, one file: landmarks with appearances and counts, and the drive that made them.
 
 The file is a zip of plain ``.npy`` arrays with a JSON header, as ``numpy.load`` reads it, without
 pickle; docs/concepts/maps.md has its table. The header holds the SHA-256 of all contents. The same
@@ -33,7 +33,7 @@ FILE = ArrayFile(
 )
 _SESSION = "session/"
 _UPPER = np.triu_indices(3)
-_LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the zip format's first moment: no file tells when it was made
+_LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the zip format's first moment: equal maps give equal bytes
 _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
 _SAME_RIG = 1e-6  # relative: the same calibration, perhaps read from another text
 
@@ -61,7 +61,7 @@ _ITEMS: dict[str, Items] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SavedMap:
-    """A map that outlives its run.
+    """A map with all that a later run needs to localise in it or to continue it.
 
     Attributes:
         rig: the cameras that saw it.
@@ -218,7 +218,7 @@ def _without_mirrors(arrays: StateArrays) -> tuple[StateArrays, list[str]]:
 
 
 def _mirrors(array: np.ndarray[Any, Any]) -> bool:
-    """To the bit: not even the sign of a zero may be lost."""
+    """Whether all matrices are symmetric to the bit, signs of zeros included."""
     return array.tobytes() == np.swapaxes(array, 1, 2).tobytes()
 
 
@@ -236,7 +236,7 @@ def _with_mirrors(arrays: StateArrays, header: dict[str, Any], where: str) -> St
 
 
 def _without_repeats(arrays: StateArrays) -> tuple[StateArrays, dict[str, str]]:
-    """Each content once: the rest by the name of the one that is kept.
+    """Arrays without those whose content equals another's, and the names that they equal.
 
     What the map holds the session often holds, too, and a smoother's inputs are the log.
     """
@@ -279,16 +279,14 @@ def _header(saved: SavedMap, where: str) -> dict[str, Any]:
         "about": saved.about,
     }
     try:
-        told = json.loads(json.dumps(header, allow_nan=False))
+        plain = json.loads(json.dumps(header, allow_nan=False))
     except (TypeError, ValueError) as error:
-        raise MapError(
-            f"{where}: what the map tells about itself is not plain JSON ({error}); leave it out"
-        ) from None
-    return dict(told)
+        raise MapError(f"{where}: `about` is not plain JSON ({error}); leave it out") from None
+    return dict(plain)
 
 
 def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
-    """Takes the header out of the arrays."""
+    """The header's values; removes it from the arrays."""
     header = FILE.read_header(arrays, where)
     del arrays["header"]
     groups = ("counts", "rig", "about", "same_as")

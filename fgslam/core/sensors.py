@@ -1,4 +1,4 @@
-"""What measures landmarks: rigs of two or three cameras, and range-bearing sensors."""
+"""Sensors that measure landmarks: rigs of two or three cameras, range-bearing sensors."""
 
 from __future__ import annotations
 

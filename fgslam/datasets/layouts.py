@@ -1,4 +1,4 @@
-"""Which layout a folder has, told from the files in it."""
+"""The layout of a recording's folder, recognised by the files in it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rendered lab as a recording: our own exact world (docs/datasets/rendered_lab.md).
+"""The rendered lab as a recording with exact ground truth (docs/datasets/rendered_lab.md).
 
 Images are rendered once, cached by the content of the settings that shape them, and get their
 noise when they are read. Poses, depths and object identities are exact.
@@ -65,7 +65,7 @@ class RenderedLabSequence:
             start: first of the drive's frames to use.
             stop: the frame after the last one; None for the drive's end.
             stride: use every so many frames.
-            progress: told (frames rendered so far, frames to render) from the calling thread.
+            progress: called with (frames rendered so far, frames to render).
 
         Raises:
             ConfigError: the path cannot be driven, leads through furniture, or no frame is left.

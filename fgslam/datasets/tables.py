@@ -1,4 +1,4 @@
-"""Text files of numbers, read strictly: every complaint names the file, the line and the mend."""
+"""Text files of numbers, read strictly: errors name the file, the line and the remedy."""
 
 from __future__ import annotations
 

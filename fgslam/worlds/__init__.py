@@ -1,1 +1,1 @@
-"""Rendered worlds with exact truth."""
+"""Rendered and simulated worlds with exact ground truth; only `datasets` opens them."""

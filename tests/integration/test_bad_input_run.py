@@ -239,7 +239,9 @@ def test_bad_odometry(row: str, expected: str, own_recording: Path, refusal: Ref
     assert expected in line
 
 
-def test_bad_odometry_hurts_only_who_uses_it(own_recording: Path, tmp_path: Path) -> None:
+def test_bad_odometry_is_an_error_only_where_it_is_used(
+    own_recording: Path, tmp_path: Path
+) -> None:
     replace_line(own_recording / "odometry.txt", 5, "101.0 nan 0 0 0 0 0 1")
     values = experiment(own_recording, odometry={"kind": "constant_velocity"})
     assert run_values(values, tmp_path / "run").result.status == "finished"

@@ -1,4 +1,4 @@
-"""Whether the odometry's clock agrees with the cameras': the truth's turns tell."""
+"""Offset of the odometry's clock against the cameras', estimated from turns of the truth."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _YAW = 2  # the body's z axis points up
 def check_clock(sequence: Sequence) -> tuple[Finding, ...]:
     """Shift of the odometry's clock at which its turns agree best with the truth's.
 
-    Told where the median yaw error of a step falls by 30 % or more. A recording that never turns
-    says nothing about its clock, and gives no finding.
+    Reported where the median yaw error of a step falls by 30 % or more. A recording that never
+    turns gives no finding: its clock cannot be checked.
     """
     if not isinstance(sequence, Recording) or sequence.odometry_source is None:
         return ()

@@ -22,9 +22,9 @@ class Finding:
     """One line of an inspection.
 
     Attributes:
-        level: ``problem`` will spoil a run, ``warning`` may, ``info`` tells.
+        level: ``problem`` will spoil a run, ``warning`` may, ``info`` informs.
         subject: what it is about, such as "time" or "odometry".
-        text: one sentence with the numbers, and the mend where there is one.
+        text: one sentence with the numbers, and the remedy where there is one.
     """
 
     level: Level

@@ -13,7 +13,7 @@ from fgslam.core.errors import FrameError
 from fgslam.core.recordings import Frame, Sequence
 from fgslam.datasets.checks.findings import Finding, Level, listed, share
 
-Told: TypeAlias = Callable[[int, int], None]
+Progress: TypeAlias = Callable[[int, int], None]
 """Called with how much is done, and of how much."""
 
 CAMERA_NAMES = ("right", "left", "top")
@@ -42,7 +42,7 @@ def spread_over(sequence: Sequence, samples: int) -> IntArray:
 
 
 def check_images(
-    sequence: Sequence, samples: int = 20, progress: Told | None = None
+    sequence: Sequence, samples: int = 20, progress: Progress | None = None
 ) -> tuple[Finding, ...]:
     """Unreadable, black, white and flat images, cameras of unequal brightness, copies.
 
@@ -111,7 +111,7 @@ def _unequal_cameras(looks: list[_Look]) -> list[Finding]:
     """Cameras that show the same image, or images of different brightness."""
     found = []
     for c, camera in enumerate(CAMERA_NAMES[1:], 1):
-        # Images without content are told of already; they are all alike.
+        # Images without content are reported already; they are all equal.
         both = [k for k in looks if c < len(k.kinds) and k.kinds[0] == k.kinds[c] == "good"]
         if not both:
             continue

@@ -1,4 +1,4 @@
-"""What feature matches between the cameras say about rectification, order, time and gates.
+"""Checks of feature matches between the cameras: rectification, order, time, gates.
 
 Finding features and matching them is the front-end's business: positions and counts are handed in.
 """
@@ -38,8 +38,8 @@ class Pair:
         subject: of the findings.
         names: the two cameras.
         lines: what must agree between them: rows or columns.
-        swapped: what negative disparities mean, and the mend.
-        crossed: what it means when the disparity runs the other way, and the mend.
+        swapped: what negative disparities mean, and the remedy.
+        crossed: what it means when the disparity runs the other way, and the remedy.
     """
 
     axis: int
@@ -100,7 +100,7 @@ def check_epipolar(
             camera row in the top minus row in the right image.
         pair: which two cameras.
         places: (n, 2) the right features' (column, row), pixels, from which the cause of unequal
-            rows is told; None where it need not be.
+            rows is found; None where it need not be.
     """
     count = len(disparities)
     if count < _FEWEST_MATCHES:
@@ -201,7 +201,7 @@ def _rectification(offset: float, spread: float, pair: Pair, turn: Turn | None) 
 
 
 def _cause(turn: Turn, pair: Pair) -> str:
-    """The slope that matters, in words, with the mend."""
+    """The larger of the two slopes in words, with the remedy."""
     other = pair.names.split(" ", maxsplit=1)[0]
     if turn.roll_matters:
         # Columns grow against the sense in which rows do when an image is turned.
@@ -221,13 +221,13 @@ def _negative_share(disparities: FloatArray) -> float:
 
 def _camera_order(disparities: FloatArray, pair: Pair) -> list[Finding]:
     negative = _negative_share(disparities)
-    told = f"{100.0 * negative:.0f} % of matches have negative disparity"
+    share = f"{100.0 * negative:.0f} % of matches have negative disparity"
     if negative > 0.5:
-        meaning, mend = pair.swapped
-        return [Finding(Level.PROBLEM, pair.subject, f"{meaning}: {told}; {mend}")]
+        meaning, remedy = pair.swapped
+        return [Finding(Level.PROBLEM, pair.subject, f"{meaning}: {share}; {remedy}")]
     if negative > 0.15:
         text = (
-            f"{told}: many wrong matches, or zero disparity is not at infinity; shift the images "
+            f"{share}: many wrong matches, or zero disparity is not at infinity; shift the images "
             "so that far points have disparity zero, and correct cx"
         )
         return [Finding(Level.WARNING, pair.subject, text)]
@@ -263,7 +263,7 @@ def check_steadiness(
 
 
 def check_disparity_agreement(horizontal: FloatArray, vertical: FloatArray) -> tuple[Finding, ...]:
-    """Whether both disparities of features seen by three cameras tell one depth.
+    """Whether both disparities of features seen by three cameras give one depth.
 
     Args:
         horizontal: (n,) disparities of right and left, pixels.
@@ -327,8 +327,8 @@ def check_stereo_counts(counts: IntArray, frames: IntArray) -> tuple[Finding, ..
         return ()
     text = (
         f"{len(bad)} of {len(counts)} frames have fewer than {_FEWEST_STEREO} matches: "
-        f"{listed(frames[bad].tolist())}; mend what is said of the images and cameras, else lower "
-        "frontend.sift.contrast_threshold"
+        f"{listed(frames[bad].tolist())}; correct what is reported of the images and cameras, else "
+        "lower frontend.sift.contrast_threshold"
     )
     return (Finding(Level.WARNING, "matches", text),)
 

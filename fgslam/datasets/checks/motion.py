@@ -99,7 +99,7 @@ def check_odometry_against_truth(sequence: Sequence) -> tuple[Finding, ...]:
     try:
         errors, sigmas = _step_errors(sequence)
     except DatasetError:
-        return ()  # check_odometry has told.
+        return ()  # check_odometry has reported it.
     if len(errors) < 5:
         return ()
     spread = 1.4826 * np.median(np.abs(errors), axis=0)

@@ -1,7 +1,7 @@
 """What is in a recording, and every problem found, in words: the checks behind ``inspect``.
 
 The checks look at any Sequence and raise nothing for what is wrong with it: each problem becomes a
-:class:`~fgslam.datasets.checks.findings.Finding`. What feature matches tell is judged in
+:class:`~fgslam.datasets.checks.findings.Finding`. Feature matches are judged in
 :mod:`fgslam.datasets.checks.matches`.
 """
 
@@ -16,7 +16,7 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.checks.clock import check_clock
 from fgslam.datasets.checks.findings import Finding, Level, by_severity
-from fgslam.datasets.checks.images import Told, check_images
+from fgslam.datasets.checks.images import Progress, check_images
 from fgslam.datasets.checks.motion import check_odometry, check_odometry_against_truth, check_truth
 
 _GAP_FACTOR = 1.8
@@ -31,11 +31,11 @@ class Inspection:
 
 
 def inspect_sequence(
-    sequence: Sequence, samples: int = 20, progress: Told | None = None
+    sequence: Sequence, samples: int = 20, progress: Progress | None = None
 ) -> Inspection:
     """All checks that need no features; reads ``samples`` frames spread over the recording.
 
-    ``progress`` is told how many of these frames have been read, and of how many.
+    ``progress`` gets the number of these frames that have been read, and of all of them.
     """
     findings = (
         *(Finding(Level.WARNING, "recording", note) for note in sequence.notes),

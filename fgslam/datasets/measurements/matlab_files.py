@@ -1,4 +1,4 @@
-"""MATLAB files of numbers, read strictly: each complaint names file, variable and mend."""
+"""MATLAB files of numbers, read strictly: errors name file, variable and remedy."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class OmniRecording:
         camera: of all pictures.
         ids: (n,) the recording's own numbers, all different.
         names: (n,) of the pictures, as people know them: file names, or frames of a video.
-        timestamps: (n,) seconds, strictly increasing; NaN where nothing tells the time.
+        timestamps: (n,) seconds, strictly increasing; NaN where times are unknown.
         poses: (n, 3) planar poses x, y in metres and heading of the camera (of the centre column
             of a panorama) in radians, in the recording's world; None where there is no truth.
         rooms: (n,) name of the room of each picture, or None.

@@ -1,8 +1,8 @@
 """Corridors that look alike: a square ring whose sixteen sections are copies of one.
 
 Each leg of the ring is the one before turned by a quarter; each leg is made of sections with the
-same doors, posters, cabinets and covers, and the covers repeat with the sections. What is seen
-tells how far it is to the next corner, and never which leg it is.
+same doors, posters, cabinets and covers, and the covers repeat with the sections. Images
+show how far it is to the next corner, and never which leg it is: perceptual aliasing.
 """
 
 from __future__ import annotations

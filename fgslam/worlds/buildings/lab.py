@@ -36,7 +36,7 @@ def build_lab(
     """
     things = [*_shell(), *_along_walls(rng), *_on_walls(rng), *_islands(rng)]
     if identical_posters:
-        things = _with_twins(things)
+        things = _with_copied_poster(things)
     if visit == 3:
         things = _rearranged(things)
     things += _loose_things(rng, moved=visit > 1)
@@ -140,7 +140,7 @@ _POSTER_PLACES = (
     ("west", 2.2, 1.35, 1.1, 1.1), ("west", -4.4, 1.5, 0.7, 0.9), ("west", -0.3, 1.95, 1.0, 0.8),
 )  # fmt: skip
 
-_TWINS = (1, 7)
+_COPIED_POSTER = (1, 7)
 """Of the places above: a poster 1.0 m x 1.2 m of the north wall, and where its copy hangs."""
 
 _PINBOARD_PLACES = (
@@ -149,12 +149,12 @@ _PINBOARD_PLACES = (
 )  # fmt: skip
 
 
-def _with_twins(things: list[Thing]) -> list[Thing]:
+def _with_copied_poster(things: list[Thing]) -> list[Thing]:
     """The things with one poster replaced by a copy of another, on the next wall."""
-    names = [f"poster_{1 + k}" for k in _TWINS]
+    names = [f"poster_{1 + k}" for k in _COPIED_POSTER]
     shown = next(thing.patches[0].surface for thing in things if thing.name == names[0])
-    _, _, z, width, height = _POSTER_PLACES[_TWINS[0]]
-    wall, along, *_ = _POSTER_PLACES[_TWINS[1]]
+    _, _, z, width, height = _POSTER_PLACES[_COPIED_POSTER[0]]
+    wall, along, *_ = _POSTER_PLACES[_COPIED_POSTER[1]]
     board = furniture.hanging(width, height, shown)
     copy = Thing(names[1], tuple(_against(board, wall, along, 0.0, z)))
     return [copy if thing.name == copy.name else thing for thing in things]

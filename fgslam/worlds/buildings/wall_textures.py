@@ -1,6 +1,6 @@
 """Grey textures of the buildings, beside the lab's: a cover for each room, and many pictures.
 
-The lab has a dozen pictures; a building whose rooms are to be told apart by what hangs in them
+The lab has a dozen pictures; a building whose rooms are recognised by what hangs in them
 needs a different one for every place.
 """
 

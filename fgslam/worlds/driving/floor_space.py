@@ -47,7 +47,7 @@ class FloorSpace:
     def clearance(self, points: FloatArray) -> FloatArray:
         """(n,) exact distance in metres of points (n, 2) to the nearest obstacle.
 
-        Points further than a metre from anything are told from the grid, to half a cell.
+        Farther than a metre from anything the grid answers, to half a cell.
         """
         points = np.atleast_2d(np.asarray(points, dtype=np.float64))
         coarse = self._coarse(points)

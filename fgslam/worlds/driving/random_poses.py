@@ -75,7 +75,7 @@ def draw_poses(
 
 
 class _Free:
-    """Places that keep their distance and can be reached."""
+    """Places with the clearance asked for that can be driven to."""
 
     def __init__(self, space: FloorSpace, start: FloatArray, clearance: float) -> None:
         self.space, self.clearance = space, clearance

@@ -1,4 +1,4 @@
-"""What comes between the house and the picture: light, exposure, noise, and the camera's tilt."""
+"""Disturbances of the house's pictures: light, exposure, noise, and the camera's tilt."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def noisy(levels: Float32, sigma: float, seed: tuple[int, ...]) -> Float32:
 
 
 class CameraTilt:
-    """Roll and pitch of the camera over time: a part that stays and a slow swaying."""
+    """Roll and pitch of the camera over time: a constant part and a slow oscillation."""
 
     def __init__(self, settings: HouseTiltSettings, rng: np.random.Generator) -> None:
         """Draws to which side the camera leans, and the swaying's phases."""

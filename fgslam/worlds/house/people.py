@@ -49,7 +49,7 @@ class Walker:
     """
 
     def __init__(self, route: FloatArray, start: float, free: Free = _anywhere) -> None:
-        """On ``route`` (n, 2), ``start`` metres from its beginning; ``free`` tells the floor."""
+        """On ``route`` (n, 2), ``start`` metres from its beginning; ``free`` is the floor."""
         self._route, self._free = route, free
         self._length = np.concatenate(
             [[0.0], np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1))]
@@ -168,7 +168,7 @@ class People:
         bank: ColourBank,
         free: Free = _anywhere,
     ) -> None:
-        """One person on each route (n, 2), starting somewhere on it; ``free`` tells the floor."""
+        """One person on each route (n, 2), starting somewhere on it; ``free`` is the floor."""
         self._free = free
         self._starts = [(route, float(rng.uniform(0.0, 100.0))) for route in routes]
         self._shirts = [int(k) for k in rng.integers(0, SHIRTS, len(routes))]

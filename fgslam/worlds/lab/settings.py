@@ -193,7 +193,7 @@ class LabPersonSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class LabEffectsSettings:
-    """What spoils the images; each null or zero when off."""
+    """Disturbances of the images; each null or zero when off."""
 
     noise_grey: Annotated[
         float, Field(ge=0.0, le=50.0, description="Gaussian image noise, grey levels")

@@ -1,4 +1,4 @@
-"""What happens to clean images on their way out of the camera: gain, noise, a cover.
+"""Effects of a real camera on rendered images: gain, noise, and a cover before the lens.
 
 Each frame has its own random generator, so that any frame can be had alone and always the same.
 """

@@ -1,7 +1,7 @@
 """Opening Open3D on machines that lack one of its system libraries.
 
 Open3D's wheel links against libusb, OpenGL, X11 and others even where only its ray caster is
-used. libusb also lives on PyPI, so its absence is mended here; for the others the user is told
+used. libusb also lives on PyPI, so its absence is handled here; for the others a message says
 what to install.
 """
 

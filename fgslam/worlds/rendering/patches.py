@@ -40,7 +40,7 @@ class Patch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Thing:
-    """A named object of the scene: ``name`` is what the object identities of the truth tell."""
+    """A named object of the scene; object identities of the ground truth are indices of these."""
 
     name: str
     patches: tuple[Patch, ...]

@@ -14,7 +14,7 @@ Int32 = npt.NDArray[np.int32]
 
 
 class RayCaster:
-    """Answers which patch a ray hits first. Safe to share between threads."""
+    """First patch hit by each ray. Safe to share between threads."""
 
     def __init__(self, patches: PatchArrays) -> None:
         """Raises MissingDependencyError where Open3D cannot be loaded."""

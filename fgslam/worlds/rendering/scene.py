@@ -93,7 +93,7 @@ def _repeats(patches: PatchArrays) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """Something that moves, seen where it stands.
+    """A moving object at its present pose.
 
     Attributes:
         layer: its patches in its own frame.

@@ -50,11 +50,11 @@ def missing_libraries(
 
 
 def describe(missing: list[str]) -> str:
-    """One line for people: what is missing, what it costs, and the mend."""
+    """One line: what is missing, what will not work without it, and how to install it."""
     packages = " ".join(DEBIAN_PACKAGES[soname] for soname in missing)
     return (
         f"Open3D cannot load here: missing {', '.join(missing)}; the rendered lab will not run, "
-        f"all else will; mend: apt-get install {packages} (or what your system calls them)"
+        f"all else will; install: apt-get install {packages} (or what your system calls them)"
     )
 
 

@@ -95,7 +95,7 @@ def _picture(name: str) -> npt.NDArray[np.generic]:
 
 
 def faded(image: Grey, contrast: float) -> Grey:
-    """Less contrast about the mean: prints fade, and a lab is no chessboard."""
+    """The texture with its contrast about the mean reduced to this fraction."""
     mean = float(image.mean())
     return np.asarray(mean + contrast * (image - mean), dtype=np.float32)
 

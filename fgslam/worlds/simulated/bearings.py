@@ -1,4 +1,4 @@
-"""A simulated homing of bearings alone: what matching and tracking would hand on, and the truth.
+"""A simulated homing of bearings alone: matches, tracked bearings, and the ground truth.
 
 Everything follows from the settings and the generator that is handed in. Outliers come in three
 ways: matches between start and target that are wrong (before any RANSAC; some of them survive

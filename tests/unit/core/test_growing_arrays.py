@@ -12,7 +12,7 @@ STEPS = st.lists(st.tuples(st.integers(0, 90), st.floats(0.0, 1.0)), max_size=12
 
 
 @given(STEPS)
-def test_like_plain_arrays(steps) -> None:
+def test_growing_columns_equal_plain_arrays(steps) -> None:
     columns = GrowingColumns(name=np.empty(0, np.int64), pair=np.empty((0, 2), np.float32))
     names, pairs = np.empty(0, np.int64), np.empty((0, 2), np.float32)
     rng = np.random.default_rng(0)

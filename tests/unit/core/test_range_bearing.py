@@ -157,7 +157,7 @@ def test_the_filter_beats_its_odometry_severalfold(rng: np.random.Generator) -> 
     assert error.mean() < 0.4 * alone.mean()
 
 
-def test_wrong_matches_are_told_by_their_deviations_alone(rng: np.random.Generator) -> None:
+def test_wrong_matches_are_rejected_by_their_deviations_alone(rng: np.random.Generator) -> None:
     """An error of 0.9 radians is far below outlier_px; a landmark dead astern is no outlier."""
     _, posts, _ = drive(rng, noise=0.0)
     posts[0] = (0.0, 0.0, -3.0)

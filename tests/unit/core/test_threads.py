@@ -69,7 +69,7 @@ def test_one_thread_inside_and_as_before_outside() -> None:
         assert blas_threads() == before
 
 
-def test_who_leaves_first_takes_no_limit_from_the_others() -> None:
+def test_nested_thread_limits_end_independently() -> None:
     with threadpool_limits(limits=2, user_api="blas"):
         first, second = one_blas_thread(), one_blas_thread()
         first.__enter__()

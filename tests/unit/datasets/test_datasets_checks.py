@@ -288,14 +288,14 @@ def test_sound_matches(rng: np.random.Generator) -> None:
     assert "rows of 400 matches differ by" in texts(found, Level.INFO)
 
 
-def test_swapped_cameras_are_told(rng: np.random.Generator) -> None:
+def test_swapped_cameras_are_reported(rng: np.random.Generator) -> None:
     rows, disparities = matches(rng)
     found = texts(check_epipolar(rows, -disparities), Level.PROBLEM)
     assert "cameras look swapped: 9" in found
     assert "swap left and right" in found
 
 
-def test_unrectified_pairs_are_told(rng: np.random.Generator) -> None:
+def test_unrectified_pairs_are_reported(rng: np.random.Generator) -> None:
     rows, disparities = matches(rng)
     found = texts(check_epipolar(rows + 2.3, disparities), Level.PROBLEM)
     assert "rows disagree by +2.3 px" in found

@@ -214,7 +214,7 @@ def test_bad_speed_log_names_the_line(tmp_path: Path, rows: str, words: list[str
         assert part in str(error.value)
 
 
-def test_bad_odometry_hurts_only_who_uses_it(tmp_path: Path) -> None:
+def test_bad_odometry_is_an_error_only_where_it_is_used(tmp_path: Path) -> None:
     root = with_speeds(tmp_path)
     (root / "odom_car.csv").write_text("0,nan,0\n", encoding="utf-8")
     recording = opened(root)

@@ -75,7 +75,7 @@ def test_report_on_kitti_names_the_drive_and_the_others(tmp_path: Path) -> None:
     assert f"other drives 07: inspect {root}/sequences/NN" in report
 
 
-def test_kitti_drive_out_of_place_is_told_how_to_be_given(tmp_path: Path) -> None:
+def test_kitti_drive_without_its_root_names_the_layout_needed(tmp_path: Path) -> None:
     root, _ = kitti(tmp_path / "a", 3)
     moved = tmp_path / "drive"
     (root / "sequences" / "06").rename(moved)
@@ -276,7 +276,9 @@ def clock(root: Path, offset: float = 0.0) -> str:
 
 
 @pytest.mark.parametrize("late", [0.06, -0.12])
-def test_shifted_clock_is_measured_and_its_mend_mends_it(tmp_path: Path, late: float) -> None:
+def test_shifted_clock_is_measured_and_the_advised_offset_corrects_it(
+    tmp_path: Path, late: float
+) -> None:
     root = winding_drive(tmp_path, late)
     assert f"shifted by {-late:+.2f} s" in clock(root)
     assert clock(root, -late) == ""
@@ -291,7 +293,7 @@ def test_sound_clock_and_straight_drive_give_no_finding(tmp_path: Path) -> None:
 # The report
 
 
-def test_report_puts_told_facts_above_and_findings_below() -> None:
+def test_report_puts_facts_above_and_findings_below() -> None:
     findings = (
         Finding(Level.PROBLEM, "images", "bad. " * 30),
         Finding(Level.WARNING, "time", "gap"),

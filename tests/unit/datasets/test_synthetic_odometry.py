@@ -56,7 +56,7 @@ def errors(sequence: SyntheticOdometry) -> FloatArray:
     return np.array(out)
 
 
-def test_it_is_a_sequence_and_says_that_it_is_synthetic(folder: Path) -> None:
+def test_synthetic_odometry_is_a_sequence_and_noted_as_synthetic(folder: Path) -> None:
     recording = opened(folder)
     sequence = SyntheticOdometry(recording, SETTINGS, 3)
     assert isinstance(sequence, Sequence)

@@ -226,9 +226,7 @@ def test_odometry_covariance_is_that_of_noisy_rates(
     )
 
 
-def test_wheels_tell_way_and_turn_and_little_of_the_side(
-    tmp_path: Path, rng: np.random.Generator
-) -> None:
+def test_wheel_odometry_is_uncertain_sideways(tmp_path: Path, rng: np.random.Generator) -> None:
     """The covariance back in the body: forward x, left y, up z."""
     recording = opened(tmp_path, woods(rng), lateral_sigma_mps=0.05, rate_sigma_scale=2.0)
     odometry = recording.log.increments[1].odometry
@@ -240,7 +238,7 @@ def test_wheels_tell_way_and_turn_and_little_of_the_side(
     assert sigma[4] == pytest.approx(0.05)
 
 
-def test_far_readings_and_frames_without_truth_are_told(
+def test_far_readings_and_frames_without_truth_are_noted(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     values = woods(rng)
@@ -303,7 +301,7 @@ def test_a_negative_pixel_is_no_measurement(tmp_path: Path, rng: np.random.Gener
         opened(tmp_path, values)
 
 
-def test_missing_and_damaged_files_are_told_in_one_line(
+def test_missing_and_damaged_files_give_one_line_errors(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     path = tmp_path / "a.mat"

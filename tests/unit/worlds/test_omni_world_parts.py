@@ -145,7 +145,7 @@ def textures(patches: PatchArrays) -> list[str]:
     return [surface.texture for surface in patches.surfaces]
 
 
-def test_house_is_the_seeds(house: House, patches: PatchArrays) -> None:
+def test_same_seed_gives_the_same_house(house: House, patches: PatchArrays) -> None:
     again = stack(build_house(rng(0)).things)
     np.testing.assert_array_equal(again.corner, patches.corner)
     assert textures(again) == textures(patches)
@@ -210,7 +210,7 @@ def test_reference_path_is_drivable(space: FloorSpace, spacing: float, within: s
     assert within is not None or len(rooms) >= 4
 
 
-def test_impossible_path_is_told(space: FloorSpace) -> None:
+def test_impossible_path_is_refused(space: FloorSpace) -> None:
     with pytest.raises(DatasetError, match=r"no path of 60 legs of 8\.0 m .* in the hall; lower"):
         PathPlanner(space, 0.9).reference_path(8.0, 60, rng(), "hall")
 

@@ -48,7 +48,7 @@ def test_robot_and_camera_keep_clear_in_all_headings_all_over_the_room() -> None
     assert (np.ptp(poses[:, :2, 3], axis=0) > 7.0).all()
 
 
-def test_each_pose_is_its_own() -> None:
+def test_random_poses_differ() -> None:
     """How many poses there are changes none of them, another seed all."""
     many, few = body(drive(40)), body(drive(10))
     np.testing.assert_array_equal(many[:10], few)
@@ -129,7 +129,7 @@ def test_which_frames_are_used_is_no_part_of_a_recording_s_identity() -> None:
 
 
 @pytest.mark.usefixtures("_unrendered")
-def test_wheels_know_of_no_carrying() -> None:
+def test_no_odometry_is_given_where_the_robot_was_carried() -> None:
     carried = RenderedLabSequence(LabSettings(drive=drive(9, burst=3)), 0)
     known = [carried.odometry(i) is not None for i in range(9)]
     assert known == [False, True, True] * 3
@@ -150,13 +150,13 @@ def test_wheels_know_of_no_carrying() -> None:
     ],
     ids=["paper", "selection", "world", "visit"],
 )
-def test_what_was_rendered_before_there_were_other_places_keeps_its_name(
+def test_cache_keys_of_the_lab_do_not_change_with_later_settings(
     settings: LabSettings, key: str
 ) -> None:
     assert content_hash(rendered_lab._render_description(settings))[:20] == key
 
 
-def test_other_places_and_posters_are_rendered_apart() -> None:
+def test_other_places_and_posters_have_other_cache_keys() -> None:
     drives = {"rooms": LabDriveSettings(path="tour"), "corridors": LabDriveSettings(path="tour")}
     keys = [
         content_hash(rendered_lab._render_description(settings))

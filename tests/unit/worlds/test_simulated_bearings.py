@@ -51,7 +51,7 @@ def test_drive_ends_after_its_part_of_the_way(part: float) -> None:
     assert np.ptp(homing.truth.robots[:, 2]) > np.deg2rad(3.0)  # the way is curved
 
 
-def test_outliers_are_as_many_as_told() -> None:
+def test_outliers_have_the_configured_share() -> None:
     settings = replace(CLEAN, wrong_matches=0.2, jumping_tracks=0.3, gross_bearings=0.0)
     homing = simulate(settings)
     assert len(homing.matches) == 250
@@ -67,7 +67,7 @@ def test_outliers_are_as_many_as_told() -> None:
     assert np.mean(stays[off]) > 0.9
 
 
-def test_single_gross_bearings_do_not_stay() -> None:
+def test_gross_bearings_last_one_image() -> None:
     homing = simulate(replace(CLEAN, gross_bearings=0.3))
     off = [
         np.abs(wrap(image.bearing - bearings(robot, homing.truth.landmarks))) > np.deg2rad(5.0)

@@ -205,7 +205,7 @@ def test_an_identity_is_kept_through_misses_and_new_after_pruning() -> None:
     assert book.point_of_id.tolist() == [0, 2, 1, 0]
 
 
-def test_books_of_a_drive_balance() -> None:
+def test_every_observation_is_new_matched_or_missed() -> None:
     """Every observation is of a landmark known and not pruned, or new under the next number."""
     recording = recorded(stop=None, detection={"probability": 0.5, "prune_after_misses": 3})
     alive: set[int] = set()
@@ -229,7 +229,7 @@ def test_books_of_a_drive_balance() -> None:
     assert recording.landmark_truth.ids.tolist() == list(range(count))
 
 
-def test_the_strongest_are_measured_where_there_are_too_many() -> None:
+def test_number_of_measurements_is_limited_to_the_strongest() -> None:
     few, many = recorded(detection={"features": 20}), recorded()
     counts = [len(increment.observations) for increment in few.log]
     assert max(counts) == 20
@@ -238,7 +238,7 @@ def test_the_strongest_are_measured_where_there_are_too_many() -> None:
     assert np.mean(followed) > 0.7
 
 
-def test_detection_takes_its_share() -> None:
+def test_detection_probability_is_respected() -> None:
     full = recorded(detection={"probability": 1.0, "features": 10_000})
     half = recorded(detection={"probability": 0.5, "features": 10_000})
     counts = [sum(len(i.observations) for i in r.log) for r in (half, full)]
@@ -289,7 +289,7 @@ def test_the_odometry_s_fault_scales_ten_steps() -> None:
     assert ratios == [1.0] * 6 + [0.5] * 4 + [1.0] * 9
 
 
-def test_a_blackout_shows_nothing_and_forgets_nothing() -> None:
+def test_blackout_gives_no_observation_and_keeps_identities() -> None:
     recording = recorded(blackout={"start": 10, "frames": 5})
     for increment in recording.log:
         dark = 10 <= increment.index < 15

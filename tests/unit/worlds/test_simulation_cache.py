@@ -19,7 +19,7 @@ def images(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, SHAPE, dtype=np.uint8)
 
 
-def test_what_is_written_is_read(cache: RenderCache) -> None:
+def test_cached_frame_is_read_as_it_was_written(cache: RenderCache) -> None:
     assert not cache.present(7)
     assert cache.read(7) is None
     cache.write(7, images(7))
@@ -46,7 +46,7 @@ def test_length_alone_decides_presence(cache: RenderCache) -> None:
     assert not cache.present(1)
 
 
-def test_folder_that_cannot_be_made_is_told_in_one_line(
+def test_cache_folder_that_cannot_be_made_gives_a_one_line_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_text("in the way")

@@ -27,7 +27,7 @@ def corners(thing: Thing) -> np.ndarray:
 
 
 @pytest.mark.parametrize("visit", VISITS)
-def test_everything_is_inside_the_room_and_has_its_own_name(visit: int) -> None:
+def test_things_are_inside_the_room_with_unique_names(visit: int) -> None:
     things = lab(visit)
     assert len({thing.name for thing in things}) == len(things)
     for thing in things:
@@ -38,7 +38,7 @@ def test_everything_is_inside_the_room_and_has_its_own_name(visit: int) -> None:
 
 
 @pytest.mark.parametrize("visit", VISITS)
-def test_nothing_floats(visit: int) -> None:
+def test_things_stand_on_something(visit: int) -> None:
     """What does not stand on the floor rests on something, by a ray cast down from its bottom."""
     things = [t for t in lab(visit) if t.name.startswith(("carton", "chair", "plotter", "desk"))]
     for thing in things:

@@ -67,7 +67,7 @@ def test_missing_libusb_everywhere_names_the_package() -> None:
     [("libGL.so.1", "libgl1"), ("libX11.so.6", "libx11-6"), ("libEGL.so.1", "libegl1"),
      ("libudev.so.1", "libudev1")],
 )  # fmt: skip
-def test_other_libraries_are_named_with_their_mend(library: str, package: str) -> None:
+def test_missing_libraries_are_named_with_their_package(library: str, package: str) -> None:
     text = explain_missing_library(f"{library}: cannot open shared object file: No such file")
     assert library in text
     assert text.endswith(f"apt-get install -y {package}")

@@ -71,7 +71,7 @@ def test_robot_drives_the_way_it_faces(settings: LabDriveSettings) -> None:
     assert np.abs(error[moving]).max() < 2e-3
 
 
-def test_papers_drive() -> None:
+def test_paper_loop_goes_once_around_the_chair_and_returns() -> None:
     drive = plan_drive(LabDriveSettings())
     poses = drive.body_poses(drive.timestamps)
     assert len(poses) == 249
@@ -127,7 +127,7 @@ def test_waypoints_that_make_no_path(points: tuple[tuple[float, float], ...], cl
         )
 
 
-def test_turning_back_on_the_spot_is_refused_and_told_where() -> None:
+def test_turning_back_on_the_spot_is_refused_with_its_place() -> None:
     there_and_back = ((0.0, -1.0), (2.0, -1.0), (0.0, -1.0))
     with pytest.raises(ConfigError, match=r"too sharply near \(2\.00, -1\.00\)"):
         plan_drive(LabDriveSettings(path="waypoints", waypoints_m=there_and_back, frames=None))

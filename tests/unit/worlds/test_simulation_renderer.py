@@ -67,7 +67,7 @@ def test_depth_is_exact_on_a_slanted_wall() -> None:
     np.testing.assert_allclose(points[:, 2], 5.0, atol=1e-12)
 
 
-def test_nothing_is_black_infinite_and_nobody() -> None:
+def test_where_nothing_is_seen_levels_are_0_depth_infinite_and_object_minus_1() -> None:
     bank = ramps(16)
     layer = make_layer([wall("across", 5.0)], bank)
     away = geometry.pose(geometry.so3_exp(np.array([0.0, np.pi, 0.0])), np.zeros(3))
@@ -136,7 +136,7 @@ def test_solids_face_outwards(yaw: float) -> None:
         assert (np.sum((middle - inside) * arrays.normal, axis=1) > 0.0).all()
 
 
-def test_mirrored_text_would_be_seen() -> None:
+def test_textures_are_not_mirrored_on_any_side_of_a_box() -> None:
     """On every upright face of a box a texture runs from left to right as one looks at it."""
     bank = ramps(64)
     solid = box((-1, -1, -1), (1, 1, 1), Surface("across"))

@@ -39,7 +39,7 @@ def needed_libraries(path: Path) -> list[str]:
     return [names[at : names.index(b"\0", at)].decode() for at in names_at]
 
 
-def test_the_table_is_what_the_wheel_needs() -> None:
+def test_listed_libraries_are_those_that_the_wheel_links() -> None:
     spec = importlib.util.find_spec("open3d")
     if spec is None or not spec.submodule_search_locations:
         pytest.skip("open3d is not installed")
@@ -51,7 +51,7 @@ def test_the_table_is_what_the_wheel_needs() -> None:
     assert needed == set(system_check.DEBIAN_PACKAGES)
 
 
-def test_nothing_is_missing_where_all_loads() -> None:
+def test_no_library_is_reported_where_all_load() -> None:
     assert system_check.missing_libraries(can_load=lambda _: True) == []
 
 
@@ -70,14 +70,14 @@ def test_libusb_may_come_from_its_python_package(carried: bool, expected: list[s
     assert missing == expected
 
 
-def test_the_loader_is_asked() -> None:
+def test_the_dynamic_loader_decides() -> None:
     assert system_check.can_load("libc.so.6")
     assert not system_check.can_load("libno-such-library-anywhere.so.1")
     assert system_check.has_package("numpy")
     assert not system_check.has_package("no_such_package_anywhere")
 
 
-def test_the_message_says_what_where_and_the_mend(
+def test_the_message_names_libraries_consequence_and_remedy(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(system_check, "missing_libraries", lambda: ["libEGL.so.1", "libGL.so.1"])
@@ -179,7 +179,7 @@ def test_setup_that_fails_leaves_no_stamp(tmp_path: Path) -> None:
     assert not (tmp_path / ".venv" / ".dev-stamp").exists()
 
 
-def test_setup_lives_with_missing_system_libraries(tmp_path: Path) -> None:
+def test_setup_succeeds_without_system_libraries(tmp_path: Path) -> None:
     executable(
         tmp_path / ".venv" / "bin" / "python",
         'case "$*" in\n'
