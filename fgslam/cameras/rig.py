@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray
+from fgslam.cameras.rectification import Rectifier
+from fgslam.cameras.rig_files.reading import read_rig
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import is_rigid
 from fgslam.core.sensors import CameraRig
@@ -34,6 +37,8 @@ class StereoRig(CameraRig):
         bTc: (4, 4) pose of the right camera in the robot's body, where its odometry is measured.
             The identity where odometry is the camera's own motion, or there is none.
 
+        rectifier: how raw images become rectified ones; None where they are rectified already.
+
     Raises:
         CalibrationError: a size, focal length or baseline is not positive and finite, the
             principal point is far from the image, or ``bTc`` is no rigid motion.
@@ -41,9 +46,42 @@ class StereoRig(CameraRig):
 
     vertical_baseline: float | None = None
     bTc: FloatArray = field(default_factory=_identity)
+    rectifier: Rectifier | None = None
 
     def __post_init__(self) -> None:
         require_rig(self)
+
+    @staticmethod
+    def load(path: str | Path, size: tuple[int, int] | None = None) -> StereoRig:
+        """The rig of a calibration file or folder; its format is told from what is in it.
+
+        Known are our calib.json; Kalibr's camchain (pinhole, radtan); the files of OpenCV's stereo
+        calibration (M1, D1, M2, D2, R, T); a folder with left.yaml and right.yaml of ROS
+        camera_info; KITTI's calib.txt and calib_cam_to_cam.txt; a EuRoC folder with
+        cam0/sensor.yaml. Where the cameras are not rectified, the rig holds the maps that rectify
+        them, and a session applies them to the raw images that it is given.
+
+        Args:
+            path: the file, or a folder that holds one.
+            size: width and height of the images in pixels, for KITTI's calib.txt and OpenCV's
+                files, which do not state it.
+
+        Raises:
+            CalibrationError: the format or a camera model is not known, a value is missing or
+                impossible, or the cameras are no horizontal pair.
+        """
+        found = read_rig(Path(path), size)
+        values = {name: getattr(found.rig, name) for name in CameraRig.__dataclass_fields__}
+        return StereoRig(**values, rectifier=found.rectifier)
+
+    def rectified(self, images: tuple[Image, ...]) -> tuple[Image, ...]:
+        """Rectified (right, left[, top]) of grey images (height, width) uint8 as the camera gives.
+
+        The images themselves where the rig has nothing to rectify.
+        """
+        if self.rectifier is None:
+            return images
+        return tuple(self.rectifier.rectify(k, image) for k, image in enumerate(images))
 
 
 def require_rig(rig: CameraRig) -> None:

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.cameras.calibration import level_mounting, read_calibration, read_json_object
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError, OdometryError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import right_from_left_camera
 from fgslam.core.measurements import Odometry
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.calibration import level_mounting, read_calibration, read_json_object
 from fgslam.datasets.images import list_numbered_images
 from fgslam.datasets.odometry_settings import RecordedOdometrySettings
 from fgslam.datasets.recorded_odometry import (

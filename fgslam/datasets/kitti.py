@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.cameras.kitti_calibration import read_projections
 from fgslam.core.arrays import FloatArray
-from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory
-from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, right_from_left_camera
+from fgslam.core.geometry import right_from_left_camera
 from fgslam.core.sensors import CameraRig
-from fgslam.core.text_files import read_lines
 from fgslam.datasets.images import list_numbered_images
 from fgslam.datasets.recording import Recording, recording_identity
 from fgslam.datasets.selection import select_frames
@@ -92,21 +92,7 @@ def _files(folder: Path, cameras: list[dict[int, Path]], frames: int) -> StereoF
 
 def _read_rig(path: Path, files: StereoFiles) -> CameraRig:
     """The rig of calib.txt; the image size, which it does not state, is the first frame's."""
-    left, right = (_projection(path, key) for key in ("P0", "P1"))
-    if not np.allclose(left[:, :3], right[:, :3]):
-        raise CalibrationError(
-            f"{path}: P0 and P1 differ in their intrinsics, so the pair is not rectified; use the "
-            "calibration that came with the sequence"
-        )
-    fx, fy = float(right[0, 0]), float(right[1, 1])
-    if fx <= 0.0 or fy <= 0.0:
-        raise CalibrationError(f"{path}: focal lengths {fx:g}, {fy:g} must be positive")
-    baseline = float(left[0, 3] - right[0, 3]) / fx
-    if baseline <= 0.0:
-        raise CalibrationError(
-            f"{path}: the baseline is {baseline:g} m, must be positive; P0 belongs to the left "
-            "camera (image_0), P1 to the right one (image_1): are they swapped?"
-        )
+    pair = read_projections(path)
     images = files.first_images()
     if images is None:
         raise DatasetError(
@@ -115,9 +101,7 @@ def _read_rig(path: Path, files: StereoFiles) -> CameraRig:
         )
     _require_same_size(path.parent, size(images[0]), size(images[1]))
     height, width = images[0].shape
-    cx, cy = float(right[0, 2]), float(right[1, 2])
-    body = BODY_FORWARD_LEFT_UP_FROM_CAMERA
-    return CameraRig(width, height, fx, fy, cx, cy, baseline, None, body)
+    return pair.rig(width, height)
 
 
 def _require_same_size(folder: Path, right: str, left: str) -> None:
@@ -125,24 +109,6 @@ def _require_same_size(folder: Path, right: str, left: str) -> None:
         raise DatasetError(
             f"{folder}: image_0 is {left} but image_1 is {right}; restore the original images"
         )
-
-
-def _projection(path: Path, key: str) -> FloatArray:
-    """Projection matrix (3, 4) of a line such as ``P1: 12 numbers``."""
-    for line, text in read_lines(path, CalibrationError):
-        name, _, rest = text.partition(":")
-        if name.strip() != key:
-            continue
-        try:
-            values = np.array([float(word) for word in rest.split()])
-        except ValueError:
-            values = np.empty(0)
-        if len(values) != 12 or not np.isfinite(values).all():
-            raise CalibrationError(
-                f"{path}, line {line}: {key} must be 12 finite numbers; restore the file"
-            )
-        return values.reshape(3, 4)
-    raise CalibrationError(f"{path} has no line {key!r}; restore the file of the odometry data set")
 
 
 def _read_poses(path: Path, frames: int) -> FloatArray | None:

@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import FrameError, OdometryError
 from fgslam.core.geometry import is_rigid
@@ -42,7 +43,7 @@ def checked_time(t: float, last: float | None) -> float:
 
 
 def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
-    """Grey images (right, left[, top]) of the rig's size from (left, right[, top]).
+    """Grey rectified images (right, left[, top]) of the rig's size from (left, right[, top]).
 
     Raises:
         FrameError: another number of images, or one of another size, type or shape.
@@ -65,7 +66,8 @@ def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
             )
         grey.append(converted)
     left, right, *top = grey
-    return (right, left, *top)
+    inside = (right, left, *top)
+    return rig.rectified(inside) if isinstance(rig, StereoRig) else inside
 
 
 def checked_odometry(

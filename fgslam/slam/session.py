@@ -107,7 +107,8 @@ class Session:
 
         Args:
             t: time stamp in seconds, later than the last frame's.
-            images: (left, right) or (left, right, top), rectified and taken at the same moment:
+            images: (left, right) or (left, right, top), taken at the same moment and rectified, or
+                raw where the rig was loaded with its rectification:
                 (height, width) grey or (height, width, 3) red, green, blue; uint8, or uint16 of
                 which the upper eight bits count; any memory layout. None where the cameras gave
                 nothing: the frame is then placed by the odometry alone.

@@ -18,12 +18,13 @@ from dataset_builders import (
     write_euroc_truth,
 )
 
+from fgslam.cameras.asl import read_camera
+from fgslam.cameras.rectification import RawCamera, rectifier
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
 from fgslam.core.geometry import inverse, pose, project, se3_exp, so3_exp, transform_to_camera
 from fgslam.core.recordings import Sequence
-from fgslam.datasets.asl_files import AslCamera, read_camera
-from fgslam.datasets.euroc import open_euroc, rectifier
+from fgslam.datasets.euroc import open_euroc
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import EurocSettings
 
@@ -37,7 +38,7 @@ def opened(root: Path, **settings: object) -> Recording:
     return open_euroc(EurocSettings(path=str(root), **settings))  # type: ignore[arg-type]
 
 
-def seen_raw(camera: AslCamera, points: FloatArray) -> FloatArray:
+def seen_raw(camera: RawCamera, points: FloatArray) -> FloatArray:
     """Raw, distorted pixels (n, 2) of body points (n, 3)."""
     cTb = inverse(camera.bTc)
     vector, _ = cv2.Rodrigues(cTb[:3, :3])

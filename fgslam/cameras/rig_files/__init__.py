@@ -1,0 +1,1 @@
+"""Calibration files of stereo rigs: one reader a format, found by content."""

@@ -1,0 +1,277 @@
+"""The stereo rig: checked numbers, and calibration files of several formats."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from fgslam.cameras.rig import StereoRig
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import CalibrationError
+from fgslam.core.geometry import inverse, pose, so3_exp
+
+WIDTH, HEIGHT = 160, 120
+INTRINSICS = ([150.0, 151.0, 78.0, 61.0], [149.0, 150.5, 81.0, 58.0])
+DISTORTION = ([-0.28, 0.07, 2e-4, 2e-5], [-0.27, 0.06, -1e-4, -3e-5])
+RIGHT_FROM_LEFT = pose(so3_exp(np.array([0.01, -0.02, 0.005])), np.array([-0.11, 0.001, 0.002]))
+"""Takes points from the left camera's axes to the right one's."""
+
+
+def numbers(**changes: Any) -> dict[str, Any]:
+    values = {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 319.5, "cy": 239.5}
+    return values | {"baseline": 0.12} | changes
+
+
+def matrix(k: int) -> FloatArray:
+    fx, fy, cx, cy = INTRINSICS[k]
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+# --------------------------------------------------------------------------------------------
+# Numbers
+
+
+def test_a_rig_needs_seven_numbers() -> None:
+    rig = StereoRig(**numbers())
+    assert rig.cameras == 2
+    np.testing.assert_array_equal(rig.bTc, np.eye(4))
+    assert StereoRig(**numbers(vertical_baseline=0.1)).cameras == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"baseline": 0.0}, "baseline is 0.0, .*one camera alone cannot measure depth"),
+        ({"baseline": None}, "baseline is None"),
+        ({"vertical_baseline": -0.1}, "vertical_baseline is -0.1"),
+        ({"fx": float("inf")}, "fx is inf"),
+        ({"fy": True}, "fy is True"),
+        ({"height": 0}, "height is 0"),
+        ({"cy": float("nan")}, "cy is nan"),
+        ({"cx": -700.0}, "cx is -700.0, far from the image"),
+        ({"bTc": np.diag([1.0, 1.0, -1.0, 1.0])}, "bTc must be a rigid motion"),
+    ],
+)
+def test_impossible_numbers_are_refused_by_name(change: dict[str, Any], words: str) -> None:
+    with pytest.raises(CalibrationError, match=words):
+        StereoRig(**numbers(**change))
+
+
+def test_a_changed_rig_is_checked_too() -> None:
+    with pytest.raises(CalibrationError, match="fx"):
+        dataclasses.replace(StereoRig(**numbers()), fx=-1.0)
+
+
+# --------------------------------------------------------------------------------------------
+# Files: one pair of cameras, written in each format
+
+
+def write_euroc(root: Path) -> Path:
+    for k, bTc in enumerate((np.eye(4), inverse(RIGHT_FROM_LEFT))):
+        folder = root / "mav0" / f"cam{k}"
+        folder.mkdir(parents=True)
+        values = {
+            "T_BS": {"cols": 4, "rows": 4, "data": bTc.ravel().tolist()},
+            "resolution": [WIDTH, HEIGHT],
+            "intrinsics": INTRINSICS[k],
+            "distortion_model": "radial-tangential",
+            "distortion_coefficients": DISTORTION[k],
+        }
+        (folder / "sensor.yaml").write_text("%YAML:1.0\n" + yaml.safe_dump(values))
+    return root
+
+
+def camchain() -> dict[str, dict[str, Any]]:
+    cameras: dict[str, dict[str, Any]] = {
+        f"cam{k}": {
+            "camera_model": "pinhole",
+            "distortion_model": "radtan",
+            "distortion_coeffs": DISTORTION[k],
+            "intrinsics": INTRINSICS[k],
+            "resolution": [WIDTH, HEIGHT],
+        }
+        for k in (0, 1)
+    }
+    cameras["cam1"]["T_cn_cnm1"] = RIGHT_FROM_LEFT.tolist()
+    return cameras
+
+
+def write_camchain(root: Path, **changes: Any) -> Path:
+    values = camchain()
+    values["cam1"] |= changes
+    path = root / "drive-camchain.yaml"
+    path.write_text(yaml.safe_dump(values))
+    return path
+
+
+def write_opencv(root: Path) -> Path:
+    for name, items in {
+        "intrinsics.yml": {
+            "M1": matrix(0),
+            "D1": np.array([DISTORTION[0]]),
+            "M2": matrix(1),
+            "D2": np.array([DISTORTION[1]]),
+        },
+        "extrinsics.yml": {"R": RIGHT_FROM_LEFT[:3, :3], "T": RIGHT_FROM_LEFT[:3, 3:]},
+    }.items():
+        storage = cv2.FileStorage(str(root / name), cv2.FILE_STORAGE_WRITE)
+        for key, value in items.items():
+            storage.write(key, np.ascontiguousarray(value))
+        storage.release()
+    return root / "extrinsics.yml"
+
+
+def write_camera_info(root: Path, **changes: Any) -> Path:
+    """As ROS' own calibrator would, by OpenCV's rectification."""
+    rotations = cv2.stereoRectify(
+        matrix(0),
+        np.array(DISTORTION[0]),
+        matrix(1),
+        np.array(DISTORTION[1]),
+        (WIDTH, HEIGHT),
+        RIGHT_FROM_LEFT[:3, :3],
+        RIGHT_FROM_LEFT[:3, 3:],
+        flags=cv2.CALIB_ZERO_DISPARITY,
+        alpha=0.0,
+    )
+    for k, name in enumerate(("left", "right")):
+        values = {
+            "image_width": WIDTH,
+            "image_height": HEIGHT,
+            "camera_matrix": {"data": matrix(k).ravel().tolist()},
+            "distortion_model": "plumb_bob",
+            "distortion_coefficients": {"data": [*DISTORTION[k], 0.0]},
+            "rectification_matrix": {"data": rotations[k].ravel().tolist()},
+            "projection_matrix": {"data": rotations[2 + k].ravel().tolist()},
+        }
+        (root / f"{name}.yaml").write_text(yaml.safe_dump(values | changes))
+    return root
+
+
+WRITERS = {
+    "kalibr": (write_camchain, None),
+    "folder with a camchain": (lambda root: write_camchain(root).parent, None),
+    "opencv": (write_opencv, (WIDTH, HEIGHT)),
+    "camera_info": (write_camera_info, None),
+}
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_one_pair_in_every_format_is_one_rig(kind: str, tmp_path: Path) -> None:
+    expected = StereoRig.load(write_euroc(tmp_path / "euroc"))
+    write, size = WRITERS[kind]
+    (tmp_path / "other").mkdir()
+    found = StereoRig.load(write(tmp_path / "other"), size)
+    for name in ("width", "height", "fx", "fy", "cx", "cy", "baseline"):
+        assert getattr(found, name) == pytest.approx(getattr(expected, name), abs=1e-9), name
+    assert found.baseline == pytest.approx(np.linalg.norm(RIGHT_FROM_LEFT[:3, 3]), abs=1e-9)
+    image = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH), np.uint8)
+    pairs = zip(found.rectified((image, image)), expected.rectified((image, image)), strict=True)
+    for a, b in pairs:
+        np.testing.assert_array_equal(a, b)
+        assert (a != image).any()
+
+
+def test_rectified_rows_agree(tmp_path: Path) -> None:
+    """A point far off the axis falls on one row of both rectified images, by the disparity."""
+    rig = StereoRig.load(write_camchain(tmp_path))
+    assert rig.rectifier is not None
+    point = np.array([0.3, -0.2, 2.0])  # in the left camera's axes
+    raw = [
+        cv2.projectPoints(p[None], np.zeros(3), np.zeros(3), matrix(k), np.array(DISTORTION[k]))[0]
+        for k, p in enumerate((point, (RIGHT_FROM_LEFT @ [*point, 1.0])[:3]))
+    ]
+    found = []
+    for (columns, rows), at in zip(rig.rectifier.maps, reversed(raw), strict=True):
+        near = np.hypot(columns - at[0, 0, 0], rows - at[0, 0, 1])
+        found.append(np.unravel_index(near.argmin(), near.shape))
+    (right_row, right_column), (left_row, left_column) = found
+    assert abs(int(right_row) - int(left_row)) <= 1
+    depth = rig.fx * rig.baseline / (int(left_column) - int(right_column))
+    assert depth == pytest.approx(2.0, abs=0.3)  # disparities of whole pixels
+
+
+def test_our_own_and_kittis_files_need_no_rectification(tmp_path: Path) -> None:
+    ours = {"width": 320, "height": 240, "fx": 200.0, "fy": 200.0, "cx": 160.0, "cy": 120.0}
+    (tmp_path / "calib.json").write_text(
+        json.dumps(ours | {"baseline_m": 0.1, "vertical_baseline_m": 0.2})
+    )
+    rig = StereoRig.load(tmp_path)
+    assert (rig.cameras, rig.vertical_baseline, rig.rectifier) == (3, 0.2, None)
+    kitti = tmp_path / "kitti.txt"
+    kitti.write_text(
+        "P0: 700 0 600 0 0 700 180 0 0 0 1 0\nP1: 700 0 600 -378 0 700 180 0 0 0 1 0\n"
+    )
+    with pytest.raises(CalibrationError, match=r"size=\(width, height\)"):
+        StereoRig.load(kitti)
+    assert StereoRig.load(kitti, (1226, 370)).baseline == pytest.approx(0.54)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"distortion_model": "equidistant"}, "cam1 is pinhole with equidistant"),
+        ({"camera_model": "omni"}, "cam1 is omni with radtan"),
+        ({"T_cn_cnm1": None}, "T_cn_cnm1"),
+        ({"T_cn_cnm1": np.diag([2.0, 1, 1, 1]).tolist()}, "not a rigid motion"),
+        ({"intrinsics": [1.0, 2.0]}, "intrinsics"),
+        ({"resolution": [80, 60]}, "one resolution"),
+    ],
+)
+def test_what_a_camchain_lacks_is_named(tmp_path: Path, changes: Any, words: str) -> None:
+    path = write_camchain(tmp_path, **changes)
+    with pytest.raises(CalibrationError, match=words):
+        StereoRig.load(path)
+
+
+def test_cameras_above_each_other_are_refused(tmp_path: Path) -> None:
+    above = pose(np.eye(3), np.array([0.0, 0.1, 0.0]))
+    with pytest.raises(CalibrationError, match="not side by side"):
+        StereoRig.load(write_camchain(tmp_path, T_cn_cnm1=above.tolist()))
+
+
+def test_camera_info_of_no_pair_is_refused(tmp_path: Path) -> None:
+    write_camera_info(tmp_path, distortion_model="equidistant")
+    with pytest.raises(CalibrationError, match="equidistant"):
+        StereoRig.load(tmp_path)
+    write_camera_info(tmp_path, projection_matrix={"data": [1.0, 0, 0, 0] * 3})
+    with pytest.raises(CalibrationError, match="states no baseline"):
+        StereoRig.load(tmp_path / "left.yaml")
+
+
+@pytest.mark.parametrize("name", ["nothing.yaml", "", "other.yaml", "binary.yaml"])
+def test_what_is_no_calibration_is_refused_with_what_is_known(tmp_path: Path, name: str) -> None:
+    (tmp_path / "other.yaml").write_text("a: 1\n")
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
+    words = "cannot be read" if name == "nothing.yaml" else "known: calib.json"
+    with pytest.raises(CalibrationError, match=words):
+        StereoRig.load(tmp_path / name)
+
+
+# --------------------------------------------------------------------------------------------
+# Files that people have
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("path", "baseline"),
+    [
+        ("kalibr/msckf_vio/camchain-imucam-euroc.yaml", 0.11008),
+        ("kalibr/torrescguo_stereo_all_models/pinhole-radtan", 0.08050),
+        ("camera_info/side_x_side_stereo", 0.05489),
+        ("camera_info/tp_vision", 0.11184),
+        ("calibrations/kitti/calib_cam_to_cam.txt", 0.53715),
+    ],
+)
+def test_real_calibrations(shared_data: Path, path: str, baseline: float) -> None:
+    folder = shared_data / "cameras"
+    if not folder.is_dir():
+        pytest.skip(f"no calibrations at {folder}")
+    assert StereoRig.load(folder / path).baseline == pytest.approx(baseline, abs=2e-5)
