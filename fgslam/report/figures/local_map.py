@@ -10,7 +10,16 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import HomingEstimate, HomingTruth
 from fgslam.report.figures.ellipses import SIGMAS, outlines
-from fgslam.report.figures.traces import Figure, Owner, Switch, Trace, joined, thinned, trace
+from fgslam.report.figures.traces import (
+    Figure,
+    Owner,
+    Switch,
+    Trace,
+    equal_axes,
+    joined,
+    thinned,
+    trace,
+)
 
 MAX_MOMENTS = 60
 _HEADING = 0.12  # length of the tick that points ahead, legs
@@ -163,13 +172,9 @@ def _layout(estimates: Sequence[HomingEstimate]) -> dict[str, Any]:
     points += [np.vstack([e.landmarks, e.robot[None, :2], e.target[None, :2]]) for e in estimates]
     every = np.vstack(points)
     seen = upwards(every[np.isfinite(every).all(axis=1)])
-    ranges = {axis: np.percentile(values, _BULK) for axis, values in seen.items()}
-    padded = {
-        axis: [float(low - 0.1 * (high - low) - 0.2), float(high + 0.1 * (high - low) + 0.2)]
-        for axis, (low, high) in ranges.items()
-    }
-    return {
-        "xaxis": {"title": {"text": "right (legs)"}, "range": padded["x"], "constrain": "domain"},
-        "yaxis": {"title": {"text": "ahead (legs)"}, "range": padded["y"], "scaleanchor": "x"},
-        "hovermode": "closest",
-    }
+    limits = []
+    for axis in ("x", "y"):
+        low, high = np.percentile(seen[axis], _BULK).tolist()
+        margin = 0.1 * (high - low) + 0.2
+        limits.append([low - margin, high + margin])
+    return equal_axes("right (legs)", "ahead (legs)", (limits[0], limits[1]))

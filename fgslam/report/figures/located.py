@@ -16,11 +16,11 @@ from fgslam.report.figures.ellipses import (
     world_position_covariances,
 )
 from fgslam.report.figures.traces import (
-    MAP_AXES,
     Figure,
     Owner,
     Switch,
     Trace,
+    equal_axes,
     joined,
     thinned,
     trace,
@@ -80,7 +80,7 @@ def located_figure(located: Located, key: str, heading: str) -> Figure:
             _line(Owner("uncertainty", colour=0, when=("ellipses",)), ellipses, 1.0),
             *_answers(located, known, plane, _HEADING * span),
         ),
-        {"xaxis": {**MAP_AXES["xaxis"], "range": x}, "yaxis": {**MAP_AXES["yaxis"], "range": y}},
+        equal_axes(ranges=(x, y)),
         (Switch("landmarks", "landmarks"), Switch("ellipses", "uncertainty")),
         note=f"Ellipses are drawn {factor} times larger." if factor > 1 else "",
     )

@@ -9,7 +9,16 @@ import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
 from fgslam.core.arrays import FloatArray
-from fgslam.report.figures.traces import Figure, Owner, Switch, Trace, joined, plain_texts, trace
+from fgslam.report.figures.traces import (
+    Figure,
+    Owner,
+    Switch,
+    Trace,
+    equal_axes,
+    joined,
+    plain_texts,
+    trace,
+)
 
 _HOVER = "%{text}<extra></extra>"
 
@@ -61,12 +70,10 @@ def network_figure(
         hovertemplate=_HOVER,
     )
     key, heading, description = words
-    blank = {"showticklabels": False} if not any(axes) else {}
-    layout = {
-        "xaxis": {"title": {"text": axes[0]}, "constrain": "domain", **blank},
-        "yaxis": {"title": {"text": axes[1]}, "scaleanchor": "x", **blank},
-        "hovermode": "closest",
-    }
+    layout = equal_axes(*axes)
+    if not any(axes):
+        for axis in ("xaxis", "yaxis"):
+            layout[axis]["showticklabels"] = False
     switches = tuple(
         Switch(f"kind{k}", f"{kind.name} ({len(kind.pairs)})", kind.shown)
         for k, kind in enumerate(kinds)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from fgslam.report.figures.traces import (
     Owner,
     Switch,
     Trace,
+    equal_axes,
     joined,
     plain_texts,
     thinned,
@@ -62,7 +62,7 @@ def drive_figure(
         f"were taken, with a tick ahead and a circle of {PASS_RADIUS_M:g} m. The robot's arrow "
         "points where the estimator says that the target lies. Grey: walls and furniture.",
         (*_outlines(drive), *_targets(drive), *_paths(drive), *moving),
-        _axes(),
+        equal_axes("x (m)", "y (m)"),
         (Switch("outlines", "walls"), Switch("targets", "targets")),
         steps=tuple(f"{drive.time[int(k)] - drive.time[0]:.1f} s" for k in rows),
     )
@@ -109,7 +109,7 @@ def catchment_figure(
         "Starts relative to their target (square), whose heading is up the page. Dots: homing "
         "arrived; crosses: it did not.",
         (target, *traces) if traces else (),
-        _axes("right of the target (m)", "ahead of the target (m)"),
+        equal_axes("right of the target (m)", "ahead of the target (m)"),
     )
 
 
@@ -173,11 +173,3 @@ def _xy(points: FloatArray) -> dict[str, FloatArray]:
 
 def _unit(angle: FloatArray) -> FloatArray:
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-
-
-def _axes(x: str = "x (m)", y: str = "y (m)") -> dict[str, Any]:
-    return {
-        "xaxis": {"title": {"text": x}, "constrain": "domain"},
-        "yaxis": {"title": {"text": y}, "scaleanchor": "x"},
-        "hovermode": "closest",
-    }

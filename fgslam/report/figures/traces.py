@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -20,14 +20,6 @@ Trace: TypeAlias = dict[str, Any]
 
 Paint: TypeAlias = Literal["estimator", "truth", "grey", "band", "own"]
 """What colour the page gives a trace: its estimator's, the ink's (dashed), grey, or none."""
-
-
-MAP_AXES: Mapping[str, Any] = {
-    "xaxis": {"title": {"text": "right (m)"}, "constrain": "domain"},
-    "yaxis": {"title": {"text": "ahead (m)"}, "scaleanchor": "x"},
-    "hovermode": "closest",
-}
-"""Layout of what is seen from above: equal axes, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +114,22 @@ class Figure:
         """Whether it needs height: a plane of equal axes, panels over each other, or space."""
         layout = self.layout
         return self.turns or "scaleanchor" in layout.get("yaxis", {}) or "yaxis3" in layout
+
+
+def equal_axes(
+    x: str = "right (m)",
+    y: str = "ahead (m)",
+    ranges: tuple[Sequence[float], Sequence[float]] | None = None,
+) -> dict[str, Any]:
+    """Layout of a plane seen from above: titles of its axes, and their limits where given."""
+    layout: dict[str, Any] = {
+        "xaxis": {"title": {"text": x}, "constrain": "domain"},
+        "yaxis": {"title": {"text": y}, "scaleanchor": "x"},
+        "hovermode": "closest",
+    }
+    for axis, limits in zip(("xaxis", "yaxis"), ranges or (), strict=False):
+        layout[axis]["range"] = list(limits)
+    return layout
 
 
 def trace(owner: Owner, axes: Mapping[str, FloatArray], **more: Any) -> Trace:

@@ -21,12 +21,12 @@ from fgslam.report.figures.ellipses import (
     world_position_covariances,
 )
 from fgslam.report.figures.traces import (
-    MAP_AXES,
     Figure,
     Owner,
     Paint,
     Switch,
     Trace,
+    equal_axes,
     joined,
     packed,
     thinned,
@@ -91,11 +91,6 @@ def drive_from_above(data: ReportData, detail: Detail = ON_PAGE) -> Figure:
     level = level_axes(data.up)
     x, y = _readable(_limits(data, level)[:2])
     ellipses, of_ellipses = _uncertainty(data, level)
-    layout = {
-        **MAP_AXES,
-        "xaxis": {**MAP_AXES["xaxis"], "range": x},
-        "yaxis": {**MAP_AXES["yaxis"], "range": y},
-    }
     alone = len(data.estimators) == 1
     dots = "coloured by height" if alone else "of the estimator chosen"
     return Figure(
@@ -110,7 +105,7 @@ def drive_from_above(data: ReportData, detail: Detail = ON_PAGE) -> Figure:
             *ellipses,
             *_returns(data, level),
         ),
-        layout,
+        equal_axes(ranges=(x, y)),
         (
             Switch("truth", "truth"),
             Switch("final", "final path"),
