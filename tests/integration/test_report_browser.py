@@ -193,6 +193,19 @@ def test_the_map_turns_by_mouse_and_stays_turned(browser: Browser) -> None:
     assert browser.js(eye) == pytest.approx(turned, abs=1e-6)
 
 
+def test_the_map_turns_by_arrow_keys(browser: Browser) -> None:
+    eye = "document.getElementById('plot-map')._fullLayout.scene._scene.getCamera().eye"
+    before = browser.js(eye)
+    scene = browser.driver.find_element(By.ID, "plot-map")
+    browser.driver.execute_script("arguments[0].focus()", scene)
+    ActionChains(browser.driver).send_keys(Keys.ARROW_LEFT).perform()
+    browser.wait(f"Math.abs({eye}.x - ({before['x']})) > 0.02")
+    turned = browser.js(eye)
+    radius = np.hypot(before["x"], before["y"])
+    assert np.hypot(turned["x"], turned["y"]) == pytest.approx(radius, rel=1e-3)
+    assert turned["z"] == pytest.approx(before["z"], abs=1e-6)
+
+
 def test_axes_from_above_are_equal(browser: Browser) -> None:
     scale = (
         "(l => Math.abs(l.xaxis._length / (l.xaxis.range[1] - l.xaxis.range[0]) "
