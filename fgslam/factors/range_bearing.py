@@ -104,7 +104,7 @@ def _on_sphere(measurement: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def _may_be_mixed_up(bearing: FloatArray, spread: FloatArray) -> bool:
-    """Whether GTSAM's directions may jump between two bearings, and the covariance would tell."""
+    """True if GTSAM's directions may jump and the covariance depends on the direction."""
     a, b, c = spread[0, 0], spread[1, 1], spread[0, 1]
     largest = max(a, b)
     linked = float(np.abs(spread[:2, 2]).max())  # with the range, by a direction

@@ -2,7 +2,7 @@
 
 The paper's reference is the right camera, GTSAM's stereo camera the left one. The
 pose variable stays the right camera's; the left one sits ``baseline`` along its -x axis and is
-told to the factor as the sensor's place on the body. GTSAM measures (u_left, u_right, v), which
+given to the factor as the sensor's place on the body. GTSAM measures (u_left, u_right, v), which
 is linear in ours: ``u_left = c + d, u_right = c, v = r``; its covariance follows exactly.
 Derivation: docs/derivations/factors.md.
 """
@@ -46,8 +46,12 @@ class StereoFactors:
             measurement: (3,) column, row, disparity, pixels.
             covariance: (3, 3) of it, pixels squared.
         """
-        column, row, disparity = measurement.tolist()
         model = self._whitening.model(covariance, FROM_MEASUREMENT)
+        return self.with_model(pose, landmark, measurement, model)
+
+    def with_model(self, pose: int, landmark: int, measurement: FloatArray, model: Any) -> Any:
+        """The same with a noise model of (u_left, u_right, v)."""
+        column, row, disparity = measurement.tolist()
         measured = gtsam.StereoPoint2(column + disparity, column, row)
         return gtsam.GenericStereoFactor3D(
             measured, model, pose, landmark, self._calibration, False, False, self._rTl

@@ -175,7 +175,7 @@ def test_estimator_reports_kind_family_and_supported_sensors(
     assert all(isinstance(kind, MeasurementType) for kind in estimator.supports)
 
 
-def test_it_starts_at_the_origin_with_an_empty_map(make: Callable[[], Estimator]) -> None:
+def test_new_estimator_is_at_the_origin_with_an_empty_map(make: Callable[[], Estimator]) -> None:
     estimator = make()
     np.testing.assert_array_equal(estimator.predict(None).wTc, np.eye(4))
     assert len(estimator.landmarks()) == 0
@@ -278,7 +278,9 @@ def test_an_unknown_landmark_is_a_key_error(make: Callable[[], Estimator], world
         estimator.landmark_covariances(np.array([PRUNED]))
 
 
-def test_covariances_are_lawful(make: Callable[[], Estimator], world: World) -> None:
+def test_covariances_are_symmetric_and_positive(
+    make: Callable[[], Estimator], world: World
+) -> None:
     estimator = make()
     play(estimator, world.increments)
     estimate = estimator.estimate()
@@ -308,7 +310,7 @@ def test_the_map_grows_more_certain_with_observations(
 
 
 @pytest.mark.parametrize("make", CORRECTING, indirect=True)
-def test_it_finds_its_way(make: Callable[[], Estimator], world: World) -> None:
+def test_trajectory_is_near_the_truth(make: Callable[[], Estimator], world: World) -> None:
     estimator = make()
     play(estimator, world.increments)
     estimate = estimator.estimate()
@@ -381,7 +383,9 @@ def absurd(loop: LoopClosure) -> LoopClosure:
     )
 
 
-def test_each_closure_gets_its_verdict(make: Callable[[], Estimator], world: World) -> None:
+def test_each_loop_closure_is_reported_as_closed_or_refused(
+    make: Callable[[], Estimator], world: World
+) -> None:
     """A true one is taken, an absurd one is not; dead reckoning takes none."""
     estimator, increments = make(), looped(world)
     true = increments[FRAMES - 2].loops

@@ -210,7 +210,7 @@ NOTHING_SEEN: dict[str, EstimatorSettings] = {
 
 
 @pytest.mark.parametrize("name", NOTHING_SEEN)
-def test_blind_all_are_dead_reckoning(name: str) -> None:
+def test_without_measurements_all_are_dead_reckoning(name: str) -> None:
     simulation = drawn(5, frames=8)
     estimator = played(NOTHING_SEEN[name], blackout(simulation.increments, range(8)))
     found = estimator.estimate()

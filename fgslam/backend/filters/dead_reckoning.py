@@ -1,4 +1,4 @@
-"""Dead reckoning: the odometry as it is, the floor of every comparison.
+"""Dead reckoning: the odometry as it is, the baseline of every comparison.
 
 No measurement of a landmark ever moves a pose. Landmarks stand where they were first seen from,
 with the uncertainty of that pose and of that one observation.
@@ -49,7 +49,7 @@ class DeadReckoning:
         return self._map
 
     def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
-        """Moves on by the odometry, or the stand-in; tracking, matches and loops have no say."""
+        """Moves on by the odometry, or the stand-in; tracking, matches and loops change nothing."""
         self._past.require_step(increment)
         predicted = self.predict(increment.odometry)
         self._current = Prediction(reorthonormalise(predicted.wTc), predicted.covariance)
@@ -69,7 +69,10 @@ class DeadReckoning:
         return self._map.covariances[self._map.rows(ids)]
 
     def joint_covariance(self, ids: IntArray) -> FloatArray:
-        """Exact to first order: an early pose's error lives on in all that came after it."""
+        """Joint covariance of the last pose and landmarks (6 + 3k, 6 + 3k), exact to first order.
+
+        An early pose's error is part of all that came after it.
+        """
         rows = self._map.rows(ids)
         frames = [*self._first_frame[rows].tolist(), len(self._past) - 1]
         jacobians = [*self._by_pose(rows), np.eye(6)]
@@ -107,7 +110,7 @@ class DeadReckoning:
     # ----------------------------------------------------------------------------------------
 
     def _add(self, observed: Observations) -> None:
-        """Type IV landmarks: their own noise and the pose's, at the pose of this frame."""
+        """Adds new landmarks (type IV): their own noise and the pose's, at this frame."""
         first = FirstSights.of(self._sensor, observed)
         wTc = self._current.wTc
         by_pose = point_pose_jacobian(first.points)
@@ -135,7 +138,7 @@ class DeadReckoning:
         return out
 
     def _between_poses(self, early: int, late: int) -> FloatArray:
-        """Cross-covariance (6, 6) of two poses of the trajectory: what the first hands on."""
+        """Cross-covariance (6, 6) of two poses of the trajectory: what the later inherits."""
         if late < 0:
             return self._current.covariance
         onward = adjoint(inverse(self._past.poses[late]) @ self._past.poses[early])

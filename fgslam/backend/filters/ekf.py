@@ -75,7 +75,7 @@ class FullEkf:
 
     @property
     def keeps_maps(self) -> bool:
-        """As Schmidt's filter: landmarks are uncertain, but no measurement changes them."""
+        """True: as in Schmidt's filter, landmarks may be uncertain and yet not be changed."""
         return True
 
     def begin_in(self, landmarks: LandmarkMap, hits: IntArray, fixed: bool) -> None:
@@ -117,7 +117,7 @@ class FullEkf:
         self._require_finite(increment)
         seen = increment.observations
         if increment.relocalised:
-            wTc, front = self._set_down(tracking)
+            wTc, front = self._at_tracked_pose(tracking)
             seen = seen.select(np.flatnonzero(~seen.is_new)[tracking.inliers])
         else:
             wTc, front = self._moved(increment.odometry)
@@ -244,8 +244,8 @@ class FullEkf:
         front[:FRONT] = congruence(transition, front[:FRONT]) + 0.5 * (noise + noise.T)
         return wTc, front
 
-    def _set_down(self, tracking: EgoMotion) -> tuple[FloatArray, FloatArray]:
-        """The pose where tracking found it, all but unknown: neither odometry nor past know it."""
+    def _at_tracked_pose(self, tracking: EgoMotion) -> tuple[FloatArray, FloatArray]:
+        """The pose where tracking found it, almost unknown: independent of odometry and past."""
         wTc = self._floor.constrain(tracking.wTc) if self._floor.rigid_dof < 6 else tracking.wTc
         front = np.zeros_like(self._covariance.front())
         unknown = _UNKNOWN**2 * tracking.covariance
@@ -309,7 +309,7 @@ class FullEkf:
         self._map = None
 
     def _retract(self, wTc: FloatArray, step: FloatArray) -> FloatArray:
-        """The corrected pose; on a hard floor the errors' horizontal and vertical stay such."""
+        """The corrected pose; on a hard floor its errors are carried into the new pose's axes."""
         moved = self._retracted(wTc, step)
         if self._floor.rigid_dof == 6:
             return moved

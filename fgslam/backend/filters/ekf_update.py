@@ -29,7 +29,7 @@ from fgslam.core.measurements import Observations
 from fgslam.core.sensors import Sensor
 
 _ITERATIONS = 30
-_SETTLED = 1e-5  # radians and metres: far below what any measurement tells
+_SETTLED = 1e-5  # radians and metres: far below what any measurement resolves
 _NEGATIVE = 1e-10  # of the largest variance: rounding of a pose covariance that is singular
 
 
@@ -151,7 +151,7 @@ class Correction:
 
 
 class DivergedError(Exception):
-    """The numbers no longer are a covariance; says which. Never leaves the package."""
+    """A matrix that is no covariance any more, named; the filter makes an EstimatorError of it."""
 
 
 def correct(
@@ -162,6 +162,8 @@ def correct(
     gate_sigmas: float,
 ) -> Correction:
     """One Kalman correction by all matches within the gate, and the floor, at once.
+
+    S = H P H^T + R, K = P H^T S^-1, step K v, and P loses K S K^T (docs/derivations/ekf.md).
 
     Args:
         covariance: of the state before the frame.
@@ -228,7 +230,7 @@ class Sightings:
 def correct_anew(
     covariance: GrowingCovariance, wTc: FloatArray, sightings: Sightings
 ) -> Correction:
-    """One correction by all sightings, linearised at its own result: the innovation is large.
+    """One correction by all sightings, linearised at its own result, for large innovations.
 
     The iterated Kalman filter (Bell and Cathey 1993), Gauss-Newton on state and measurement at
     once; without gate and floor.
@@ -268,7 +270,7 @@ def _with_landmarks(
 
 
 def _within_gate(matches: Matches, s: FloatArray, gate_sigmas: float) -> BoolArray:
-    """Which matches' own innovations their own covariances explain."""
+    """Mask (k,) of matches whose own innovation is within the gate of its own covariance."""
     k = len(matches)
     if gate_sigmas == 0.0 or not k:
         return np.ones(k, np.bool_)
@@ -293,7 +295,7 @@ def _with_floor(
 def _require_definite(
     covariance: GrowingCovariance, front: FloatArray, gain: FloatArray, half: FloatArray
 ) -> None:
-    """Judges the pose's block and each landmark's as they will be."""
+    """Raises DivergedError where the pose's block, or a landmark's, would not be a covariance."""
     pose = front[:FRONT] - gain[:FRONT] @ half[:FRONT].T - half[:FRONT] @ gain[:FRONT].T
     if not np.isfinite(pose).all():
         raise DivergedError("the pose's covariance is not finite")

@@ -27,7 +27,8 @@ from fgslam.core.geometry import (
 from fgslam.core.measurements import Observations
 from fgslam.core.sensors import CameraRig
 from fgslam.factors.keys import landmark_key, pose_key
-from fgslam.factors.stereo import FROM_MEASUREMENT
+from fgslam.factors.noise import Whitening
+from fgslam.factors.stereo import FROM_MEASUREMENT, StereoFactors
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 
 _POSE = pose_key(0)
@@ -43,8 +44,7 @@ class FixedMapPose:
         self._rig = rig
         self._settings = settings
         self._floor = Floor.under(rig, settings.dof)
-        self._calibration = gtsam.Cal3_S2Stereo(rig.fx, rig.fy, 0.0, rig.cx, rig.cy, rig.baseline)
-        self._rTl = gtsam.Pose3(gtsam.Rot3(), np.array([-rig.baseline, 0.0, 0.0]))
+        self._factors = StereoFactors(rig, Whitening())
 
     def solve(
         self,
@@ -80,19 +80,8 @@ class FixedMapPose:
         graph = gtsam.NonlinearFactorGraph()
         roots = self._roots(weighted_at, landmarks, observed)
         for i, (measured, root) in enumerate(zip(observed.measurement, roots, strict=True)):
-            column, row, disparity = measured.tolist()
-            graph.add(
-                gtsam.GenericStereoFactor3D(
-                    gtsam.StereoPoint2(column + disparity, column, row),
-                    gtsam.noiseModel.Gaussian.SqrtInformation(root),
-                    _POSE,
-                    landmark_key(i),
-                    self._calibration,
-                    False,
-                    False,
-                    self._rTl,
-                )
-            )
+            model = gtsam.noiseModel.Gaussian.SqrtInformation(root)
+            graph.add(self._factors.with_model(_POSE, landmark_key(i), measured, model))
         if self._settings.prior:
             wTp = Prediction(self._floor.constrain(prediction.wTc), prediction.covariance)
             graph.add(_exact_prior(wTp))

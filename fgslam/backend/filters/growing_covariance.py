@@ -91,7 +91,7 @@ class GrowingCovariance:
         self._size = n + k
 
     def append_independent(self, blocks: FloatArray) -> None:
-        """Adds landmarks (k, 3, 3) that hang together with nothing."""
+        """Adds landmarks (k, 3, 3) that are correlated with nothing."""
         n, k = self._size, BLOCK * len(blocks)
         self.reserve((n + k - FRONT) // BLOCK)
         self._buffer[n : n + k, : n + k] = 0.0

@@ -18,7 +18,7 @@ import numpy as np
 
 from fgslam.backend.filters.filtered import FilteredTrajectory, moved
 from fgslam.backend.filters.landmark_rows import LandmarkRows
-from fgslam.backend.filters.loop_correction import DriveBook
+from fgslam.backend.filters.loop_correction import DriveRecord
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.backend.filters.submaps import Chain, changes, home_changes, rotated, transported
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
@@ -60,12 +60,12 @@ class LandmarkKalman:
         self._current = prior
         self._past = FilteredTrajectory()
         self._rows = LandmarkRows()
-        self._drive = DriveBook(settings.loops)
+        self._drive = DriveRecord(settings.loops)
         self._fixed = False
 
     @property
     def keeps_maps(self) -> bool:
-        """A pose is that of the least squares: it needs no landmark to move."""
+        """True: the pose is that of the least squares, whether landmarks are updated or not."""
         return True
 
     def begin_in(self, landmarks: LandmarkMap, hits: IntArray, fixed: bool) -> None:
@@ -84,8 +84,8 @@ class LandmarkKalman:
     def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """Pose from the tracking; matched landmarks filtered, missed ones grown, new ones added.
 
-        Then loops are closed: the pose told is the corrected one, with the covariance of the
-        closure, which is what it is known by beside the place returned to.
+        Then loops are closed: the reported pose is the corrected one, with the covariance of the
+        closure, which is its uncertainty relative to the place returned to.
         """
         self._past.require_later(increment)
         before, self._current = self._current, Prediction(tracking.wTc, tracking.covariance)
@@ -94,7 +94,7 @@ class LandmarkKalman:
         nis, dof = self._update_matched(used)
         self._grow(increment.missed_ids)
         self._add(increment.observations.select(increment.observations.is_new))
-        self._book(increment, tracking, before, used.ids)
+        self._record(increment, tracking, before, used.ids)
         self._rows.remove(increment.pruned_ids)
         self._past.append(increment.timestamp, self._current)
         closed = tuple(self._close(increment, loop) for loop in increment.loops)
@@ -168,17 +168,17 @@ class LandmarkKalman:
         rows = self._rows
         return rows.ids, rows.positions, rows.covariances, rows.counts, rows.homes
 
-    def _book(
+    def _record(
         self, increment: Increment, tracking: EgoMotion, before: Prediction, used: IntArray
     ) -> None:
-        """The step to this frame, for loops to come; and which old landmarks placed it."""
+        """Keeps the step to this frame, for later loops, and which old landmarks placed it."""
         step = inverse(before.wTc) @ tracking.wTc if len(self._past) else tracking.wTc
         self._drive.step(step, tracking, increment.odometry, increment.relocalised)
         homes = self._rows.homes[self._rows.rows(used)]
         self._drive.tie(homes, self._past.poses, tracking, increment.relocalised)
 
     def _close(self, increment: Increment, loop: LoopClosure) -> bool:
-        """Moves the drive and the map to where the loop has them; or remarks why not."""
+        """Moves the drive and the map to where the loop has them; False if it is refused."""
         poses = self._drive.close(loop, self._current.wTc, f"frame {increment.index}")
         if poses is None:
             return False
@@ -192,7 +192,7 @@ class LandmarkKalman:
         return True
 
     def _update_matched(self, observed: Observations) -> tuple[float, int]:
-        """Type III landmarks, all at once; returns the innovation squared and its freedom."""
+        """Updates matched landmarks (type III); innovation squared and its degrees of freedom."""
         if not len(observed):
             return float("nan"), 0
         rows = self._rows.rows(observed.ids)
@@ -210,7 +210,12 @@ class LandmarkKalman:
         return nis, 3 * len(rows)
 
     def _pixel_update(self, rows: IntArray, observed: Observations) -> float:
-        """Kalman update on the measurement itself, linearised at the landmark, Joseph form."""
+        """Kalman update on (column, row, disparity), linearised at the landmark.
+
+        With H the Jacobian by the landmark, S its covariance and R that of the measurement (plus
+        the pose's, ``J P J^T``): K = S H^T (H S H^T + R)^-1, and S becomes
+        (I - K H) S (I - K H)^T + K R K^T (Joseph's form). Se et al. 6.4 update in world axes.
+        """
         wTc = self._current.wTc
         points = transform_to_camera(wTc, self._rows.positions[rows])
         jacobian = projection_jacobian(self._rig, points)
@@ -223,7 +228,7 @@ class LandmarkKalman:
         return self._kalman(rows, jacobian @ wTc[:3, :3].T, innovation, noise)
 
     def _world_update(self, rows: IntArray, observed: Observations) -> float:
-        """Kalman fusion of the observed 3-D position with the landmark's (6.4)."""
+        """Kalman fusion of the observed 3-D position with the landmark's (6.4): H = I above."""
         positions, noise = self._observed_positions(observed)
         identity = np.broadcast_to(np.eye(3), noise.shape)
         return self._kalman(rows, identity, positions - self._rows.positions[rows], noise)
@@ -240,7 +245,11 @@ class LandmarkKalman:
         return float(np.einsum("ki,kij,kj->", innovation, precision, innovation))
 
     def _average(self, rows: IntArray, observed: Observations) -> float:
-        """Averaging of 4.1: a running mean, or half old and half new."""
+        """Averaging of Se et al. 4.1: a running mean of all sightings, or half old and half new.
+
+        The position becomes (1 - w) s + w s', the covariance (1 - w)^2 S + w^2 S', with w one over
+        the number of sightings, or one half.
+        """
         positions, noise = self._observed_positions(observed)
         before = self._rows.positions[rows]
         innovation = positions - before
@@ -265,13 +274,13 @@ class LandmarkKalman:
         return transform_to_world(wTc, points), congruence(wTc[:3, :3], local)
 
     def _grow(self, ids: IntArray) -> None:
-        """Type II landmarks: the ellipsoid expands (6.4)."""
+        """Expands the ellipsoids of missed landmarks (type II, Se et al. 6.4)."""
         if len(ids):
             rows = self._rows.rows(ids)
             self._rows.covariances[rows] += self._settings.miss_growth_m**2 * np.eye(3)
 
     def _add(self, observed: Observations) -> None:
-        """Type IV landmarks."""
+        """Adds new landmarks (type IV) where this frame sees them."""
         if not len(observed):
             return
         positions, covariances = self._observed_positions(observed)

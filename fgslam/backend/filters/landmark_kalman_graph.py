@@ -33,7 +33,7 @@ _POSE, _LANDMARK = pose_key(0), landmark_key(0)
 
 
 class LandmarkKalmanGraph(LandmarkKalman):
-    """Estimator of kind ``landmark_kalman_graph``; books and state are the closed form's."""
+    """Estimator of kind ``landmark_kalman_graph``; all but the updates is the closed form's."""
 
     kind: ClassVar[str] = "landmark_kalman_graph"
     supports: ClassVar[frozenset[MeasurementType]] = frozenset(

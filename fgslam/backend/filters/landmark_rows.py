@@ -1,7 +1,7 @@
-"""Landmarks as rows of arrays with room to grow: a hundred thousand of them cost nothing a frame.
+"""Landmarks as rows of arrays with room to grow, so that an update costs what it touches.
 
 New ones are appended in place, and those that go are mostly young: only what lies behind the first
-of them moves. So an update costs what it touches, not what the map holds.
+of them moves.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""What a filter keeps of its drive so that a loop can be closed, and whether it may be.
+"""The chain of steps that a filter keeps of its drive, and the acceptance of loop closures by it.
 
-The filter's own covariance of a pose says how well it is known beside the map around it, and never
-grows: drift is not in it. What drifts is the chain of steps, each as uncertain as its frame was
-tracked; where no landmark had a say, as uncertain as the odometry; where the robot was carried
-off, not known at all.
+The filter's own covariance of a pose says how well it is known relative to the map around it, and
+never grows: drift is not in it. What drifts is the chain of steps, each as uncertain as its frame
+was tracked; where no landmark was matched, as uncertain as the odometry; where the robot was
+carried off, unknown. Derivation: docs/derivations/submaps.md.
 """
 
 from __future__ import annotations
@@ -28,26 +28,40 @@ has bent them. Measured on four rounds of the lab: up to 20 the corrected drive 
 below 5 true closures are taken for impossible (docs/results)."""
 
 
-class DriveBook:
-    """The chain of steps of a drive, the constraints on it, and the verdicts on loops."""
+def refusal(what: str, squared: float, gate_sigmas: float) -> str:
+    """Why a loop closure is refused, beginning with ``what``; empty where it is accepted.
+
+    Args:
+        what: names the closure.
+        squared: the rise of the cost by it, or its innovation squared.
+        gate_sigmas: the root of the largest that is accepted; 0: any.
+    """
+    if gate_sigmas == 0.0 or squared <= gate_sigmas**2:
+        return ""
+    off = np.sqrt(max(squared, 0.0))
+    return f"{what} refused: {off:.1f} standard deviations off, {gate_sigmas:g} allowed"
+
+
+class DriveRecord:
+    """The chain of steps of a drive, the constraints on it, and which loops were accepted."""
 
     def __init__(self, settings: LoopCorrectionSettings) -> None:
         """An empty drive."""
         self._settings = settings
         self._chain = Chain()
         self._tied = -1
-        self._sound = True
+        self._coherent = True
         self.remarks: list[str] = []
 
     @property
     def chain(self) -> Chain:
-        """The steps, and what else holds the drive together."""
+        """The steps, and the constraints between frames that are no neighbours."""
         return self._chain
 
     def step(
         self, motion: FloatArray, tracking: EgoMotion, known: Odometry | None, free: bool
     ) -> None:
-        """Books the step (4, 4) to a frame.
+        """Adds the step (4, 4) to a frame.
 
         Two frames that were tracked well lie beside the same landmarks. Where most of what a frame
         matched contradicts its pose, as at a return to places that the drift has displaced, old
@@ -60,10 +74,10 @@ class DriveBook:
             known: what the frame was predicted with.
             free: nobody knows the step: the frame was found without a prior.
         """
-        before, self._sound = self._sound, tracking.coherent
+        before, self._coherent = self._coherent, tracking.coherent
         if free:
             covariance = FREE
-        elif known is None or (before and self._sound and tracking.status.measured):
+        elif known is None or (before and self._coherent and tracking.status.measured):
             covariance = tracking.covariance
         else:
             motion, covariance = known.motion, known.covariance
@@ -72,7 +86,7 @@ class DriveBook:
     def tie(
         self, homes: IntArray, poses: list[FloatArray], tracking: EgoMotion, free: bool
     ) -> None:
-        """Books that the last frame was placed by landmarks of an old part of the drive, if so.
+        """Adds a constraint if the last frame was placed by landmarks of an old part of the drive.
 
         Once a submap; a frame found without a prior hangs on nothing else.
 
@@ -85,7 +99,7 @@ class DriveBook:
         frame, every = len(self._chain) - 1, SUBMAP_FRAMES
         homes = np.maximum(homes, 0)  # a saved map's landmarks stay, and so does the first pose
         old = homes[homes < (frame if free else frame - _OLD * every)]
-        due = self._sound and (self._tied < 0 or frame - self._tied >= every)
+        due = self._coherent and (self._tied < 0 or frame - self._tied >= every)
         # A few old ones among many new, far ones as a rule, do not say where the frame is.
         if len(old) < _TIED_BY or 2 * len(old) < len(homes) or not (free or due):
             return
@@ -112,18 +126,16 @@ class DriveBook:
         last = len(self._chain) - 1
         what = f"{where}: loop closure to frame {loop.frame} of the log"
         if not 0 <= loop.frame < last:
-            raise EstimatorError(f"{what}, which does not come before it; mend the log")
+            raise EstimatorError(f"{what}, which does not come before it; correct the log")
         covariance = CLOSURE_FACTOR**2 * loop.covariance
         known = Constraint(loop.frame, last, loop.oTc, covariance)
         every, gate = SUBMAP_FRAMES, self._settings.gate_sigmas
         before = self._chain.cost(self._chain.constraints, every)
         found = self._chain.solve([*self._chain.constraints, known], every)
         rise = found.cost - before
-        if gate > 0.0 and not rise <= gate**2:
-            self.remarks.append(
-                f"{what} refused: {np.sqrt(max(rise, 0.0)):.1f} standard deviations off, "
-                f"{gate:g} allowed"
-            )
+        refused = refusal(what, rise, gate)
+        if refused:
+            self.remarks.append(refused)
             return None
         self._chain.constraints.append(dataclasses.replace(known, doubted=True))
         shift = found.poses[-1, :3, 3] - here[:3, 3]
@@ -136,7 +148,7 @@ class DriveBook:
         """All of it as plain arrays."""
         return self._chain.state() | {
             "chain_tied": np.array(self._tied),
-            "chain_sound": np.array(self._sound),
+            "chain_sound": np.array(self._coherent),
             "chain_remarks": np.array(self.remarks, np.str_),
         }
 
@@ -144,5 +156,5 @@ class DriveBook:
         """Continues from :meth:`state`."""
         self._chain = Chain.restored(state)
         self._tied = int(state["chain_tied"])
-        self._sound = bool(state["chain_sound"])
+        self._coherent = bool(state["chain_sound"])
         self.remarks = [str(words) for words in state["chain_remarks"]]

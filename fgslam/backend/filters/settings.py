@@ -34,7 +34,7 @@ class DeadReckoningSettings(NamedSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class PerLandmarkSettings(NamedSettings):
-    """What the paper's filter and its twin of factor graphs share."""
+    """What the paper's filter and the same filter as factor graphs share."""
 
     family: ClassVar[Family] = "filter"
     pose_covariance: Annotated[

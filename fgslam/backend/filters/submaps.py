@@ -46,7 +46,7 @@ FREE = np.diag([FREE_RAD**2] * 3 + [FREE_M**2] * 3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Constraint:
-    """A measured motion between two frames of the chain that are no neighbours.
+    """A measured motion between two frames of the chain that are not neighbours.
 
     Attributes:
         before, after: frames.
@@ -77,7 +77,7 @@ class Corrected:
 
 @dataclass(slots=True, eq=False)
 class Chain:
-    """A drive as it was tracked: never revised, so that corrections do not pile up.
+    """A drive as it was tracked: never revised, so that corrections do not accumulate.
 
     Attributes:
         poses: one (4, 4) a frame, each the last one's moved on by the step as tracked.

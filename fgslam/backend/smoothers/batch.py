@@ -99,7 +99,7 @@ class BatchSolver:
         marginals = gtsam.Marginals(self._factors(), self._values)
         covariance = np.asarray(marginals.marginalCovariance(pose_key(last)))
         covariance = allowed_parts(self._floor, here[None], covariance[None])[0]
-        return ClosedLoop(Smoothed(self._values, Prediction(here, covariance), bent=True))
+        return ClosedLoop(Smoothed(self._values, Prediction(here, covariance), by_loop=True))
 
     def solution(self) -> Solution:
         """The minimum over all that was measured."""
@@ -121,7 +121,7 @@ class BatchSolver:
             raise self._failed(error, "after") from None
 
     def _minimise(self, graph: Any, values: Any) -> tuple[Any, Any]:
-        """Values at the minimum, and the factors that have a say in it."""
+        """Values at the minimum, and the factors that count there."""
         params = solver_parameters(_MAX_ITERATIONS, _RELATIVE_TOLERANCE)
         if self._settings.method == "gnc":
             return graduated(graph, values, params, self._settings.noise_factor)

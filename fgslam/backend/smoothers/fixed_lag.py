@@ -2,7 +2,7 @@
 
 What a marginalised variable said about the others stays, as a linear factor; the variable itself
 can no longer change. A landmark that comes back after the lag is a new variable: the smoother
-has forgotten it, which is the price of a constant effort (design, gtsam.md 1).
+has forgotten it, which is the price of a constant effort.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import gtsam
 import numpy as np
 
+from fgslam.backend.filters.loop_correction import refusal
 from fgslam.backend.filters.submaps import Constraint, constraint_factor, nearest_positive
 from fgslam.backend.graphs import poses_of_frame, without_gaps
 from fgslam.backend.smoothers.graph_builder import NewFactors
@@ -127,12 +128,10 @@ class FixedLagSolver:
 
     def _taken_in(self, known: Constraint, what: str) -> bool:
         """Adds a loop within the lag, where hardly anything drifts, as a factor; or refuses it."""
-        factor, gate = constraint_factor(known), self._loop_gate
-        off = misfit(factor, self._values)
-        if gate > 0.0 and not off <= gate**2:
-            self.remarks.append(
-                f"{what} refused: {np.sqrt(off):.1f} standard deviations off, {gate:g} allowed"
-            )
+        factor = constraint_factor(known)
+        refused = refusal(what, misfit(factor, self._values), self._loop_gate)
+        if refused:
+            self.remarks.append(refused)
             return False
         self._recent[-1].graph.add(factor)
         self._rebuild(gtsam.Values(self._values))
@@ -151,11 +150,9 @@ class FixedLagSolver:
         drift = basis.T @ drift @ basis
         innovation = drift + basis.T @ known.covariance @ basis
         gain = np.linalg.solve(innovation, drift).T
-        squared, gate = float(off @ np.linalg.solve(innovation, off)), self._loop_gate
-        if gate > 0.0 and not squared <= gate**2:
-            self.remarks.append(
-                f"{what} refused: {np.sqrt(squared):.1f} standard deviations off, {gate:g} allowed"
-            )
+        refused = refusal(what, float(off @ np.linalg.solve(innovation, off)), self._loop_gate)
+        if refused:
+            self.remarks.append(refused)
             return None
         target = wTc @ se3_exp(basis @ gain @ off)
         target = self._floor.constrain(target) if self._floor.rigid_dof < 6 else target
@@ -213,7 +210,7 @@ class FixedLagSolver:
         params.setFactorization("CHOLESKY")
         params.setRelinearizeThreshold(self._relinearize)
         params.relinearizeSkip = 1
-        # Without it the list of factors, and the effort, grow with the run (gtsam.md 1).
+        # Without it the list of factors, and the effort, grow with the run .
         params.findUnusedFactorSlots = True
         return gtsam.IncrementalFixedLagSmoother(self._lag, params)
 

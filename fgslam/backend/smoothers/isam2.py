@@ -59,7 +59,7 @@ class Isam2Solver:
         self._settings = settings
         self._loops = GraphLoops(problem.builder, settings.loops)
         self._answer = WholeGraphAnswer(problem.builder, problem.floor, self._refined)
-        self._careful = False
+        self._with_qr = False
         self._isam = self._new_solver()
         self._graph = gtsam.NonlinearFactorGraph()
         self._new_values = gtsam.Values()
@@ -104,7 +104,7 @@ class Isam2Solver:
         last = self._builder.frames[-1]
         here = reorthonormalise(poses_of_frame(self._values, last))
         return ClosedLoop(
-            Smoothed(self._values, Prediction(here, self._covariance(last)), bent=True)
+            Smoothed(self._values, Prediction(here, self._covariance(last)), by_loop=True)
         )
 
     def solution(self) -> Solution:
@@ -147,7 +147,7 @@ class Isam2Solver:
     def _new_solver(self) -> Any:
         params = gtsam.ISAM2Params()
         params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams())
-        params.setFactorization("QR" if self._careful else "CHOLESKY")
+        params.setFactorization("QR" if self._with_qr else "CHOLESKY")
         params.setRelinearizeThreshold(self._settings.relinearize_threshold)
         params.relinearizeSkip = 1  # looks for variables to relinearise in every update
         return gtsam.ISAM2(params)
@@ -182,12 +182,12 @@ class Isam2Solver:
     def _repair(self, values: Any, error: Exception) -> None:
         """Builds the solver anew from the last good values, without the landmark that failed.
 
-        After an exception iSAM2's inside is unusable; our own graph is not.
+        After an exception iSAM2's own state is unusable; the builder's graph is not.
         """
         for _ in range(_REPAIRS):
             key = suspect(error)
-            if key is not None and is_pose(key) and not self._careful:
-                self._careful = True
+            if key is not None and is_pose(key) and not self._with_qr:
+                self._with_qr = True
                 self.remarks.append(
                     f"pose of frame {number(key)} known too unevenly for Cholesky at frame "
                     f"{self._builder.frames[-1]}: iSAM2 built anew, with QR from here on"

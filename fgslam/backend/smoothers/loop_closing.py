@@ -15,6 +15,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from fgslam.backend.filters.loop_correction import refusal
 from fgslam.backend.filters.settings import LoopCorrectionSettings
 from fgslam.backend.filters.submaps import (
     SUBMAP_FRAMES,
@@ -99,10 +100,10 @@ class GraphLoops:
         guess = first_guess(self._builder, before, drive.chain, loops)
         factors.add(constraint_factor(known))
         found = solved(factors, guess)
-        rise, gate = 2.0 * (float(factors.error(found)) - cost), self._settings.gate_sigmas
-        if gate > 0.0 and not rise <= gate**2:
-            off = f"{np.sqrt(max(rise, 0.0)):.1f} standard deviations off, {gate:g} allowed"
-            return Acceptance(False, None, f"{what} refused: {off}")
+        rise = 2.0 * (float(factors.error(found)) - cost)
+        refused = refusal(what, rise, self._settings.gate_sigmas)
+        if refused:
+            return Acceptance(False, None, refused)
         self._accept(known)
         here = poses_of_frame(found, known.after)[:3, 3]
         shift = float(np.linalg.norm(here - drive.wTc[:3, 3]))

@@ -232,7 +232,7 @@ class UndeterminedError(EstimatorError):
     """The measurements do not determine all variables; ``row`` of the first one's, as ordered."""
 
     def __init__(self, row: int, message: str) -> None:
-        """Row of the information matrix and the line to tell."""
+        """Row of the information matrix and the message."""
         super().__init__(message)
         self.row = row
 

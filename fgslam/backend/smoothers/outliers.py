@@ -70,7 +70,7 @@ def trimmed(graph: Any, values: Any, params: Any, noise_factor: float = 1.0) -> 
     factors = [graph.at(row) for row in range(graph.size())]
     observed = [_landmark(factor) is not None for factor in factors]
     # A robust factor whitens with its kernel's weight, after which everything would seem to fit.
-    # Loops keep their kernels: they are too few to be told apart by a trim.
+    # Loops keep their kernels: they are too few to be separated by a trim.
     factors = [plain(f) if is_one else f for f, is_one in zip(factors, observed, strict=True)]
     gate = _GATE / noise_factor**2
     fits: list[bool] = []

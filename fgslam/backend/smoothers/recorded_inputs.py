@@ -1,7 +1,7 @@
 """What an estimator was given, frame by frame: the state of those that cannot show their inside.
 
 Of the tracking only what smoothers use is kept: pose, covariance, inliers, residuals, and whether
-the landmarks had a say in it.
+the landmarks determined it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The last word on a graph: what does not fit is left out, the rest solved once more.
+"""The final solution of a graph: what does not fit is left out, the rest solved once more.
 
 It changes neither the builder nor the solver that it starts from, so that asking for an estimate
 in the middle of a run leaves the run as it was.

@@ -1,4 +1,4 @@
-"""Keyframes, and what the frames between them measured, summarised.
+"""Keyframes, and the summary of what the frames between them measured.
 
 Of every segment two poses enter the graph: the keyframe with its own observations, and the middle
 frame of the rest, the *block*, with the observations of all frames of the block fused into one

@@ -269,7 +269,7 @@ class Smoother:
         """A loop between poses of the graph, the last of which is the present frame's.
 
         An earlier frame that has none gives way to the nearest one that was tracked on the same
-        map, since only among such do tracked poses tell the way.
+        map, since only the tracked poses of such are relative to each other.
         """
         last = len(self._inputs.increments) - 1
         if not 0 <= loop.frame < last:

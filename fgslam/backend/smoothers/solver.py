@@ -24,12 +24,12 @@ class Smoothed:
     Attributes:
         values: GTSAM values of the poses and landmarks that the solver holds.
         last: pose ``wTc`` (4, 4) and covariance (6, 6) of the frame that entered last.
-        bent: a loop moved the map: landmarks that the solver does not hold move with the camera.
+        by_loop: a loop moved the map: landmarks that the solver does not hold move with the camera.
     """
 
     values: Any
     last: Prediction
-    bent: bool = False
+    by_loop: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

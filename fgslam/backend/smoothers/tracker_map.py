@@ -50,14 +50,14 @@ class TrackerMap:
     def take_over(self, smoothed: Smoothed, current: Prediction) -> None:
         """Lets the tracker go on from a solution, at its ``current`` pose.
 
-        Landmarks that the graph knows nothing of stay; where the solution is ``bent`` by a loop
-        they move along with the last pose, near which they are, unless they are a saved map's.
+        Landmarks that the graph knows nothing of stay; where a loop moved the map they
+        move along with the last pose, near which they are, unless they are a saved map's.
         """
         ids, positions = self._in_graph(smoothed.values)
         waiting_ids, waiting_positions = self._waiting(smoothed.values)
         ids = np.concatenate([ids, waiting_ids])
         positions = np.concatenate([positions, waiting_positions])
-        if smoothed.bent:
+        if smoothed.by_loop:
             known = self._tracker.landmarks()
             rest = np.flatnonzero(~np.isin(known.ids, ids) & (self._tracker.homes >= 0))
             moved = current.wTc @ inverse(self._tracker.predict(None).wTc)

@@ -1,4 +1,4 @@
-"""Batch: plain least squares at the end, wrong matches out, honest covariances and messages."""
+"""Batch: least squares at the end, wrong matches out, consistent covariances, clear messages."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_pose_and_landmarks_are_consistent_over_20_drives(name: str) -> None:
         assert verdict.verdict == "consistent", verdict
 
 
-def test_it_stays_consistent_among_wrong_matches() -> None:
+def test_covariances_stay_consistent_among_wrong_matches() -> None:
     """The last solution is plain least squares over what fits: its covariances hold."""
     found = []
     for seed in range(20):
@@ -54,7 +54,7 @@ def test_it_stays_consistent_among_wrong_matches() -> None:
     assert verdict.verdict == "consistent", verdict
 
 
-def test_the_end_is_the_minimum_of_what_fits() -> None:
+def test_final_solution_is_the_minimum_over_what_fits() -> None:
     simulation = drawn(5)
     spoilt = wrong_matches(simulation.increments, 0.3, np.random.default_rng(5))
     estimator, _ = run(BatchSettings(), spoilt)
@@ -72,7 +72,7 @@ def test_the_end_is_the_minimum_of_what_fits() -> None:
     assert 2.0 * graph.error(values) == pytest.approx(freedom, rel=0.2)
 
 
-def test_steering_answers_with_the_smoothed_pose() -> None:
+def test_solving_on_the_way_reports_the_smoothed_pose() -> None:
     """At the frames that are solved; in between the tracker goes on from there."""
     increments = drawn(60, frames=8).increments
     _, stats = run(BatchSettings(solve_every=4), increments)
@@ -96,7 +96,7 @@ def test_a_blackout_is_bridged_and_the_uncertainty_shows_it() -> None:
     assert error[20:].max() < 0.03
 
 
-def test_a_solver_that_fails_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failing_solver_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     estimator, _ = run(BatchSettings(), drawn(7, frames=6).increments)
 
     def failing(*arguments: object) -> None:
@@ -107,7 +107,7 @@ def test_a_solver_that_fails_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch
         estimator.estimate()
 
 
-def test_a_landmark_of_which_nothing_fits_is_left_out_and_told(
+def test_landmark_without_any_fitting_observation_is_left_out_with_a_remark(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     simulation = drawn(7)
@@ -140,7 +140,7 @@ def test_landmarks_lost_in_every_round_come_to_an_end(monkeypatch: pytest.Monkey
 
 
 @METHODS
-def test_restored_it_continues_to_the_bit(name: str) -> None:
+def test_restored_smoother_continues_to_the_bit(name: str) -> None:
     increments = drawn(9, frames=12).increments
     straight, first, second = (build(SMOOTHERS[name]) for _ in range(3))
     play(straight, increments, FREE)

@@ -59,7 +59,7 @@ def offsets(found: Solution, simulation: Simulation) -> FloatArray:
     return np.array([g.se3_log(g.inverse(a) @ b) for a, b in pairs])
 
 
-def test_without_noise_it_finds_the_truth() -> None:
+def test_without_noise_poses_between_are_the_truth() -> None:
     simulation = drawn(1, noise=0.0)
     for sees in (True, False):
         found = filled(simulation, sees=sees)
@@ -80,7 +80,7 @@ def test_the_graph_s_own_poses_stay_and_nothing_between_is_nothing_done() -> Non
 
 
 @pytest.mark.parametrize("sees", [True, False])
-def test_its_covariances_tell_the_truth(sees: bool) -> None:
+def test_covariances_of_frames_between_are_consistent(sees: bool) -> None:
     """The graph's poses are exact here, and claim nearly that."""
     values = []
     for seed in range(12):
@@ -92,7 +92,7 @@ def test_its_covariances_tell_the_truth(sees: bool) -> None:
     assert 0.75 < np.mean(values) < 1.25
 
 
-def test_what_it_saw_beats_what_it_drove() -> None:
+def test_visual_pose_replaces_wheel_odometry() -> None:
     seen, blind = filled(drawn(2)), filled(drawn(2), sees=False)
     for k in (1, 2, 3, 9, 10):
         assert np.trace(seen.pose_covariances[k]) < 0.2 * np.trace(blind.pose_covariances[k])

@@ -1,4 +1,4 @@
-"""Dead reckoning: poses from odometry alone, landmarks where first seen, honest covariances."""
+"""Dead reckoning: poses from odometry alone, landmarks where first seen, consistent covariances."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_landmarks_stay_where_they_were_first_seen_until_pruned() -> None:
     assert gone > 5
 
 
-def test_tracking_has_no_say() -> None:
+def test_tracked_pose_is_ignored() -> None:
     simulation = drawn(4)
     a, b = at(NO_PRIOR), at(NO_PRIOR)
     play(a, simulation.increments)

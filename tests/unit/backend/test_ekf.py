@@ -1,4 +1,4 @@
-"""The full filter: the marginalised graph, consistent, lawful, and honest when it fails."""
+"""The full filter: equal to the marginalised graph, consistent, and clear when it fails."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ class LinearGraph:
         return np.concatenate(origins) + covariance @ vector, covariance
 
 
-def test_it_is_the_graph_marginalised_at_the_same_linearisation_points() -> None:
+def test_filter_is_the_graph_marginalised_at_the_same_linearisation_points() -> None:
     simulation = drawn(SMALL, 1)
     estimator, linear = make(prior=PRIOR, gate_sigmas=0.0), LinearGraph()
     before = None
@@ -174,7 +174,7 @@ def whole(covariance: GrowingCovariance) -> FloatArray:
     return covariance.square(np.arange(6 + 3 * covariance.blocks))
 
 
-def test_what_memory_held_before_does_no_harm(
+def test_uninitialised_memory_does_not_matter(
     monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
 ) -> None:
     """Above the diagonal nothing is ever read, but a slab's update touches it (and may warn)."""
@@ -267,7 +267,7 @@ def test_pose_and_landmarks_are_consistent_over_20_drives() -> None:
     assert np.mean(innovations) == pytest.approx(1.0, abs=0.05)
 
 
-def test_300_frames_leave_a_lawful_covariance() -> None:
+def test_covariance_stays_positive_over_300_frames() -> None:
     drive = dataclasses.replace(SMALL, frames=300, points=20, prune_after=3, depth_m=(1.0, 3.0))
     turning = dataclasses.replace(drive, twist=(0.0, 0.02, 0.0, 0.0, 0.0, 0.01))
     estimator = make()
@@ -286,7 +286,7 @@ def test_300_frames_leave_a_lawful_covariance() -> None:
 # The map
 
 
-def test_a_pruned_landmark_leaves_and_the_others_do_not_notice() -> None:
+def test_pruning_a_landmark_leaves_the_others_unchanged() -> None:
     simulation = drawn(SMALL, 3)
     kept, pruned = make(prior=PRIOR), make(prior=PRIOR)
     for increment in simulation.increments[:6]:
@@ -327,7 +327,7 @@ def test_too_many_landmarks_are_refused_and_change_nothing() -> None:
     assert_same_bits(estimator.state(), before)
 
 
-def test_wrong_matches_are_left_out_and_told() -> None:
+def test_wrong_matches_are_left_out_with_a_remark() -> None:
     simulation = drawn(SMALL, 5)
     clean, spoilt = make(), make()
     for increment in simulation.increments[:5]:
@@ -348,7 +348,7 @@ def test_wrong_matches_are_left_out_and_told() -> None:
     assert clean.estimate().remarks == ()
 
 
-def test_what_it_does_not_hold_and_what_is_behind_is_skipped() -> None:
+def test_unknown_landmarks_and_those_behind_are_skipped() -> None:
     simulation = drawn(SMALL, 6)
     first = simulation.increments[0]
     measurement = first.observations.measurement.copy()
@@ -374,7 +374,7 @@ def test_what_it_does_not_hold_and_what_is_behind_is_skipped() -> None:
 
 
 @pytest.mark.parametrize("kind", ["odometry", "measurement", "negative", "noise"])
-def test_a_failed_update_is_told_by_frame_and_changes_nothing(kind: str) -> None:
+def test_failed_update_names_the_frame_and_changes_nothing(kind: str) -> None:
     simulation = drawn(SMALL, 7)
     estimator = make()
     for increment in simulation.increments[:4]:
@@ -479,7 +479,7 @@ def test_a_soft_floor_keeps_height_and_tilt_near(dof: int) -> None:
     assert abs(ground.down @ a.wTc[:3, 3]) < 4 * 0.002
 
 
-def test_the_solvers_pose_has_no_say() -> None:
+def test_tracked_pose_is_ignored() -> None:
     simulation = drawn(SMALL, 10)
     tracked, alone = make(), make()
     play(tracked, simulation.increments, EgoMotionSettings(min_matches=3))

@@ -1,4 +1,4 @@
-"""Fixed lag: what leaves is frozen and told, effort and memory stay, failures are mended."""
+"""Fixed lag: what leaves stays as it was, effort and memory are bounded, failures repaired."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_factors_and_variables_do_not_grow_with_the_run() -> None:
     assert late[-1, 4] <= np.array(counts[:45])[:, 4].max()  # slots of factors are used again
 
 
-def test_the_frozen_place_is_shown_until_the_landmark_is_seen_again() -> None:
+def test_landmark_that_left_keeps_its_place_until_it_is_seen_again() -> None:
     simulation = drawn(8, frames=24)
     estimator = smoother()
     increments = unseen(simulation.increments, 28, range(5, 16))
@@ -165,7 +165,7 @@ def test_a_blackout_longer_than_the_lag_is_bridged_and_never_forgotten() -> None
     assert (error[1:] < 4 * position_sigma(found.covariances)[1:]).all()
 
 
-def test_a_failure_at_a_landmark_is_mended_again_and_again() -> None:
+def test_repeated_failures_at_landmarks_are_repaired() -> None:
     simulation = drawn(8, frames=24)
     estimator = smoother()
     play(estimator, simulation.increments[:9], FREE)
@@ -188,14 +188,14 @@ def test_a_failure_at_a_landmark_is_mended_again_and_again() -> None:
 
 def test_the_rebuilt_window_is_as_uncertain_as_the_one_that_failed() -> None:
     simulation = drawn(8, frames=24)
-    mended, whole = smoother(), smoother()
-    for estimator in (mended, whole):
+    repaired, whole = smoother(), smoother()
+    for estimator in (repaired, whole):
         play(estimator, simulation.increments[:12], FREE)
-    variable = mended._builder.admission.tracks[28].variable
-    spoil(mended, f"variable {landmark_key(variable)} (")
-    for estimator in (mended, whole):
+    variable = repaired._builder.admission.tracks[28].variable
+    spoil(repaired, f"variable {landmark_key(variable)} (")
+    for estimator in (repaired, whole):
         play(estimator, simulation.increments[12:13], FREE)
-    a, b = (position_sigma(e.estimate().covariances[-6:]) for e in (mended, whole))
+    a, b = (position_sigma(e.estimate().covariances[-6:]) for e in (repaired, whole))
     # Of the landmarks' shared past only the oldest pose's part is kept.
     assert ((a > 0.95 * b) & (a < 2.0 * b)).all(), a / b
 
@@ -203,17 +203,17 @@ def test_the_rebuilt_window_is_as_uncertain_as_the_one_that_failed() -> None:
 def test_a_window_rebuilt_from_the_first_frame_on_has_one_prior() -> None:
     simulation = drawn(8, frames=8)
     prior = Prediction(np.eye(4), np.diag([1e-4] * 3 + [1e-2] * 3))
-    mended, whole = build(LAG, prior), build(LAG, prior)
-    for estimator in (mended, whole):
+    repaired, whole = build(LAG, prior), build(LAG, prior)
+    for estimator in (repaired, whole):
         play(estimator, simulation.increments[:3], FREE)
-    assert isinstance(mended, Smoother)
-    variable = mended._builder.admission.tracks[28].variable
-    spoil(mended, f"variable {landmark_key(variable)} (")
-    for estimator in (mended, whole):
+    assert isinstance(repaired, Smoother)
+    variable = repaired._builder.admission.tracks[28].variable
+    spoil(repaired, f"variable {landmark_key(variable)} (")
+    for estimator in (repaired, whole):
         play(estimator, simulation.increments[3:4], FREE)
-    found = mended.estimate()
+    found = repaired.estimate()
     np.testing.assert_allclose(found.covariances[0], prior.covariance, rtol=1e-6, atol=1e-12)
-    a, b = (position_sigma(e.estimate().covariances) for e in (mended, whole))
+    a, b = (position_sigma(e.estimate().covariances) for e in (repaired, whole))
     assert (a > 0.999 * b).all()
 
 
@@ -246,7 +246,7 @@ def test_asking_changes_nothing_where_several_frames_leave_at_once() -> None:
 @pytest.mark.parametrize(
     "message", [f"variable {pose_key(4)} (", "odd\nwords", f"variable {landmark_key(999)} ("]
 )
-def test_what_cannot_be_mended_ends_in_one_clear_line(message: str) -> None:
+def test_failure_beyond_repair_is_one_clear_line(message: str) -> None:
     simulation, estimator = drawn(8, frames=12), smoother()
     play(estimator, simulation.increments[:9], FREE)
     spoil(estimator, message)
@@ -257,7 +257,7 @@ def test_what_cannot_be_mended_ends_in_one_clear_line(message: str) -> None:
 
 
 @pytest.mark.parametrize("at", [3, 9])
-def test_restored_it_continues_to_the_bit(at: int) -> None:
+def test_restored_smoother_continues_to_the_bit(at: int) -> None:
     increments = drawn(9, frames=14).increments
     straight, first, second = smoother(), smoother(), smoother()
     play(straight, increments, FREE)

@@ -1,4 +1,4 @@
-"""The graph doctor: who waits, who is let in, who starts anew, and what every smoother tells."""
+"""Admission of landmarks to the graph: which wait, enter, start anew, and are reported."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_the_weak_prior_holds_two_ranges_about_the_place() -> None:
     assert prior.error(new.values) == pytest.approx(0.5)  # one standard deviation: 2 x 5 m
 
 
-def test_waiting_landmarks_tell_nothing_about_poses() -> None:
+def test_waiting_landmarks_hold_no_information_about_poses() -> None:
     """Those seen once enter or wait: the rest of the answer is the same."""
     simulation = drawn(8, frames=9, miss_rate=0.4)
     increments = simulation.increments
@@ -142,7 +142,7 @@ def test_waiting_landmarks_tell_nothing_about_poses() -> None:
 
 
 @pytest.mark.parametrize("name", ["batch", "isam2, keyframes", "fixed_lag"])
-def test_what_waits_is_told_with_an_honest_covariance(name: str) -> None:
+def test_waiting_landmarks_are_reported_with_a_consistent_covariance(name: str) -> None:
     """Landmarks seen once, over many drives: the pose's uncertainty is in their covariance."""
     errors = []
     for seed in range(20):
@@ -410,7 +410,7 @@ def test_what_came_out_behind_a_camera_is_taken_out(
 
 
 @GRAPHS
-def test_points_at_infinity_let_in_at_once_spoil_nothing(name: str) -> None:
+def test_points_at_infinity_admitted_at_once_do_no_harm(name: str) -> None:
     """No waiting, no weak prior: disparities of half a pixel, with as much noise."""
     far = simulate(
         Drive(frames=12, points=40, depth_m=(40.0, 90.0), sigma_px=(0.3, 0.3, 0.3)),

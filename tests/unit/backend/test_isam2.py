@@ -1,4 +1,4 @@
-"""iSAM2: solver failures are mended or told, orderings agree, covariances tell the truth."""
+"""iSAM2: solver failures are repaired or reported, orderings agree, covariances are consistent."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def played(frames: int, settings: Isam2Settings = EVERY_FRAME) -> tuple[Any, Map
     [EVERY_FRAME, Isam2Settings(), Isam2Settings(keyframe_every=4)],
     ids=["every frame", "buffered", "keyframes"],
 )
-def test_a_failure_at_a_landmark_is_mended_and_told(settings: Isam2Settings) -> None:
+def test_failure_at_a_landmark_is_repaired_with_a_remark(settings: Isam2Settings) -> None:
     simulation, estimator = played(13, settings)
     variable = estimator._builder.admission.tracks[5].variable
     sightings = estimator._builder.admission.tracks[5].sightings
@@ -121,9 +121,9 @@ def test_one_taken_out_comes_back_when_it_is_known_twice_as_well() -> None:
 @pytest.mark.parametrize(
     "message",
     ["something\nelse", FAILED.format(key=landmark_key(9999))],
-    ids=["no variable", "a stranger"],
+    ids=["no variable", "unknown landmark"],
 )
-def test_what_cannot_be_mended_ends_in_one_clear_line(message: str) -> None:
+def test_failure_beyond_repair_is_one_clear_line(message: str) -> None:
     simulation, estimator = played(10)
     estimator._solver._isam = Failing(estimator._solver._isam, message)
     with pytest.raises(EstimatorError, match=r"^isam2: the solver failed at frame 10 \(") as told:
@@ -186,7 +186,7 @@ def test_orderings_give_the_same_estimate() -> None:
         )
 
 
-def test_updates_come_in_their_rhythm_and_the_tracker_answers_between() -> None:
+def test_tracker_answers_between_updates_of_the_graph() -> None:
     simulation, estimator = played(0, Isam2Settings(update_every=5))
     sizes = []
     for increment in simulation.increments[:12]:
@@ -197,7 +197,7 @@ def test_updates_come_in_their_rhythm_and_the_tracker_answers_between() -> None:
     assert len(estimator.estimate().trajectory) == 12
 
 
-def test_asking_on_the_way_leaves_the_run_as_it_was() -> None:
+def test_asking_for_estimates_changes_nothing() -> None:
     simulation = drawn(9, frames=18)
     asked, silent = build(Isam2Settings()), build(Isam2Settings())
     for increment in simulation.increments:
@@ -268,7 +268,7 @@ def test_with_keyframes_the_joint_covariance_is_of_the_last_frame(frames: int) -
     assert np.linalg.eigvalsh(joint)[0] > -1e-12
 
 
-def test_a_landmark_seen_since_the_last_keyframe_only_is_told_to_wait() -> None:
+def test_joint_covariance_of_a_landmark_outside_the_graph_is_refused() -> None:
     _, estimator = played(14, Isam2Settings(keyframe_every=4))
     outside = set(estimator.landmarks().ids.tolist()) - set(estimator._builder.admission.tracks)
     for identity in sorted(outside):

@@ -93,7 +93,7 @@ def test_old_landmarks_stay_and_their_doubles_go(name: str) -> None:
 
 
 @every
-def test_a_closure_is_told(name: str) -> None:
+def test_closure_is_reported(name: str) -> None:
     told = [words for words in at_end(name)[1].remarks if "loop closure to frame" in words]
     assert len(told) == 1
     assert f"frame {returned().increments[CLOSED].index}:" in told[0]
@@ -185,7 +185,7 @@ def test_a_second_closure_that_agrees_moves_nothing(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["isam2", "batch"])
-def test_poses_are_as_certain_as_they_say_after_a_loop(name: str) -> None:
+def test_covariances_are_consistent_after_a_loop(name: str) -> None:
     """NEES of the pose midway and of the last one, over 30 drives: within its chi-square band."""
     values = {ROUND // 2: [], -1: []}
     for seed in range(30):
@@ -237,7 +237,7 @@ def carried_off(relocalised: bool) -> tuple[FloatArray, list[Increment]]:
 
 
 @pytest.mark.parametrize("name", ["landmark_kalman", "ekf", "fixed_lag", "isam2", "batch"])
-def test_a_robot_that_was_carried_off_is_where_its_landmarks_are(name: str) -> None:
+def test_relocalised_robot_is_where_its_landmarks_are(name: str) -> None:
     poses, increments = carried_off(relocalised=True)
     estimator = build(CLOSING[name])
     stats = play(estimator, increments, FREE)
@@ -248,7 +248,7 @@ def test_a_robot_that_was_carried_off_is_where_its_landmarks_are(name: str) -> N
 
 
 @pytest.mark.parametrize("name", ["isam2", "ekf"])
-def test_its_odometry_would_mislead(name: str) -> None:
+def test_odometry_of_a_carried_robot_would_mislead(name: str) -> None:
     """Unless the frame says that it was found without a prior."""
     poses, increments = carried_off(relocalised=False)
     estimator = build(CLOSING[name])

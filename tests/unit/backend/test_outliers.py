@@ -37,7 +37,7 @@ def test_30_percent_gross_errors_less_than_double_the_error(name: str) -> None:
         assert ate(answer(ROBUST[name], spoilt), simulation) < 2.0 * clean, seed
 
 
-def test_without_kernel_and_trim_they_would() -> None:
+def test_without_kernel_and_trim_gross_errors_more_than_double_the_error() -> None:
     """The errors above are gross indeed."""
     simulation = drawn(0)
     spoilt = wrong_matches(simulation.increments, 0.3, np.random.default_rng(100))

@@ -184,7 +184,7 @@ ESTIMATORS: list[tuple[EstimatorSettings, bool]] = [
 @pytest.mark.parametrize(
     ("settings", "extends"), ESTIMATORS, ids=[f"{s.kind}-{e}" for s, e in ESTIMATORS]
 )
-def test_every_estimator_is_back_in_the_map(settings: EstimatorSettings, extends: bool) -> None:
+def test_every_estimator_returns_to_the_map(settings: EstimatorSettings, extends: bool) -> None:
     """The closure takes it to its place in the map, whose landmarks stay where they are."""
     _, reports = returned(extends)
     estimator = make_estimator(RIG, settings, SETTINGS.ego_motion, arrival(extends).prior)

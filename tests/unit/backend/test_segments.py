@@ -1,4 +1,4 @@
-"""Keyframes: what a block's summary says is what its frames said, and nobody's pose twice."""
+"""Keyframes: a block's summary holds the information of its frames, each pose counted once."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def nothing(frame: TrackedFrame) -> TrackedFrame:
 @pytest.mark.parametrize(
     ("blind", "middle"), [([], 3), ([3], 2), ([2, 3], 4), ([1, 2], 3), ([1, 2, 3, 4], 3)]
 )
-def test_a_blind_frame_never_passes_for_one_that_saw(blind: list[int], middle: int) -> None:
+def test_blind_frame_is_never_the_middle_of_a_block(blind: list[int], middle: int) -> None:
     frames, landmarks = frames_of(1.0)
     segments = Segments(RIG, 5)
     for frame in frames:
@@ -205,7 +205,7 @@ def test_pose_and_landmarks_are_consistent_over_20_drives(every: int) -> None:
         assert verdict.verdict == "consistent", verdict
 
 
-def test_they_cost_little() -> None:
+def test_keyframes_cost_little_accuracy() -> None:
     errors = {}
     for every in (1, 5):
         settings = Isam2Settings(keyframe_every=every)
@@ -217,7 +217,7 @@ def test_they_cost_little() -> None:
 
 
 @pytest.mark.parametrize("frames", [1, 2, 4, 6, 9, 10, 13])
-def test_every_frame_is_told_wherever_the_run_ends(frames: int) -> None:
+def test_every_frame_has_a_pose_wherever_the_run_ends(frames: int) -> None:
     simulation = drawn(9, frames=13)
     estimator = build(KEYFRAMES)
     play(estimator, simulation.increments[:frames], FREE)

@@ -79,7 +79,7 @@ def test_the_loop_is_met_and_the_first_pose_stays(rng: np.random.Generator) -> N
 
 
 @pytest.mark.parametrize("every", [3, 10, 100])
-def test_submaps_say_what_single_frames_say(every: int, rng: np.random.Generator) -> None:
+def test_submaps_give_the_solution_of_single_frames(every: int, rng: np.random.Generator) -> None:
     """To first order the frames within a submap have their shares from the formula."""
     poses, steps = drifted(rng, 1e-3), uncertain()
     steps[1:] *= rng.uniform(0.2, 5.0, (COUNT - 1, 1, 1)) ** 2
@@ -110,7 +110,7 @@ def test_the_cost_of_true_loops_is_chi_square(rng: np.random.Generator) -> None:
     assert 6.0 - 4.0 * np.sqrt(12.0 / 60.0) < np.mean(costs) < 6.0 + 4.0 * np.sqrt(12.0 / 60.0)
 
 
-def test_nothing_tears(rng: np.random.Generator) -> None:
+def test_corrected_drive_has_no_jumps(rng: np.random.Generator) -> None:
     """No step changes by much more than its share of the whole."""
     poses = drifted(rng, 3.0)
     found = corrected(poses, uncertain(), [home()], every=10).poses
@@ -121,7 +121,7 @@ def test_nothing_tears(rng: np.random.Generator) -> None:
         assert np.abs(change).max() < 0.15 * whole
 
 
-def test_the_step_that_nobody_knows_takes_it_all(rng: np.random.Generator) -> None:
+def test_unknown_step_takes_the_whole_correction(rng: np.random.Generator) -> None:
     poses, steps = drifted(rng), uncertain()
     steps[17] = FREE
     found = corrected(poses, steps, [home()], every=10).poses

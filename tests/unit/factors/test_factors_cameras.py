@@ -116,7 +116,7 @@ def information(factors: list[Any], values: Any) -> tuple[FloatArray, FloatArray
 
 
 @pytest.mark.parametrize("rig", RIGS)
-def test_the_fused_measurement_says_what_all_raw_pixels_say(
+def test_fused_measurement_has_the_information_of_all_raw_pixels(
     rig: CameraRig, rng: np.random.Generator
 ) -> None:
     """Six numbers and three: information and gradient are equal, at and away from the optimum."""
@@ -135,7 +135,9 @@ def test_the_fused_measurement_says_what_all_raw_pixels_say(
             assert_near(a, b, 1e-9 * np.abs(b).max())
 
 
-def test_the_papers_measurement_says_less_than_all_raw_pixels(rng: np.random.Generator) -> None:
+def test_papers_measurement_has_less_information_than_all_raw_pixels(
+    rng: np.random.Generator,
+) -> None:
     paper = measurement_map("paper", 3, 1.0)
     raw = RawPixelFactors(RIG, 1.0, Whitening())
     wTc = random_pose(rng)
@@ -175,7 +177,7 @@ def all_three(rig: CameraRig) -> list[Any]:
 
 @pytest.mark.parametrize("depth", [0.0, -1e-9, -0.5, -1e4])
 @pytest.mark.parametrize("which", [0, 1, 2])
-def test_behind_the_camera_the_residual_is_constant_and_pulls_at_nothing(
+def test_behind_the_camera_the_residual_is_constant_without_gradient(
     depth: float, which: int
 ) -> None:
     values = values_of(np.eye(4), np.array([0.1, -0.2, depth]))

@@ -340,7 +340,7 @@ def both(a: float, b: float) -> float:
     return 1.0 / (a**-2 + b**-2)
 
 
-def test_a_soft_floor_weighs_as_its_sigma_says() -> None:
+def test_soft_floor_has_the_weight_of_its_sigma() -> None:
     """Height: a prior 0.1 m off the floor with the floor's own sigma ends half way."""
     ground = floor(5, TILTED, False)
     off = g.pose(np.eye(3), 0.1 * TILTED)

@@ -123,7 +123,7 @@ def test_diagonal_and_full_covariances_of_equal_information_weigh_alike() -> Non
     assert first == pytest.approx(np.linalg.norm(models[1].whiten(turn @ error)), rel=1e-12)
 
 
-def test_keys_say_what_they_are() -> None:
+def test_keys_hold_kind_and_number() -> None:
     for n in (0, 1, 255, 2**31, 2**40):
         assert is_pose(pose_key(n))
         assert not is_pose(landmark_key(n))
