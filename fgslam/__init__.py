@@ -38,9 +38,10 @@ if TYPE_CHECKING:
     from fgslam.homing.path_memory import PathMemory
     from fgslam.report.plotting import plot
     from fgslam.runs.library import open_recording, rendered_recording, replay, run
-    from fgslam.runs.live import Slam
+    from fgslam.runs.live import Result, Slam
     from fgslam.runs.maps import Map
     from fgslam.slam.feature_stream import FeatureExtractor
+    from fgslam.slam.results import Step
 
 __all__ = [
     "DriveCommand",
@@ -54,7 +55,9 @@ __all__ = [
     "PathFollower",
     "PathMemory",
     "Refusal",
+    "Result",
     "Slam",
+    "Step",
     "StereoRig",
     "Trajectory",
     "TwoViewVector",
@@ -82,7 +85,9 @@ _HOMES = {
     "PathFollower": "fgslam.homing.api",
     "PathMemory": "fgslam.homing.path_memory",
     "Refusal": "fgslam.core.homing",
+    "Result": "fgslam.runs.live",
     "Slam": "fgslam.runs.live",
+    "Step": "fgslam.slam.results",
     "StereoRig": "fgslam.cameras.rig",
     "Trajectory": "fgslam.core.trajectories",
     "TwoViewVector": "fgslam.core.homing",

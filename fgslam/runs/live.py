@@ -20,7 +20,7 @@ from fgslam.runs.named_experiments import find_experiment
 from fgslam.runs.opening import open_sequence
 from fgslam.slam.feature_stream import FeatureExtractor
 from fgslam.slam.maps import saved_map
-from fgslam.slam.results import Result
+from fgslam.slam.results import SessionResult
 from fgslam.slam.session import Session
 
 Overrides = Mapping[str, Any] | Iterable[str]
@@ -28,10 +28,16 @@ Overrides = Mapping[str, Any] | Iterable[str]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SlamResult(Result):
-    """A session's result with its map.
+class Result(SessionResult):
+    """Everything that a session knows at one moment: trajectory, covariances, map, remarks.
 
     Attributes:
+        kind: the estimator.
+        estimate: trajectory, pose covariances and landmarks as known now.
+        online: each pose as it was first estimated, at its own time.
+        online_covariances: (n, 6, 6) of those.
+        closed: of all loop closures offered so far, whether the estimator took them.
+        frames: the record of every frame, by name of the column.
         map: landmarks with covariances and appearance, to save or to find oneself in.
     """
 
@@ -98,7 +104,7 @@ class Slam(Session):
         slam._remark = remark_of(settings)
         return slam
 
-    def result(self) -> SlamResult:
+    def result(self) -> Result:
         """Trajectory, covariances, map and remarks as known now; tracking may go on afterwards.
 
         Raises:
@@ -109,9 +115,9 @@ class Slam(Session):
         about = {"drives": [self._drive(found)]}
         saved = saved_map(self.pipeline, self.rig, found.estimate, about)
         values = {name: getattr(found, name) for name in found.__dataclass_fields__}
-        return SlamResult(**values, map=Map(saved, points, self._remark))
+        return Result(**values, map=Map(saved, points, self._remark))
 
-    def _drive(self, found: Result) -> dict[str, Any]:
+    def _drive(self, found: SessionResult) -> dict[str, Any]:
         return {
             "name": "session",
             "fgslam": __version__,

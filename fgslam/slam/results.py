@@ -68,7 +68,7 @@ class Step(Brief):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Result(Brief):
+class SessionResult(Brief):
     """Everything that a session knows at one moment.
 
     Attributes:
@@ -113,10 +113,10 @@ class Result(Brief):
         return self.frames[name]
 
 
-def result_of(pipeline: SlamPipeline, recorder: RunRecorder) -> Result:
+def result_of(pipeline: SlamPipeline, recorder: RunRecorder) -> SessionResult:
     """The result of the frames so far; nothing is changed."""
     stamps = np.array([increment.timestamp for increment in recorder.log], np.float64)
-    return Result(
+    return SessionResult(
         kind=pipeline.estimator.kind,
         estimate=pipeline.estimator.estimate(),
         online=Trajectory(stamps, np.array(recorder.online_poses).reshape(-1, 4, 4)),

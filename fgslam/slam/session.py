@@ -27,7 +27,7 @@ from fgslam.slam.frontend_settings import FrontendSettings
 from fgslam.slam.inputs import Images, checked_images, checked_odometry, checked_time
 from fgslam.slam.pipeline import FrameReport
 from fgslam.slam.recorder import RunRecorder
-from fgslam.slam.results import Result, Step, result_of
+from fgslam.slam.results import SessionResult, Step, result_of
 
 
 class Session:
@@ -177,7 +177,7 @@ class Session:
         """Measurements of all frames so far, which any estimator can replay."""
         return self.recorder.log
 
-    def result(self) -> Result:
+    def result(self) -> SessionResult:
         """Trajectory, covariances and map as known now; tracking may go on afterwards.
 
         Raises:

@@ -18,7 +18,7 @@ from fgslam.errors import (
     MeasurementLogError,
     OutputError,
 )
-from fgslam.runs.live import SlamResult, override_texts
+from fgslam.runs.live import override_texts
 
 FRAMES = 6
 
@@ -30,7 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def driven(folder: Path) -> tuple[fg.Slam, SlamResult]:
+def driven(folder: Path) -> tuple[fg.Slam, fg.Result]:
     recording = fg.open_recording(folder)
     with fg.Slam(recording.rig, "landmark_kalman") as slam:
         for t, images, odometry in recording:
@@ -80,7 +80,7 @@ def test_overrides_choose_frames(folder: Path) -> None:
 
 
 def test_a_replay_of_the_log_gives_the_live_result(
-    driven: tuple[fg.Slam, SlamResult], tmp_path: Path
+    driven: tuple[fg.Slam, fg.Result], tmp_path: Path
 ) -> None:
     slam, live = driven
     slam.log.save(tmp_path / "drive.npz")
@@ -92,7 +92,7 @@ def test_a_replay_of_the_log_gives_the_live_result(
 
 
 def test_live_and_replayed_results_stand_in_one_table(
-    driven: tuple[fg.Slam, SlamResult], folder: Path
+    driven: tuple[fg.Slam, fg.Result], folder: Path
 ) -> None:
     slam, live = driven
     answers: dict[str, Any] = {"live": live, "isam2": fg.replay(slam.log, "isam2")}
@@ -106,7 +106,7 @@ def test_live_and_replayed_results_stand_in_one_table(
 
 
 def test_an_estimator_brought_along_is_replayed_and_named(
-    driven: tuple[fg.Slam, SlamResult],
+    driven: tuple[fg.Slam, fg.Result],
 ) -> None:
     from fgslam.slam.choosing import chosen_estimator
     from fgslam.slam.factory import made_or_given
@@ -124,7 +124,7 @@ def test_an_estimator_brought_along_is_replayed_and_named(
 # Results on disk
 
 
-def test_a_trajectory_survives_its_file(driven: tuple[fg.Slam, SlamResult], tmp_path: Path) -> None:
+def test_a_trajectory_survives_its_file(driven: tuple[fg.Slam, fg.Result], tmp_path: Path) -> None:
     path = driven[1].trajectory
     path.save(tmp_path / "path.tum")
     again = fg.Trajectory.load(tmp_path / "path.tum")
@@ -137,7 +137,7 @@ def test_a_trajectory_survives_its_file(driven: tuple[fg.Slam, SlamResult], tmp_
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".off"])
 def test_a_map_is_written_as_a_point_cloud(
-    driven: tuple[fg.Slam, SlamResult], tmp_path: Path, suffix: str
+    driven: tuple[fg.Slam, fg.Result], tmp_path: Path, suffix: str
 ) -> None:
     place = driven[1].map
     place.save(tmp_path / f"map{suffix}")
@@ -146,7 +146,7 @@ def test_a_map_is_written_as_a_point_cloud(
 
 
 def test_a_saved_map_locates_a_frame_and_refuses_another_rig(
-    driven: tuple[fg.Slam, SlamResult], folder: Path, tmp_path: Path
+    driven: tuple[fg.Slam, fg.Result], folder: Path, tmp_path: Path
 ) -> None:
     live = driven[1]
     live.map.save(tmp_path / "place.fgmap")

@@ -29,7 +29,7 @@ from fgslam.core.estimates import EgoMotionStatus, Prediction
 from fgslam.core.features import Features
 from fgslam.core.measurements import Odometry
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
-from fgslam.slam.results import Result
+from fgslam.slam.results import SessionResult
 from fgslam.slam.session import Session
 
 FRAMES = 7
@@ -281,7 +281,7 @@ def test_after_a_failure_of_the_estimator_the_results_before_it_remain(views: Vi
     with pytest.raises(SessionError, match=r"failed at t = 1\.5.* s \(no solution\)"):
         push(slam, views, range(4, 5))
     result = slam.result()
-    assert isinstance(result, Result)
+    assert isinstance(result, SessionResult)
     assert len(result.trajectory) == len(slam.log) == 3
 
 
