@@ -62,10 +62,20 @@ def checkout(tmp_path: Path) -> Path:
     return Path(shutil.copytree(ROOT, tmp_path / "checkout", ignore=ignore))
 
 
+def run_python(folder: Path) -> None:
+    """The Python block, as a script."""
+    (block,) = blocks("python")
+    (folder / "readme.py").write_text(block, encoding="utf-8")
+    run([sys.executable, "readme.py"], folder)
+
+
 def run_all(folder: Path, replaced: dict[str, list[str]]) -> None:
-    """All commands in order."""
+    """All commands in order, then the Python."""
     for command in commands():
         run(replaced.get(command, shlex.split(command)), folder)
+    run_python(folder)
+    assert (folder / "path.tum").is_file()
+    assert (folder / "map.ply").is_file()
 
 
 def test_readme_fits_a_screen_and_a_half() -> None:
