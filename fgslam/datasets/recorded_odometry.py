@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import OdometryError
@@ -113,6 +112,8 @@ def motions_from_speed(
     """
     planar = planar_poses(log, frames)
     poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    from scipy.spatial.transform import Rotation  # not needed by all that have no odometry
+
     poses[:, :3, :3] = Rotation.from_euler("z", planar[:, 2:]).as_matrix()
     poses[:, :2, 3] = planar[:, :2]
     rotation = [settings.roll_rate_sigma_dps, settings.pitch_rate_sigma_dps]
@@ -165,6 +166,8 @@ def read_pose_log(path: Path, settings: RecordedOdometrySettings) -> Trajectory:
     motions = inverse(log.poses[:-1]) @ log.poses[1:]
     duration = np.diff(log.timestamps)
     speed = np.linalg.norm(motions[:, :3, 3], axis=1) / duration
+    from scipy.spatial.transform import Rotation
+
     angle = Rotation.from_matrix(motions[:, :3, :3]).magnitude()
     arrival = Table(path, table.values[1:], table.lines[1:])
     _require_sane(arrival, speed, settings.max_speed_mps, "speed", "m/s")

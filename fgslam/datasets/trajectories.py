@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import DatasetError
@@ -23,6 +22,8 @@ AnyStamps = TypeVar("AnyStamps", FloatArray, IntArray)
 def poses_from_quaternions(positions: FloatArray, quaternions: FloatArray) -> FloatArray:
     """Poses (n, 4, 4) of positions (n, 3) and quaternions (n, 4) (x, y, z, w)."""
     poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    from scipy.spatial.transform import Rotation
+
     poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
     poses[:, :3, 3] = positions
     return poses
@@ -101,6 +102,8 @@ def interpolate_poses(trajectory: Trajectory, at: FloatArray) -> FloatArray:
         return np.repeat(trajectory.poses, len(at), axis=0)
     clipped = np.clip(at, stamps[0], stamps[-1])
     out = np.tile(np.eye(4), (len(at), 1, 1))
+    from scipy.spatial.transform import Rotation, Slerp
+
     rotations = Rotation.from_matrix(trajectory.poses[:, :3, :3])
     out[:, :3, :3] = Slerp(stamps, rotations)(clipped).as_matrix()
     for axis in range(3):

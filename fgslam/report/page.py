@@ -14,14 +14,14 @@ import json
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
-
-import jinja2
+from typing import TYPE_CHECKING, Any
 
 from fgslam.core.atomic_files import write_text
 from fgslam.report.content import Page
-from fgslam.report.embedding import embed
 from fgslam.report.figures import palette
+
+if TYPE_CHECKING:
+    import jinja2
 
 NOT_KNOWN = "not known"
 
@@ -41,6 +41,8 @@ def write_html(path: Path, page: Page) -> None:
 
 def render(page: Page) -> str:
     """The page as text."""
+    from fgslam.report.embedding import embed  # Pillow: what draws no page needs none
+
     shown, left_out = embed(page.pictures)
     script = _asset("page.js")
     return _template().render(
@@ -59,6 +61,8 @@ def render(page: Page) -> str:
 
 
 def _template() -> jinja2.Template:
+    import jinja2
+
     environment = jinja2.Environment(
         autoescape=True,
         trim_blocks=True,

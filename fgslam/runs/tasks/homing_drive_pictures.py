@@ -16,7 +16,6 @@ from fgslam.homing.active_homing import ActiveHoming
 from fgslam.homing.command import Command
 from fgslam.homing.path_following import HomingChain
 from fgslam.report.content import Picture
-from fgslam.report.pictures.view_tracks import draw_view_tracks
 
 FOLDER = "pictures"
 _TRAIL = 15  # images
@@ -93,6 +92,8 @@ class DriveWatcher:
 
 def draw_leg_views(folder: Path, seed: int, views: Sequence[LegView]) -> tuple[Picture, ...]:
     """A picture for each view. Raises OutputError."""
+    from fgslam.report.pictures.view_tracks import draw_view_tracks  # Matplotlib takes a second
+
     pictures = []
     for view in views:
         path = make_subfolder(folder, FOLDER) / f"leg_{view.target + 1:02d}.png"

@@ -16,7 +16,6 @@ from fgslam.evaluation.metrics import JsonValue, UpdateTime
 from fgslam.frontend.homing.video_tracking import ReplenishedTracker, TrackedImage, VideoState
 from fgslam.report.content import Column, Picture, TextTable
 from fgslam.report.figures.curves import Line, curve_figure
-from fgslam.report.pictures.view_tracks import draw_view_tracks
 from fgslam.report.tables import write_csv
 from fgslam.runs.config_models import OmniVideoConfig
 from fgslam.runs.documents import write_document, write_page
@@ -147,6 +146,8 @@ def _draw(
     tracks: _Tracks, tracker: ReplenishedTracker, recording: OmniRecording, folder: Path
 ) -> None:
     """The last frame with the ways of its points."""
+    from fgslam.report.pictures.view_tracks import draw_view_tracks  # Matplotlib takes a second
+
     i = len(tracks.frames) - 1
     name, _, points, added, _ = tracks.frames[i]
     caption = f"{name}: {points} points, {added} of them new"

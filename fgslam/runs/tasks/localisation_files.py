@@ -13,7 +13,6 @@ from fgslam.evaluation.localisation import Bounds, LocalisationScore, Spread
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.figures.located import Located, located_figure
 from fgslam.report.figures.traces import Figure
-from fgslam.report.pictures.on_paper import draw_figure
 from fgslam.report.tables import Cell, write_csv, write_json
 from fgslam.runs.documents import write_page
 from fgslam.runs.files import METRICS_FILE
@@ -73,6 +72,8 @@ def write_results(result: LocalisationResult, given: GivenMap, subtitle: str) ->
     bounds = bounds_of(result.config)
     figures = {one.frames: _figure(given, one, bounds) for one in judged}
     if output.pictures:
+        from fgslam.report.pictures.on_paper import draw_figure  # Matplotlib takes a second
+
         pictures = make_subfolder(folder, "pictures")
         for frames, figure in figures.items():
             draw_figure(pictures / f"localisation_{frames}.png", figure, figure.heading)

@@ -1,4 +1,7 @@
-"""Chooses what of a run to draw: the paper's figures 1 to 6, and the curves over time."""
+"""Chooses what of a run to draw: the paper's figures 1 to 6, and the curves over time.
+
+What draws is imported when something is drawn: Matplotlib takes a second.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,6 @@ from fgslam.core.estimates import Estimate, Trajectory
 from fgslam.core.measurements import Increment
 from fgslam.report.figures.over_time import error_by_axis, matches_over_time
 from fgslam.report.figures.trajectory import ON_PAPER, drive_from_above, map_to_turn
-from fgslam.report.pictures.image_overlays import draw_disparities, draw_features, draw_flow
-from fgslam.report.pictures.on_paper import draw_figure, draw_views
 from fgslam.report.run_results import ReportData, judged_report, truth_in_their_world
 from fgslam.runs.tasks.slam_outputs import RunOutputs
 from fgslam.slam.pipeline import FrameReport
@@ -34,6 +35,8 @@ def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
     """Features (Fig. 1), disparities (Fig. 2) and flow from the frame before (Fig. 3)."""
     if report.found.frame is None:
         return
+    from fgslam.report.pictures.image_overlays import draw_disparities, draw_features, draw_flow
+
     folder = make_subfolder(outputs.folder, FOLDER)
     images = report.found.frame.images
     title = _title(outputs, f"frame {report.increment.index}")
@@ -99,6 +102,8 @@ def figures_of(outputs: RunOutputs) -> RunFigures:
 
 def draw_run(run: Path, figures: RunFigures) -> list[Path]:
     """Map from above (Fig. 5), in perspective (Fig. 6), errors and matches over time."""
+    from fgslam.report.pictures.on_paper import draw_figure, draw_views
+
     folder = make_subfolder(run, FOLDER)
     results = _results(figures)
     what = figures.title("valid landmarks" if figures.valid.any() else "landmarks")
