@@ -23,7 +23,6 @@ from fgslam.frontend.features.omni_settings import OmniMatchingSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_views import pair_generator, vector_between
 from fgslam.report.content import Picture
-from fgslam.report.pictures.view_matches import MatchedPixels, draw_view_matches
 from fgslam.runs.engine import Context
 from fgslam.runs.tasks.homing_pair_answers import PairAnswer, PairErrors
 from fgslam.runs.tasks.homing_views import Views
@@ -151,6 +150,8 @@ def draw_pairs(
 
 def draw_pair(folder: Path, views: Views, search: PairSearch, answer: PairAnswer) -> Picture:
     """One pair: its accepted matches on both views."""
+    from fgslam.report.pictures.view_matches import MatchedPixels, draw_view_matches
+
     found, matches = answer_pair(search, answer.a, answer.b)
     a, b = views.names[answer.a], views.names[answer.b]
     vector = found.found
