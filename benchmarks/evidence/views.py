@@ -26,13 +26,6 @@ FORWARD_M = 0.10
 CLOCKWISE_DEG = 5.0
 
 
-def place_of(settings: RenderedLabSettings) -> PlaceChoice:
-    """The place that the recording of these settings is rendered in."""
-    return PlaceChoice(
-        settings.place, settings.room_seed, settings.visit, settings.posters == "identical"
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class View:
     """One look of the rig: images and features of right, left and top; ``wTc`` in the room."""
@@ -52,7 +45,7 @@ class LabViews:
         self.settings, self.seed = config.dataset, config.seed
         self.sequence = RenderedLabSequence(self.settings, self.seed)
         self.rig = self.sequence.rig
-        self._world = World(self.rig, open_room(place_of(self.settings)))
+        self._world = World(self.rig, open_room(PlaceChoice.of(self.settings)))
         sift = SiftExtractor(config.frontend.sift, config.frontend.appearance.mode)
         self._extract = sift.extract
 

@@ -47,8 +47,8 @@ def make_settings(kind: type[S], values: Mapping[str, Any], where: str) -> S:
 
 
 @dataclass(frozen=True, config=STRICT)
-class MeasurementSelection:
-    """What every recording of measurements has: which of its frames are used."""
+class FrameSelection:
+    """Which frames of a recording are used, as a Python slice."""
 
     start: Annotated[int, Field(ge=0, description="first frame used, counted from 0")] = 0
     stop: Annotated[

@@ -75,7 +75,7 @@ class RenderedLabSequence:
         self._settings = settings
         self._seed = seed
         self._rig = make_rig(settings.rig)
-        self._place = _place_of(settings)
+        self._place = PlaceChoice.of(settings)
         self._drive = plan_in_place(self._place, settings.drive, self._rig)
         self._indices = _selection(len(self._drive.timestamps), start, stop, stride)
         self._body = self._drive.body_poses(self._drive.timestamps)
@@ -283,15 +283,9 @@ def first_camera_pose(settings: RenderedLabSettings) -> FloatArray:
         ConfigError: the path cannot be driven.
     """
     rig = make_rig(settings.rig)
-    drive = plan_in_place(_place_of(settings), settings.drive, rig)
+    drive = plan_in_place(PlaceChoice.of(settings), settings.drive, rig)
     first = drive.timestamps[settings.start : settings.start + 1]
     return np.asarray(drive.body_poses(first)[0] @ rig.bTc)
-
-
-def _place_of(settings: LabSettings) -> PlaceChoice:
-    return PlaceChoice(
-        settings.place, settings.room_seed, settings.visit, settings.posters == "identical"
-    )
 
 
 def _selection(count: int, start: int, stop: int | None, stride: int) -> IntArray:

@@ -2,32 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from fgslam.core.arrays import IntArray
 from fgslam.core.errors import DatasetError
+from fgslam.core.settings import FrameSelection
 from fgslam.datasets.settings import RecordingSettings
-
-
-class Selection(Protocol):
-    """Settings that choose frames."""
-
-    @property
-    def start(self) -> int:
-        """First frame used, counted from 0."""
-        ...
-
-    @property
-    def stop(self) -> int | None:
-        """Frame before which to stop, or None."""
-        ...
-
-    @property
-    def stride(self) -> int:
-        """Every so many frames."""
-        ...
 
 
 def select_frames(count: int, settings: RecordingSettings) -> IntArray:
@@ -35,7 +15,7 @@ def select_frames(count: int, settings: RecordingSettings) -> IntArray:
     return select_of(count, settings, settings.path)
 
 
-def select_of(count: int, settings: Selection, name: str) -> IntArray:
+def select_of(count: int, settings: FrameSelection, name: str) -> IntArray:
     """Indices (m,) of the chosen ones of ``count`` frames, increasing, at least one.
 
     ``name`` is what messages call the recording.

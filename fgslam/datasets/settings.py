@@ -10,7 +10,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT, MeasurementSelection
+from fgslam.core.settings import STRICT, FrameSelection
 from fgslam.worlds.lab.settings import RenderedLabSettings
 from fgslam.worlds.simulated.settings import Correlation, SimulatedMeasurementsSettings
 
@@ -36,16 +36,11 @@ Vector3: TypeAlias = tuple[float, float, float]
 # Images on disk
 
 
-@dataclass(frozen=True, config=STRICT)
-class RecordingSettings:
-    """What every recording has: where it lies and which of its frames are used."""
+@dataclass(frozen=True, config=STRICT, kw_only=True)
+class RecordingSettings(FrameSelection):
+    """What every recording on disk has: where it lies and which of its frames are used."""
 
     path: Annotated[str, Field(min_length=1, description="folder of the recording")]
-    start: Annotated[int, Field(ge=0, description="first frame used, counted from 0")] = 0
-    stop: Annotated[
-        int | None, Field(ge=1, description="frame before which to stop; null: to the end")
-    ] = None
-    stride: Annotated[int, Field(ge=1, description="use every n-th frame")] = 1
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -143,7 +138,7 @@ class LightFieldSettings(RecordingSettings):
 
 
 @dataclass(frozen=True, config=STRICT)
-class StereoTracksSettings(MeasurementSelection):
+class StereoTracksSettings(FrameSelection):
     """Stereo feature tracks of KITTI drives, inside GTSAM (docs/datasets/stereo_tracks.md)."""
 
     kind: Literal["stereo_tracks"] = "stereo_tracks"
@@ -169,7 +164,7 @@ class StereoTracksSettings(MeasurementSelection):
     ] = 0.1
 
 
-@dataclass(frozen=True, config=STRICT)
+@dataclass(frozen=True, config=STRICT, kw_only=True)
 class UtiasStereoSettings(RecordingSettings):
     """UTIAS "Starry Night": stereo pixels, body rates, truth (docs/datasets/utias.md)."""
 
@@ -190,7 +185,7 @@ class UtiasStereoSettings(RecordingSettings):
     ] = 1.0
 
 
-@dataclass(frozen=True, config=STRICT)
+@dataclass(frozen=True, config=STRICT, kw_only=True)
 class UtiasRangeBearingSettings(RecordingSettings):
     """UTIAS "Lost in the Woods": laser ranges, wheel odometry, truth (docs/datasets/utias.md)."""
 

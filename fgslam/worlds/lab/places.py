@@ -26,7 +26,7 @@ from fgslam.worlds.driving.paths import (
     round_corners,
 )
 from fgslam.worlds.driving.random_poses import draw_poses
-from fgslam.worlds.lab.settings import LabDriveSettings, PathName, PlaceName
+from fgslam.worlds.lab.settings import LabDriveSettings, LabSettings, PathName, PlaceName
 from fgslam.worlds.rendering.lighting import LIGHT_SPACING_M
 from fgslam.worlds.rendering.patches import Thing, stack
 from fgslam.worlds.rendering.texture_library import build_library
@@ -58,6 +58,12 @@ class PlaceChoice:
     seed: int
     visit: int
     identical_posters: bool
+
+    @staticmethod
+    def of(settings: LabSettings) -> PlaceChoice:
+        """The place that the settings name."""
+        identical = settings.posters == "identical"
+        return PlaceChoice(settings.place, settings.room_seed, settings.visit, identical)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT
+from fgslam.core.settings import STRICT, FrameSelection
 
 PositiveFloat = Annotated[float, Field(gt=0.0)]
 NonNegativeFloat = Annotated[float, Field(ge=0.0)]
@@ -239,12 +239,7 @@ class LabSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
-class RenderedLabSettings(LabSettings):
+class RenderedLabSettings(LabSettings, FrameSelection):
     """The rendered lab as a recording: which of the drive's frames are used."""
 
     kind: Literal["rendered_lab"] = "rendered_lab"
-    start: Annotated[int, Field(ge=0, description="first frame used, counted from 0")] = 0
-    stop: Annotated[
-        int | None, Field(ge=1, description="frame before which to stop; null: to the end")
-    ] = None
-    stride: Annotated[int, Field(ge=1, description="use every n-th frame")] = 1

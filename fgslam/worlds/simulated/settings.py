@@ -7,7 +7,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT, MeasurementSelection
+from fgslam.core.settings import STRICT, FrameSelection
 from fgslam.worlds.lab.settings import LabRigSettings, WheelOdometrySettings
 
 Correlation: TypeAlias = Annotated[float, Field(gt=-1.0, lt=1.0)]
@@ -143,7 +143,7 @@ class MovedLandmarksSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
-class SimulatedMeasurementsSettings(MeasurementSelection):
+class SimulatedMeasurementsSettings(FrameSelection):
     """A simulated drive without images (docs/datasets/simulated_measurements.md)."""
 
     kind: Literal["simulated_measurements"] = "simulated_measurements"
