@@ -91,7 +91,7 @@ def draw_views(path: Path, figure: Figure, title: str) -> None:
             for order, trace in enumerate(traces):
                 _draw(axes, trace, order, "xyz")
             axes.set(**{f"{a}lim": scene[f"{a}axis"]["range"] for a in "xyz"})
-            axes.set_box_aspect([scene["aspectratio"][a] for a in "xyz"], zoom=1.25)
+            axes.set_box_aspect([scene["aspectratio"][a] for a in "xyz"], zoom=1.1)
             axes.view_init(elevation, azimuth)
             axes.set_title(name, y=0.98)
             for axis in (axes.xaxis, axes.yaxis, axes.zaxis):

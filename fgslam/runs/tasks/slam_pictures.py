@@ -106,7 +106,8 @@ def draw_run(run: Path, figures: RunFigures) -> list[Path]:
 
     folder = make_subfolder(run, FOLDER)
     results = _results(figures)
-    what = figures.title("valid landmarks" if figures.valid.any() else "landmarks")
+    kind = "valid landmarks" if figures.valid.any() else "landmarks"
+    what = figures.title(f"{len(results.estimators[0].landmarks):,} {kind}")
     above, ellipses = drive_from_above(results, ON_PAPER), {"landmark-ellipses": True}
     draw_figure(folder / "map_from_above.png", above, what, ellipses)
     draw_views(folder / "map_views.png", map_to_turn(results, ON_PAPER), what)
