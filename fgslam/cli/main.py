@@ -200,7 +200,7 @@ def localize(
 ) -> None:
     """Where in a map were these frames taken? Without any prior.
 
-    A pose is told only where it is beyond doubt, with the reasons. Exits with 0 whatever the
+    A pose is given only where it is beyond doubt, with the reasons. Exits with 0 whatever the
     answers are, with 2 where map or recording cannot be used.
     """
     from fgslam.runs.tasks.localisation_command import Wanted

@@ -62,7 +62,7 @@ def compare_runs(
             None: `compare` inside each run.
         existing: what to do where results are already.
         jobs: processes at a time; more than one disturbs the times.
-        progress: told of each estimator that is done.
+        progress: called after each estimator that is done.
         stopped: True ends the replays; what was finished is kept.
 
     Raises:
@@ -120,7 +120,7 @@ def write_comparison(
 
 
 def _open_slam(run: Path, choice: Choice) -> tuple[ExperimentConfig, Task[RunResult]]:
-    """The comparison of a run; one that cannot be judged is told before anything is written."""
+    """The comparison of a run; one that cannot be judged is refused before anything is written."""
     config, log = load_run(run)
     load_truth(run, log)
     estimators = choose(config, choice)

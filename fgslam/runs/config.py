@@ -1,6 +1,6 @@
 """Reads the configuration of an experiment: one YAML file and dotted overrides, strictly.
 
-The key `task` tells which model of :mod:`fgslam.runs.config_models` it is; without it, SLAM's.
+The key `task` says which model of :mod:`fgslam.runs.config_models` it is; without it, SLAM's.
 Unknown keys are refused with the nearest known one suggested.
 """
 

@@ -145,7 +145,7 @@ class ExperimentConfig(Experiment):
 
 
 def _map_problem(config: ExperimentConfig) -> str:
-    """What is contradictory about the map, with its mend; empty where nothing is."""
+    """What is contradictory about the map, with its fix; empty where nothing is."""
     given, first = config.map, config.map.made_from
     datasets = (config.dataset, *(() if first is None else (first.dataset,)))
     measurements = any(isinstance(one, MeasurementDatasetSettings) for one in datasets)

@@ -146,7 +146,7 @@ def run_task(
         config: the experiment.
         folder: the run folder itself.
         existing: what to do where it holds a run already.
-        progress: told of each step of the work.
+        progress: called after each step of the work.
         stopped: asked after each step; True ends the run early, resumable, with all files valid.
         jobs: processes at a time; None: as the configuration says, else one.
 

@@ -34,7 +34,7 @@ def inspect_recording(
         dataset: folder of a recording in any known layout, or an experiment's .yaml.
         overrides: ``a.b=value`` for the configuration, that of the file or the default one.
         frames: in how many frames, spread over the recording, features are matched.
-        progress: told after each frame.
+        progress: called after each frame.
 
     Raises:
         FgslamError: the recording cannot be opened at all, or the configuration is wrong.
@@ -101,17 +101,17 @@ _MOTION = ("ground truth", "odometry", "odometry against truth")
 
 
 def render_report(recording: Facts, seen: Facts, findings: tuple[Finding, ...]) -> str:
-    """Aligned facts, then the findings with their mends, then the verdict.
+    """Aligned facts, then the findings with their fixes, then the conclusion.
 
     Args:
         recording: what it is.
         seen: what its images show.
         findings: the worst first; those that only tell something stand among the facts.
     """
-    told = [(f.subject, f.text) for f in findings if f.level is Level.INFO]
-    moved = tuple(fact for fact in told if fact[0] in _MOTION)
-    matched = tuple(fact for fact in told if fact[0] not in _MOTION)
-    width = max(len(label) for label, _ in (*recording, *seen, *told))
+    information = [(f.subject, f.text) for f in findings if f.level is Level.INFO]
+    moved = tuple(fact for fact in information if fact[0] in _MOTION)
+    matched = tuple(fact for fact in information if fact[0] not in _MOTION)
+    width = max(len(label) for label, _ in (*recording, *seen, *information))
     bad = tuple(
         (f.level.value.upper(), f"{f.subject}: {f.text}")
         for f in findings

@@ -191,7 +191,7 @@ def _medians(offsets: list[FloatArray]) -> FloatArray:
 def _both_disparities(looks: tuple[Look, ...], rig: CameraRig) -> tuple[FloatArray, FloatArray]:
     """Horizontal and, scaled to it, vertical disparity (k,) of features matched in all images.
 
-    Only matches near both epipolar lines: the others are wrong, or told of already.
+    Only matches near both epipolar lines: the others are wrong, or reported already.
     """
     horizontal, vertical = [], []
     for look in looks:

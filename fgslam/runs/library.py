@@ -33,7 +33,7 @@ RecordedFrame: TypeAlias = tuple[float, tuple[Image, ...] | None, Odometry | Non
 """Time in seconds, images (left, right[, top]) or None, odometry of the body or None."""
 
 Progress: TypeAlias = Callable[[str, int, int], None]
-"""Told what is under way, how much of it is done, and of how much."""
+"""Called with what is under way, how much of it is done, and of how much."""
 
 _WORLDS = {"lab": "lab_loop"}
 """Worlds that are rendered, and the experiment that describes each."""
@@ -162,7 +162,7 @@ def run(
         out: the run folder; None for runs/NAME.
         overrides: settings that differ, by dotted key: ``{"seed": 3}``; or texts: ``["seed=3"]``.
         existing: what to do where the folder holds a run: `refuse`, `overwrite` or `resume`.
-        progress: told what is under way, how much of it is done, and of how much.
+        progress: called with what is under way, how much of it is done, and of how much.
 
     Returns:
         How it ended: `folder`, `status` (`finished` or `interrupted`), `metrics` (the document of

@@ -22,7 +22,7 @@ def open_sequence(
 ) -> Sequence:
     """Opens the recording, rendered or read, with the odometry that the configuration wants.
 
-    ``progress`` is told how many frames of a rendered recording are done, and of how many.
+    ``progress`` is called with how many frames of a rendered recording are done, and of how many.
     """
     dataset = config.dataset
     if isinstance(dataset, RenderedLabSettings):

@@ -108,7 +108,7 @@ def _start(index: int, function: Callable[[Argument], Result], argument: Argumen
 def _work(
     connection: Connection, function: Callable[[Argument], Result], argument: Argument
 ) -> None:
-    """In the worker: Ctrl-C is the parent's to answer; told to end, it clears up first."""
+    """In the worker: Ctrl-C is the parent's to answer; asked to end, it clears up first."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
@@ -118,7 +118,7 @@ def _work(
 
 
 def _see_off(process: SpawnProcess) -> None:
-    """Waits for a process that was told to end; one that is deep in a solver is killed."""
+    """Waits for a process that was asked to end; one that is deep in a solver is killed."""
     process.join(_GRACE_S)
     if process.is_alive():
         process.kill()

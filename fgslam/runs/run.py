@@ -33,7 +33,7 @@ def run_experiment(
         config: the experiment, of any task.
         folder: the run folder itself.
         existing: what to do where it holds a run already.
-        progress: told of each step of the work.
+        progress: called after each step of the work.
         stopped: asked after each step; True ends the run early, resumable, with all files valid.
 
     Raises:

@@ -81,8 +81,8 @@ class QuerySettings:
         int,
         Field(
             ge=0,
-            description="a pose from which fewer of the map's landmarks are visible is told apart; "
-            "where depth is not known nobody knows, and all count",
+            description="a pose from which fewer of the map's landmarks are visible is counted "
+            "apart; where depth is not known all count",
         ),
     ] = 20
     within_m: Annotated[

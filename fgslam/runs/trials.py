@@ -96,7 +96,7 @@ def run_trials(
         out: folder of the results; None: `trials` in the run folder, or `runs/NAME_trials`.
         existing: what to do where results are already.
         jobs: processes at a time, each with linear algebra on one thread.
-        progress: told of each trial that is done.
+        progress: called after each trial that is done.
         stopped: True ends the trials; those finished are kept.
 
     Raises:

@@ -34,7 +34,7 @@ class Stage(Generic[Argument, Result]):
 
     Attributes:
         name: unique in the run; of the files.
-        label: what is told of their progress.
+        label: of their progress.
         count: units, numbered from 0.
         work: of a module's top level; the results of a block's units, in their order.
         argument: what a process is given for a block of units.
@@ -113,7 +113,7 @@ def perform(
         stage: which units.
         store: where finished ones are.
         jobs: processes at a time.
-        progress: told of each block that is done.
+        progress: called after each block that is done.
         stopped: True ends it; what was done until then is kept.
         single_threaded: linear algebra on one thread a process.
 

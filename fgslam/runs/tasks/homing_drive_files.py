@@ -79,7 +79,7 @@ def write_logs(folder: Path, seed: int, record: DriveRecord) -> None:
 
 
 def bearing_log(record: DriveRecord, homing: HomingLog) -> BearingLog:
-    """One homing as estimators were told it; true places of its features are not known."""
+    """One homing as estimators were given it; true places of its features are not known."""
     start = record.truth[homing.first_step]
     truth = None
     if homing.target < len(record.targets) and np.isfinite(record.targets[homing.target]).all():

@@ -42,13 +42,13 @@ class LegView:
         target: its number.
         view: (h, w) grey, unwrapped.
         trails: (k, 2) of each point, its place in the last k images, the present one last.
-        told: what the robot made of it.
+        caption: what the robot made of it.
     """
 
     target: int
     view: ByteArray
     trails: tuple[FloatArray, ...]
-    told: str
+    caption: str
 
 
 class DriveWatcher:
@@ -73,10 +73,10 @@ class DriveWatcher:
             i: np.vstack([before.get(i, none)[1 - _TRAIL :], place])
             for i, place in zip(homing.tracked.ids.tolist(), places, strict=True)
         }
-        told = (
+        caption = (
             f"{command.time:.1f} s, {len(places)} tracks, {command.remaining:.2f} of the leg left"
         )
-        self._last[command.target] = (image, self._trails, told)
+        self._last[command.target] = (image, self._trails, caption)
 
     def views(self, most: int) -> tuple[LegView, ...]:
         """At most so many legs, spread evenly, the last one among them."""
@@ -86,8 +86,8 @@ class DriveWatcher:
         return tuple(self._view(targets[k]) for k in chosen.tolist())
 
     def _view(self, target: int) -> LegView:
-        image, trails, told = self._last[target]
-        return LegView(target, self._front_end.unwrapped(image), tuple(trails.values()), told)
+        image, trails, caption = self._last[target]
+        return LegView(target, self._front_end.unwrapped(image), tuple(trails.values()), caption)
 
 
 def draw_leg_views(folder: Path, seed: int, views: Sequence[LegView]) -> tuple[Picture, ...]:
@@ -97,7 +97,7 @@ def draw_leg_views(folder: Path, seed: int, views: Sequence[LegView]) -> tuple[P
     pictures = []
     for view in views:
         path = make_subfolder(folder, FOLDER) / f"leg_{view.target + 1:02d}.png"
-        told = f"Seed {seed}, leg {view.target + 1}, {view.told}"
-        draw_view_tracks(path, view.view, view.trails, told)
-        pictures.append(Picture(told, path.read_bytes()))
+        caption = f"Seed {seed}, leg {view.target + 1}, {view.caption}"
+        draw_view_tracks(path, view.view, view.trails, caption)
+        pictures.append(Picture(caption, path.read_bytes()))
     return tuple(pictures)

@@ -251,8 +251,8 @@ def _catchment(driven: Sequence[DrivenSeed]) -> Figure:
     known = [one for one in driven if len(one.record)]
     offsets = [between(one.record.targets[0], one.record.truth[0])[:2] for one in known]
     arrived = np.array([_reached_first(record) for record in _records(known)])
-    told = [f"seed {one.seed}: {one.record.legs[0].reason}" for one in known if one.record.legs]
-    return catchment_figure(np.array(offsets), arrived, told)
+    reasons = [f"seed {one.seed}: {one.record.legs[0].reason}" for one in known if one.record.legs]
+    return catchment_figure(np.array(offsets), arrived, reasons)
 
 
 def _reached_first(record: DriveRecord) -> bool:

@@ -209,7 +209,7 @@ def _verdict(
     parts = topology.components()
     largest = len(parts[0]) if parts else 0
     lines = [
-        f"{largest} of {len(topology)} views hang together by {len(topology.links)} links; "
+        f"{largest} of {len(topology)} views are connected by {len(topology.links)} links; "
         f"there are {len(parts)} parts."
     ]
     lines += [
@@ -234,9 +234,9 @@ def _table(topology: TopologicalMap, views: Views) -> TextTable:
         ("fewest inliers of a link", "least_support"),
         ("pairs tried and not linked", "pairs_not_linked"),
     )
-    told = tuple((name, (_value(numbers[key]),)) for name, key in rows)
+    labels = tuple((name, (_value(numbers[key]),)) for name, key in rows)
     column = Column("value", "of the whole map; links.csv has each link")
-    return TextTable("map", "The map", "quantity", (column,), told)
+    return TextTable("map", "The map", "quantity", (column,), labels)
 
 
 def _value(value: JsonValue) -> str:
@@ -280,14 +280,14 @@ def _figure(topology: TopologicalMap, views: Views) -> Figure:
     places = (
         unfolded(len(topology), pairs) if views.poses is None else views.poses[: len(topology), :2]
     )
-    told = tuple(_told(topology, link) for link in topology.links)
+    labels = tuple(_label(topology, link) for link in topology.links)
     rejected = tuple(sorted(topology.rejected))
     why = tuple(
         f"{topology.names[a]} to {topology.names[b]}: {topology.rejected[a, b]}"
         for a, b in rejected
     )
     kinds = (
-        Links("links", 0, pairs, told),
+        Links("links", 0, pairs, labels),
         Links("tried, no link", 1, rejected, why, shown=False),
     )
     where = (
@@ -300,7 +300,7 @@ def _figure(topology: TopologicalMap, views: Views) -> Figure:
     return network_figure(words, places, topology.names, kinds, axes)
 
 
-def _told(topology: TopologicalMap, link: Link) -> str:
+def _label(topology: TopologicalMap, link: Link) -> str:
     return (
         f"{topology.names[link.a]} to {topology.names[link.b]}: {link.support} inliers, rotation "
         f"{np.rad2deg(link.rotation):.0f} degrees"

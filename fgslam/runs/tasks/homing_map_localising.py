@@ -90,16 +90,16 @@ def localise(
 
     words = VisualWords(nodes, config.map.retrieval, rng)
     localiser = Localiser(topology, words, linker, config.localisation)
-    told = []
+    located = []
     context.progress("localising", 0, len(out))
     for done, view in enumerate(out):
         if context.stopped():
             break
         localiser.update(features[view])
         node, probability = localiser.best()
-        told.append((names[view], names[kept[node]], probability, _next_to(view, kept, node)))
+        located.append((names[view], names[kept[node]], probability, _next_to(view, kept, node)))
         context.progress("localising", done + 1, len(out))
-    return Localised(*zip(*told, strict=True)) if told else Localised((), (), (), ())
+    return Localised(*zip(*located, strict=True)) if located else Localised((), (), (), ())
 
 
 def localised_numbers(found: Localised | None) -> JsonValue:

@@ -41,7 +41,7 @@ class PairAnswer:
         a, b: numbers of the views; b is the target.
         found: the homing vector, or why there is none.
         matches: tentative ones.
-        rows: (k, 2) SIFT features of both views that are inliers; None where nobody asked.
+        rows: (k, 2) SIFT features of both views that are inliers; None where they were not kept.
     """
 
     a: int

@@ -166,14 +166,14 @@ def draw_pair(folder: Path, views: Views, search: PairSearch, answer: PairAnswer
         _pixels(camera, kept.bearing_b, kept.elevation_b),
         kept.kind == FeatureKind.COLUMN,
     )
-    told = _told(vector, matches) if isinstance(vector, TwoViewVector) else "refused"
+    caption = _caption(vector, matches) if isinstance(vector, TwoViewVector) else "refused"
     path = make_subfolder(folder, FOLDER) / f"matches_{a}_{b}.png"
     images = views.recording.image(answer.a), views.recording.image(answer.b)
-    draw_view_matches(path, images, pixels, (f"view {a}: {told}", f"view {b}"))
-    return Picture(f"Matches of views {a} and {b}: {told}", path.read_bytes())
+    draw_view_matches(path, images, pixels, (f"view {a}: {caption}", f"view {b}"))
+    return Picture(f"Matches of views {a} and {b}: {caption}", path.read_bytes())
 
 
-def _told(vector: TwoViewVector, matches: BearingMatches) -> str:
+def _caption(vector: TwoViewVector, matches: BearingMatches) -> str:
     direction, rotation = np.rad2deg([vector.direction, vector.rotation])
     return (
         f"{vector.support} of {len(matches)} matches, direction {direction:.1f}, "

@@ -185,15 +185,15 @@ def _plan(
     for k, kind in enumerate(kinds):
         rows = np.flatnonzero((errors.worst >= limits[k]) & (errors.worst < limits[k + 1]))
         pairs = tuple((answered[i].a, answered[i].b) for i in rows)
-        told = tuple(
+        labels = tuple(
             f"{names[answered[i].a]} to {names[answered[i].b]}: direction off by "
             f"{errors.direction[i]:.2f} degrees, rotation by {errors.rotation[i]:.2f}"
             for i in rows
         )
-        links.append(Links(kind, k, pairs, told))
+        links.append(Links(kind, k, pairs, labels))
     refused = tuple((answer.a, answer.b) for answer in answers if not answer.answered)
-    told = tuple(f"{names[a]} to {names[b]}: refused" for a, b in refused)
-    links.append(Links("refused", 3, refused, told, shown=False))
+    labels = tuple(f"{names[a]} to {names[b]}: refused" for a, b in refused)
+    links.append(Links("refused", 3, refused, labels, shown=False))
     words = (
         "pairs",
         "The pairs, from above",

@@ -201,8 +201,8 @@ def _table(numbers: dict[str, JsonValue]) -> TextTable:
         ("the same of those that ended", "ended_track_life_median_frames"),
         ("frames a second, unwrapping and tracking", "frames_a_second"),
     )
-    told = tuple((name, (_text(numbers[key]),)) for name, key in rows)
-    return TextTable("video", "The tracks", "quantity", (Column("value", "of the run"),), told)
+    cells = tuple((name, (_text(numbers[key]),)) for name, key in rows)
+    return TextTable("video", "The tracks", "quantity", (Column("value", "of the run"),), cells)
 
 
 def _text(value: JsonValue) -> str:

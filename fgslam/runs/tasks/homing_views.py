@@ -67,7 +67,7 @@ def mirror_notes(recording: OmniRecording) -> tuple[str, ...]:
 
 
 def _rim(camera: RadialCamera, recording: OmniRecording, place: int) -> MirrorCircle | None:
-    """The rim near where it should be, else amid any circle: its holder's, say, is concentric."""
+    """The rim near where it should be, else around any circle: its holder's, say, is concentric."""
     image = recording.image(place)
     found = _circle(image, (camera.frame.centre, camera.outer_radius))
     if found is not None:

@@ -26,7 +26,12 @@ from fgslam.runs.folder import ExistingFolder, create_run_folder, is_run_folder
 from fgslam.runs.tasks.localisation import open_queries, provenance_of
 from fgslam.runs.tasks.localisation_files import write_results
 from fgslam.runs.tasks.localisation_queries import ask_all
-from fgslam.runs.tasks.localisation_results import LocalisationResult, details, result_of, told
+from fgslam.runs.tasks.localisation_results import (
+    LocalisationResult,
+    answer_line,
+    details,
+    result_of,
+)
 from fgslam.runs.tasks.slam_map_entry import GivenMap, open_map
 from fgslam.runs.units import Progress, UnitStore
 
@@ -89,7 +94,7 @@ def _one_by_one(result: LocalisationResult) -> LocalisationResult:
     if len(attempts) == 1:
         lines = tuple(f"{name:<{_NAME_WIDTH}}{value}" for name, value in details(attempts[0]))
         return dataclasses.replace(result, lines=lines, tables=())
-    lines = tuple(told(attempt) for attempt in attempts)
+    lines = tuple(answer_line(attempt) for attempt in attempts)
     return dataclasses.replace(result, lines=(*lines, *result.lines))
 
 
@@ -120,7 +125,7 @@ def _config(wanted: Wanted, saved: SavedMap) -> LocalisationConfig:
 
 
 def settings_of_map(saved: SavedMap) -> dict[str, Any]:
-    """Settings of the last drive that made the map; empty where it tells none."""
+    """Settings of the last drive that made the map; empty where it holds none."""
     drives = saved.about.get("drives")
     last = drives[-1] if isinstance(drives, list) and drives else {}
     settings = last.get("settings") if isinstance(last, dict) else None

@@ -89,8 +89,8 @@ class Asked:
 
 def nothing_asked(why: str) -> Asked:
     """No query at all, and why."""
-    nobody = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
-    return Asked((), nobody, why, whole=False)
+    none = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+    return Asked((), none, why, whole=False)
 
 
 _ANSWERS = tuple[Attempt, ...]

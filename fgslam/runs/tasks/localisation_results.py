@@ -144,7 +144,7 @@ def _sentence(config: LocalisationConfig, judged: Scored) -> str:
     apart = ""
     if judged.apart.queries:
         apart = (
-            f"; told apart: {judged.apart.queries} poses from which fewer than "
+            f"; counted apart: {judged.apart.queries} poses from which fewer than "
             f"{wanted.least_visible} landmarks are visible, {judged.apart.accepted} of them found, "
             f"{judged.apart.false} false"
         )
@@ -159,7 +159,7 @@ def _score_table(config: LocalisationConfig, judged: Sequence[Scored]) -> TextTa
     wanted = config.localisation
     right = f"accepted, within {100 * wanted.within_m:g} cm and {wanted.within_deg:g} degrees"
     columns = (
-        Column("queries", "asked; those with too few landmarks in view are told apart"),
+        Column("queries", "asked; those with too few landmarks in view are counted apart"),
         Column("right", right),
         Column("less exact", "accepted, neither right nor false"),
         Column(
@@ -228,7 +228,7 @@ def _spread(values: Spread, factor: float, digits: int) -> str:
     return ", ".join(f"{factor * part:.{digits}f}" for part in parts)
 
 
-def told(attempt: Attempt) -> str:
+def answer_line(attempt: Attempt) -> str:
     """One query in a line, for the terminal."""
     start = f"frame {attempt.frame:>5}  {verdict_of(attempt):<16}"
     found = attempt.found

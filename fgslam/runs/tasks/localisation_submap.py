@@ -73,7 +73,7 @@ class Window:
 
     @property
     def ground_truth(self) -> Trajectory | None:
-        """Nobody asks a window."""
+        """None: a window is not judged."""
         return None
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""What rendered depth tells of landmarks: where they truly are, and which are in view."""
+"""Truth about landmarks from rendered depth: where they truly are, and which are in view."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ _BEHIND_M = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Sighted:
-    """How many landmarks are truly in view of a pose; -1 where nobody knows.
+    """How many landmarks are truly in view of a pose; -1 where that is not known.
 
     Attributes:
         visible: in all images, not too near and not too small for the rig, and not hidden.

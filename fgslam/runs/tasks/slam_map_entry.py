@@ -93,18 +93,18 @@ class Entry:
         return Arrival(given.saved, self.prior, self.relocalised, settings.extend)
 
     def notes(self, given: GivenMap, settings: MapSettings) -> tuple[str, ...]:
-        """What is to be told about the entry."""
+        """Notes on the entry: which map, where, and frames left out."""
         x, y, z = self.prior.wTc[:3, 3]
         how = "located" if self.relocalised else f"put back at its {settings.start}"
         use = "extended" if settings.extend else "left as it is"
-        told = (
+        entered = (
             f"map {given.path} of {len(given.saved)} landmarks, {use}: {how} at ({x:.2f}, "
             f"{y:.2f}, {z:.2f}) m"
         )
         if not self.frames_before:
-            return (told,)
+            return (entered,)
         left_out = f"the first {self.frames_before} frames could not be located: left out"
-        return (told, left_out)
+        return (entered, left_out)
 
 
 def open_map(path: Path) -> GivenMap:

@@ -91,8 +91,8 @@ class RunOutputs:
 
     def _with_kind(self, metrics: EstimatorMetrics) -> EstimatorMetrics:
         places = self.pipeline.places
-        told = {} if places is None else closure_counts(places.taken)
-        more = {"kind": self.pipeline.estimator.kind} | dict(metrics.more) | told
+        closures = {} if places is None else closure_counts(places.taken)
+        more = {"kind": self.pipeline.estimator.kind} | dict(metrics.more) | closures
         return dataclasses.replace(metrics, more=more)
 
     def _write_truth(self, with_landmarks: bool) -> Truth:
@@ -179,7 +179,9 @@ def run_notes(outputs: RunOutputs, metrics: EstimatorMetrics) -> tuple[str, ...]
     if len(problems) > _PROBLEMS_SHOWN:
         lines.append(f"and {len(problems) - _PROBLEMS_SHOWN} more such frames, see metrics.json")
     if not metrics.landmarks:
-        lines.append("there is no landmark in the map; fgslam inspect says what ails the recording")
+        lines.append(
+            "there is no landmark in the map; fgslam inspect says what is wrong with the recording"
+        )
     return tuple(lines)
 
 

@@ -83,7 +83,7 @@ class RunFigures:
 
 def figures_of(outputs: RunOutputs) -> RunFigures:
     """A live run's figures."""
-    # Once for all pictures: a smoother's estimate may be dear.
+    # Once for all pictures: a smoother's estimate may take long.
     estimate = outputs.pipeline.estimator.estimate()
     database, recorder = outputs.pipeline.tracker.database, outputs.recorder
     return RunFigures(
