@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
+from fgslam.core.gauss_newton import GaussNewton, Linearised
 from fgslam.factors.bearing_residuals import bearing, bearing_jacobians
 
-_ITERATIONS = 8
 _WIDTH = 2.0  # of Cauchy's kernel, in deviations
-_STILL = 1e-6  # legs and radians: a smaller step ends the iteration
+_SEARCH = GaussNewton(iterations=8, converged=1e-6)  # legs and radians
 
 
 def resected(
@@ -34,15 +34,14 @@ def resected(
         measured: (n,) bearings.
         sigma: (n,) their deviations.
     """
-    pose = np.array(predicted, dtype=np.float64)
-    for _ in range(_ITERATIONS):
+
+    def linearised(poses: FloatArray, iteration: int) -> Linearised:
+        pose = poses[0]
         residual = bearing(pose, points, measured) / sigma
         by_pose = bearing_jacobians(pose, points)[0] / sigma[:, None]
         weighted = by_pose / (1.0 + (residual / _WIDTH) ** 2)[:, None]
         normal = weighted.T @ by_pose + np.diag(information)
         gradient = weighted.T @ residual + information * (pose - predicted)
-        step = np.linalg.solve(normal, gradient)
-        pose = pose - step
-        if np.abs(step).max() < _STILL:
-            break
-    return pose
+        return normal[None], gradient[None]
+
+    return np.asarray(_SEARCH.minimise(predicted[None], linearised)[0])

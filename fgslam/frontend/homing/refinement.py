@@ -15,6 +15,7 @@ import numpy as np
 
 from fgslam.cameras.omni.bearing_measurement import unit_rays
 from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.gauss_newton import GaussNewton, Linearised
 from fgslam.core.homing import BearingMatches
 from fgslam.core.planar import wrap
 from fgslam.frontend.homing.epipolar import in_front, ray_derivatives
@@ -23,10 +24,14 @@ from fgslam.frontend.homing.match_probability import COMMON_CHANCE, gain, right_
 _WIDENED = (4.0, 3.0, 2.0, 1.5)
 """Inliers' threshold in the first iterations: a hypothesis from two matches is a few degrees off,
 and the matches that would pull it right are its outliers (1 to 2 degrees)."""
-_ITERATIONS = 15
-_CONVERGED = 1e-7  # radians; a thousandth of the best covariance's square root
 _MAD_TO_SIGMA = 1.4826
-_DAMPING = 1e-3  # of the information: a handful of inliers may leave a direction open
+_SEARCH = GaussNewton(
+    iterations=15,
+    converged=1e-7,  # radians; a thousandth of the best covariance's square root
+    settling=len(_WIDENED),
+    longest=0.3,  # radians, legs
+    damping=1e-3,  # of the information: a handful of inliers may leave a direction open
+)
 _LEAST_SIGMA = 1e-6  # of a parameter that is not to be estimated; less spoils the conditioning
 
 
@@ -91,26 +96,18 @@ class HomingRefinement:
         """Gauss-Newton from hypotheses (c,), side by side; inliers are chosen anew each time."""
         parameters = np.zeros((len(directions), 7))
         parameters[:, 0], parameters[:, 1] = directions, rotations
-        going = np.arange(len(parameters))
-        for k in range(_ITERATIONS):
-            widened = _WIDENED[k] if k < len(_WIDENED) else 1.0
-            step = self._step(parameters[going], widened)
-            parameters[going] += np.clip(step, -0.3, 0.3)
-            if k >= len(_WIDENED):
-                going = going[np.max(np.abs(step), axis=1) >= _CONVERGED]
-            if not len(going):
-                break
+        parameters = _SEARCH.minimise(parameters, self._normal)
         parameters[:, :2] = wrap(parameters[:, :2])
         return self._finished(parameters)
 
-    def _step(self, parameters: FloatArray, widened: float) -> FloatArray:
-        """(c, 7) the damped Gauss-Newton step from (c, 7)."""
+    def _normal(self, parameters: FloatArray, iteration: int) -> Linearised:
+        """Information (c, 7, 7) and gradient (c, 7) at parameters (c, 7)."""
+        widened = _WIDENED[iteration] if iteration < len(_WIDENED) else 1.0
         residuals, jacobian = self._linearised(parameters)
         weights = self._weights(parameters, residuals, widened)
-        information = self._information(jacobian, weights) + _DAMPING * np.eye(7)
         gradient = (jacobian @ (weights * residuals)[:, :, None])[:, :, 0]
         gradient += self._prior * parameters
-        return np.asarray(np.linalg.solve(information, -gradient[:, :, None])[:, :, 0])
+        return self._information(jacobian, weights), gradient
 
     def _information(self, jacobian: FloatArray, weights: FloatArray) -> FloatArray:
         """(c, 7, 7) of Jacobians (c, 7, n) and weights (c, n), with the prior's."""
