@@ -16,6 +16,22 @@ from fgslam.core.planar import wrap
 from fgslam.homing.bearing_consistency import common_turn, parallax, target_misfit, tracked_misfit
 from fgslam.homing.settings import HomingControlSettings
 
+_MAX_ACROSS = 0.1
+"""Deviation of the target's place across the way, in parts of the leg, beyond which the target is
+matched anew."""
+
+CONTRADICTION_DEG = 30.0
+"""A new homing vector that differs by more from a sound estimate (and by more than four deviations)
+must be confirmed by another image."""
+
+_MAX_RESIDUAL_DEG = 5.0
+"""Median difference of the bearings from the estimate's prediction beyond which the estimate counts
+as diverged."""
+
+_FEWEST_TRACKS = 4
+"""With fewer than this the estimate is not believed any more (a third view needs three
+bearings)."""
+
 EstimatorMaker: TypeAlias = Callable[[HomingStart], HomingEstimator]
 
 _FARTHEST = 3.0  # legs; whoever believes to be farther away has diverged
@@ -105,7 +121,7 @@ class ActiveHoming:
     def _unusable(self, tracked: TrackedBearings) -> Fault | None:
         """Too little to estimate from, or a picture that was turned rather than the robot."""
         s = self._settings
-        if len(tracked) < s.fewest_tracks:
+        if len(tracked) < _FEWEST_TRACKS:
             return Fault(f"{len(tracked)} tracks left", False)
         step = tracked.time - self.tracked.time
         turn = common_turn(self.tracked, tracked)
@@ -123,7 +139,7 @@ class ActiveHoming:
             ("tracks", tracked_misfit(self.estimate, self.tracked)),
             ("target's bearings", target_misfit(self.estimate, self.start)),
         ):
-            if misfit > np.deg2rad(self._settings.max_residual_deg):
+            if misfit > np.deg2rad(_MAX_RESIDUAL_DEG):
                 degrees = np.rad2deg(misfit)
                 return Fault(f"estimate diverged: {name} misfit by {degrees:.1f} deg", False)
         return None
@@ -137,7 +153,7 @@ class ActiveHoming:
         home = self.home
         with np.errstate(invalid="ignore"):
             across = float(home.distance * np.sqrt(home.covariance[1, 1]))
-        if np.isfinite(across) and across > s.max_across:
+        if np.isfinite(across) and across > _MAX_ACROSS:
             return Fault(f"target uncertain by {across:.2f} legs across", True)
         return None
 
@@ -162,7 +178,7 @@ class ActiveHoming:
         home = self.home
         turns = [vector.direction - home.direction, vector.rotation - home.rotation]
         variance = np.diag(vector.covariance) + np.nan_to_num(np.diag(home.covariance)[1:])
-        limit = np.deg2rad(self._settings.contradiction_deg)
+        limit = np.deg2rad(CONTRADICTION_DEG)
         allowed = np.maximum(limit, _SIGMAS * np.sqrt(variance))
         return np.abs(wrap(np.array(turns))) > allowed
 

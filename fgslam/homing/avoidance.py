@@ -15,6 +15,14 @@ from fgslam.core.planar import wrap
 from fgslam.homing.command import Drive
 from fgslam.homing.settings import AvoidanceSettings
 
+_ESCAPE_MPS = 0.25  # speed on the way out
+_ESCAPE_M = 1.2  # ways longer than this are equally good ways out
+_ESCAPE_STEPS = 20  # steps of driving along it; 2 s at 10 a second
+_ESCAPE_AFTER = 20  # steps held up until a way out is taken; 2 s at 10 a second
+_GAIN_PER_S = 2.0  # turning rate over the chosen direction
+_KEEP_WEIGHT = 0.5  # weight of staying with the last choice, against turning towards home
+_DIRECTIONS = 72  # corridors that are looked at, all around
+
 _AHEAD = np.deg2rad(45.0)  # farther off than this: turn on the spot
 _BRAKE = 0.5  # part of the speed at which the clear way is driven in a second
 _TURNING = 1.0 / 3.0  # an about-face of five seconds is a third as bad as being blocked
@@ -71,8 +79,8 @@ class CorridorAvoidance:
 
     def __init__(self, settings: AvoidanceSettings) -> None:
         self._settings = settings
-        step = 2.0 * np.pi / settings.directions
-        self._directions: FloatArray = -np.pi + step * np.arange(settings.directions, dtype=float)
+        step = 2.0 * np.pi / _DIRECTIONS
+        self._directions: FloatArray = -np.pi + step * np.arange(_DIRECTIONS, dtype=float)
         self._chosen: float | None = None
         self._held_up = 0.0  # steps in which the robot was not let drive
         self._escaping = 0  # steps that are left of a way out
@@ -85,9 +93,9 @@ class CorridorAvoidance:
         driven = self._in_corridor(wanted, heading, scan)
         stands = driven.overridden and driven.speed < _STANDING
         self._held_up = self._held_up + self._impatience() if stands else 0.0
-        if self._held_up >= self._settings.escape_after:
+        if self._held_up >= _ESCAPE_AFTER:
             self._held_up, self._chosen = 0.0, None
-            self._escaping = self._settings.escape_steps
+            self._escaping = _ESCAPE_STEPS
         return driven
 
     def _impatience(self) -> float:
@@ -99,15 +107,15 @@ class CorridorAvoidance:
         s = self._settings
         ways = clear_ways(self._directions, points, s.body_m)
         # Of ways that are long enough the one that needs the least turning.
-        worth = np.minimum(ways, s.escape_m) - 0.1 * np.abs(self._directions)
+        worth = np.minimum(ways, _ESCAPE_M) - 0.1 * np.abs(self._directions)
         direction = float(self._directions[int(np.argmax(worth))])
         limit = np.deg2rad(s.max_turn_deg_s)
-        rate = float(np.clip(s.gain_per_s * direction, -limit, limit))
+        rate = float(np.clip(_GAIN_PER_S * direction, -limit, limit))
         if abs(direction) > _AHEAD:
             self._escaping += 1  # turning does not count
             return Drive(0.0, rate, True)
         way = float(clear_ways(np.zeros(1), points, s.body_m)[0])
-        return Drive(min(s.escape_mps, _BRAKE * max(way, 0.0)), rate, True)
+        return Drive(min(_ESCAPE_MPS, _BRAKE * max(way, 0.0)), rate, True)
 
     def _in_corridor(self, wanted: Drive, heading: float, scan: RangeScan) -> Drive:
         if wanted.speed <= 0.0 and self._chosen is None:
@@ -130,13 +138,13 @@ class CorridorAvoidance:
         cost = np.abs(wrap(self._directions - heading))
         if self._chosen is not None:
             kept = np.abs(wrap(self._directions - self._chosen))
-            cost = cost + self._settings.keep_weight * kept
+            cost = cost + _KEEP_WEIGHT * kept
         return float(self._directions[int(np.argmin(np.where(free, cost, np.inf)))])
 
     def _drive(self, wanted: Drive, direction: float, points: FloatArray) -> Drive:
         s = self._settings
         limit = np.deg2rad(s.max_turn_deg_s)
-        rate = float(np.clip(s.gain_per_s * direction, -limit, limit))
+        rate = float(np.clip(_GAIN_PER_S * direction, -limit, limit))
         if abs(direction) > _AHEAD:
             return Drive(0.0, rate, True)
         slowed = self._slowed(Drive(wanted.speed, rate, True), points)

@@ -16,10 +16,19 @@ from fgslam.core.arrays import ByteArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
-from fgslam.homing.active_homing import ActiveHoming, EstimatorMaker, Fault
+from fgslam.homing.active_homing import CONTRADICTION_DEG, ActiveHoming, EstimatorMaker, Fault
 from fgslam.homing.command import Command, HomingState
 from fgslam.homing.front_end import HomingFrontEnd, Sighting
 from fgslam.homing.settings import HomingControlSettings
+
+_FARTHER_S = 2.5
+"""Drive straight on, at reduced speed, to look for a refused target from elsewhere; 0.4 m with the
+default steering."""
+
+_BLIND_HEADING_DEG = 20.0  # without tracks the robot drives on only if home was so nearly ahead
+_PASS_FRACTION = 0.25
+"""A target nearer than this part of the leg that has fallen behind the robot counts as reached:
+passed by."""
 
 _PROGRESS = 0.02  # parts of a leg; less is noise of the distance
 
@@ -125,7 +134,7 @@ class HomingController:
         if self.remaining <= s.switch_fraction:
             return f"reached: {self.remaining:.2f} of the leg left"
         # A renewed homing's own distance counts, too: its unit may be wrong, not its zero.
-        near = min(self.remaining, self.remaining / unit) <= s.pass_fraction
+        near = min(self.remaining, self.remaining / unit) <= _PASS_FRACTION
         if behind and near and self._was_ahead:
             return f"passed: target behind at {self.remaining:.2f} of the leg"
         self._was_ahead = self._was_ahead or not behind
@@ -163,9 +172,7 @@ class HomingController:
             return self._doubt(time, "near the target it is seen elsewhere", seen.vector)
         left = homing.part_left(seen.parallax)
         behind = abs(seen.vector.direction) > np.pi / 2 and self._was_ahead
-        if left <= self._settings.switch_fraction or (
-            behind and left <= self._settings.pass_fraction
-        ):
+        if left <= self._settings.switch_fraction or (behind and left <= _PASS_FRACTION):
             self.remaining = left
             return self._end(time, HomingState.ARRIVED, f"passed: seen at {left:.2f} of the leg")
         return self._doubt(time, "near the target it is seen elsewhere", seen.vector, left)
@@ -207,7 +214,7 @@ class HomingController:
     def _lose(self, image: ByteArray, time: float, why: str) -> Command:
         """The estimate is not to be believed: match anew at once, or drive blind for a while."""
         s = self._settings
-        ahead = abs(self._heading) <= np.deg2rad(s.blind_heading_deg)
+        ahead = abs(self._heading) <= np.deg2rad(_BLIND_HEADING_DEG)
         self._blind_until = time + s.blind_s if ahead else -np.inf
         self.active, self._next_try = None, time
         return self._seek(image, time, why)
@@ -253,7 +260,7 @@ class HomingController:
         if self._pending is None:
             return not self._ambiguous
         turn = float(np.abs(wrap(np.array(vector.direction - self._pending.direction))))
-        return bool(turn <= np.deg2rad(self._settings.contradiction_deg))
+        return bool(turn <= np.deg2rad(CONTRADICTION_DEG))
 
     def _accept(self, homing: ActiveHoming, why: str) -> Command:
         time = homing.start.time
@@ -288,7 +295,7 @@ class HomingController:
 
     def _search(self, time: float, why: str) -> Command:
         self._searches += 1
-        self._search_until = time + self._settings.farther_s
+        self._search_until = time + _FARTHER_S
         self._standing_since = self._pending = None
         self._progress.pause(time)
         return self._hold(time, why)

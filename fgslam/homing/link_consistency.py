@@ -18,6 +18,15 @@ from fgslam.core.planar import wrap
 from fgslam.homing.links import Link, Pair
 from fgslam.homing.settings import TopologicalMapSettings
 
+_HEADING_DEG = 15.0  # largest misfit of an edge's rotation with all others' together
+_LOOP_DEG = 6.0
+"""Largest sum of the rotations around a triangle, and largest misfit of its directions, beyond
+three deviations."""
+
+_LONE_SUPPORT = 50
+"""Inliers of an edge that no third image confirms, unless its images follow each other in an
+ordered set (false ones had up to 39 on `omni_home`)."""
+
 _SIGMAS = 3.0
 _ROUNDS = 10  # of the rotation averaging's reweighting
 _HUBER = np.deg2rad(5.0)  # residual from which on a link's rotation counts less
@@ -66,7 +75,7 @@ class LinkConsistency:
 
     def _holds(self, a: int, b: int, c: int) -> bool:
         ab, bc, ac = self._links[a, b], self._links[b, c], self._links[a, c]
-        limit = np.deg2rad(self._settings.loop_deg)
+        limit = np.deg2rad(_LOOP_DEG)
         turn = abs(float(wrap(np.array(ab.rotation + bc.rotation - ac.rotation))))
         if turn > max(limit, _SIGMAS * np.sqrt(_variance(1, ab, bc, ac))):
             return False
@@ -109,7 +118,7 @@ class LinkConsistency:
         for pair, (good, _) in self.votes().items():
             support = self._links[pair].support
             follows = (ordered and pair[1] == pair[0] + 1) or pair in witnessed
-            if good == 0 and not follows and support < self._settings.lone_support:
+            if good == 0 and not follows and support < _LONE_SUPPORT:
                 text = f"no third image confirms it, and {support} inliers are too few alone"
                 self._drop(pair, text, rejected)
 
@@ -127,7 +136,7 @@ class LinkConsistency:
 
     def _drop_turned(self, rejected: dict[Pair, str], *, ordered: bool) -> None:
         """Of an ordered set neighbours weigh more than any other link: headings follow the walk."""
-        limit = np.deg2rad(self._settings.heading_deg)
+        limit = np.deg2rad(_HEADING_DEG)
         while self._links:
             pairs = list(self._links)
             rotations = np.array([self._links[p].rotation for p in pairs])

@@ -13,6 +13,10 @@ from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVect
 from fgslam.core.planar import wrap
 from fgslam.homing.settings import TopologicalMapSettings
 
+_MUTUAL_DEG = 5.0  # largest difference between the answers there and back, beyond three deviations
+_ONE_WAY_SUPPORT = 25
+"""Inliers of an edge that is answered in one direction and ambiguous in the other."""
+
 Answer: TypeAlias = TwoViewVector | Refusal
 Linker: TypeAlias = Callable[[OmniFeatures, OmniFeatures], Answer]
 """The homing vector from the first image's place to the second's."""
@@ -78,7 +82,7 @@ def link_pair(
     )
     apart = float(np.max(np.abs(wrap(gap))))
     variance = float(np.max(np.diag(there.covariance) + np.diag(back.covariance)))
-    if apart > max(np.deg2rad(settings.mutual_deg), _SIGMAS * np.sqrt(variance)):
+    if apart > max(np.deg2rad(_MUTUAL_DEG), _SIGMAS * np.sqrt(variance)):
         return f"there and back disagree by {np.rad2deg(apart):.1f} deg"
     return Link(
         *pair, there.direction, there.rotation, back.direction, there.covariance,
@@ -100,10 +104,9 @@ def _one_way(
         raise TypeError("one direction must be answered, the other refused")
     if other.reason not in _UNDECIDED:
         return f"refused in one direction: {other.details}"
-    if answer.support < settings.one_way_support:
+    if answer.support < _ONE_WAY_SUPPORT:
         return (
-            f"{answer.support} inliers one way, of {settings.one_way_support} needed; "
-            f"back: {other.details}"
+            f"{answer.support} inliers one way, of {_ONE_WAY_SUPPORT} needed; back: {other.details}"
         )
     opposite = _opposite(answer)
     ahead, behind = (opposite, answer) if answer is back else (answer, opposite)
@@ -133,10 +136,10 @@ def _same_place(
     if there.rotation is None or back.rotation is None:
         return "taken at one place as seen from one of them only"
     apart = abs(float(wrap(np.array(there.rotation + back.rotation))))
-    if apart > np.deg2rad(settings.mutual_deg):
+    if apart > np.deg2rad(_MUTUAL_DEG):
         return f"there and back disagree by {np.rad2deg(apart):.1f} deg"
     nowhere = np.full((2, 2), np.nan)
-    nowhere[1, 1] = np.deg2rad(settings.mutual_deg / _SIGMAS) ** 2
+    nowhere[1, 1] = np.deg2rad(_MUTUAL_DEG / _SIGMAS) ** 2
     return Link(
         *pair, float("nan"), there.rotation, float("nan"), nowhere, nowhere, settings.min_support,
     )  # fmt: skip

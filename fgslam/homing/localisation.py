@@ -17,6 +17,8 @@ from fgslam.homing.retrieval import VisualWords
 from fgslam.homing.settings import LocalisationSettings
 from fgslam.homing.topological_map import TopologicalMap
 
+_BACKGROUND = 4.0  # inliers that a wrong place may get, on average
+
 
 class Localiser:
     """Tells at which node the robot is, or nearest to it.
@@ -57,7 +59,7 @@ class Localiser:
         expected = self.belief if self._fresh else self._moved()
         self._fresh = False
         supports = self._supports(image, expected)
-        posterior = expected * likelihoods(supports, self._settings.background)
+        posterior = expected * likelihoods(supports, _BACKGROUND)
         self.belief = posterior / posterior.sum()
         return self.belief.copy()
 

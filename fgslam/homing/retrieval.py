@@ -17,6 +17,9 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.homing import OmniFeatures
 from fgslam.homing.settings import RetrievalSettings
 
+_ITERATIONS = 6  # of k-means
+_SAMPLE = 10_000  # descriptors that the vocabulary is made of, at most
+
 
 class VisualWords:
     """The vocabulary of a set of images, and the images in it."""
@@ -68,15 +71,15 @@ def _vocabulary(
     images: Sequence[OmniFeatures], settings: RetrievalSettings, rng: np.random.Generator
 ) -> FloatArray:
     everything = np.vstack([np.empty((0, 128)), *(_rooted(i) for i in images)])
-    if len(everything) > settings.sample:
-        everything = everything[np.sort(rng.choice(len(everything), settings.sample, False))]
+    if len(everything) > _SAMPLE:
+        everything = everything[np.sort(rng.choice(len(everything), _SAMPLE, False))]
     words = min(settings.words, len(everything))
     if words < 2:
         return np.empty((0, 128))
     first = everything[np.sort(rng.choice(len(everything), words, replace=False))]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a word that nothing is nearest to is kept
-        centres, _ = kmeans2(everything, first, iter=settings.iterations, minit="matrix")
+        centres, _ = kmeans2(everything, first, iter=_ITERATIONS, minit="matrix")
     return np.asarray(centres)
 
 

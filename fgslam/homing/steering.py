@@ -7,6 +7,14 @@ import numpy as np
 from fgslam.homing.command import Command, Drive, HomingState
 from fgslam.homing.settings import SteeringSettings
 
+_TURN_IN_PLACE_DEG = 60.0
+"""Home farther off than this: turn without driving, until it is within half of it."""
+
+_BLIND_SHARE = 0.4  # of the speed, without tracks
+_PASSING_SHARE = 0.6  # of the speed, at targets on the way
+_LEAST_SHARE = 0.25  # of the speed, at the last target
+_SLOW_FRACTION = 0.3  # part of the leg that is left from which on the robot slows down
+
 _BEHIND = np.deg2rad(150.0)  # from here on both ways round are as long; noise must not choose
 
 
@@ -50,7 +58,7 @@ class Steering:
 
     def _forward(self, command: Command) -> float:
         s = self._settings
-        limit = np.deg2rad(s.turn_in_place_deg)
+        limit = np.deg2rad(_TURN_IN_PLACE_DEG)
         # Two thresholds: with one, noise would switch between turning and driving.
         self._turning = abs(command.heading) > (0.5 * limit if self._turning else limit)
         if self._turning:
@@ -59,11 +67,10 @@ class Steering:
         return s.max_speed_mps * ahead * self._share(command)
 
     def _share(self, command: Command) -> float:
-        s = self._settings
         if command.state in (HomingState.BLIND, HomingState.SEARCH):
-            return s.blind_share
-        least = s.least_share if command.final else s.passing_share
-        return float(np.clip(command.remaining / s.slow_fraction, least, 1.0))
+            return _BLIND_SHARE
+        least = _LEAST_SHARE if command.final else _PASSING_SHARE
+        return float(np.clip(command.remaining / _SLOW_FRACTION, least, 1.0))
 
 
 def _towards(now: float, wanted: float, most: float) -> float:

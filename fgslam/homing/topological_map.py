@@ -40,6 +40,7 @@ _PER_LINK: Items = {
     "link_covariances": ("f", (2, 2, 2)),
     "link_cost": ("f", ()),
 }
+_DOUBLING_SUPPORT = 25.0  # inliers at which an edge costs twice what many inliers cost
 _SIGMA_OF_ONE = np.deg2rad(5.0)  # direction's deviation that costs as much as a leg by itself
 
 
@@ -222,7 +223,7 @@ def link_cost(link: Link, settings: TopologicalMapSettings) -> float:
     So a route prefers a few safe legs to many, and two safe ones to one that is not.
     """
     variance = np.nan_to_num(max(link.covariance[0, 0], link.back_covariance[0, 0]))
-    weak = settings.doubling_support / max(link.support, 1)
+    weak = _DOUBLING_SUPPORT / max(link.support, 1)
     return float(1.0 + weak + variance / _SIGMA_OF_ONE**2)
 
 

@@ -23,6 +23,8 @@ from fgslam.factors.bearing_residuals import (
     triangulated,
 )
 
+_INITIAL_SPEED = 0.5  # deviation of the speed at the start, around 0, legs/s
+
 ROBOT, TARGET, FEATURES = slice(0, 4), slice(4, 7), slice(7, None)
 _FIRST = 7
 
@@ -83,7 +85,7 @@ def initial_state(start: HomingStart, settings: HomingEkfSettings) -> FilterStat
     covariance = np.zeros((len(mean), len(mean)))
     make = _joint_covariance if settings.target == "joint" else _independent_covariance
     covariance[4:, 4:] = make(start, kept, settings.exact_bearings)
-    covariance[3, 3] = settings.motion.initial_speed**2
+    covariance[3, 3] = _INITIAL_SPEED**2
     state = FilterState(chart.ids[kept], mean, 0.5 * (covariance + covariance.T))
     return _with_one_distance(state, settings) if settings.gauge == "one_distance" else state
 

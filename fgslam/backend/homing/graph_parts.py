@@ -27,6 +27,8 @@ from fgslam.factors.bearing import (
 )
 from fgslam.factors.keys import height_key, landmark_key, pose_key, target_key, velocity_key
 
+_INITIAL_TURNING_DEG = 30.0  # of the turning rate at the start, degrees/s
+_INITIAL_SPEED = 0.5  # deviation of the speed at the start, around 0, legs/s
 TARGET = -1
 
 
@@ -95,8 +97,8 @@ def motion_densities(motion: GraphMotionSettings) -> FloatArray:
 
 def first_speeds(motion: GraphMotionSettings) -> FloatArray:
     """(3,) deviations of the velocity at the start."""
-    turning = float(np.deg2rad(motion.initial_turning_deg))
-    return np.array([motion.initial_speed, motion.sideways, turning])
+    turning = float(np.deg2rad(_INITIAL_TURNING_DEG))
+    return np.array([_INITIAL_SPEED, motion.sideways, turning])
 
 
 class GtsamParts:

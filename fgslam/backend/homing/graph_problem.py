@@ -20,6 +20,7 @@ from fgslam.core.homing import HomingStart, TrackedBearings
 from fgslam.core.planar import compose, unit, wrap
 from fgslam.factors.bearing_residuals import bearing, bearing_jacobians, polar_points, triangulated
 
+_PRIOR_DISTANCES = 2.0  # deviation of the weak prior on a landmark's place, in initial distances
 _COLLAPSED = 0.1  # of the first distance from the start: gates let no error of ninety percent in
 _CONFIRMED, _SAME_SIGMAS = 3, 1.0  # agreements in a row before a waiting feature enters
 _JUMPED = 4  # misses in a row after which a track follows something else
@@ -159,7 +160,7 @@ class HomingProblem:
     def _enter(self, new: NewPart, row: int, point: FloatArray, distance: float) -> None:
         """A landmark with its bearings from start and target."""
         settings, matches = self._settings, self._start.matches
-        new.points[row] = (point, settings.prior_distances * distance)
+        new.points[row] = (point, _PRIOR_DISTANCES * distance)
         from_start, _, from_target, _ = matches.sigma[row].tolist()
         new.bearings += [
             Sight(0, row, float(matches.bearing_a[row]), from_start),
@@ -187,7 +188,7 @@ class HomingProblem:
         _, sigma, _, sigma_target = matches.sigma[row].tolist()
         self._tall[row] = True
         tall = distance * float(np.tan(up))
-        new.heights[row] = (tall, self._settings.prior_distances * distance)
+        new.heights[row] = (tall, _PRIOR_DISTANCES * distance)
         new.elevations += [Sight(0, row, up, sigma), Sight(TARGET, row, up_target, sigma_target)]
 
     def _enter_seen(

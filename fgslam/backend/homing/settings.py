@@ -34,9 +34,6 @@ class FilterMotionSettings:
         float,
         Field(gt=0.0, description="deviation of the position after a second, legs: wheels slip"),
     ] = 0.02
-    initial_speed: Annotated[
-        float, Field(gt=0.0, description="deviation of the speed at the start, around 0, legs/s")
-    ] = 0.5
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -120,12 +117,6 @@ class GraphMotionSettings:
     turning_deg: Annotated[
         float, Field(gt=0.0, description="the same of the turning rate, degrees/s")
     ] = 60.0
-    initial_speed: Annotated[
-        float, Field(gt=0.0, description="deviation of the speed at the start, around 0, legs/s")
-    ] = 0.5
-    initial_turning_deg: Annotated[
-        float, Field(gt=0.0, description="of the turning rate at the start, degrees/s")
-    ] = 30.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -161,13 +152,6 @@ class HomingGraphSettings(NamedSettings):
             "may cross the camera's centre and take the solution along",
         ),
     ] = 0.3
-    prior_distances: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="deviation of the weak prior on a landmark's place, in initial distances",
-        ),
-    ] = 2.0
     gate_sigmas: Annotated[
         float,
         Field(

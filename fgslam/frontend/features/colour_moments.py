@@ -19,6 +19,10 @@ import numpy.typing as npt
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.frontend.features.omni_settings import ColourMomentSettings
 
+_MEAN_FLOOR = 8.0
+"""Grey values; means (and deviations) below it count as it, so that the noise of dark patches is no
+colour."""
+
 Float32Image: TypeAlias = npt.NDArray[np.float32]
 
 PAIRS = ((0, 2), (0, 1), (1, 2))
@@ -42,11 +46,11 @@ def colour_from_means(means: FloatArray, settings: ColourMomentSettings) -> Floa
     first = means[:, [p for p, _ in PAIRS]]
     second = means[:, [q for _, q in PAIRS]]
     if settings.form == "ratio":
-        floor = settings.mean_floor
+        floor = _MEAN_FLOOR
         # The covariance is floored with its means: dark areas tend to 1, as grey ones are.
         covariance = means[:, 3:6] - first * second
         return np.asarray(1.0 + covariance / (np.maximum(first, floor) * np.maximum(second, floor)))
-    variances = np.maximum(means[:, 6:9] - means[:, :3] ** 2, settings.mean_floor**2)
+    variances = np.maximum(means[:, 6:9] - means[:, :3] ** 2, _MEAN_FLOOR**2)
     deviations = np.sqrt(variances)
     scale = deviations[:, [p for p, _ in PAIRS]] * deviations[:, [q for _, q in PAIRS]]
     return np.asarray((means[:, 3:6] - first * second) / scale)

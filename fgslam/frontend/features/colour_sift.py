@@ -22,6 +22,10 @@ from fgslam.core.planar import wrap
 from fgslam.frontend.features.colour_moments import PatchColours
 from fgslam.frontend.features.omni_settings import ColourMomentSettings, UprightSiftSettings
 
+_SIGMA_SCALES = 0.27  # scales of a feature, added in quadrature to its position's sigma
+_BASE_SIGMA_PX = 1.6  # Gaussian of the first level, doubled image
+_EDGE_THRESHOLD = 10.0  # ratio of principal curvatures above which edges go
+_OCTAVE_LAYERS = 3  # levels an octave; 3 in Lowe
 _STEP = 1e-3
 """Radians of elevation over which directions in the image are taken."""
 
@@ -104,10 +108,10 @@ class UprightSift:
         self._camera, self._settings, self._colour = camera, settings, colour
         self._sift = cv2.SIFT.create(
             0,
-            settings.octave_layers,
+            _OCTAVE_LAYERS,
             settings.contrast_threshold,
-            settings.edge_threshold,
-            settings.base_sigma_px,
+            _EDGE_THRESHOLD,
+            _BASE_SIGMA_PX,
             cv2.CV_8U,
             True,
         )
@@ -199,7 +203,7 @@ class UprightSift:
         descriptors: ByteArray,
         colour: FloatArray,
     ) -> UprightFeatures:
-        sigma = np.hypot(self._settings.sigma_px, self._settings.sigma_scales * scale_px)
+        sigma = np.hypot(self._settings.sigma_px, _SIGMA_SCALES * scale_px)
         bearing, elevation, covariance = measure(self._camera, pixels, 1.0)
         return UprightFeatures(
             pixels=pixels,

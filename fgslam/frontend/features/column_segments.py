@@ -27,9 +27,19 @@ from fgslam.frontend.features.colour_moments import colour_from_means, moment_im
 from fgslam.frontend.features.colour_sift import inner_part, wrapping_period
 from fgslam.frontend.features.omni_settings import ColourMomentSettings, ColumnSegmentSettings
 
+_SIGMA_RUN = 0.15  # part of a run's width added to the bearing's deviation
+_RUN_STEP_PX = 1.5  # ends of one run shift less than this between columns
+_MAX_RUN_DEG = 8.0
+"""Wider runs (a table's edge, the joint of wall and ceiling) have no bearing of their own and are
+dropped."""
+
+_MIN_RUN_PX = 2  # neighbouring columns that must show a segment
+_MIN_CONTRAST = 4.0  # least standard deviation of the luminance along it, grey values
+_MIN_LENGTH_TANGENT = 0.05  # nor have segments that appear smaller, tangents of elevation
+_MIN_LENGTH_PX = 8.0  # shorter segments have no profile to tell them by
+_SMOOTHING_PX = 1.2  # Gaussian before the gradient is taken
 PROFILE_SAMPLES = 32
 COEFFICIENTS = 7
-
 _RIM_SIGMAS = 3.0
 """Of the smoothing: so far the end of the picture reaches into it."""
 
@@ -70,7 +80,7 @@ class ColumnSegmentFinder:
         self._width, self._height = view.width, view.height
         self._period = wrapping_period(view) or view.width
         self._bearings, (self._tangent_0, self._tangent_step) = _axes(view)
-        rim = int(np.ceil(_RIM_SIGMAS * settings.smoothing_px))
+        rim = int(np.ceil(_RIM_SIGMAS * _SMOOTHING_PX))
         self._blind = None if seen is None else inner_part(seen, rim)[:, : self._period] == 0
         self._dct = dct_rows() / np.sqrt(PROFILE_SAMPLES)
 
@@ -82,7 +92,7 @@ class ColumnSegmentFinder:
             return empty_segments()
         sums = _ColumnSums(image, self._colour)
         means, contrast = sums.means(raw.column, raw.top, raw.bottom)
-        keep = contrast >= self._settings.min_contrast
+        keep = contrast >= _MIN_CONTRAST
         raw, means = raw.select(keep), means[keep]
         chosen, width = self._representatives(raw)
         return self._described(raw.select(chosen), means[chosen], width, sums)
@@ -97,8 +107,8 @@ class ColumnSegmentFinder:
         at = row + _summit(before[row, column], middle[row, column], after[row, column]) + 1.0
         length = np.diff(at)
         shortest = max(
-            self._settings.min_length_px,
-            self._settings.min_length_tangent / abs(self._tangent_step),
+            _MIN_LENGTH_PX,
+            _MIN_LENGTH_TANGENT / abs(self._tangent_step),
         )
         pair = (np.diff(column) == 0) & (length >= shortest)
         return _Raw(column[:-1][pair], at[:-1][pair], at[1:][pair])
@@ -108,7 +118,7 @@ class ColumnSegmentFinder:
         smooth = cv2.GaussianBlur(
             image.astype(np.float32),
             (0, 0),
-            self._settings.smoothing_px,
+            _SMOOTHING_PX,
             borderType=cv2.BORDER_REPLICATE,
         )
         slope = np.zeros_like(smooth)
@@ -131,8 +141,8 @@ class ColumnSegmentFinder:
         order = np.lexsort((shifted, labels))
         first = np.concatenate([[0], np.cumsum(width)[:-1]])
         middle = order[first + (width - 1) // 2] if len(width) else order
-        widest = np.deg2rad(self._settings.max_run_deg) / (2.0 * np.pi) * self._period
-        keep = (width >= self._settings.min_run_px) & (width <= max(widest, 1.0))
+        widest = np.deg2rad(_MAX_RUN_DEG) / (2.0 * np.pi) * self._period
+        keep = (width >= _MIN_RUN_PX) & (width <= max(widest, 1.0))
         middle, width = middle[keep], width[keep]
         sorting = np.argsort(middle)
         return middle[sorting], width[sorting]
@@ -149,8 +159,8 @@ class ColumnSegmentFinder:
             other = at[beside, np.clip(top + 2 + shift, 0, self._height + 3)]
             near = (
                 (other >= 0)
-                & (np.abs(raw.top[other] - raw.top) < self._settings.run_step_px)
-                & (np.abs(raw.bottom[other] - raw.bottom) < self._settings.run_step_px)
+                & (np.abs(raw.top[other] - raw.top) < _RUN_STEP_PX)
+                & (np.abs(raw.bottom[other] - raw.bottom) < _RUN_STEP_PX)
             )
             sources.append(np.flatnonzero(near))
             targets.append(other[near])
@@ -182,7 +192,7 @@ class ColumnSegmentFinder:
         sigma_end = settings.sigma_px * abs(self._tangent_step)
         return ColumnSegments(
             bearing=self._bearings[raw.column],
-            sigma_bearing=pixel * np.hypot(settings.sigma_px, settings.sigma_run * width),
+            sigma_bearing=pixel * np.hypot(settings.sigma_px, _SIGMA_RUN * width),
             tangents=np.column_stack([low, high]),
             sigma_tangents=np.full((len(raw), 2), sigma_end),
             descriptors=np.column_stack([-low / (high - low), colour, intensity]),

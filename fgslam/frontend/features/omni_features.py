@@ -21,6 +21,10 @@ from fgslam.frontend.features.colour_sift import (
 from fgslam.frontend.features.column_segments import ColumnSegmentFinder, empty_segments
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
 
+_MAX_VIEW_WIDTH = 2048  # of the unwrapped view, pixels
+_MAX_TANGENT = 1.0  # of the elevation, up and down, that the cylinder has
+_MAX_CYLINDER_WIDTH = 2048  # of the cylinder, pixels; less for coarser cameras
+
 
 class _View:
     """Another camera's picture of what one camera sees."""
@@ -51,9 +55,9 @@ class OmniFeatureExtractor:
         seen = self._sift_view.seen if self._sift_view else None
         self._sift = UprightSift(described, settings.sift, settings.colour, seen)
         columns = settings.columns
-        width = min(columns.max_width, round(2.0 * np.pi * resolution))
-        height = round(2.0 * columns.max_tangent * width / (2.0 * np.pi)) + 1
-        cylinder = Cylinder(width, height, -columns.max_tangent, columns.max_tangent)
+        width = min(_MAX_CYLINDER_WIDTH, round(2.0 * np.pi * resolution))
+        height = round(2.0 * _MAX_TANGENT * width / (2.0 * np.pi)) + 1
+        cylinder = Cylinder(width, height, -_MAX_TANGENT, _MAX_TANGENT)
         self._cylinder = _View(camera, cylinder)
         self._columns = ColumnSegmentFinder(cylinder, columns, settings.colour, self._cylinder.seen)
 
@@ -92,7 +96,7 @@ class OmniFeatureExtractor:
     def _view_for_sift(self, settings: OmniFeatureSettings, resolution: float) -> _View | None:
         if wrapping_period(self._camera) is not None or settings.sift.view == "raw":
             return None
-        width = min(settings.sift.max_view_width, round(2.0 * np.pi * resolution))
+        width = min(_MAX_VIEW_WIDTH, round(2.0 * np.pi * resolution))
         limits = np.deg2rad([settings.sift.max_elevation_deg, settings.sift.min_elevation_deg])
         height = round((limits[0] - limits[1]) * width / (2.0 * np.pi)) + 1
         view = Equirectangular(width, height, float(limits[0]), float(limits[1]))

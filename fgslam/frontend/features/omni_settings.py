@@ -29,21 +29,12 @@ class ColourMomentSettings:
         float,
         Field(gt=0.0, description="half side of a feature's patch, in SIFT scales; 6 is SIFT's"),
     ] = 6.0
-    mean_floor: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="grey values; means (and deviations) below it count as it, so that the "
-            "noise of dark patches is no colour",
-        ),
-    ] = 8.0
 
 
 @dataclass(frozen=True, config=STRICT)
 class UprightSiftSettings:
     """Rotation-reduced SIFT (III-A1)."""
 
-    octave_layers: Annotated[int, Field(ge=1, le=8, description="levels an octave; 3 in Lowe")] = 3
     contrast_threshold: Annotated[
         float,
         Field(
@@ -52,12 +43,6 @@ class UprightSiftSettings:
             "and wide baselines need many weak features",
         ),
     ] = 0.015
-    edge_threshold: Annotated[
-        float, Field(gt=1.0, description="ratio of principal curvatures above which edges go")
-    ] = 10.0
-    base_sigma_px: Annotated[
-        float, Field(gt=0.5, le=3.0, description="Gaussian of the first level, doubled image")
-    ] = 1.6
     max_features: Annotated[
         int, Field(ge=0, le=1_000_000, description="keep the strongest so many; 0 keeps all")
     ] = 3000
@@ -74,31 +59,15 @@ class UprightSiftSettings:
             "radius where they are, `unwrapped` works on the panorama; panoramas are as they are"
         ),
     ] = "unwrapped"
-    max_view_width: Annotated[
-        int, Field(ge=64, le=16384, description="of the unwrapped view, pixels")
-    ] = 2048
     sigma_px: Annotated[
         float, Field(gt=0.0, description="position of a feature: this, in pixels of its view")
     ] = 1.2
-    sigma_scales: Annotated[
-        float, Field(ge=0.0, description="and this many of its scales, added in quadrature")
-    ] = 0.27
 
 
 @dataclass(frozen=True, config=STRICT)
 class ColumnSegmentSettings:
     """Invariant column segments (III-A2)."""
 
-    max_width: Annotated[
-        int, Field(ge=64, le=16384, description="of the cylinder, pixels; less for coarser cameras")
-    ] = 2048
-    max_tangent: Annotated[
-        float,
-        Field(gt=0.0, le=10.0, description="of the elevation, up and down, that the cylinder has"),
-    ] = 1.0
-    smoothing_px: Annotated[
-        float, Field(gt=0.0, le=10.0, description="Gaussian before the gradient is taken")
-    ] = 1.2
     min_gradient: Annotated[
         float,
         Field(
@@ -106,36 +75,9 @@ class ColumnSegmentSettings:
             description="of the three bands together, grey values a pixel, at a segment's ends",
         ),
     ] = 4.0
-    min_length_px: Annotated[
-        float, Field(ge=2.0, description="shorter segments have no profile to tell them by")
-    ] = 8.0
-    min_length_tangent: Annotated[
-        float, Field(ge=0.0, description="nor have those that appear smaller, in tangents")
-    ] = 0.05
-    min_contrast: Annotated[
-        float,
-        Field(gt=0.0, description="standard deviation of the luminance along it, grey values"),
-    ] = 4.0
-    min_run_px: Annotated[
-        int, Field(ge=1, description="neighbouring columns that must show a segment")
-    ] = 2
-    max_run_deg: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="wider runs (a table's edge, the joint of wall and ceiling) have no "
-            "bearing of their own and are dropped",
-        ),
-    ] = 8.0
-    run_step_px: Annotated[
-        float, Field(gt=0.0, description="ends of one run shift less than this between columns")
-    ] = 1.5
     sigma_px: Annotated[
         float, Field(gt=0.0, description="position of an end, and of a run of one column")
     ] = 1.8
-    sigma_run: Annotated[
-        float, Field(ge=0.0, description="part of a run's width added to the bearing's deviation")
-    ] = 0.15
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -166,24 +108,9 @@ class OmniMatchingSettings:
             "of opposite sign, apparent sizes against elevations"
         ),
     ] = True
-    horizon_margin_deg: Annotated[
-        float,
-        Field(ge=0.0, description="elevations nearer to the horizon may have either sign"),
-    ] = 3.0
-    max_scale_ratio: Annotated[
-        float,
-        Field(
-            gt=1.0,
-            description="between the ratio of scales and that of the sines of the elevations",
-        ),
-    ] = 2.0
     column_ratio: Annotated[
         float, Field(gt=0.0, le=1.0, description="column segments: nearest over second nearest")
     ] = 0.7
-    max_column_distance: Annotated[
-        float,
-        Field(gt=0.0, description="Mahalanobis, of 11 elements; 4.4 is exceeded by 5 % if normal"),
-    ] = 4.4
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -21,6 +21,22 @@ from fgslam.frontend.homing.reference_patches import ReferencePatches, align, an
 from fgslam.frontend.homing.stabilised_view import StabilisedImage, StabilisedView
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 
+_SIGMA_DEFORMED_PX = 1.0
+"""Pixels of sigma for each unit of a patch's deformation, added in squares: measured on the
+rendered house."""
+
+_MAX_DEFORMATION = 1.0
+"""A point whose patch is stretched and sheared by more (Frobenius norm of the affine map less one)
+is lost."""
+
+_PATCH_DEFORMATION = 0.05  # sigma of its stretching and shearing from image to image
+PATCH_PX = 13  # side of the patch that holds a point in place
+MIN_EIGENVALUE = 1e-4  # smaller eigenvalue of eq. 2 over the window, a pixel, grey values 0 to 1
+_MAX_BACK_PX = 1.0  # a point tracked back that misses its origin by more is lost
+_PRECISION_PX = 0.03  # a smaller step ends the iteration
+_ITERATIONS = 15  # of Newton's method on each level
+_PYRAMID_LEVELS = 2  # halvings of the view above the view itself
+
 Float32 = npt.NDArray[np.float32]
 
 _GAIN = (0.2, 5.0)  # from one exposure to the next
@@ -53,7 +69,7 @@ class BearingTracker:
     def __init__(self, camera: OmniCamera, settings: OmniTrackingSettings) -> None:
         self._settings = settings
         self.stabilised = StabilisedView(
-            camera, settings.max_view_width, settings.window_px, settings.pyramid_levels
+            camera, settings.max_view_width, settings.window_px, _PYRAMID_LEVELS
         )
         self._last: StabilisedImage | None = None
         self._places: FloatArray = np.empty((0, 2))
@@ -134,7 +150,7 @@ class BearingTracker:
 
     def _anchored(self, image: StabilisedImage, places: FloatArray) -> ReferencePatches:
         s = self._settings
-        return anchor(image.grey, places, s.patch_px, s.patch_noise_grey, s.patch_deformation)
+        return anchor(image.grey, places, PATCH_PX, s.patch_noise_grey, _PATCH_DEFORMATION)
 
     def _settle(
         self, now: StabilisedImage, places: FloatArray, ids: IntArray, patches: ReferencePatches
@@ -142,7 +158,7 @@ class BearingTracker:
         """Aligns each point with its first patch, and keeps those that look like it."""
         patches, places, correlation = align(patches, now.grey, places)
         s = self._settings
-        kept = (correlation >= s.min_correlation) & (patches.deformation() <= s.max_deformation)
+        kept = (correlation >= s.min_correlation) & (patches.deformation() <= _MAX_DEFORMATION)
         kept &= self._inside(places)
         self._places, self._ids = self._centred(places[kept]), ids[kept]
         self._patches = patches.select(kept)
@@ -160,21 +176,21 @@ class BearingTracker:
         origin = self._places.astype(np.float32)
         window = (s.window_px, s.window_px)
         kinds = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT
-        criteria = (kinds, s.iterations, s.precision_px)
+        criteria = (kinds, _ITERATIONS, _PRECISION_PX)
         start = np.empty_like(origin)  # not read without the flag
         alike = _in_light_of(before.grey, now.grey)
         found, good, _ = cv2.calcOpticalFlowPyrLK(
             before.grey, alike, origin, start, None, None,
-            window, s.pyramid_levels, criteria, 0, s.min_eigenvalue,
+            window, _PYRAMID_LEVELS, criteria, 0, MIN_EIGENVALUE,
         )  # fmt: skip
         # The way back starts at its end, so that the finest level alone does: it costs a third.
         back, good_back, _ = cv2.calcOpticalFlowPyrLK(
             alike, before.grey, found, origin.copy(), None, None,
-            window, 0, criteria, cv2.OPTFLOW_USE_INITIAL_FLOW, s.min_eigenvalue,
+            window, 0, criteria, cv2.OPTFLOW_USE_INITIAL_FLOW, MIN_EIGENVALUE,
         )  # fmt: skip
         ends = np.asarray(found, np.float32)
         missed = np.hypot(*(np.asarray(back, np.float32) - origin).T)
-        kept = np.asarray((good[:, 0] == 1) & (good_back[:, 0] == 1) & (missed <= s.max_back_px))
+        kept = np.asarray((good[:, 0] == 1) & (good_back[:, 0] == 1) & (missed <= _MAX_BACK_PX))
         kept &= self._inside(ends)
         return ends.astype(np.float64), kept
 
@@ -191,7 +207,7 @@ class BearingTracker:
         a_column = 2.0 * np.pi / self.stabilised.period
         a_row = (view.top_elevation - view.bottom_elevation) / (view.height - 1)
         deformation = np.empty(0) if self._patches is None else self._patches.deformation()
-        sigma = np.hypot(s.sigma_px, s.sigma_deformed_px * deformation)
+        sigma = np.hypot(s.sigma_px, _SIGMA_DEFORMED_PX * deformation)
         return TrackedBearings(
             time=time,
             ids=self._ids.copy(),

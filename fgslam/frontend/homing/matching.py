@@ -25,6 +25,10 @@ from fgslam.core.homing import (
 from fgslam.frontend.features.column_whitening import whitened
 from fgslam.frontend.features.omni_settings import OmniMatchingSettings
 
+_MAX_COLUMN_DISTANCE = 4.4  # Mahalanobis, of 11 elements; 4.4 is exceeded by 5 % if normal
+_MAX_SCALE_RATIO = 2.0  # factor between the ratio of scales and that of the sines of the elevations
+_HORIZON_MARGIN_DEG = 3.0  # elevations nearer to the horizon may have either sign
+
 Float32Array = npt.NDArray[np.float32]
 
 
@@ -87,10 +91,10 @@ def _forbid_impossible(
     squared: Float32Array, a: UprightFeatures, b: UprightFeatures, settings: OmniMatchingSettings
 ) -> None:
     """Sets distances of candidates to infinity that no planar motion explains."""
-    margin = np.deg2rad(settings.horizon_margin_deg)
+    margin = np.deg2rad(_HORIZON_MARGIN_DEG)
     side_a, side_b = _side(a.elevation, margin), _side(b.elevation, margin)
     apart = _height_in_sizes(a, margin)[:, None] - _height_in_sizes(b, margin)
-    impossible = np.abs(apart, out=apart) > np.float32(np.log(settings.max_scale_ratio))
+    impossible = np.abs(apart, out=apart) > np.float32(np.log(_MAX_SCALE_RATIO))
     # Near the horizon in both views the elevations tell nothing about the sizes.
     impossible &= (side_a != 0)[:, None] | (side_b != 0)
     impossible |= side_a[:, None] * side_b < 0
@@ -155,7 +159,7 @@ def match_columns(
     if len(a) < 2 or len(b) < 2:
         return _column_matches(a, b, none, none, np.zeros(0))
     i, j, distance, ratio = nearest_segments(whitened(a.descriptors), whitened(b.descriptors))
-    keep = (ratio < settings.column_ratio) & (distance < settings.max_column_distance)
+    keep = (ratio < settings.column_ratio) & (distance < _MAX_COLUMN_DISTANCE)
     return _column_matches(a, b, i[keep], j[keep], 1.0 - ratio[keep])
 
 

@@ -26,6 +26,9 @@ from fgslam.frontend.homing.refinement import HomingRefinement, Refined, Refinem
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_point import TwoPointSamples, solve_two_point
 
+_LEAST_PARALLAX_DEG = 3.0  # of two rays; below, the signs of the distances are noise
+
+_INLIER_SIGMAS = 3.0  # normalised epipolar residual; right matches exceed it in 0.3 %
 _BATCH = 50  # samples between two looks at the confidence
 _MAX_LOG_RATIO_SIGMA = 0.7  # of ln rho: matches near the horizon support, but are not sampled
 _SHUFFLES = 10  # times the matches are paired wrongly to learn what chance supports
@@ -90,13 +93,13 @@ class _Search:
         self._matches = matches
         self._settings = settings
         self._rng = rng
-        self._least_parallax = np.deg2rad(settings.least_parallax_deg)
+        self._least_parallax = np.deg2rad(_LEAST_PARALLAX_DEG)
         tilt = np.deg2rad(settings.tilt_sigma_deg)
         self._test = EpipolarTest.of(matches, tilt)
         self._refinement = HomingRefinement(
             matches,
             RefinementPrior(tilt, settings.height_sigma),
-            settings.inlier_sigmas,
+            _INLIER_SIGMAS,
             self._least_parallax,
         )
         self._cells = _cells(matches)
@@ -151,14 +154,14 @@ class _Search:
         )
         direction, rotation = solved.direction[solved.valid], solved.rotation[solved.valid]
         inliers, residuals = self._test.inliers(
-            direction, rotation, self._settings.inlier_sigmas, self._least_parallax
+            direction, rotation, _INLIER_SIGMAS, self._least_parallax
         )
         share = self._right @ inliers / np.sum(self._right)
         return np.stack([direction, rotation, share, self._score(inliers, residuals)])
 
     def _score(self, inliers: BoolArray, residuals: FloatArray) -> FloatArray:
         """(c,) log-likelihoods of hypotheses, up to a constant, of (n, c) residuals."""
-        gains = gain(residuals, self._settings.inlier_sigmas, COMMON_CHANCE)
+        gains = gain(residuals, _INLIER_SIGMAS, COMMON_CHANCE)
         odds = (self._right / (1.0 - self._right))[:, None]
         return np.asarray(np.sum(np.where(inliers, np.log1p(odds * gains), 0.0), axis=0))
 
@@ -278,7 +281,7 @@ class _Search:
         How often a wrong match agrees with this hypothesis is read off wrong matches: the same
         features paired by lot (an *a contrario* test, Moisan and Stival 2004).
         """
-        n, sigmas = len(self._matches), self._settings.inlier_sigmas
+        n, sigmas = len(self._matches), _INLIER_SIGMAS
         shuffled = np.concatenate([self._rng.permutation(n) for _ in range(_SHUFFLES)])
         every = np.tile(np.arange(n), _SHUFFLES)
         wrong = EpipolarTest.of(paired_anew(self._matches, every, shuffled), self._tilt)

@@ -25,17 +25,6 @@ class HomingVectorSettings:
             description="stop earlier once a better answer is this unlikely to have been missed",
         ),
     ] = 0.999
-    inlier_sigmas: Annotated[
-        float,
-        Field(gt=0.0, description="normalised epipolar residual of an inlier (2.5 to 3)"),
-    ] = 3.0
-    least_parallax_deg: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="of two rays; the distances' signs are tested above it only (3)",
-        ),
-    ] = 3.0
     tilt_sigma_deg: Annotated[
         float,
         Field(

@@ -17,7 +17,17 @@ from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.homing import BearingMatches, FeatureKind, OmniFeatures
 from fgslam.core.planar import wrap
+from fgslam.frontend.homing.bearing_tracking import MIN_EIGENVALUE, PATCH_PX
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
+
+DISTINCT_PX = 3.0  # of two trackable points nearer than this one is kept
+_PLANE_ERROR = 0.2
+"""Part of the offset from the feature's centre by which its place in the target view is uncertain:
+features are not flat, nor seen head on."""
+
+_SEARCH_PX = 3.0
+"""The best trackable point is sought within the feature's scale, at least this far from its centre
+and at most three times as far."""
 
 
 def move_to_trackable(
@@ -46,10 +56,10 @@ def move_to_trackable(
     centres = _in_view(matches, view)
     strength = _strength(grey, settings.window_px)
     points, strongest = _best_near(strength, centres, radius)
-    rim = max(settings.window_px, settings.patch_px) / 2.0
-    good = (strongest >= settings.min_eigenvalue) & (points[:, 1] >= rim)
+    rim = max(settings.window_px, PATCH_PX) / 2.0
+    good = (strongest >= MIN_EIGENVALUE) & (points[:, 1] >= rim)
     good &= points[:, 1] <= view.height - 1 - rim
-    good &= _distinct(points, strongest, settings.distinct_px)
+    good &= _distinct(points, strongest, DISTINCT_PX)
     rows = np.flatnonzero(good)
     ratio = _scale_ratio(matches, *features)
     moved = _moved(matches, points - centres, ratio, view, settings)
@@ -67,7 +77,7 @@ def _search_radius(
     size = np.zeros(len(matches))
     sift = matches.kind == int(FeatureKind.SIFT)
     size[sift] = features.sift.scale[matches.index_a[sift]] * a_radian
-    return np.clip(size, settings.search_px, 3.0 * settings.search_px)
+    return np.clip(size, _SEARCH_PX, 3.0 * _SEARCH_PX)
 
 
 def _in_view(matches: BearingMatches, view: Equirectangular) -> FloatArray:
@@ -141,7 +151,7 @@ def _moved(
     left, up = -offset[:, 0] * a_column, -offset[:, 1] * a_row
     # The point is a pixel of the start image, known as well as a track; in the target it has the
     # feature's own uncertainty, and that of its offset.
-    off_plane = settings.plane_error * ratio * np.hypot(left, up)
+    off_plane = _PLANE_ERROR * ratio * np.hypot(left, up)
     sigma = matches.sigma.copy()
     sigma[:, 0], sigma[:, 1] = settings.sigma_px * a_column, settings.sigma_px * a_row
     sigma[:, 2:] = np.hypot(sigma[:, 2:], off_plane[:, None])

@@ -11,6 +11,7 @@ from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.homing import TrackedBearings
 from fgslam.frontend.homing.bearing_tracking import BearingTracker, TrackerState
+from fgslam.frontend.homing.trackable_points import DISTINCT_PX
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 
 
@@ -113,7 +114,7 @@ class ReplenishedTracker:
         if wanted <= 0:
             return np.empty((0, 2))
         found = cv2.goodFeaturesToTrack(
-            grey, wanted, 0.005, max(s.distinct_px, s.window_px / 3.0), mask=mask,
+            grey, wanted, 0.005, max(DISTINCT_PX, s.window_px / 3.0), mask=mask,
             blockSize=s.window_px,
         )  # fmt: skip
         return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import to_robot, wrap
@@ -34,9 +35,9 @@ def scan_from(pose: FloatArray, points: FloatArray) -> RangeScan:
     return RangeScan(BEAMS, ranges)
 
 
-def drive(escape_after: int) -> FloatArray:
+def drive() -> FloatArray:
     """(k, 2) places while homing points east, through the pocket's end, for 40 s."""
-    avoider = CorridorAvoidance(AvoidanceSettings(escape_after=escape_after))
+    avoider = CorridorAvoidance(AvoidanceSettings())
     pose, places = np.array([0.4, 0.0, 0.0]), []
     for _ in range(400):
         heading = float(wrap(np.arctan2(-pose[1], 5.0 - pose[0]) - pose[2]))
@@ -50,12 +51,13 @@ def drive(escape_after: int) -> FloatArray:
 
 
 def test_held_up_robot_leaves_the_pocket_and_touches_nothing() -> None:
-    places = drive(escape_after=20)
+    places = drive()
     assert np.min(places[:, 0]) < -0.3
     nearest = np.hypot(*(places[:, None] - dead_end()).transpose(2, 0, 1)).min(axis=1)
     assert np.min(nearest) > 0.35
 
 
-def test_without_a_way_out_it_stays() -> None:
-    places = drive(escape_after=10_000)
+def test_robot_that_does_not_escape_stays_in_the_pocket(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fgslam.homing.avoidance._ESCAPE_AFTER", 10_000)
+    places = drive()
     assert np.min(places[:, 0]) > 0.0

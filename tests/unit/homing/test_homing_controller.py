@@ -29,10 +29,10 @@ from fgslam.core.homing import (
     TwoViewVector,
 )
 from fgslam.core.planar import bearings, between, unit, wrap
-from fgslam.homing.active_homing import ActiveHoming
+from fgslam.homing.active_homing import _MAX_ACROSS, ActiveHoming
 from fgslam.homing.bearing_consistency import parallax
 from fgslam.homing.command import Command, HomingState
-from fgslam.homing.controller import HomingController
+from fgslam.homing.controller import _FARTHER_S, HomingController
 from fgslam.homing.front_end import Sighting
 from fgslam.homing.settings import HomingControlSettings
 from tests.homing import make_matches
@@ -277,7 +277,7 @@ def test_uncertain_estimate_is_matched_anew() -> None:
     b = bench(vector_to(0.0))
     b.step()
     b.step()
-    b.estimators[-1].sigma = SETTINGS.max_across
+    b.estimators[-1].sigma = _MAX_ACROSS
     command = b.step(SETTINGS.retry_s)
     assert "uncertain" in command.reason
     assert b.controller.initialisations == 2
@@ -476,7 +476,7 @@ def test_search_is_bounded() -> None:
     states = [b.step().state for _ in range(400)]
     assert states[-1] is HomingState.REFUSED
     driven = 0.1 * states.count(HomingState.SEARCH)
-    assert driven == pytest.approx(SETTINGS.farther_tries * SETTINGS.farther_s, abs=0.5)
+    assert driven == pytest.approx(SETTINGS.farther_tries * _FARTHER_S, abs=0.5)
     begun = [now for was, now in itertools.pairwise(states) if now is not was]
     assert begun.count(HomingState.SEARCH) == SETTINGS.farther_tries
 

@@ -18,7 +18,13 @@ from fgslam.homing.avoidance import (
 )
 from fgslam.homing.command import Command, Drive, HomingState
 from fgslam.homing.settings import AvoidanceSettings, HomingBehaviourSettings, SteeringSettings
-from fgslam.homing.steering import Steering
+from fgslam.homing.steering import (
+    _BLIND_SHARE,
+    _PASSING_SHARE,
+    _SLOW_FRACTION,
+    _TURN_IN_PLACE_DEG,
+    Steering,
+)
 from tests.landmark_world import drive_path, ray_ranges, winding_path
 
 SETTINGS = SteeringSettings()
@@ -55,7 +61,7 @@ def test_limits_hold_whatever_is_asked() -> None:
 def test_turns_on_the_spot_until_half_way_round() -> None:
     """Two thresholds, so that noise around one does not switch."""
     steering = Steering(SETTINGS)
-    limit = np.deg2rad(SETTINGS.turn_in_place_deg)
+    limit = np.deg2rad(_TURN_IN_PLACE_DEG)
     assert settled(steering, command(1.01 * limit)).speed == 0.0
     assert settled(steering, command(0.9 * limit)).speed == 0.0
     assert settled(steering, command(0.49 * limit)).speed > 0.0
@@ -64,11 +70,11 @@ def test_turns_on_the_spot_until_half_way_round() -> None:
 
 def test_slows_down_at_the_last_target_most() -> None:
     """Half the slow part left: half the speed at the last target, more at one on the way."""
-    near = 0.5 * SETTINGS.slow_fraction
+    near = 0.5 * _SLOW_FRACTION
     last = settled(Steering(SETTINGS), command(0.0, near)).speed
     between = settled(Steering(SETTINGS), command(0.0, near, final=False)).speed
     assert last == pytest.approx(0.5 * SETTINGS.max_speed_mps)
-    assert between == pytest.approx(SETTINGS.passing_share * SETTINGS.max_speed_mps)
+    assert between == pytest.approx(_PASSING_SHARE * SETTINGS.max_speed_mps)
     assert settled(Steering(SETTINGS), command(0.0, 0.0)).speed > 0.0
 
 
@@ -80,7 +86,7 @@ def test_stops_when_told() -> None:
     assert settled(steering, stop) == Drive(0.0, 0.0)
     for state in (HomingState.BLIND, HomingState.SEARCH):
         slow = settled(steering, command(state=state))
-        assert slow.speed == pytest.approx(SETTINGS.blind_share * SETTINGS.max_speed_mps)
+        assert slow.speed == pytest.approx(_BLIND_SHARE * SETTINGS.max_speed_mps)
 
 
 def test_home_behind_is_turned_to_one_way_round() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -97,8 +95,9 @@ def test_walk_vouches_for_a_few_steps_but_not_across_a_gap() -> None:
         assert (short not in views.confirmed()[2]) is believed
 
 
-def test_map_of_a_walk_has_confirmed_far_links_only() -> None:
+def test_map_of_a_walk_has_confirmed_far_links_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few inliers are enough where third views confirm them; many do not help where they do not."""
+    monkeypatch.setattr("fgslam.homing.link_consistency._LONE_SUPPORT", THINGS + 1)
 
     def built(seed: int | None) -> TopologicalMap:
         walk = [(k, k + 1) for k in range(COUNT - 1)]
@@ -111,9 +110,8 @@ def test_map_of_a_walk_has_confirmed_far_links_only() -> None:
             for a, b in pairs
         }
         rows = rows_of(walk) | rows_of(NEIGHBOURS, seed)
-        settings = dataclasses.replace(SETTINGS, lone_support=THINGS + 1)
         images = [view()] * COUNT
-        return map_of_answers(images, answers, settings, ordered=True, rows=rows)
+        return map_of_answers(images, answers, SETTINGS, ordered=True, rows=rows)
 
     true, false = built(None), built(0)
     assert FAR in {(k.a, k.b) for k in true.links}

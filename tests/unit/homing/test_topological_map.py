@@ -15,8 +15,13 @@ from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVect
 from fgslam.core.planar import between, wrap
 from fgslam.frontend.homing.ransac import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.homing.link_consistency import LinkConsistency, between_misfit, heading_residuals
-from fgslam.homing.links import Answer, Link, link_pair
+from fgslam.homing.link_consistency import (
+    _LONE_SUPPORT,
+    LinkConsistency,
+    between_misfit,
+    heading_residuals,
+)
+from fgslam.homing.links import _MUTUAL_DEG, _ONE_WAY_SUPPORT, Answer, Link, link_pair
 from fgslam.homing.localisation import Localiser
 from fgslam.homing.retrieval import VisualWords, candidate_pairs
 from fgslam.homing.settings import LocalisationSettings, RetrievalSettings, TopologicalMapSettings
@@ -81,7 +86,7 @@ def test_answers_that_disagree_are_no_link() -> None:
     a, b = random_poses(1, 2)
     there, back = true_vector(a, b), true_vector(b, a)
     assert isinstance(link_pair((0, 1), there, back, SETTINGS), Link)
-    off = np.deg2rad(SETTINGS.mutual_deg + 1.0)
+    off = np.deg2rad(_MUTUAL_DEG + 1.0)
     for wrong in (
         vector(back.direction, back.rotation + off),
         vector(back.direction + off, back.rotation),
@@ -103,7 +108,7 @@ def test_ambiguous_in_one_direction_is_decided_by_the_other() -> None:
     assert isinstance(other, Link)
     gap = [one.direction - other.direction, one.rotation - other.rotation, one.back - other.back]
     assert np.abs(wrap(np.array(gap))).max() < 1e-12
-    few = true_vector(a, b, SETTINGS.one_way_support - 1)
+    few = true_vector(a, b, _ONE_WAY_SUPPORT - 1)
     assert "one way" in str(link_pair((0, 1), few, unsure, SETTINGS))
 
 
@@ -163,7 +168,7 @@ def test_long_link_between_lookalikes_needs_a_witness() -> None:
     """A chain of places in order, and a link from one end to the other that nothing confirms."""
     poses = np.column_stack([np.arange(8.0), np.zeros(8), np.zeros(8)])
     chain = [true_link(poses, k, k + 1, 20) for k in range(7)]
-    long = turned(true_link(poses, 1, 6, SETTINGS.lone_support - 1), 0.0, 1.0)
+    long = turned(true_link(poses, 1, 6, _LONE_SUPPORT - 1), 0.0, 1.0)
     believed, rejected = LinkConsistency(8, [*chain, long], SETTINGS).believed(ordered=True)
     assert [(k.a, k.b) for k in believed] == [(k, k + 1) for k in range(7)]
     assert "no third image" in rejected[1, 6]
@@ -274,7 +279,7 @@ def test_routes_that_are_none_are_told() -> None:
     _, images = hall()
     poses = hall()[0]
     answers: dict[tuple[int, int], Answer] = {
-        pair: true_vector(poses[pair[0]], poses[pair[1]], SETTINGS.lone_support)
+        pair: true_vector(poses[pair[0]], poses[pair[1]], _LONE_SUPPORT)
         for pair in ((0, 1), (1, 0), (2, 3), (3, 2), (4, 5))
     }
     topology = map_of_answers(images[:6], answers, SETTINGS)

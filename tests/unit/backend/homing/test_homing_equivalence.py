@@ -15,6 +15,7 @@ from homings import Trial, trial
 
 from fgslam.backend.homing.ekf import HomingEkf, updated
 from fgslam.backend.homing.ekf_model import (
+    _INITIAL_SPEED,
     FilterState,
     initial_state,
     motion,
@@ -129,7 +130,7 @@ def run_both(
         identity: np.arange(2) if joint else free_rows(state, k, exact=True)
         for k, identity in enumerate(state.ids.tolist())
     }
-    speed = settings.motion.initial_speed
+    speed = _INITIAL_SPEED
     linear.add({robot(0): np.eye(1)}, np.zeros(1), speed)
     time = case.start.time
     for k, image in enumerate(case.tracks):

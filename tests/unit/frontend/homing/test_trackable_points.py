@@ -16,7 +16,7 @@ from fgslam.core.homing import (
 from fgslam.core.planar import wrap
 from fgslam.frontend.features.colour_sift import empty_features
 from fgslam.frontend.features.column_segments import empty_segments
-from fgslam.frontend.homing.trackable_points import move_to_trackable
+from fgslam.frontend.homing.trackable_points import DISTINCT_PX, move_to_trackable
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from tests.homing import make_matches
 from tests.textured_room import CAMERA, angles, hits, picture
@@ -140,7 +140,7 @@ def test_features_with_the_same_point_give_it_once() -> None:
     rows, pixels, _ = move_to_trackable(view_of(START), CAMERA, matches, features, SETTINGS)
     apart = np.hypot(*(pixels[:, None] - pixels[None]).transpose(2, 0, 1))
     apart[np.diag_indices(len(apart))] = np.inf
-    assert apart.min() >= SETTINGS.distinct_px
+    assert apart.min() >= DISTINCT_PX
     assert (rows % 2 == 0).all()  # of equals the first
 
 
