@@ -21,7 +21,7 @@ def estimator_kinds() -> tuple[str, ...]:
 
 
 def is_settings(value: object) -> TypeGuard[EstimatorSettings]:
-    """Whether this describes an estimator of this package."""
+    """True if the value is the settings of an estimator of this package."""
     return isinstance(value, _classes())
 
 

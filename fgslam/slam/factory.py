@@ -1,4 +1,4 @@
-"""Builds the parts of a run from its configuration; the only place where kinds are told apart.
+"""Builds the parts of a session from settings; the only place that distinguishes kinds.
 
 An estimator is imported when its kind is made: a filter needs no solver of graphs.
 """
@@ -56,12 +56,12 @@ def make_stream(sequence: Sequence, settings: FrontendSettings) -> FeatureStream
 
 
 def make_extractor(settings: FrontendSettings) -> FeatureExtractor:
-    """What finds the features of an image."""
+    """Feature extractor by the settings: SIFT."""
     return SiftExtractor(settings.sift, settings.appearance.mode).extract
 
 
 def make_stereo_matcher(rig: CameraRig, settings: FrontendSettings) -> StereoMatcher:
-    """What matches features over the rig."""
+    """Stereo matcher of the rig."""
     return StereoMatcher(rig, settings.stereo, settings.appearance)
 
 
@@ -74,7 +74,7 @@ def make_tracker(rig: CameraRig, settings: FrontendSettings) -> LandmarkTracker:
 
 
 def make_motion(rig: CameraRig, settings: OdometrySettings) -> MotionModel:
-    """What predicts the camera's motion."""
+    """Motion model by the settings."""
     if isinstance(settings, ConstantVelocitySettings):
         return ConstantVelocityMotion(settings)
     gap = settings.gap if isinstance(settings, RecordedOdometrySettings) else None
@@ -167,7 +167,7 @@ def make_pipeline(
     seed: int = 0,
     arrival: Arrival | None = None,
 ) -> SlamPipeline:
-    """The whole system for one rig.
+    """All parts of a session for one rig.
 
     Args:
         rig: the rectified cameras.
@@ -199,7 +199,7 @@ def make_pipeline(
 def make_places(
     rig: CameraRig, settings: FrontendSettings, tracker: LandmarkTracker, seed: int
 ) -> PlaceRecognition | None:
-    """What looks for returns and finds the lost camera; None where neither is wanted."""
+    """Place recognition: loop closures and relocalisation; None where neither is wanted."""
     if settings.loops is None and settings.lost is None:
         return None
     from fgslam.frontend.places.loops.recognition import PlaceRecognition, RecognitionParts
@@ -215,7 +215,7 @@ def make_places(
 
 
 def make_relocaliser(rig: CameraRig, settings: FrontendSettings) -> Relocaliser:
-    """What finds a frame in a map without a prior, for the poses that the ego-motion allows."""
+    """Relocaliser without a prior, for the poses that the ego-motion allows."""
     from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 
     floor = Floor.under(rig, settings.ego_motion.dof)

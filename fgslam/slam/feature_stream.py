@@ -139,7 +139,7 @@ def _timed(extract: FeatureExtractor, image: Image) -> tuple[Features, float]:
 
 
 def _checked(found: Features) -> Features:
-    """What an extractor gave, if everything later can use it; raises ConfigError."""
+    """Features of an extractor, checked for form; raises ConfigError."""
     if not isinstance(found, Features):
         raise ConfigError(
             f"features: the extractor returned {type(found).__name__}; return fgslam.Features"

@@ -1,4 +1,4 @@
-"""What users hand to a session, checked before it touches any state."""
+"""Input of a session, checked before it touches any state."""
 
 from __future__ import annotations
 

@@ -83,5 +83,5 @@ class MapSettings:
 
     @property
     def given(self) -> bool:
-        """Whether the run goes on with a map."""
+        """True if the run continues with a map."""
         return self.load is not None or self.made_from is not None

@@ -1,4 +1,4 @@
-"""The map of a session as one that outlives it."""
+"""Saved map of a session."""
 
 from __future__ import annotations
 

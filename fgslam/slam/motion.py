@@ -1,4 +1,4 @@
-"""What predicts the camera's motion between frames: recorded odometry, or constant velocity."""
+"""Motion models: odometry moved to the camera, or constant velocity."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class MotionModel(Protocol):
 
     @property
     def uses_odometry(self) -> bool:
-        """Whether the body's odometry is of any use to it."""
+        """True if it uses the odometry of the body."""
         ...
 
     def between(self, timestamp: float, body: Odometry | None) -> Odometry | None:
@@ -76,7 +76,7 @@ class OdometryMotion:
         return odometry_of_camera(body, self._bTc)
 
     def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
-        """Keeps the stand-in's velocity fresh."""
+        """Updates the velocity of the stand-in."""
         self._stand_in.observe(timestamp, wTc, measured)
 
     def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
@@ -88,11 +88,11 @@ class OdometryMotion:
         return {"kind": self._kind, "stand_in": self._stand_in.description()}
 
     def state(self) -> StateArrays:
-        """The stand-in's."""
+        """State of the stand-in."""
         return self._stand_in.state()
 
     def restore(self, state: StateArrays) -> None:
-        """The stand-in's."""
+        """State of the stand-in."""
         self._stand_in.restore(state)
 
 
@@ -120,7 +120,7 @@ class ConstantVelocityMotion:
         self._velocity: FloatArray | None = None
 
     def between(self, timestamp: float, body: Odometry | None = None) -> Odometry | None:
-        """The last velocity over the new interval ``dt``; ``body`` has no say in it.
+        """Motion at the last velocity over the new interval ``dt``; ``body`` is not used.
 
         The velocity has wandered by ``sigma * T`` over the time T since it was last measured, so
         the step's standard deviation is ``sigma * T * dt``: ``sigma * dt^2`` from frame to frame,

@@ -1,4 +1,4 @@
-"""The SLAM loop (Se et al. 4): predict, match, ego-motion, update, upkeep of the database.
+"""The SLAM loop (Se et al. 4): predict, match, ego-motion, update, database maintenance.
 
 The same ego-motion serves a live run and the replay of its log, against each estimator's own map.
 """
@@ -60,7 +60,7 @@ class Stopwatch:
         self._last = time.perf_counter()
 
     def lap(self, stage: str) -> None:
-        """Books the time since the last lap to ``stage``, beside what it has."""
+        """Adds the time since the last lap to ``stage``."""
         now = time.perf_counter()
         self.ms[stage] = self.ms.get(stage, 0.0) + 1e3 * (now - self._last)
         self._last = now
@@ -86,7 +86,7 @@ class SlamPipeline:
     def process(
         self, found: FeatureFrame, index: int, timestamp: float, body: Odometry | None = None
     ) -> FrameReport:
-        """One frame: Sections 2 to 4 of the paper in their order, then what 7 leaves to do.
+        """Processes one frame: Sections 2 to 4 of the paper in order, then loops (its section 7).
 
         Args:
             found: the frame with its features.
@@ -118,7 +118,7 @@ class SlamPipeline:
     def _fused(self) -> tuple[LandmarkMap, IntArray]:
         """The map to track on, and which landmarks a loop closed in the last frame ends.
 
-        The estimator drops these with this frame's measurements, as the log tells it.
+        The estimator drops these with this frame's measurements, as the log records it.
         """
         landmarks = self.estimator.landmarks()
         ended = np.empty(0, np.int64) if self.places is None else self.places.fuse(landmarks)
@@ -247,7 +247,7 @@ def _relocated(
 def _observe(
     motion: MotionModel, increment: Increment, tracking: EgoMotion, stats: UpdateStats
 ) -> None:
-    """Tells the motion model the pose; what a loop or a relocalisation moved it by is no motion."""
+    """Hands the pose to the motion model; a jump by loop or relocalisation is no motion."""
     if any(stats.closed) or increment.relocalised:
         motion.displaced(increment.timestamp, stats.wTc, increment.relocalised)
     else:
@@ -255,7 +255,7 @@ def _observe(
 
 
 def _anchored(increment: Increment, tracking: EgoMotion, stats: UpdateStats) -> bool:
-    """Whether odometry or the map had a say in the pose, or the frame founds the map."""
+    """True if odometry or the map determined the pose, or the frame starts the map."""
     founding = stats.landmarks > 0 and stats.landmarks == int(increment.observations.is_new.sum())
     odometry = increment.odometry
     known = odometry is not None and odometry.measured

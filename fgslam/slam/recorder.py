@@ -1,4 +1,4 @@
-"""Keeps what a run computes, frame by frame: the log, online poses, counts and times."""
+"""Record of a session, frame by frame: measurement log, online poses, counts and times."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class FrameRow(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class RunRecorder:
-    """Everything of a run that outputs need, besides the estimator's answer."""
+    """Record of all frames, besides the estimator's result."""
 
     log: MeasurementLog
     rows: list[FrameRow] = field(default_factory=list)
@@ -47,7 +47,7 @@ class RunRecorder:
         return len(self.rows)
 
     def add(self, report: FrameReport, wait_ms: float, stereo_precision: float) -> None:
-        """Books one frame."""
+        """Appends one frame."""
         self.log.append(report.increment)
         self.rows.append(_row(report, stereo_precision))
         self.tracked_poses.append(report.tracking.wTc)

@@ -60,7 +60,7 @@ class ReplayRow(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Replay(Brief):
-    """What an estimator made of a log.
+    """Result of an estimator on a replayed log.
 
     Attributes:
         title: the estimator's name in tables and folders.
@@ -111,7 +111,7 @@ def replay(
         log: the measurements; not changed.
         settings: of the estimator; or a new one, at its prior pose.
         ego_motion: of the least squares that finds each frame's pose against the estimator's map.
-        progress: told frames done and of how many.
+        progress: called with frames done, and of how many.
         arrival: where the run began in a saved map; None began with an empty one.
     """
     before_mb = memory_mb("VmRSS")
@@ -194,7 +194,7 @@ def _require_support(estimator: Estimator, log: MeasurementLog) -> None:
 
 
 class _Replaying:
-    """What has been computed so far."""
+    """Collects the frames of a replay."""
 
     def __init__(self, log: MeasurementLog, settings: EstimatorSettings | Estimator) -> None:
         self._log = log

@@ -19,7 +19,7 @@ from fgslam.slam.recorder import STAGES, RunRecorder
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Step(Brief):
-    """One frame tracked.
+    """Pose of one tracked frame, and what was matched in it.
 
     Attributes:
         index: number of the frame in the session, from 0.
@@ -50,7 +50,7 @@ class Step(Brief):
 
     @staticmethod
     def of(report: FrameReport) -> Step:
-        """What a user wants to know of a frame's report."""
+        """Step of a frame's report."""
         increment, stats = report.increment, report.stats
         seen = increment.observations
         return Step(

@@ -151,7 +151,7 @@ class Session:
             body: odometry of the body, checked.
             index: number of the frame in its recording, for the log; None: by ``numbering``.
             wait_ms: time that the loop waited for this frame, for the record.
-            precision_of: fraction of right stereo matches, where truth tells it, for the record.
+            precision_of: fraction of right stereo matches, where truth is known.
         """
         self._require_open()
         first, stride = self.numbering

@@ -1,1 +1,1 @@
-"""Matching over two and three cameras."""
+"""Stereo matching over two and three cameras."""

@@ -27,7 +27,7 @@ from fgslam.frontend.tracking.visibility import (
 
 
 class LandmarkDatabase(LandmarkTable):
-    """The table as the frames change it: hits n, misses m, consecutive misses l."""
+    """Landmark table updated frame by frame: hits n, misses m, consecutive misses l."""
 
     def __init__(self, rig: CameraRig, settings: DatabaseSettings, max_disparity_px: float) -> None:
         """Starts empty (4.2); landmarks of more than ``max_disparity_px`` are not expected."""
@@ -118,7 +118,7 @@ class LandmarkDatabase(LandmarkTable):
         rejected: IntArray,
         seen: FloatArray,
     ) -> None:
-        """What a located frame says against permanent landmarks: too often, and one is demoted.
+        """Counts contradictions of permanent landmarks by a located frame; too many demote one.
 
         It contradicts those missing whose match was rejected as an outlier, and those whose place
         it sees past (``permanence.seen_past``). What hides them says nothing.
@@ -182,7 +182,7 @@ class LandmarkDatabase(LandmarkTable):
     # ----------------------------------------------------------------------------------------
 
     def _larger_than(self, least: float, ids: IntArray) -> Wanted:
-        """Says which landmarks of a map, by their rows and depths, look at least that large."""
+        """Predicate on landmarks, by rows and depths: expected scale at least that large."""
 
         def wanted(rows: IntArray, depth: FloatArray) -> BoolArray:
             return np.asarray(self._largest_sizes(self.rows(ids[rows])) >= least * depth)

@@ -157,7 +157,7 @@ class EgoMotionSolver:
         return _Minimum(best, hessian, self._determined(best, hessian), iteration)
 
     def _determined(self, wTc: FloatArray, hessian: FloatArray) -> bool:
-        """Whether the matches (and the prior) fix all degrees of freedom, beyond rounding."""
+        """True if the matches (and the prior) determine all degrees of freedom."""
         basis = self.floor.basis(wTc)
         reduced = basis.T @ hessian @ basis
         size = np.sqrt(np.diagonal(reduced))
@@ -274,7 +274,7 @@ class EgoMotionSolver:
         )
 
     def _allowed_fraction(self, correction: FloatArray) -> float:
-        """Fraction of the correction that the cap lets through (section 5)."""
+        """Fraction of the correction that is applied under the cap (section 5)."""
         rotation = float(np.linalg.norm(correction[:3]))
         translation = float(np.linalg.norm(correction[3:]))
         return float(
@@ -315,7 +315,7 @@ class EgoMotionSolver:
 
 
 def unmeasured(prediction: Prediction, status: EgoMotionStatus) -> EgoMotion:
-    """The predicted pose as it stands, for a frame without matches."""
+    """Ego-motion equal to the prediction, for a frame without matches."""
     return EgoMotion(
         prediction.wTc, prediction.covariance, np.empty(0, np.bool_), np.empty(0), status, 0
     )

@@ -1,4 +1,4 @@
-"""What is kept of each landmark: identity, counts, views (Se et al. 6.1 to 6.3)."""
+"""Landmark table: identity, counts and views of each landmark (Se et al. 6.1 to 6.3)."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class LandmarkTable:
 
     @property
     def contradicted(self) -> IntArray:
-        """(n,) frames since the last hit that speak against a permanent landmark."""
+        """(n,) frames since the last hit that contradict a permanent landmark."""
         return self._columns["contradicted"]
 
     @property
@@ -132,7 +132,7 @@ class LandmarkTable:
         )
 
     def find_words(self) -> None:
-        """Finds the words of all views: asked for now and then, no search waits for many."""
+        """Computes the visual words of all views in advance, so that a search need not wait."""
         self._pool.find_words()
 
     def rows(self, ids: IntArray) -> IntArray:
@@ -140,7 +140,7 @@ class LandmarkTable:
         return np.searchsorted(self.ids, ids)
 
     def merge(self, pairs: IntArray) -> None:
-        """Two identities of one landmark become one: looks and counts go to the one that stays.
+        """Merges two identities of one landmark: views and counts go to the one that stays.
 
         Args:
             pairs: (m, 2) (identity that ends, identity that stays); several may end in one.
@@ -262,7 +262,7 @@ class LandmarkTable:
         return self._pool.largest_sizes(self._places[rows])
 
     def _refresh(self, rows: IntArray, seen: Views) -> None:
-        """The rows (k,) were matched and looked like this: their nearest view, or a further one."""
+        """Updates the nearest view of matched rows (k,), or adds a further one."""
         places = self._places[rows]
         self._pool.refresh(places, seen)
         self._places[rows] = places

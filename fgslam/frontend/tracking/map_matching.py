@@ -41,16 +41,16 @@ class MapMatcher:
 
     @property
     def widens(self) -> bool:
-        """Whether the gates follow the predicted uncertainty."""
+        """True if the gates widen with the predicted uncertainty."""
         return self._settings.widen_sigmas > 0.0
 
     @property
     def refines(self) -> bool:
-        """Whether to match a second time, around the pose found."""
+        """True if a frame is matched a second time, around the pose found."""
         return self._settings.refine
 
     def match_anywhere(self, expected: ExpectedLandmarks, features: StereoFeatures) -> MapMatches:
-        """Matches within the largest window, whatever the prediction claims to know."""
+        """Matches within the largest window, regardless of the predicted uncertainty."""
         reach = np.full((len(expected), 3), self._limit)
         return self._match_within(expected, features, reach)
 

@@ -1,4 +1,4 @@
-"""Which landmarks last, and what speaks against one that is said to (Se et al. 6.2)."""
+"""Permanent landmarks: which qualify, and what contradicts one (Se et al. 6.2)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def reliable(hits: IntArray, misses: IntArray, settings: PermanenceSettings) -> 
 
 
 def is_blind(expected: ExpectedLandmarks, hit: BoolArray, settings: PermanenceSettings) -> bool:
-    """Whether so few of the landmarks well in view were matched (v,) that the view is blocked."""
+    """True if so few of the landmarks well in view were matched (v,) that the view is blocked."""
     certain = int(expected.certain.sum())
     return int((hit & expected.certain).sum()) < settings.blind_below * certain
 

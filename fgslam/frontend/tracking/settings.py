@@ -84,7 +84,7 @@ class PermanenceSettings:
             ge=0.0,
             le=1.0,
             description="a frame that matches less than this share of the landmarks expected well "
-            "in view is blocked or lost: it tells of no landmark that it is gone; 0 believes all",
+            "in view is blocked or lost: it is no evidence that a landmark is gone; 0 believes all",
         ),
     ] = 0.05
     contradicted_after: Annotated[
@@ -108,7 +108,7 @@ class PermanenceSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class ViewpointSettings:
-    """Several looks of a landmark, from different directions (Se et al. 6.3)."""
+    """Several views of a landmark, from different directions (Se et al. 6.3)."""
 
     view_angle_deg: Annotated[
         float,
@@ -126,7 +126,7 @@ class ViewpointSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class DatabaseSettings:
-    """Life and death of landmarks (Se et al. 4 and 6.1)."""
+    """Initiation, validation and pruning of landmarks (Se et al. 4 and 6.1)."""
 
     prune_after_misses: Annotated[
         int, Field(ge=1, description="N: consecutive misses until a landmark goes; 20 in 4.3")

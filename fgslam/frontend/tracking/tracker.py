@@ -57,7 +57,7 @@ class Association:
 
     @staticmethod
     def nothing() -> Association:
-        """Of a frame without images: no landmark was looked for."""
+        """Association of a frame without images: nothing matched, nothing missed."""
         none = np.empty(0, np.int64)
         observations = StereoFeatures.empty().observations(none, none, is_new=False)
         return Association(observations, np.empty(0, np.bool_), none, none, none)
@@ -87,7 +87,7 @@ class LandmarkTracker:
     def track(
         self, prediction: Prediction, landmarks: LandmarkMap, features: StereoFeatures
     ) -> Tracked:
-        """Matches expected landmarks and solves for the pose; wider or closer again if asked."""
+        """Matches expected landmarks and solves for the pose; wider or narrower again if set so."""
         around = Prediction(self._ego_motion.floor.constrain(prediction.wTc), prediction.covariance)
         tracked = self._attempt(prediction, around, landmarks, features)
         if self._matcher.rescues and not tracked.ego_motion.status.measured:
@@ -145,7 +145,7 @@ class LandmarkTracker:
     def associate(
         self, tracked: Tracked, features: StereoFeatures, image: Image, start_new: bool = True
     ) -> Association:
-        """Books hits and misses, starts new tracks if it may, prunes (4.1 to 4.3)."""
+        """Records hits and misses, initiates landmarks if allowed, prunes (4.1 to 4.3)."""
         expected, matches = tracked.expected, tracked.matches
         inliers = tracked.ego_motion.inliers
         matched = _matched(expected, matches, features)

@@ -1,4 +1,4 @@
-"""How landmarks look, from one or several directions (Se et al. 6.3).
+"""Appearance of landmarks, seen from one or several directions (Se et al. 6.3).
 
 A landmark has up to ``max_views`` views: SIFT scale (kept as the physical size, scale times depth),
 orientation, descriptor and view vector, the unit vector from the camera to the landmark. The views
@@ -80,7 +80,7 @@ class ViewPool:
 
     @property
     def several(self) -> bool:
-        """Whether a landmark may have more than one view."""
+        """True if a landmark may have more than one view."""
         return self.max_views > 1
 
     def start(self, views: Views) -> Places:
@@ -122,7 +122,7 @@ class ViewPool:
         return self._words[places]
 
     def find_words(self) -> None:
-        """Finds the words of all views, so that whoever asks does not wait for them."""
+        """Computes the visual words of all views in advance."""
         self._find_words(np.flatnonzero(self._words == _UNKNOWN))
 
     def last_use(self, places: npt.NDArray[np.int32]) -> IntArray:

@@ -74,7 +74,7 @@ class InView(Rows):
 
 
 class FieldOfView:
-    """The cameras' common field of view, as the settings draw it."""
+    """Common field of view of the cameras, by the settings."""
 
     def __init__(self, rig: CameraRig, settings: DatabaseSettings, max_disparity_px: float) -> None:
         """Points of more than ``max_disparity_px`` are outside."""
@@ -133,7 +133,7 @@ class FieldOfView:
         return np.asarray((np.abs(points[:, :2]) < self._tangent * points[:, 2:]).all(axis=1))
 
     def _in_images(self, measurement: FloatArray, border: float) -> BoolArray:
-        """Whether a landmark falls inside all images of the rig, the border left out."""
+        """True if a landmark projects into all images of the rig, the border excluded."""
         rig = self._rig
         column, row, disparity = measurement.T
         vertical = (
