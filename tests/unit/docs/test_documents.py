@@ -35,8 +35,6 @@ def test_lines_fit_a_screen(page: Path) -> None:
 
 @pytest.mark.parametrize("page", EVERY, ids=ids)
 def test_words_are_those_of_the_field(page: Path) -> None:
-    if page.name == "settings.md":
-        pytest.skip("made of the settings' descriptions")
     text = prose(page)
     assert not CODES.findall(text)
     assert not [found.group() for found in WORDS.finditer(text)]
