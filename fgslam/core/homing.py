@@ -43,7 +43,7 @@ class FeatureKind(int, Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UprightFeatures(Rows):
-    """Rotation-reduced colour SIFT features of one image (III-A1).
+    """Rotation-reduced colour SIFT features of one image (III-A, 1).
 
     Attributes:
         pixels: (n, 2) in the image that was given, column and row.
@@ -65,7 +65,7 @@ class UprightFeatures(Rows):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColumnSegments(Rows):
-    """Invariant column segments of one image (III-A2).
+    """Invariant column segments of one image (III-A, 2).
 
     Attributes:
         bearing: (n,) radians of the segment's column.
