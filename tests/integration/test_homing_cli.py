@@ -139,6 +139,34 @@ def test_mistakes_in_comparing(
     assert words in mistake(capfd, monkeypatch, "compare", trials, *given)
 
 
+def test_trials_repeat_simulated_homings_with_other_noise(
+    trials: Path, tmp_path: Path, monkeypatch: Patch
+) -> None:
+    out = tmp_path / "trials"
+    arguments = ("--trials", 3, "--seed", 7, "--estimators", "homing_ekf,alv", "--out", out)
+    assert main(monkeypatch, "compare", trials, *arguments) == 0
+    numbers = values_of(out)
+    assert (numbers["trials"], list(numbers["estimators"])) == (3, ["homing_ekf", "alv"])
+    assert load_homing(out / RUN_MARKER).seed == 7
+
+
+def test_a_baseline_of_homing_runs_is_checked(
+    trials: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    baseline, out = tmp_path / "baseline.json", ("--estimators", "homing_ekf", "--overwrite")
+    compared = ("compare", trials, *out, "--out", tmp_path / "compared")
+    assert main(monkeypatch, *compared, "--write-baseline", baseline) == 0
+    expected = json.loads(baseline.read_text(encoding="utf-8"))
+    numbers = expected["runs"]["few_trials"]["homing_ekf"]
+    assert {"direction_median_deg", "nees_home_per_dof"} <= numbers.keys()
+    assert main(monkeypatch, *compared, "--check-baseline", baseline) == 0
+    numbers["direction_median_deg"] *= 0.5
+    baseline.write_text(json.dumps(expected), encoding="utf-8")
+    capfd.readouterr()
+    assert main(monkeypatch, *compared, "--check-baseline", baseline) == 1
+    assert "REGRESSION" in capfd.readouterr().out
+
+
 def test_a_run_is_neither_resumed_nor_overwritten_unasked(
     trials: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:
