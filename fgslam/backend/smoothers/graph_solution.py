@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from fgslam.backend.graphs import poses_of_frame
-from fgslam.backend.smoothers.marginals import marginals_of
-from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.errors import EstimatorError
+from fgslam.core.arrays import FloatArray
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import congruence
 from fgslam.factors.keys import landmark_key, pose_key
@@ -35,30 +32,6 @@ class Solution:
     remarks: tuple[str, ...] = ()
 
 
-class SolvedGraph(Protocol):
-    """Factors, values of all variables, and what was left out."""
-
-    @property
-    def graph(self) -> Any:
-        """The factors that count."""
-        ...
-
-    @property
-    def values(self) -> Any:
-        """Values of all variables."""
-        ...
-
-    @property
-    def variables(self) -> list[int]:
-        """Landmark variables, ascending."""
-        ...
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """In words."""
-        ...
-
-
 def poses_of(values: Any, frames: list[int]) -> FloatArray:
     """Poses (n, 4, 4) by frame, up to the last of ``frames``; NaN for those not among them."""
     out = np.full((frames[-1] + 1, 4, 4), np.nan)
@@ -72,37 +45,12 @@ def points_of(values: Any, variables: list[int]) -> dict[int, FloatArray]:
     return {v: np.asarray(values.atPoint3(landmark_key(v))) for v in variables}
 
 
-def solution(refined: SolvedGraph, frames: list[int], floor: Floor) -> Solution:
-    """Everything about frames of a solved graph and its landmark variables."""
-    graph, values, variables = refined.graph, refined.values, refined.variables
-    poses, points = poses_of(values, frames), points_of(values, variables)
-    kept = np.full((len(poses), 6, 6), np.nan)
-    try:
-        marginals = marginals_of(graph, values)
-        by_key = dict(zip(marginals.landmark_keys.tolist(), marginals.landmarks(), strict=True))
-        covariances = {v: by_key[landmark_key(v)] for v in variables}
-        kept[frames] = allowed_parts(floor, poses[frames], marginals.poses())
-    except EstimatorError as error:
-        missing = {v: np.full((3, 3), np.nan) for v in variables}
-        return Solution(poses, kept, points, missing, (*refined.remarks, str(error)))
-    return Solution(poses, kept, points, covariances, refined.remarks)
-
-
 def allowed_parts(floor: Floor, poses: FloatArray, covariances: FloatArray) -> FloatArray:
     """Covariances (n, 6, 6) without what a hard floor excludes, which the graph holds stiffly."""
     if floor.rigid_dof == 6:
         return covariances
     pairs = zip(poses, covariances, strict=True)
     return np.array([floor.allowed_part(pose, covariance) for pose, covariance in pairs])
-
-
-def joint_of(graph: Any, values: Any, floor: Floor, frame: int, variables: list[int]) -> FloatArray:
-    """Joint covariance (6 + 3k, 6 + 3k) of a frame's pose and landmark variables."""
-    marginals = marginals_of(graph, values)
-    pose = int(np.searchsorted(marginals.pose_keys, pose_key(frame)))
-    keys = np.array([landmark_key(v) for v in variables], np.int64)
-    rows: IntArray = np.searchsorted(marginals.landmark_keys, keys).astype(np.int64)
-    return allowed_joint(floor, poses_of_frame(values, frame), marginals.joint(pose, rows))
 
 
 def allowed_joint(floor: Floor, wTc: FloatArray, joint: FloatArray) -> FloatArray:

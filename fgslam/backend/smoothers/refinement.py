@@ -11,20 +11,23 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import gtsam
+import numpy as np
 
+from fgslam.backend.graphs import poses_of_frame
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.graph_solution import (
     Solution,
-    joint_of,
+    allowed_joint,
+    allowed_parts,
     points_of,
     poses_of,
-    solution,
 )
+from fgslam.backend.smoothers.marginals import marginals_of
 from fgslam.backend.smoothers.outliers import observed_variables
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.floor import Floor
-from fgslam.factors.keys import is_pose, landmark_key, number
+from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
 
 _ROUNDS = 5  # solutions until no landmark lies behind a camera any more
 _BEHIND = "came out behind a camera"
@@ -108,6 +111,31 @@ class WholeGraphAnswer:
             raise EstimatorError(f"{self._builder.describe(min(lost))} was left out of the graph")
         last = self._builder.frames[-1]
         return joint_of(refined.graph, refined.values, self._floor, last, variables)
+
+
+def solution(refined: Refined, frames: list[int], floor: Floor) -> Solution:
+    """Everything about frames of a solved graph and its landmark variables."""
+    graph, values, variables = refined.graph, refined.values, refined.variables
+    poses, points = poses_of(values, frames), points_of(values, variables)
+    kept = np.full((len(poses), 6, 6), np.nan)
+    try:
+        marginals = marginals_of(graph, values)
+        by_key = dict(zip(marginals.landmark_keys.tolist(), marginals.landmarks(), strict=True))
+        covariances = {v: by_key[landmark_key(v)] for v in variables}
+        kept[frames] = allowed_parts(floor, poses[frames], marginals.poses())
+    except EstimatorError as error:
+        missing = {v: np.full((3, 3), np.nan) for v in variables}
+        return Solution(poses, kept, points, missing, (*refined.remarks, str(error)))
+    return Solution(poses, kept, points, covariances, refined.remarks)
+
+
+def joint_of(graph: Any, values: Any, floor: Floor, frame: int, variables: list[int]) -> FloatArray:
+    """Joint covariance (6 + 3k, 6 + 3k) of a frame's pose and landmark variables."""
+    marginals = marginals_of(graph, values)
+    pose = int(np.searchsorted(marginals.pose_keys, pose_key(frame)))
+    keys = np.array([landmark_key(v) for v in variables], np.int64)
+    rows: IntArray = np.searchsorted(marginals.landmark_keys, keys).astype(np.int64)
+    return allowed_joint(floor, poses_of_frame(values, frame), marginals.joint(pose, rows))
 
 
 def landmark_variables(values: Any) -> list[int]:
