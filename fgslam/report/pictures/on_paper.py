@@ -97,11 +97,13 @@ def draw_views(path: Path, figure: Figure, title: str) -> None:
             for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
                 axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
                 axis.set_tick_params(labelsize=8.0)
-            axes.set(xlabel="right (m)", ylabel="ahead (m)")
-            if elevation < _STEEP:
-                axes.set_zlabel("up (m)")
-            else:
+            axes.set_xlabel("right (m)")
+            if elevation > _STEEP:
                 axes.set_zticks([])
+                continue
+            # Beside the first view its neighbour leaves no room for these.
+            axes.set_ylabel("ahead (m)")
+            axes.set_zlabel("up (m)", labelpad=-2.0)
         canvas.suptitle(title, fontsize=16, fontweight="bold", x=0.01, ha="left")
         canvas.supxlabel(figure.note, fontsize=12.0)
         _legend(canvas, canvas.axes[0], "outside upper right")
