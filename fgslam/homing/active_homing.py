@@ -21,15 +21,15 @@ _MAX_ACROSS = 0.1
 matched anew."""
 
 CONTRADICTION_DEG = 30.0
-"""A new homing vector that differs by more from a sound estimate (and by more than four deviations)
-must be confirmed by another image."""
+"""A new homing vector that differs by more from a consistent estimate (and by more than four
+deviations) must be confirmed by another image."""
 
 _MAX_RESIDUAL_DEG = 5.0
 """Median difference of the bearings from the estimate's prediction beyond which the estimate counts
 as diverged."""
 
 _FEWEST_TRACKS = 4
-"""With fewer than this the estimate is not believed any more (a third view needs three
+"""With fewer than this the estimate is not used any more (a third view needs three
 bearings)."""
 
 EstimatorMaker: TypeAlias = Callable[[HomingStart], HomingEstimator]
@@ -49,13 +49,13 @@ class Fault:
 
 
 class ActiveHoming:
-    """An estimator that is fed with tracks, and what tells whether to believe it.
+    """An estimator that is fed with tracks, and the checks of its estimate.
 
     Attributes:
         start: what it began with.
         unit: its leg in parts of the leg where the robot first set out for this target.
         tracked: the last image's bearings, at first those of the start.
-        history: all images that the estimator was told.
+        history: all images that the estimator was given.
         estimate: the last state.
         home: its steering vector, with distance and covariance in legs where the robot set out.
     """

@@ -212,7 +212,7 @@ class HomingController:
         return self._accept(answer, f"matched anew: {why}")
 
     def _lose(self, image: ByteArray, time: float, why: str) -> Command:
-        """The estimate is not to be believed: match anew at once, or drive blind for a while."""
+        """The estimate is not usable: match anew at once, or drive blind for a while."""
         s = self._settings
         ahead = abs(self._heading) <= np.deg2rad(_BLIND_HEADING_DEG)
         self._blind_until = time + s.blind_s if ahead else -np.inf
@@ -256,7 +256,7 @@ class HomingController:
             return Refusal(RefusalReason.UNCERTAIN, str(error))
 
     def _confirmed(self, vector: TwoViewVector) -> bool:
-        """Whether a new vector is to be believed: nothing was in doubt, or two images agree."""
+        """Whether a new vector is accepted: nothing was in doubt, or two images agree."""
         if self._pending is None:
             return not self._ambiguous
         turn = float(np.abs(wrap(np.array(vector.direction - self._pending.direction))))

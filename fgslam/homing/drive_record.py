@@ -19,8 +19,8 @@ class HomingLog:
 
     Attributes:
         target: number of the target image.
-        start: what was told to the estimator.
-        tracks: what it was told afterwards, image by image.
+        start: what the estimator began with.
+        tracks: what it was given afterwards, image by image.
         estimate: its last state.
         unit: length of its leg in parts of the leg where the robot set out for the target.
         first_step: row of the drive's record at which it started.

@@ -1,4 +1,4 @@
-"""Which links to believe: a false one, between places that look alike, contradicts its neighbours.
+"""Selection of consistent links: a false one, by perceptual aliasing, contradicts its neighbours.
 
 Around a triangle of images the rotations add up to zero, and the direction from the first to the
 third lies between the directions of the two steps. Links that break more triangles than they
@@ -43,18 +43,18 @@ class LinkConsistency:
         self._verdicts = self._judge_triangles()
 
     def believed(
-        self, *, ordered: bool, witnessed: Collection[Pair] = ()
+        self, *, ordered: bool, confirmed: Collection[Pair] = ()
     ) -> tuple[list[Link], dict[Pair, str]]:
         """Links that pass every check, by pair, and why the others do not.
 
         Args:
-            ordered: images follow each other on a way; neighbours in it need no third witness. It
+            ordered: images follow each other on a way; neighbours in it need no third view. It
                 is no proof: their link must still not contradict others.
-            witnessed: links that third images confirm in other ways, likewise.
+            confirmed: links that third images confirm in other ways, likewise.
         """
         rejected: dict[Pair, str] = {}
         self._drop_contradicted(rejected, ordered=ordered)
-        self._drop_lone(rejected, witnessed, ordered=ordered)
+        self._drop_lone(rejected, confirmed, ordered=ordered)
         self._drop_turned(rejected, ordered=ordered)
         return [self._links[pair] for pair in sorted(self._links)], rejected
 
@@ -113,11 +113,11 @@ class LinkConsistency:
             self._drop(worst, f"breaks {bad} of {good + bad} triangles", rejected)
 
     def _drop_lone(
-        self, rejected: dict[Pair, str], witnessed: Collection[Pair], *, ordered: bool
+        self, rejected: dict[Pair, str], confirmed: Collection[Pair], *, ordered: bool
     ) -> None:
         for pair, (good, _) in self.votes().items():
             support = self._links[pair].support
-            follows = (ordered and pair[1] == pair[0] + 1) or pair in witnessed
+            follows = (ordered and pair[1] == pair[0] + 1) or pair in confirmed
             if good == 0 and not follows and support < _LONE_SUPPORT:
                 text = f"no third image confirms it, and {support} inliers are too few alone"
                 self._drop(pair, text, rejected)

@@ -1,4 +1,4 @@
-"""Which of many images look alike: visual words, before anything is matched.
+"""Image retrieval by visual words: candidates for links, before anything is matched.
 
 A vocabulary of SIFT descriptors by k-means; an image is the vector of its words' counts, weighted
 by how rare they are (tf-idf, Sivic and Zisserman 2003) and with repeated ones damped by the square

@@ -33,7 +33,7 @@ class HomingControlSettings:
         float,
         Field(
             gt=0.0,
-            description="an image turned faster than this against the last one is not believed",
+            description="an image turned faster than this against the last one is rejected",
         ),
     ] = 120.0
     retry_s: Annotated[
@@ -175,7 +175,7 @@ class RetrievalSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class TopologicalMapSettings:
-    """Edges where homing succeeds, and what makes an edge believed."""
+    """Edges where homing succeeds, and when an edge is accepted."""
 
     candidates: Annotated[
         int,

@@ -1,4 +1,4 @@
-"""Do third views confirm a link's features? Places that look alike match, but not the same things.
+"""Confirmation of links by third views, against perceptual aliasing.
 
 Halls with two equal sides, corridors with the same lockers: links between them have hundreds of
 inliers, agree in triangles, and are false. They match things of one kind, not one thing: a baluster

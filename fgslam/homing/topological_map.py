@@ -51,9 +51,9 @@ class TopologicalMap:
     Attributes:
         images: features of the nodes.
         names: of the nodes, for people.
-        links: believed, ascending by their pair (a < b).
+        links: accepted, ascending by their pair (a < b).
         costs: (m,) of the links: 1 for a leg of many inliers and a sure direction, more otherwise.
-        rejected: pairs that were answered, but not believed, and why; not saved.
+        rejected: pairs that were answered, but not accepted, and why; not saved.
     """
 
     images: tuple[OmniFeatures, ...]
@@ -149,7 +149,7 @@ def build_map(
     ordered: bool = False,
     names: Sequence[str] | None = None,
 ) -> TopologicalMap:
-    """Tries every candidate pair both ways, and keeps the links that are believed.
+    """Tries every candidate pair both ways, and keeps the links that are accepted.
 
     Args:
         images: features of the nodes.
@@ -212,7 +212,7 @@ def map_of_answers(
         links, seen, unseen = ThirdViewConsistency(images, links, rows, settings).confirmed()
         refused |= unseen
     checks = LinkConsistency(len(images), links, settings)
-    believed, rejected = checks.believed(ordered=ordered, witnessed=seen)
+    believed, rejected = checks.believed(ordered=ordered, confirmed=seen)
     costs = np.array([link_cost(link, settings) for link in believed])
     return TopologicalMap(memory.images, memory.names, tuple(believed), costs, refused | rejected)
 

@@ -75,7 +75,7 @@ class HomingEkf:
         self._state = state
 
     def _with_target(self, state: FilterState) -> FilterState:
-        """The target's own filter, told the same bearings once more."""
+        """The target's own filter, given the same bearings once more."""
         rows = np.searchsorted(self._target_ids, state.ids)
         seen = seen_from_target(state, self._target_bearing[rows], self._target_sigma[rows])
         extra = np.zeros((len(rows), len(rows)))

@@ -61,7 +61,7 @@ class HomingEkfSettings(NamedSettings):
     target: Annotated[
         Literal["separate", "joint"],
         Field(
-            description="`separate`: a filter of its own, told the target's bearings anew with "
+            description="`separate`: a filter of its own, given the target's bearings anew with "
             "every image, as printed; `joint`: the target is part of the state and its "
             "bearings count once, in the initial triangulation"
         ),

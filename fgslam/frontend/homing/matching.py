@@ -4,7 +4,7 @@ SIFT features: the nearest descriptor, clearly nearer than the second, mutually;
 filter of eq. 1. Column segments: the nearest of the whitened vectors, likewise.
 
 Both images are taken on one plane. What no motion on it explains is left out *before* the nearest
-are sought, so it does not count as a rival either: elevations of opposite sign, and
+are sought, so it does not compete either: elevations of opposite sign, and
 apparent sizes that disagree with the elevations. A thing at height z and distance r has size ~ 1/r
 and sin(elevation) = z/r, so s_a / s_b = sin(e_a) / sin(e_b).
 """
@@ -114,7 +114,7 @@ def _height_in_sizes(features: UprightFeatures, margin: float) -> Float32Array:
 def _mutual_nearest(squared: Float32Array) -> tuple[IntArray, IntArray, FloatArray]:
     """Rows, columns, and nearest over second nearest distance of mutual nearest pairs.
 
-    A candidate without a rival at all has ratio 0. The distances are used up.
+    A candidate without any competing candidate has ratio 0. The distances are used up.
     """
     every = np.arange(len(squared))
     j = squared.argmin(axis=1)
@@ -123,7 +123,7 @@ def _mutual_nearest(squared: Float32Array) -> tuple[IntArray, IntArray, FloatArr
     squared[every, j] = np.inf
     second = squared.min(axis=1).astype(np.float64)
     keep = mutual & np.isfinite(best)
-    # Equal descriptors differ by rounding; two equal ones in a row are rivals all the same.
+    # Equal descriptors differ by rounding; two equal ones in a row compete all the same.
     best, second = (np.maximum(d[keep], 0.0) + _ROUNDING for d in (best, second))
     return every[keep], j[keep], np.minimum(np.sqrt(best / second), 1.0)
 
@@ -182,7 +182,7 @@ def nearest_segments(
     other = squared.argmin(axis=1)
     i = np.flatnonzero(back[j] == i)
     best, second = (np.linalg.norm(a[i] - b[k[i]], axis=1) for k in (j, other))
-    # A second one just as near, be it at no distance at all, is a full rival.
+    # A second one just as near, be it at no distance at all, competes in full.
     ratio = np.ones(len(i))
     np.divide(best, second, out=ratio, where=second > best)
     return i, j[i], best, ratio

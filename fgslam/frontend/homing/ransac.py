@@ -36,7 +36,7 @@ _REFINED = 8  # different hypotheses that are refined, the best supported first
 _ALIKE = np.deg2rad(5.0)  # hypotheses closer than this lead to the same refined solution, mostly
 _SAME = np.deg2rad(0.2)  # refined solutions closer than this are one
 _TEMPER = 2.0  # residuals have common causes: so many of them count as one, see `covariance`
-_CELLS_AROUND = 180  # of 2 degrees: matches within one cell in both views are one witness
+_CELLS_AROUND = 180  # of 2 degrees: matches within one cell in both views count as one inlier
 _TURNED = 3.0  # times the median's limit: what is explained by the turn alone
 _LEAST_SPREAD = 0.25  # of directions; half a turn has 0.31, all around 0.71
 
@@ -67,13 +67,13 @@ def estimate_homing_vector(
     at_target = search.turn_at_target(best)
     if at_target is not None:
         return at_target
-    rivals = [r for r in refined[1:] if search.differ(r, best)]
+    competitors = [r for r in refined[1:] if search.differ(r, best)]
     covariance = search.covariance(refined)
-    refusal = search.refusal(best, rivals, float(np.sqrt(covariance[0, 0])))
+    refusal = search.refusal(best, competitors, float(np.sqrt(covariance[0, 0])))
     if refusal is not None:
         return refusal
     theta, psi = (float(v) for v in best.parameters[:2])
-    support = max((search.witnesses(r.inliers) for r in rivals), default=0)
+    support = max((search.independent_inliers(r.inliers) for r in competitors), default=0)
     floor = np.deg2rad([settings.direction_floor_deg, settings.rotation_floor_deg])
     return TwoViewVector(theta, psi, covariance + np.diag(floor**2), best.inliers, support)
 
@@ -197,7 +197,7 @@ class _Search:
         """(2, 2) of the best solution, widened by those near it that fit nearly as well.
 
         Features all on one side leave a valley with several minima. Each solution within the
-        rivals' angle weighs by its likelihood, tempered since residuals have common causes.
+        competitors' angle weighs by its likelihood, tempered since residuals have common causes.
         """
         best = refined[0]
         near = [r for r in refined if not self.differ(r, best)]
@@ -212,7 +212,7 @@ class _Search:
         """Whether two solutions are not one and the same."""
         return _apart(one, other) > float(np.deg2rad(self._settings.rival_angle_deg))
 
-    def witnesses(self, which: BoolArray) -> int:
+    def independent_inliers(self, which: BoolArray) -> int:
         """Number of inliers that are independent of each other."""
         return len(np.unique(self._cells[which]))
 
@@ -233,7 +233,7 @@ class _Search:
             return None
         turned = best.inliers & (parallaxes < _TURNED * limit)
         if (
-            self.witnesses(turned) < self._settings.min_inliers
+            self.independent_inliers(turned) < self._settings.min_inliers
             or _spread(m.bearing_a[turned]) < _LEAST_SPREAD
         ):
             return None
@@ -243,15 +243,15 @@ class _Search:
             psi,
         )
 
-    def _undecided(self, best: Refined, rival: Refined) -> bool:
-        return self._score_of(best) - self._score_of(rival) < self._settings.rival_log_odds
+    def _undecided(self, best: Refined, competitor: Refined) -> bool:
+        return self._score_of(best) - self._score_of(competitor) < self._settings.rival_log_odds
 
     def refusal(
-        self, best: Refined, rivals: list[Refined], direction_sigma: float
+        self, best: Refined, competitors: list[Refined], direction_sigma: float
     ) -> Refusal | None:
         """Why the best solution is no answer, or None."""
         s = self._settings
-        support = self.witnesses(best.inliers)
+        support = self.independent_inliers(best.inliers)
         alarms = self._log_false_alarms(best)
         if support < s.min_inliers:
             reason, text = (
@@ -264,9 +264,9 @@ class _Search:
                 f"{support} inliers of {len(self._matches)} matches may be chance "
                 f"(1e{alarms / np.log(10.0):.1f} expected)"
             )
-        elif undecided := [r for r in rivals if self._undecided(best, r)]:
+        elif undecided := [r for r in competitors if self._undecided(best, r)]:
             reason = RefusalReason.AMBIGUOUS
-            other = self.witnesses(undecided[0].inliers)
+            other = self.independent_inliers(undecided[0].inliers)
             text = f"{support} inliers, {other} for a different solution"
         elif direction_sigma > np.deg2rad(s.max_direction_sigma_deg):
             reason = RefusalReason.UNCERTAIN
@@ -290,9 +290,9 @@ class _Search:
         )
         chance = (np.count_nonzero(good) + 1.0) / (len(good) + 2.0)
         gains = np.where(best.inliers, gain(best.residuals, sigmas, chance), 0.0)
-        witnesses = _one_a_cell(gains, self._cells)
+        kept = _one_a_cell(gains, self._cells)
         tests = float(np.log(n * (n - 1.0)))  # two solutions for each pair
-        return tests - log_likelihood_ratio(gains[witnesses], self._right[witnesses])
+        return tests - log_likelihood_ratio(gains[kept], self._right[kept])
 
 
 def _spread(bearing: FloatArray) -> float:
@@ -357,7 +357,7 @@ def _log_ratios(
 
 
 def _cells(matches: BearingMatches) -> IntArray:
-    """(n,) number of the cell of both views that a match lies in: one cell, one witness."""
+    """(n,) number of the cell of both views that a match lies in: one cell counts once."""
     angles = [matches.bearing_a, matches.bearing_b, matches.elevation_a, matches.elevation_b]
     grid = np.round(np.column_stack(angles) * (_CELLS_AROUND / (2.0 * np.pi)))
     grid[:, :2] %= _CELLS_AROUND  # both sides of the seam are one cell

@@ -378,7 +378,7 @@ def test_blind_only_where_home_was_ahead() -> None:
     assert b.step().state is HomingState.WAIT
 
 
-def test_image_that_flips_is_not_believed() -> None:
+def test_image_that_flips_is_rejected() -> None:
     """The picture turned by 180 degrees between two images: no wheelchair did that."""
     b = bench(vector_to(0.0))
     b.step()

@@ -78,7 +78,7 @@ def test_slows_down_at_the_last_target_most() -> None:
     assert settled(Steering(SETTINGS), command(0.0, 0.0)).speed > 0.0
 
 
-def test_stops_when_told() -> None:
+def test_robot_stops_at_a_stop_command() -> None:
     """And drives slowly when blind or searching."""
     steering = Steering(SETTINGS)
     settled(steering, command(0.2))

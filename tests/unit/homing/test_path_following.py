@@ -182,7 +182,7 @@ def test_drive_that_takes_too_long_is_ended() -> None:
     assert "1 s" in record.legs[-1].reason
 
 
-def test_bad_input_is_told() -> None:
+def test_empty_path_and_wrong_times_are_refused() -> None:
     """No target; time that runs backwards, also right after a switch."""
     setting = winding_path(7, 1, 2.0)
     with pytest.raises(ConfigError, match="no target image"):

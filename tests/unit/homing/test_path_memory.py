@@ -83,7 +83,7 @@ def test_no_pixels_are_kept(tmp_path: Path) -> None:
     assert {f.name for f in fields(UprightFeatures)} - kept == {"pixels", "covariance"}
 
 
-def test_kilobytes_an_image_are_told(tmp_path: Path) -> None:
+def test_saving_returns_kilobytes_an_image(tmp_path: Path) -> None:
     """The file's size over its images; a fraction of an image of 320 x 240 in colour."""
     memory = PathMemory.of([some_features(k) for k in range(3)])
     kilobytes = memory.save(tmp_path / "path.npz")
@@ -106,7 +106,7 @@ def test_truncated_file_is_refused(tmp_path: Path, kept: int) -> None:
         PathMemory.load(tmp_path / "path.npz")
 
 
-def test_every_flipped_bit_is_noticed_or_harmless(tmp_path: Path) -> None:
+def test_every_flipped_bit_is_detected_or_harmless(tmp_path: Path) -> None:
     """The archive's CRCs: damage is told, and never gives other features."""
     path = tmp_path / "path.npz"
     whole = written(path)

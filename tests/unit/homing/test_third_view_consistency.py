@@ -66,7 +66,7 @@ def test_features_of_a_place_come_back_in_its_neighbours() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_look_alike_matches_things_of_a_kind_by_lot(seed: int) -> None:
+def test_similar_place_matches_things_of_a_kind_at_random(seed: int) -> None:
     """As many inliers and links as before, but not the same things."""
     views = checked(NEIGHBOURS, seed)
     assert views.share(link(FAR)) < 0.5

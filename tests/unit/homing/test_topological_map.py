@@ -164,7 +164,7 @@ def test_false_links_are_found_and_true_ones_kept(seed: int) -> None:
     assert len(believed) == len(links) - len(false)
 
 
-def test_long_link_between_lookalikes_needs_a_witness() -> None:
+def test_long_link_between_similar_places_needs_a_third_view() -> None:
     """A chain of places in order, and a link from one end to the other that nothing confirms."""
     poses = np.column_stack([np.arange(8.0), np.zeros(8), np.zeros(8)])
     chain = [true_link(poses, k, k + 1, 20) for k in range(7)]
@@ -173,7 +173,7 @@ def test_long_link_between_lookalikes_needs_a_witness() -> None:
     assert [(k.a, k.b) for k in believed] == [(k, k + 1) for k in range(7)]
     assert "no third image" in rejected[1, 6]
     unordered, _ = LinkConsistency(8, chain, SETTINGS).believed(ordered=False)
-    assert unordered == []  # order is the only witness there was
+    assert unordered == []  # nothing but their order confirmed it
 
 
 def test_strong_lone_link_that_is_turned_breaks_a_loop() -> None:
@@ -274,7 +274,7 @@ def test_route_takes_the_short_way_round(built: tuple[FloatArray, TopologicalMap
         assert other in topology.neighbours(one)
 
 
-def test_routes_that_are_none_are_told() -> None:
+def test_impossible_routes_are_refused() -> None:
     """Another part of the map; a node that is none."""
     _, images = hall()
     poses = hall()[0]

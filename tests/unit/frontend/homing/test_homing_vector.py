@@ -132,7 +132,7 @@ def test_one_thing_of_the_same_kind_elsewhere_is_no_arrival(half_width_deg: floa
     assert reasons.count(None) <= 1  # a rigid thing fits some motion, too; hardly ever best
 
 
-def test_witnesses_are_counted_across_the_seam() -> None:
+def test_independent_inliers_are_counted_across_the_seam() -> None:
     """What lies behind is one thing on both sides of the turn from +pi to -pi."""
     behind = np.pi - np.deg2rad([0.3, 0.6, -0.3, -0.6])
     angles = np.column_stack([wrap(behind), np.full(4, 0.2), np.full(4, 1.0), np.full(4, 0.2)])
