@@ -21,6 +21,7 @@ from pydantic_core import ErrorDetails
 from fgslam.core.errors import ConfigError
 from fgslam.runs.named_experiments import suggestion
 from fgslam.runs.override_values import Schema, accepted_at, typed_value
+from fgslam.runs.retired_settings import RETIRED
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -65,8 +66,11 @@ class Reader(Generic[Model]):
         try:
             return self.model.model_validate(values)
         except ValidationError as error:
-            schema = _schema_of(self.model)
-            raise ConfigError(_describe(error.errors(), where, schema)) from None
+            schema, errors = _schema_of(self.model), error.errors()
+        known = _without_retired(values, errors, schema)
+        if known is None:
+            raise ConfigError(_describe(errors, where, schema))
+        return self.parse(known, where)
 
     def _drop_unknown(self, inner: Any, group: str, given: set[str]) -> None:
         """Drops keys that meant something to the file's kind, not to the one an override chose.
@@ -202,8 +206,35 @@ class _Override:
 
 
 # --------------------------------------------------------------------------------------------
+# Keys of earlier versions
+
+
+def _without_retired(
+    values: Mapping[str, Any], errors: list[ErrorDetails], schema: dict[str, Any]
+) -> dict[str, Any] | None:
+    """The values without keys that are constants now and agree with these; None: there are none."""
+    retired = [tuple(e["loc"]) for e in errors if e["type"] in _UNKNOWN and _is_retired(e, schema)]
+    kept = copy.deepcopy(dict(values))
+    for location in retired:
+        group: Any = kept
+        for name in location[:-1]:  # tags of unions are no keys
+            if isinstance(name, int) or (isinstance(group, dict) and name in group):
+                group = group[name]
+        group.pop(location[-1], None)
+    return kept if retired else None
+
+
+def _is_retired(error: ErrorDetails, schema: dict[str, Any]) -> bool:
+    *group, key = (str(name) for name in error["loc"])
+    _, nodes = _descend(schema, group)
+    constants = [RETIRED.get(node.get("title", ""), {}) for node in nodes]
+    return any(key in found and found[key] == error["input"] for found in constants)
+
+
+# --------------------------------------------------------------------------------------------
 # Messages
 
+_UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
 _PLAIN_WORDS = {
     "tuple_type": "give a list, e.g. [a, b]",
@@ -225,13 +256,12 @@ _PLAIN_WORDS = {
 
 
 def _describe(errors: list[ErrorDetails], where: str, schema: dict[str, Any]) -> str:
-    unknown = ("extra_forbidden", "unexpected_keyword_argument")
     # A misspelt key also leaves the right one missing; the misspelling is the cause.
-    first = sorted(errors, key=lambda e: e["type"] not in unknown)[0]
+    first = sorted(errors, key=lambda e: e["type"] not in _UNKNOWN)[0]
     names = [str(part) for part in first["loc"]]
     key = ".".join(_without_tags(schema, names))
     more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-    if first["type"] in unknown:
+    if first["type"] in _UNKNOWN:
         return f"{where}: unknown key {key}{_suggestion(schema, names)}{more}"
     if first["type"] in ("missing", "missing_argument"):
         return f"{where}: key {key} is missing; add it{more}"

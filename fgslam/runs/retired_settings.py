@@ -1,0 +1,210 @@
+"""Settings of version 0.1 that are constants now, with the values that they have.
+
+Configurations, run folders and saved maps of that version name them. With these values they mean
+the same as without; other values are refused.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+RETIRED: dict[str, dict[str, Any]] = {
+    "AvoidanceSettings": {
+        "directions": 72,
+        "keep_weight": 0.5,
+        "gain_per_s": 2.0,
+        "escape_after": 20,
+        "escape_steps": 20,
+        "escape_m": 1.2,
+        "escape_mps": 0.25,
+    },
+    "BatchSettings": {
+        "weak_prior_ranges": 2.0,
+        "max_iterations": 100,
+    },
+    "ColourMomentSettings": {
+        "mean_floor": 8.0,
+    },
+    "ColumnSegmentSettings": {
+        "max_width": 2048,
+        "max_tangent": 1.0,
+        "smoothing_px": 1.2,
+        "min_length_px": 8.0,
+        "min_length_tangent": 0.05,
+        "min_contrast": 4.0,
+        "min_run_px": 2,
+        "max_run_deg": 8.0,
+        "run_step_px": 1.5,
+        "sigma_run": 0.15,
+    },
+    "EkfSettings": {
+        "loop_gate_sigmas": 10.0,
+    },
+    "FilterMotionSettings": {
+        "initial_speed": 0.5,
+    },
+    "FixedLagSettings": {
+        "weak_prior_ranges": 2.0,
+    },
+    "GraphMotionSettings": {
+        "initial_speed": 0.5,
+        "initial_turning_deg": 30.0,
+    },
+    "GraphSettings": {
+        "weak_prior_ranges": 2.0,
+    },
+    "HomingControlSettings": {
+        "pass_fraction": 0.25,
+        "fewest_tracks": 4,
+        "max_across": 0.1,
+        "max_residual_deg": 5.0,
+        "blind_heading_deg": 20.0,
+        "farther_s": 2.5,
+        "contradiction_deg": 30.0,
+    },
+    "HomingGraphSettings": {
+        "prior_distances": 2.0,
+        "relinearize_threshold": 0.01,
+        "trust_radius": 1.0,
+        "max_iterations": 50,
+    },
+    "HomingVectorSettings": {
+        "inlier_sigmas": 3.0,
+        "least_parallax_deg": 3.0,
+    },
+    "HouseExposureSettings": {
+        "period_s": 20.0,
+        "offset": 0.0,
+        "gamma": 1.0,
+    },
+    "HousePathSettings": {
+        "clearance_m": 0.55,
+    },
+    "HouseTiltSettings": {
+        "period_s": 7.0,
+    },
+    "Isam2Settings": {
+        "weak_prior_ranges": 2.0,
+        "relinearize_skip": 1,
+    },
+    "LocalisationSettings": {
+        "background": 4.0,
+    },
+    "LoopCorrectionSettings": {
+        "submap_frames": 10,
+        "drift_factor": 1.0,
+        "closure_factor": 3.0,
+    },
+    "LoopSettings": {
+        "agreement_m": 0.15,
+        "agreement_deg": 2.0,
+        "least_offset_m": 0.03,
+        "least_offset_deg": 0.3,
+    },
+    "OmniHouseSettings": {
+        "camera_height_m": 1.2,
+        "door_width_m": 1.6,
+        "range_sensor": {
+            "beams": 32,
+            "heights_m": [0.15, 0.45, 0.72, 1.0],
+            "max_range_m": 5.0,
+            "noise_m": 0.02,
+        },
+    },
+    "OmniMatchingSettings": {
+        "horizon_margin_deg": 3.0,
+        "max_scale_ratio": 2.0,
+        "max_column_distance": 4.4,
+    },
+    "OmniTrackingSettings": {
+        "pyramid_levels": 2,
+        "iterations": 15,
+        "precision_px": 0.03,
+        "max_back_px": 1.0,
+        "min_eigenvalue": 0.0001,
+        "patch_px": 13,
+        "patch_deformation": 0.05,
+        "max_deformation": 1.0,
+        "sigma_deformed_px": 1.0,
+        "search_px": 3.0,
+        "plane_error": 0.2,
+        "distinct_px": 3.0,
+    },
+    "RecordedOdometrySettings": {
+        "translation_floor_m": 0.002,
+        "rotation_floor_deg": 0.1,
+    },
+    "RelocalisationSettings": {
+        "neighbours": 12,
+        "max_distance": 400.0,
+        "ratio": 0.85,
+        "candidates": 3,
+        "same_place_m": 0.3,
+        "size_ratio": 1.6,
+        "orientation_deg": 30.0,
+        "height_m": 0.05,
+        "hypotheses": 64,
+        "rounds": 6,
+        "confidence": 0.999,
+        "bin_m": 0.3,
+        "bin_deg": 5.0,
+        "bins": 16,
+        "refined": 4,
+        "piece_m": 0.5,
+        "gate_sigmas": 4.0,
+        "enough_witnesses": 36,
+        "max_misfit": 1.2,
+        "least_agreement": 0.57,
+        "least_covered": 0.5,
+        "ambiguous_share": 0.5,
+        "ambiguous_own": 0.2,
+        "view_deg": 20.0,
+        "elsewhere_m": 0.5,
+        "elsewhere_deg": 15.0,
+    },
+    "RetrievalSettings": {
+        "sample": 10000,
+        "iterations": 6,
+    },
+    "SimulatedBearingsSettings": {
+        "lowest_m": 0.2,
+        "highest_m": 1.5,
+        "direction_deg": 20.0,
+        "rotation_deg": 30.0,
+        "speed_mps": 0.3,
+        "wander_deg": 10.0,
+        "slip": 0.05,
+    },
+    "SteeringSettings": {
+        "turn_in_place_deg": 60.0,
+        "slow_fraction": 0.3,
+        "least_share": 0.25,
+        "passing_share": 0.6,
+        "blind_share": 0.4,
+    },
+    "SyntheticOdometrySettings": {
+        "translation_floor_m": 0.001,
+        "rotation_floor_deg": 0.01,
+    },
+    "TopologicalMapSettings": {
+        "one_way_support": 25,
+        "lone_support": 50,
+        "mutual_deg": 5.0,
+        "loop_deg": 6.0,
+        "heading_deg": 15.0,
+        "doubling_support": 25.0,
+    },
+    "UprightSiftSettings": {
+        "octave_layers": 3,
+        "edge_threshold": 10.0,
+        "base_sigma_px": 1.6,
+        "max_view_width": 2048,
+        "sigma_scales": 0.27,
+    },
+    "WheelchairSettings": {
+        "max_acceleration_m_s2": 0.5,
+        "max_turn_acceleration_deg_s2": 120.0,
+        "radius_m": 0.35,
+    },
+}
+"""By the class of the group: key and value."""
