@@ -1,7 +1,8 @@
 """Every command and every line of Python in README.md runs, in the order in which it stands.
 
-The commands run in a copy of the checkout. One is replaced: `pip install .` would change the
-environment that runs the tests, so that it installs into a folder of its own, without dependencies
+The commands run in a copy of the checkout whose `.venv` is the environment that runs the tests. Two
+are replaced: `make test` is shown but not run, since it would run this test again; `pip install .`
+would change that environment, so that it installs into a folder of its own, without dependencies
 and without downloading the build system. The fast test shortens the demo to its first frames, the
 slow one drives it whole.
 """
@@ -44,6 +45,15 @@ def run(command: list[str], folder: Path) -> None:
     assert done.returncode == 0, f"{shlex.join(command)}\n{done.stdout}\n{done.stderr}"
 
 
+def provide_environment(folder: Path) -> None:
+    """What `make` sets up first, without the installation: it is there already."""
+    environment = folder / ".venv"
+    environment.mkdir()
+    (environment / "bin").symlink_to(Path(sys.executable).parent)
+    for stamp in ("runtime", "dev"):
+        (environment / f".{stamp}-stamp").touch()
+
+
 def installed_elsewhere(folder: Path) -> list[str]:
     """The installation into a folder of its own."""
     target = ["--target", str(folder.parent / "installed"), "--no-deps", "--no-build-isolation"]
@@ -59,7 +69,9 @@ def checkout(tmp_path: Path) -> Path:
     def ignore(folder: str, names: list[str]) -> set[str]:
         return (left_out if Path(folder) == ROOT else caches)(folder, names)
 
-    return Path(shutil.copytree(ROOT, tmp_path / "checkout", ignore=ignore))
+    folder = Path(shutil.copytree(ROOT, tmp_path / "checkout", ignore=ignore))
+    provide_environment(folder)
+    return folder
 
 
 def run_python(folder: Path) -> None:
@@ -81,26 +93,35 @@ def run_all(folder: Path, replaced: dict[str, list[str]]) -> None:
 def test_readme_fits_a_screen_and_a_half() -> None:
     assert len(README.splitlines()) <= 90
     assert len(re.findall(r"!\[", README)) == 1
-    assert len(commands()) == 3
+    assert len(commands()) == 4
+
+
+def replaced_in(folder: Path) -> dict[str, list[str]]:
+    """Commands that would change more than the copy, and what is run instead."""
+    return {
+        "make test": ["make", "--dry-run", "test"],
+        "pip install .": installed_elsewhere(folder),
+    }
+
+
+def assert_demo_and_installation(folder: Path) -> None:
+    assert (folder / "runs/demo/report.html").is_file()
+    assert (folder / "runs/demo/compare/comparison.csv").is_file()
+    assert (folder.parent / "installed/fgslam/py.typed").is_file()
 
 
 def test_commands_run_in_order_with_a_short_demo(checkout: Path) -> None:
-    replaced = {
-        "pip install .": installed_elsewhere(checkout),
-        "fgslam demo": shlex.split(DEMO_SHORT),
-    }
+    run(["make", "--dry-run", "demo"], checkout)
+    replaced = replaced_in(checkout) | {"make demo": shlex.split(DEMO_SHORT)}
     assert set(replaced) <= set(commands())
     run_all(checkout, replaced)
-    assert (checkout / "runs/demo/report.html").is_file()
-    assert (checkout / "runs/demo/compare/comparison.csv").is_file()
-    assert (checkout.parent / "installed/fgslam/py.typed").is_file()
+    assert_demo_and_installation(checkout)
 
 
 @pytest.mark.slow
 def test_commands_run_in_order(checkout: Path) -> None:
-    run_all(checkout, {"pip install .": installed_elsewhere(checkout)})
-    assert (checkout / "runs/demo/report.html").is_file()
-    assert (checkout / "runs/demo/compare/comparison.csv").is_file()
+    run_all(checkout, replaced_in(checkout))
+    assert_demo_and_installation(checkout)
 
 
 def test_make_targets_that_the_documents_name_exist() -> None:
