@@ -85,7 +85,12 @@ class StereoRig(CameraRig):
 
 
 def require_rig(rig: CameraRig) -> None:
-    """Raises CalibrationError where the numbers of a rig cannot be those of one."""
+    """Raises CalibrationError where ``rig`` is none, or its numbers cannot be those of one."""
+    if not isinstance(rig, CameraRig):
+        raise CalibrationError(
+            f"rig: it is a {type(rig).__name__}; give a fgslam.StereoRig, or load one by "
+            "fgslam.StereoRig.load(file)"
+        )
     for name in ("width", "height"):
         value = getattr(rig, name)
         if not isinstance(value, int | np.integer) or isinstance(value, bool) or value <= 0:

@@ -7,6 +7,7 @@ from dataclasses import fields
 from difflib import get_close_matches
 from typing import Annotated, Any, TypeVar
 
+import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
@@ -44,6 +45,12 @@ def make_settings(kind: type[S], values: Mapping[str, Any], where: str) -> S:
         raise ConfigError(
             f"{where}: {key} is {first['input']!r}, but it {message}; correct it"
         ) from None
+
+
+def require_seed(seed: object, where: str) -> None:
+    """Raises ConfigError where a random generator cannot begin with it."""
+    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
+        raise ConfigError(f"{where}: seed is {seed!r}; give a whole number, 0 or larger")
 
 
 @dataclass(frozen=True, config=STRICT)

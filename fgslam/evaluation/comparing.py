@@ -75,10 +75,26 @@ def compare(
         landmark_truth: true positions of landmarks, in the same world as ``truth``.
 
     Raises:
-        ConfigError: one of the answers is none.
+        ConfigError: one of the answers is none, or they have no names, or the truth is no
+            trajectory.
     """
+    require_named(answers, truth)
     known = Truth(truth, landmark_truth)
     return metrics_frame({name: _judged(name, one, known) for name, one in answers.items()})
+
+
+def require_named(answers: Mapping[str, Comparable], truth: Trajectory | None) -> None:
+    """Raises ConfigError where the answers have no names, or the truth is no trajectory."""
+    if not isinstance(answers, Mapping):
+        raise ConfigError(
+            f"the answers are a {type(answers).__name__}; give a dict of results by name: "
+            '{"isam2": result}'
+        )
+    if not isinstance(truth, Trajectory | None):
+        raise ConfigError(
+            f"the truth is a {type(truth).__name__}; give a trajectory: "
+            "fgslam.Trajectory.load(file)"
+        )
 
 
 def metrics_frame(

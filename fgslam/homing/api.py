@@ -18,7 +18,7 @@ from fgslam.backend.homing.settings import HomingEstimatorKind
 from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.errors import CalibrationError, EstimatorError, SessionError, StoredMapError
 from fgslam.core.homing import Refusal, TwoViewVector
-from fgslam.core.settings import make_settings
+from fgslam.core.settings import make_settings, require_seed
 from fgslam.frontend.features.colour_image import colour_image
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
@@ -57,6 +57,7 @@ class HomingVector:
             ConfigError: a setting is unknown or out of its bounds.
         """
         self._camera = _require_camera(camera, "HomingVector")
+        require_seed(seed, "HomingVector")
         self._features = features or OmniFeatureSettings()
         self._settings = make_settings(HomingVectorSettings, settings, "HomingVector")
         self._seed = seed
@@ -159,6 +160,7 @@ class PathFollower:
                 "fgslam.teach(images, camera), or load it by fgslam.PathMemory.load(file)"
             )
         self._camera = _require_camera(camera, "PathFollower")
+        require_seed(seed, "PathFollower")
         settings = homing_settings_of(estimator)
         behaviour = behaviour or HomingBehaviourSettings()
         self._homing = HomingChain(
@@ -205,12 +207,13 @@ class PathFollower:
 
         Raises:
             SessionError: the follower is closed.
-            EstimatorError: a number is not finite.
+            EstimatorError: a number is not finite, or the time is negative.
         """
         self._require_open()
-        if not all(map(_is_finite, (v, omega, seconds))):
+        if not all(map(_is_finite, (v, omega, seconds))) or seconds < 0.0:
             raise EstimatorError(
-                f"PathFollower: driven({v!r}, {omega!r}, {seconds!r}); give finite numbers"
+                f"PathFollower: driven({v!r}, {omega!r}, {seconds!r}); give finite numbers, and a "
+                "time that is not negative"
             )
         self._steering.driven(Drive(v, omega, overridden=True))
         self._homing.held_up(seconds)

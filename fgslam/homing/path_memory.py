@@ -49,7 +49,7 @@ class PathMemory:
     def __len__(self) -> int:
         return len(self.images)
 
-    def save(self, path: Path) -> float:
+    def save(self, path: str | Path) -> float:
         """Writes the memory atomically.
 
         Returns:
@@ -59,17 +59,17 @@ class PathMemory:
             OutputError: it cannot be written.
         """
         arrays = FILE.header(names=list(self.names)) | pack_features(self.images)
-        size = write_arrays(path, arrays, compressed=True)
+        size = write_arrays(Path(path), arrays, compressed=True)
         return size / 1000.0 / max(len(self), 1)
 
     @staticmethod
-    def load(path: Path) -> PathMemory:
+    def load(path: str | Path) -> PathMemory:
         """Reads a memory; pixel positions of features are NaN.
 
         Raises:
             StoredMapError: the file is missing, truncated, damaged, foreign or of another version.
         """
-        arrays = FILE.load(path)
+        arrays = FILE.load(Path(path))
         header = FILE.read_header(arrays, str(path))
         images = unpack_features(arrays, str(path))
         return PathMemory(images, read_names(header, len(images), str(path)))

@@ -107,7 +107,7 @@ class TopologicalMap:
         """The target images of a route, ready to be followed."""
         return PathMemory.of([self.images[k] for k in nodes], [self.names[k] for k in nodes])
 
-    def save(self, path: Path) -> float:
+    def save(self, path: str | Path) -> float:
         """Writes the map atomically.
 
         Returns:
@@ -118,17 +118,17 @@ class TopologicalMap:
         """
         arrays = FILE.header(names=list(self.names)) | pack_features(self.images)
         arrays |= _link_arrays(self.links, self.costs)
-        size = write_arrays(path, arrays, compressed=True)
+        size = write_arrays(Path(path), arrays, compressed=True)
         return size / 1000.0 / max(len(self), 1)
 
     @staticmethod
-    def load(path: Path) -> TopologicalMap:
+    def load(path: str | Path) -> TopologicalMap:
         """Reads a map; pixel positions of features are NaN, and nothing is known as rejected.
 
         Raises:
             StoredMapError: the file is missing, truncated, damaged, foreign or of another version.
         """
-        arrays = FILE.load(path)
+        arrays = FILE.load(Path(path))
         header = FILE.read_header(arrays, str(path))
         images = unpack_features(arrays, str(path))
         names = read_names(header, len(images), str(path))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fgslam.core.estimates import Estimate, Trajectory
-from fgslam.evaluation.comparing import Comparable
+from fgslam.evaluation.comparing import Comparable, require_named
 from fgslam.evaluation.judging import Answer
 from fgslam.report.figures import palette
 from fgslam.report.figures.over_time import error_over_time, nees_over_time, time_per_frame
@@ -47,7 +47,11 @@ def plot(answers: Mapping[str, Comparable], truth: Trajectory | None = None) -> 
 
     Returns:
         The figure; ``show()`` opens it, ``write_html(path)`` keeps it.
+
+    Raises:
+        ConfigError: the answers have no names, or the truth is no trajectory.
     """
+    require_named(answers, truth)
     reports = tuple(_report(name, answer, truth) for name, answer in answers.items())
     known = truth_in_their_world(reports, truth)
     data = ReportData(title="", subtitle="", estimators=reports, truth=known)

@@ -10,7 +10,7 @@ from typing import TypeAlias
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.errors import ConfigError, FrameError
+from fgslam.core.errors import ConfigError, FrameError, MeasurementLogError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
@@ -195,5 +195,11 @@ def replay(
 
     Raises:
         ConfigError: no such estimator.
+        MeasurementLogError: ``log`` is none.
     """
+    if not isinstance(log, MeasurementLog):
+        raise MeasurementLogError(
+            f"replay: the log is a {type(log).__name__}; give that of a session, slam.log, or load "
+            "one by fgslam.MeasurementLog.load(file)"
+        )
     return replay_log(log, chosen_estimator(estimator), ego_motion or EgoMotionSettings())

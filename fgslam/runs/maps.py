@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.cameras.rig import require_rig
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.brief import Brief
 from fgslam.core.errors import MapError, OutputError
 from fgslam.core.estimates import LandmarkMap, Relocalisation, Trajectory
-from fgslam.core.saved_map import SavedMap, load_map, require_rig, save_map
+from fgslam.core.saved_map import SavedMap, load_map, save_map
+from fgslam.core.saved_map import require_rig as require_rig_of_map
 from fgslam.core.sensors import CameraRig
+from fgslam.core.settings import require_seed
 from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.report.point_cloud import MapPoints, write_map
@@ -96,10 +99,13 @@ class Map(Brief):
             [rotation, translation]; ``why`` gives the reason in words.
 
         Raises:
+            CalibrationError: the rig is impossible.
             MapError: the map is of other cameras, or holds no landmark.
             FrameError: wrong number, size, type or shape of images.
         """
-        require_rig(self.saved, rig, "the map")
+        require_rig(rig)
+        require_seed(seed, "locate")
+        require_rig_of_map(self.saved, rig, "the map")
         if not len(self.saved):
             raise MapError("the map holds no landmark; make it anew")
         frontend = frontend or FrontendSettings()

@@ -42,6 +42,8 @@ def chosen_estimator(
         return _named(estimator)
     if is_settings(estimator):
         return estimator
+    if isinstance(estimator, type):
+        raise ConfigError(f"estimator: {estimator.__name__} is a class; give an object of it")
     lacking = [name for name in _ESSENTIAL if not hasattr(estimator, name)]
     if lacking:
         raise ConfigError(

@@ -30,7 +30,7 @@ def checked_time(t: float, last: float | None) -> float:
     """The time stamp in seconds. Raises FrameError where it is none, or not after ``last``."""
     try:
         timestamp = float(t)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise FrameError(f"time stamp {t!r} is not a number; give seconds") from None
     if not math.isfinite(timestamp):
         raise FrameError(f"time stamp {timestamp} is not finite; give seconds")
@@ -48,9 +48,15 @@ def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
     Raises:
         FrameError: another number of images, or one of another size, type or shape.
     """
-    given = len(images)
+    wanted = ", ".join(_NAMES[: rig.cameras])
+    try:
+        given = len(images)
+    except TypeError:
+        raise FrameError(
+            f"the images are a {type(images).__name__}; give a tuple ({wanted}), or None where the "
+            "cameras gave nothing"
+        ) from None
     if given != rig.cameras:
-        wanted = ", ".join(_NAMES[: rig.cameras])
         raise FrameError(
             f"{given} images given, the rig has {rig.cameras} cameras; give ({wanted}), or a rig "
             f"{'with' if given == 3 else 'without'} vertical_baseline"

@@ -17,6 +17,7 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
+from fgslam.core.settings import require_seed
 from fgslam.core.threads import one_blas_thread
 from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.slam.arrival import Arrival
@@ -79,9 +80,11 @@ class Session:
 
         Raises:
             CalibrationError: the rig is impossible.
-            ConfigError: no such estimator, or it cannot use what will be measured.
+            ConfigError: no such estimator, it cannot use what will be measured, or the seed is
+                negative.
         """
         require_rig(rig)
+        require_seed(seed, "session")
         frontend = frontend or FrontendSettings()
         odometry = odometry or RecordedOdometrySettings()
         self.rig = rig

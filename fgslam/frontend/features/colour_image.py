@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from fgslam.core.arrays import Image
 from fgslam.core.errors import FrameError
+from fgslam.frontend.features.grey import as_array
 
 
 def colour_image(image: npt.ArrayLike, size: tuple[int, int], name: str = "image") -> Image:
@@ -23,7 +24,7 @@ def colour_image(image: npt.ArrayLike, size: tuple[int, int], name: str = "image
     Raises:
         FrameError: another type, shape or size.
     """
-    array = np.asarray(image)
+    array = as_array(image, name)
     wanted = (size[1], size[0])
     if array.dtype != np.uint8:
         raise FrameError(

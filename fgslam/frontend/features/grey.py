@@ -30,7 +30,7 @@ def grey_image(image: npt.ArrayLike, name: str = "image") -> Image:
     Raises:
         FrameError: another type or shape.
     """
-    array = _checked(np.asarray(image), name)
+    array = _checked(as_array(image, name), name)
     if array.dtype == np.uint16:
         array = (array >> 8).astype(np.uint8)
     if array.ndim == 2:
@@ -39,6 +39,14 @@ def grey_image(image: npt.ArrayLike, name: str = "image") -> Image:
         return np.ascontiguousarray(array[:, :, 0], np.uint8)
     code = cv2.COLOR_RGB2GRAY if array.shape[2] == 3 else cv2.COLOR_RGBA2GRAY
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(array), code), np.uint8)
+
+
+def as_array(image: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
+    """The image as an array, of any type and shape. Raises FrameError where it has none."""
+    try:
+        return np.asarray(image)
+    except (TypeError, ValueError):
+        raise FrameError(f"{name} has rows of different lengths; give one array") from None
 
 
 def _checked(array: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:

@@ -78,6 +78,12 @@ WRONG: dict[str, tuple[Callable[[], object], type[FgslamError], str]] = {
     "camera": (lambda: fg.HomingVector("x.txt"), CalibrationError, "load_camera"),  # type: ignore[arg-type]
     "setting": (lambda: fg.HomingVector(CAMERA, sample=3), ConfigError, "did you mean samples"),
     "bound": (lambda: fg.HomingVector(CAMERA, samples=0), ConfigError, "samples is 0"),
+    "seed": (lambda: fg.HomingVector(CAMERA, seed=-1), ConfigError, "seed is -1"),
+    "rows": (
+        lambda: fg.HomingVector(CAMERA).between([[1, 2], [3]], picture(0)),  # type: ignore[list-item]
+        FrameError,
+        "image_a has rows of different lengths",
+    ),
     "size": (
         lambda: fg.HomingVector(CAMERA).between(picture(0), picture(0)[:64]),
         FrameError,
@@ -144,11 +150,13 @@ def test_a_closed_follower_refuses_images(path: fg.PathMemory) -> None:
 def test_what_the_robot_drove_must_be_finite(path: fg.PathMemory) -> None:
     with pytest.raises(EstimatorError, match="finite"):
         fg.PathFollower(CAMERA, path).driven(0.1, float("nan"), 0.1)
+    with pytest.raises(EstimatorError, match="not negative"):
+        fg.PathFollower(CAMERA, path).driven(0.1, 0.0, -0.1)
 
 
 def test_a_path_is_saved_and_loaded(path: fg.PathMemory, tmp_path: Path) -> None:
-    path.save(tmp_path / "path.npz")
-    loaded = fg.PathMemory.load(tmp_path / "path.npz")
+    path.save(str(tmp_path / "path.npz"))
+    loaded = fg.PathMemory.load(str(tmp_path / "path.npz"))
     assert loaded.names == path.names == ("0", "1")
     command = fg.PathFollower(CAMERA, loaded).step(picture(0), 0.0)
     assert command.state is HomingState.INITIALISE

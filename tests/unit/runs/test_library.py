@@ -191,6 +191,11 @@ def test_a_session_is_configured_by_name_with_overrides(folder: Path) -> None:
     assert not slam.pipeline.motion.uses_odometry
 
 
+def as_any(value: object) -> Any:
+    """What type checkers would refuse."""
+    return value
+
+
 def wrong_uses() -> dict[str, tuple[type[FgslamError], str, Any]]:
     return {
         "experiment": (ConfigError, "comes with fgslam", lambda _: fg.run("lab_lop")),
@@ -204,6 +209,10 @@ def wrong_uses() -> dict[str, tuple[type[FgslamError], str, Any]]:
         "map": (MapError, "no such file", lambda p: fg.Map.load(p / "no.fgmap")),
         "log": (MeasurementLogError, "no such file", lambda p: fg.MeasurementLog.load(p / "x.npz")),
         "path": (DatasetError, "check the path", lambda p: fg.Trajectory.load(p / "x.tum")),
+        "no log": (MeasurementLogError, "slam.log", lambda _: fg.replay(as_any("x.npz"), "ekf")),
+        "no names": (ConfigError, "give a dict", lambda _: fg.compare(as_any([1]))),
+        "no names to plot": (ConfigError, "give a dict", lambda _: fg.plot(as_any([1]))),
+        "truth": (ConfigError, "Trajectory.load", lambda _: fg.compare({}, as_any("truth.tum"))),
         "world": (ConfigError, "known: lab", lambda _: fg.rendered_recording("moon")),
         "begins in a map": (
             ConfigError,

@@ -216,6 +216,10 @@ WRONG: dict[str, tuple[type[FgslamError], str, dict[str, Any]]] = {
     "time runs back": (FrameError, "order of their times", {"t": 0.4}),
     "time is NaN": (FrameError, "not finite", {"t": float("nan")}),
     "time is no number": (FrameError, "not a number", {"t": "now"}),
+    "time is huge": (FrameError, "not a number", {"t": 10**400}),
+    "images are a number": (FrameError, "images are a int; give a tuple", {"images": lambda v: 5}),
+    "images are a generator": (FrameError, "generator", {"images": lambda v: (x for x in v)}),
+    "rows differ": (FrameError, "different lengths", {"images": lambda v: ([[1, 2], [3]], *v[1:])}),
     "one image": (FrameError, "1 images given", {"images": lambda v: v[:1]}),
     "two images": (FrameError, "without vertical_baseline", {"images": lambda v: v[:2]}),
     "half size": (FrameError, "160x120", {"images": lambda v: tuple(x[::2, ::2] for x in v)}),
@@ -290,6 +294,7 @@ def test_after_a_failure_of_the_estimator_the_results_before_it_remain(views: Vi
     [
         ("isam", r"no kind 'isam'; did you mean isam2\?"),
         ("gauss", "known: odometry, landmark_kalman"),
+        (LandmarkKalman, "LandmarkKalman is a class; give an object"),
         (object(), "object lacks kind, supports, predict"),
     ],
 )
@@ -312,6 +317,17 @@ def test_an_unknown_estimator_is_refused_with_what_is_known(estimator: Any, word
 def test_an_impossible_rig_is_refused(change: dict[str, Any], words: str) -> None:
     with pytest.raises(CalibrationError, match=words):
         Session(dataclasses.replace(RIG, **change))
+
+
+def test_a_negative_seed_is_refused() -> None:
+    with pytest.raises(ConfigError, match="seed is -1; give a whole number"):
+        Session(RIG, seed=-1)
+
+
+def test_what_is_no_rig_is_refused() -> None:
+    no_rig: Any = "camchain.yaml"
+    with pytest.raises(CalibrationError, match=r"it is a str; give a fgslam\.StereoRig"):
+        Session(no_rig)
 
 
 @pytest.mark.parametrize(
