@@ -78,7 +78,6 @@ class BatchSolver:
 
     def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
         """Tracks on from the solution; where nothing moves, the next one takes the loop in."""
-        self._answer.changed()
         try:
             found = self._loops.judge(
                 loop,
@@ -91,8 +90,11 @@ class BatchSolver:
         except RuntimeError as error:
             raise self._failed(error) from None
         self.remarks.append(found.remark)
+        if not found.closed:
+            return None
+        self._answer.changed()  # it may have been solved in this very frame, without the loop
         if found.values is None:
-            return ClosedLoop() if found.closed else None
+            return ClosedLoop()
         self._values = found.values
         last = self._builder.frames[-1]
         here = reorthonormalise(poses_of_frame(self._values, last))

@@ -14,8 +14,6 @@ from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT
 
-NonNegative = Annotated[float, Field(ge=0.0)]
-
 
 @dataclass(frozen=True, config=STRICT)
 class HouseMirrorSettings:

@@ -9,8 +9,6 @@ from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT, FrameSelection
 
-PositiveFloat = Annotated[float, Field(gt=0.0)]
-NonNegativeFloat = Annotated[float, Field(ge=0.0)]
 PlaceName: TypeAlias = Literal["lab", "rooms", "corridors"]
 PathName: TypeAlias = Literal["paper_loop", "laps", "waypoints", "tour", "one_way", "random_poses"]
 FrameRange = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]

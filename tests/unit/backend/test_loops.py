@@ -118,11 +118,7 @@ def test_a_wrong_loop_is_refused_and_changes_nothing(name: str) -> None:
 @pytest.mark.parametrize("name", ["landmark_kalman", "isam2", "ekf"])
 def test_without_the_gate_the_wrong_loop_is_taken(name: str) -> None:
     """So it is the gate that refuses it."""
-    settings = CLOSING[name]
-    if isinstance(settings, EkfSettings):
-        settings = dataclasses.replace(settings, loops=LoopCorrectionSettings(gate_sigmas=0.0))
-    else:
-        settings = dataclasses.replace(settings, loops=LoopCorrectionSettings(gate_sigmas=0.0))
+    settings = dataclasses.replace(CLOSING[name], loops=LoopCorrectionSettings(gate_sigmas=0.0))
     drive = returned(lies=True)
     increments = drive.increments[: CLOSED + 1]
     estimator = build(settings)
@@ -181,6 +177,32 @@ def test_a_second_closure_that_agrees_moves_nothing(name: str) -> None:
     told = [words for words in estimator.estimate().remarks if "loop closure" in words]
     assert len(told) == 2
     assert "nothing moved" in told[1]
+
+
+def test_batch_solved_in_the_frame_of_a_loop_has_the_loop_in_its_answer() -> None:
+    """The closing frame is one of those after which the batch solves, too."""
+    increments = returned().increments[: CLOSED + 1]
+    at_once = build(BatchSettings(solve_every=CLOSED + 1))
+    stats = play(at_once, increments, FREE)
+    assert stats[-1].closed == (True,)
+    found = at_once.estimate().trajectory.poses
+    later = build(BatchSettings())
+    play(later, increments, FREE)
+    np.testing.assert_allclose(found, later.estimate().trajectory.poses, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(found[-1], stats[-1].wTc, rtol=0, atol=0.02)
+
+
+def test_refused_loop_leaves_the_answer_of_its_frame_alone() -> None:
+    increments = list(returned(lies=True).increments[: CLOSED + 1])
+    answers = []
+    for loops in (increments[-1].loops, ()):
+        estimator = build(BatchSettings(solve_every=CLOSED + 1))
+        play(estimator, [*increments[:-1], dataclasses.replace(increments[-1], loops=loops)], FREE)
+        answers.append(estimator.estimate())
+    assert "refused" in answers[0].remarks[0]
+    assert_same_bits(answers[0].trajectory, answers[1].trajectory)
+    assert_same_bits(answers[0].covariances, answers[1].covariances)
+    assert_same_bits(answers[0].landmarks, answers[1].landmarks)
 
 
 @pytest.mark.slow
