@@ -232,7 +232,7 @@ def test_the_camera_s_last_view_of_each_leg_is_drawn(tmp_path: Path) -> None:
     views = watcher.views(2)
     assert len(views) == 2
     last = record.homings[-1].tracks[-1]  # nothing is drawn that another image showed
-    assert f"{last.time:.1f} s, {len(last)} tracks" in views[-1].told
+    assert f"{last.time:.1f} s, {len(last)} tracks" in views[-1].caption
     ends = np.array([trail[-1, 0] for trail in views[-1].trails])
     np.testing.assert_allclose(ends, np.rad2deg(np.pi - last.bearing))
     assert max(len(trail) for trail in views[-1].trails) == 15
