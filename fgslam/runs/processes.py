@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -111,10 +112,22 @@ def _work(
     """In the worker: Ctrl-C is the parent's to answer; asked to end, it clears up first."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         connection.send(function(argument))
     except FgslamError as error:
         connection.send(error)
+
+
+def _end_with_parent() -> None:
+    """In the worker: a parent that was killed cannot ask it to end, and nobody else would.
+
+    A worker that went on would write into the run folder beside the run that was resumed there.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _see_off(process: SpawnProcess) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import time
@@ -86,3 +87,27 @@ def test_stopping_ends_what_runs_and_starts_no_more() -> None:
     assert running.why == "interrupted"
     assert isinstance(waiting, WorkerEnded)
     assert waiting.why == "interrupted before it began"
+
+
+def run_and_wait(path: str) -> None:
+    """In a process that is killed: waits for a worker of its own."""
+    list(run_apart(clear_up, [path]))
+
+
+def test_a_process_ends_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+    parent = multiprocessing.get_context("spawn").Process(
+        target=run_and_wait, args=(str(tmp_path),)
+    )
+    parent.start()
+    assert appears(tmp_path / "begun")
+    parent.kill()
+    parent.join()
+    assert appears(tmp_path / "cleared")
+
+
+def appears(path: Path, within_s: float = 30.0) -> bool:
+    """Whether the file is there in time."""
+    end = time.monotonic() + within_s
+    while not path.exists() and time.monotonic() < end:
+        time.sleep(0.05)
+    return path.exists()
