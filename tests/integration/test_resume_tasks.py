@@ -1,8 +1,9 @@
 """A run of any task that is killed at any moment goes on to the bytes of an uninterrupted one.
 
-The kill is exact: the n-th file that is renamed into its place is the last thing that happens, once
-just before and once just after it. Units are done in this process, which changes nothing of them
-and makes a run fast.
+Files appear by renaming alone, so the moments that differ are those just before and just after each
+rename. Most tests stop there by an exception that leaves what SIGKILL would: no clearing up, and a
+half-written file where the rename was still to come. Units are then done in this process, which
+makes a run fast. The last test sends SIGKILL to the command itself, with its worker processes.
 """
 
 from __future__ import annotations
@@ -11,15 +12,21 @@ import csv
 import json
 import os
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from PIL import Image as PictureFile
 from recordings import experiment
 
+from fgslam.core import atomic_files
 from fgslam.runs.config import parse_experiment
 from fgslam.runs.engine import RunResult
 from fgslam.runs.folder import ExistingFolder
@@ -48,6 +55,13 @@ HOUSE: dict[str, Any] = {
     "behaviour": {"loop": {"longest_s": 0.3}, "avoidance": {"method": "none"}},
     "output": SILENT,
 }
+IN_SMALL_BLOCKS = """
+from fgslam.cli.main import main
+from fgslam.runs.tasks import homing_trials, homing_views
+homing_trials._BLOCK = 1
+homing_views._VIEWS_A_BLOCK = 2
+main()
+"""
 _TIMED_FILES = ("timing.csv", "trials_timing.csv", "report.html")
 _TIMED_VALUES = ("ms", "mb", "seconds", "second", "growth", "memory")
 
@@ -146,14 +160,22 @@ def renames(monkeypatch: pytest.MonkeyPatch, most: float, *, after: bool) -> lis
 
     def replace(source: Path, target: Path) -> None:
         last = len(seen) >= most
-        if last and not after:
-            raise Killed
-        real(source, target)
+        if not last or after:
+            real(source, target)
         seen.append(Path(target))
         if last:
             raise Killed
 
+    def remove_quietly(path: Path) -> None:
+        """A process that was killed removes nothing, and may have written only half."""
+        if len(seen) <= most:
+            real_remove(path)
+        elif path.is_file():
+            os.truncate(path, path.stat().st_size // 2)
+
+    real_remove = atomic_files._remove_quietly
     monkeypatch.setattr("fgslam.core.atomic_files.os.replace", replace)
+    monkeypatch.setattr("fgslam.core.atomic_files._remove_quietly", remove_quietly)
     return seen
 
 
@@ -271,3 +293,30 @@ def test_killed_at_ten_moments_a_run_resumes_to_the_same_bytes(
     tmp_path: Path,
 ) -> None:
     killed_and_resumed(task, 10, straight, values_of, tmp_path)
+
+
+@pytest.mark.parametrize("task", ["homing_pairs", "homing_trials"])
+def test_a_command_killed_by_a_signal_resumes_to_the_same_bytes(
+    task: str,
+    straight: Straight,
+    values_of: Callable[[str], dict[str, Any]],
+    tmp_path: Path,
+) -> None:
+    """Killed as soon as a worker's first results are kept, wherever it is by then."""
+    folder = tmp_path / "run"
+    expected, _ = straight.of(task, folder)
+    experiment_file = tmp_path / "experiment.yaml"
+    experiment_file.write_text(yaml.safe_dump(values_of(task)))
+    command = [sys.executable, "-c", IN_SMALL_BLOCKS, "run", str(experiment_file)]
+    with subprocess.Popen([*command, "--out", str(folder)], stdout=subprocess.DEVNULL) as process:  # noqa: S603
+        try:
+            while process.poll() is None and not any(folder.glob("units/*.npz")):
+                time.sleep(0.001)
+        finally:
+            process.kill()
+    assert process.returncode == -signal.SIGKILL, "it was faster than the signal"
+    assert unfinished(folder)
+    assert run(values_of(task), folder, "resume").status == "finished"
+    found = content_of(folder)
+    assert found.keys() == expected.keys()
+    assert [name for name in found if found[name] != expected[name]] == []
