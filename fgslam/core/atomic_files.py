@@ -62,6 +62,11 @@ def replacing(path: Path) -> Iterator[Path]:
             _remove_quietly(partial)
 
 
+def is_unfinished_file(path: Path) -> bool:
+    """Whether a process that was killed while writing left this file beside its place."""
+    return path.name.startswith(".") and ".partial" in path.name and path.is_file()
+
+
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a whole file atomically. Raises OutputError when it cannot be written."""
     with replacing(path) as partial:

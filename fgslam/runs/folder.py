@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias
 
 from fgslam.core.atomic_files import (
     clear_output_errors,
+    is_unfinished_file,
     make_subfolder,
     replacing,
     require_writable,
@@ -122,8 +123,8 @@ def _make_room(path: Path, *, overwrite: bool) -> None:
     if not path.is_dir():
         raise OutputError(f"cannot write {path}: it is not a folder; choose another name")
     with clear_output_errors(path):
-        empty = not any(path.iterdir())
-    if empty:
+        empty = not any(file for file in path.iterdir() if not is_unfinished_file(file))
+    if empty:  # a run that was killed before its first file is none
         return
     if not is_run_folder(path):
         raise OutputError(

@@ -153,6 +153,10 @@ def override_texts(overrides: Overrides) -> list[str]:
     """
     if isinstance(overrides, str):
         raise ConfigError(f"overrides: {overrides!r} is one text; give a list of texts or a dict")
+    if not isinstance(overrides, Iterable):
+        raise ConfigError(
+            f"overrides: {overrides!r} is no settings; give a dict or a list of texts"
+        )
     if not isinstance(overrides, Mapping):
         return list(overrides)
     return [f"{key}={_as_yaml(key, value)}" for key, value in overrides.items()]

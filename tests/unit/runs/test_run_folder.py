@@ -188,3 +188,14 @@ def test_unwritable_folder_is_found_out_before_the_run(
     monkeypatch.setattr(Path, "write_bytes", refuse)
     with pytest.raises(OutputError, match="read-only"):
         create_run_folder(tmp_path / "run")
+
+
+@pytest.mark.parametrize("left", [".config.yaml.partial.yaml", ".writable.partial"])
+def test_a_run_killed_before_its_first_file_leaves_room_for_another(
+    tmp_path: Path, left: str
+) -> None:
+    (tmp_path / left).write_text("ex")
+    create_run_folder(tmp_path)
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match="something else than a run"):
+        create_run_folder(tmp_path)
