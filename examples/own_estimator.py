@@ -11,6 +11,7 @@ import numpy as np
 
 import fgslam as fg
 from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.geometry import transform_to_world, triangulate, triangulation_covariance
 from fgslam.core.measurements import Increment, MeasurementType
@@ -43,6 +44,8 @@ class FirstSight:
 
     def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """Keeps the tracked pose; adds new landmarks, drops those that the database dropped."""
+        if self.times and increment.timestamp <= self.times[-1]:
+            raise EstimatorError("time must increase from frame to frame")
         self.times.append(increment.timestamp)
         self.poses.append(tracking.wTc)
         self.covariances.append(tracking.covariance)

@@ -44,6 +44,7 @@ class StereoRig(CameraRig):
             principal point is far from the image, or ``bTc`` is no rigid motion.
     """
 
+    baseline: float = math.nan
     vertical_baseline: float | None = None
     bTc: FloatArray = field(default_factory=_identity)
     rectifier: Rectifier | None = None

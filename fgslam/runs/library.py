@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
@@ -25,7 +25,7 @@ from fgslam.runs.live import Overrides, override_texts, slam_config
 from fgslam.runs.named_experiments import find_experiment
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.run import run_experiment
-from fgslam.slam.choosing import chosen_estimator
+from fgslam.slam.choosing import chosen_estimator, is_settings
 from fgslam.slam.replay import Replay
 from fgslam.slam.replay import replay as replay_log
 
@@ -202,4 +202,16 @@ def replay(
             f"replay: the log is a {type(log).__name__}; give that of a session, slam.log, or load "
             "one by fgslam.MeasurementLog.load(file)"
         )
-    return replay_log(log, chosen_estimator(estimator), ego_motion or EgoMotionSettings())
+    return replay_log(log, _unused(chosen_estimator(estimator)), ego_motion or EgoMotionSettings())
+
+
+def _unused(estimator: EstimatorSettings | Estimator) -> EstimatorSettings | Estimator:
+    """The estimator. Raises ConfigError for an object that holds landmarks of frames before."""
+    if is_settings(estimator):
+        return estimator
+    own = cast("Estimator", estimator)
+    if len(own.landmarks()):
+        raise ConfigError(
+            f"estimator: this {type(own).__name__} has taken in frames already; give a new one"
+        )
+    return own

@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from fgslam.cameras.rig import require_rig
 from fgslam.core.arrays import BoolArray, FloatArray
-from fgslam.core.brief import Brief
 from fgslam.core.errors import MapError, OutputError
 from fgslam.core.estimates import LandmarkMap, Relocalisation, Trajectory
 from fgslam.core.saved_map import SavedMap, load_map, save_map
@@ -31,7 +30,7 @@ _SUFFIX = ".fgmap"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Map(Brief):
+class Map:
     """Landmarks with their covariances and appearance: a session's, or one that was saved.
 
     Attributes:
@@ -44,6 +43,9 @@ class Map(Brief):
     saved: SavedMap
     points: MapPoints
     remark: str = ""
+
+    def __repr__(self) -> str:
+        return f"<map of {len(self.saved.landmarks)} landmarks>"
 
     @staticmethod
     def load(path: str | Path) -> Map:

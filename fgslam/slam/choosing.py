@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Mapping
 from typing import Any, TypeGuard, cast, get_args
 
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.errors import ConfigError
+from fgslam.core.measurements import MeasurementType
+from fgslam.slam.frontend_settings import FrontendSettings
 
 _ESSENTIAL = ("kind", "supports", "predict", "landmarks", "update", "estimate")
 """What the loop needs of an estimator; the protocol's other members serve resuming and tests."""
@@ -43,7 +46,9 @@ def chosen_estimator(
     if is_settings(estimator):
         return estimator
     if isinstance(estimator, type):
-        raise ConfigError(f"estimator: {estimator.__name__} is a class; give an object of it")
+        raise ConfigError(
+            f"estimator: {estimator.__name__} is a class; give an object of it, made for this rig"
+        )
     lacking = [name for name in _ESSENTIAL if not hasattr(estimator, name)]
     if lacking:
         raise ConfigError(
@@ -51,7 +56,44 @@ def chosen_estimator(
             f"({', '.join(estimator_kinds())}), its settings, or an object with the members of "
             "fgslam.Estimator"
         )
+    _require_supports(estimator)
     return cast("Estimator", estimator)
+
+
+def chosen_frontend(given: FrontendSettings | Mapping[str, Any] | None) -> FrontendSettings:
+    """Settings of the front-end as given; None: the defaults; a mapping: what differs from these.
+
+    Raises:
+        ConfigError: a key of the mapping is not known, or its value is not usable.
+    """
+    if isinstance(given, FrontendSettings):
+        return given
+    adapter: TypeAdapter[FrontendSettings] = TypeAdapter(FrontendSettings)
+    try:
+        return adapter.validate_python(dict(given or {}))
+    except (ValidationError, TypeError, ValueError) as error:
+        first = error.errors()[0] if isinstance(error, ValidationError) else None
+        what = "not a mapping" if first is None else f"{_dotted(first['loc'])}: {first['msg']}"
+        raise ConfigError(
+            f"frontend: {what}; give settings by group, e.g. "
+            '{"stereo": {"max_disparity_px": 80}}, as in the settings reference'
+        ) from None
+
+
+def _dotted(location: tuple[int | str, ...]) -> str:
+    return ".".join(map(str, location))
+
+
+def _require_supports(estimator: object) -> None:
+    supports = getattr(estimator, "supports", None)
+    known = isinstance(supports, set | frozenset) and all(
+        isinstance(one, MeasurementType) for one in supports
+    )
+    if not known:
+        raise ConfigError(
+            f"estimator: supports of {type(estimator).__name__} is {supports!r}; give a frozenset "
+            "of fgslam.core.measurements.MeasurementType"
+        )
 
 
 def _named(kind: str) -> EstimatorSettings:

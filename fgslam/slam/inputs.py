@@ -56,10 +56,13 @@ def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
             f"the images are a {type(images).__name__}; give a tuple ({wanted}), or None where the "
             "cameras gave nothing"
         ) from None
+    if isinstance(images, np.ndarray) and images.ndim < 3:
+        raise FrameError(f"one image given instead of {rig.cameras}; give ({wanted})")
     if given != rig.cameras:
+        other = {2: ", or a rig without vertical_baseline", 3: ", or a rig with one more camera"}
         raise FrameError(
-            f"{given} images given, the rig has {rig.cameras} cameras; give ({wanted}), or a rig "
-            f"{'with' if given == 3 else 'without'} vertical_baseline"
+            f"{given} images given, the rig has {rig.cameras} cameras; give ({wanted})"
+            f"{other.get(given, '')}"
         )
     grey = []
     for name, image in zip(_NAMES, images, strict=False):

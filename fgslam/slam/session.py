@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy.typing as npt
 
@@ -21,7 +21,7 @@ from fgslam.core.settings import require_seed
 from fgslam.core.threads import one_blas_thread
 from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.slam.arrival import Arrival
-from fgslam.slam.choosing import chosen_estimator
+from fgslam.slam.choosing import chosen_estimator, chosen_frontend
 from fgslam.slam.factory import make_extractor, make_pipeline
 from fgslam.slam.feature_stream import FeatureExtractor, FeatureFrame, FrameDescriber
 from fgslam.slam.frontend_settings import FrontendSettings
@@ -55,7 +55,7 @@ class Session:
         rig: CameraRig,
         estimator: str | EstimatorSettings | Estimator = "isam2",
         *,
-        frontend: FrontendSettings | None = None,
+        frontend: FrontendSettings | Mapping[str, Any] | None = None,
         odometry: OdometrySettings | None = None,
         features: FeatureExtractor | None = None,
         seed: int = 0,
@@ -68,7 +68,8 @@ class Session:
             estimator: the kind (`odometry`, `landmark_kalman`, `landmark_kalman_graph`,
                 `ekf`, `fixed_lag`, `isam2` or `batch`), settings of one, or an own object with the
                 members of :class:`fgslam.backend.protocol.Estimator`.
-            frontend: settings of features, matching and tracking; None for the defaults.
+            frontend: settings of features, matching and tracking; None for the defaults; a mapping
+                for what differs from these: ``{"stereo": {"max_disparity_px": 80}}``.
             odometry: what predicts the motion. None: the odometry that is handed in, and constant
                 velocity over frames without any. With `constant_velocity` what is handed in is
                 ignored.
@@ -80,12 +81,12 @@ class Session:
 
         Raises:
             CalibrationError: the rig is impossible.
-            ConfigError: no such estimator, it cannot use what will be measured, or the seed is
-                negative.
+            ConfigError: no such estimator, it cannot use what will be measured, the seed is
+                negative, or a setting of the front-end is not known or not usable.
         """
         require_rig(rig)
         require_seed(seed, "session")
-        frontend = frontend or FrontendSettings()
+        frontend = chosen_frontend(frontend)
         odometry = odometry or RecordedOdometrySettings()
         self.rig = rig
         self.frontend = frontend

@@ -275,3 +275,10 @@ def test_real_calibrations(shared_data: Path, path: str, baseline: float) -> Non
     if not folder.is_dir():
         pytest.skip(f"no calibrations at {folder}")
     assert StereoRig.load(folder / path).baseline == pytest.approx(baseline, abs=2e-5)
+
+
+def test_a_rig_without_baseline_is_refused() -> None:
+    values = numbers()
+    del values["baseline"]
+    with pytest.raises(CalibrationError, match="baseline is nan"):
+        StereoRig(**values)
