@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.brief import Brief
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import inverse
 from fgslam.core.sensors import CameraRig
@@ -41,8 +42,8 @@ class RawCamera:
     name: str = "camera"
 
 
-@dataclass(frozen=True, eq=False)
-class Rectifier:
+@dataclass(frozen=True, eq=False, repr=False)
+class Rectifier(Brief):
     """Remaps raw images of a stereo pair to rectified ones; maps are computed once.
 
     Attributes:

@@ -20,7 +20,7 @@ def _identity() -> FloatArray:
     return np.eye(4)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class StereoRig(CameraRig):
     """Two or three rectified cameras, checked; it goes wherever a :class:`CameraRig` is asked for.
 

@@ -33,8 +33,9 @@ def read_camchain(path: Path) -> tuple[RawCamera, RawCamera]:
             f"{path}: a stereo rig needs cam0 and cam1; give the camchain of both cameras"
         )
     step = values["cam1"].get("T_cn_cnm1")
-    flat = np.ravel(step) if isinstance(step, list) else np.empty(0)
-    pose = numbers(path, {"cam1.T_cn_cnm1": flat.tolist()}, "cam1.T_cn_cnm1", 16).reshape(4, 4)
+    rows = step if isinstance(step, list) else []
+    flat = [value for row in rows for value in (row if isinstance(row, list) else [row])]
+    pose = numbers(path, {"cam1.T_cn_cnm1": flat}, "cam1.T_cn_cnm1", 16).reshape(4, 4)
     if not is_rigid(pose):
         raise CalibrationError(f"{path}: cam1.T_cn_cnm1 is not a rigid motion; correct the file")
     return (

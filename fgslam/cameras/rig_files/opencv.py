@@ -62,10 +62,18 @@ def _matrix(files: list[Path], name: str) -> FloatArray:
     return matrix
 
 
+def _opened(file: Path) -> cv2.FileStorage:
+    try:
+        return cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
+    except (cv2.error, SystemError) as error:  # its constructor wraps the one in the other
+        cause = " ".join(str(error.__cause__ or error).split())
+        raise CalibrationError(f"{file} is malformed: {cause}; write the file again") from None
+
+
 def _read(file: Path, name: str) -> FloatArray | None:
     if not file.is_file():
         return None
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
+    storage = _opened(file)
     try:
         matrix = storage.getNode(name).mat()
     except cv2.error:
@@ -78,7 +86,7 @@ def _read(file: Path, name: str) -> FloatArray | None:
 def _size(path: Path, files: list[Path]) -> tuple[int, int]:
     for file in files:
         if file.is_file():
-            storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
+            storage = _opened(file)
             width, height = (storage.getNode(n).real() for n in ("image_width", "image_height"))
             storage.release()
             if width > 0.0 and height > 0.0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -45,6 +45,8 @@ def read_rig(path: Path, size: Size | None = None) -> RigFile:
     Raises:
         CalibrationError: the format is unknown, of one camera only, or a value is impossible.
     """
+    if size is not None and not (isinstance(size, Sequence) and len(size) == 2):
+        raise CalibrationError(f"size is {size!r}; give (width, height) of the images in pixels")
     if path.is_dir():
         return _of_folder(path, size)
     text = _text(path)
@@ -106,10 +108,22 @@ def _kitti(path: Path, size: Size | None) -> RigFile:
 
 
 def _kitti_raw(path: Path, size: Size | None) -> RigFile:
-    sizes = [text.split()[1:] for _, text in read_lines(path) if text.startswith("S_rect_00:")]
-    if size is None and sizes and len(sizes[0]) == 2:
-        size = int(float(sizes[0][0])), int(float(sizes[0][1]))
+    size = _stated_size(path) if size is None else size
     return RigFile(read_projections(path, _KITTI_RAW).rig(*_known_size(path, size)))
+
+
+def _stated_size(path: Path) -> Size | None:
+    """Width and height by the line S_rect_00, if there is one."""
+    for number, text in read_lines(path):
+        if text.startswith("S_rect_00:"):
+            try:
+                width, height = map(float, text.split()[1:])
+                return round(width), round(height)
+            except (ValueError, OverflowError):
+                raise CalibrationError(
+                    f"{path}, line {number}: S_rect_00 must be width and height; restore the file"
+                ) from None
+    return None
 
 
 def _kalibr(path: Path, _: Size | None) -> RigFile:

@@ -220,6 +220,7 @@ def test_our_own_and_kittis_files_need_no_rectification(tmp_path: Path) -> None:
         ({"distortion_model": "equidistant"}, "cam1 is pinhole with equidistant"),
         ({"camera_model": "omni"}, "cam1 is omni with radtan"),
         ({"T_cn_cnm1": None}, "T_cn_cnm1"),
+        ({"T_cn_cnm1": [[1.0, 0.0], [0.0]]}, "expected 16 finite numbers"),
         ({"T_cn_cnm1": np.diag([2.0, 1, 1, 1]).tolist()}, "not a rigid motion"),
         ({"intrinsics": [1.0, 2.0]}, "intrinsics"),
         ({"resolution": [80, 60]}, "one resolution"),
@@ -253,6 +254,28 @@ def test_what_is_no_calibration_is_refused_with_what_is_known(tmp_path: Path, na
     words = "cannot be read" if name == "nothing.yaml" else "known: calib.json"
     with pytest.raises(CalibrationError, match=words):
         StereoRig.load(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "text", ["%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: [", "P_rect_00: 1\nS_rect_00: wide\n"]
+)
+def test_a_malformed_calibration_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
+    (tmp_path / "calib.yml").write_text(text)
+    with pytest.raises(CalibrationError, match=r"calib\.yml") as caught:
+        StereoRig.load(tmp_path / "calib.yml")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_size_that_is_none_is_refused(tmp_path: Path) -> None:
+    no_size: Any = 640
+    with pytest.raises(CalibrationError, match=r"give \(width, height\)"):
+        StereoRig.load(tmp_path, no_size)
+
+
+def test_a_loaded_rig_is_described_in_one_line(tmp_path: Path) -> None:
+    text = repr(StereoRig.load(write_camchain(tmp_path)))
+    assert "\n" not in text
+    assert len(text) < 600
 
 
 # --------------------------------------------------------------------------------------------
