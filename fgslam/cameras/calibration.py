@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,10 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, is_rigid, pose, so3_exp
 from fgslam.core.sensors import CameraRig
+
+# 'baseline' is close to 'baseline_m' (0.89); 'fy' to 'fx' (0.5) and 'baseline_m' to
+# 'vertical_baseline_m' (0.69), which are keys of their own, are not.
+_CLOSE_NAMES = 0.8
 
 
 def read_calibration(path: Path, three_cameras: bool) -> CameraRig:
@@ -62,11 +67,20 @@ def read_json_object(path: Path) -> Mapping[str, Any]:
 def number(path: Path, values: Mapping[str, Any], key: str) -> float:
     """A finite number of the calibration. Raises CalibrationError otherwise."""
     if key not in values:
-        raise CalibrationError(f"{path} has no {key!r}; add it to the calibration")
+        raise CalibrationError(f"{path} has no {key!r}; {_remedy(values, key)}")
     value = values[key]
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise CalibrationError(f"{path}: {key} is {value!r}, not a finite number; correct it")
     return float(value)
+
+
+def _remedy(values: Mapping[str, Any], missing: str) -> str:
+    """What to do about a missing key: to rename one that is spelled nearly alike, or to add it."""
+    close = get_close_matches(missing, values, n=1, cutoff=_CLOSE_NAMES)
+    if not close:
+        return "add it to the calibration"
+    unit = " in metres" if missing.endswith("_m") else ""
+    return f"if {close[0]!r} means it, rename it to {missing!r} (a number{unit})"
 
 
 def positive(path: Path, values: Mapping[str, Any], key: str) -> float:

@@ -16,6 +16,7 @@ from fgslam.core.geometry import right_from_left_camera
 from fgslam.core.measurements import Odometry
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.images import list_numbered_images
+from fgslam.datasets.layouts import layout_hint
 from fgslam.datasets.odometry_settings import RecordedOdometrySettings
 from fgslam.datasets.recorded_odometry import (
     motions_from_poses,
@@ -86,8 +87,12 @@ def _camera_folders(root: Path, use_top: bool) -> list[Path]:
     folders = [root / "right", root / "left"]
     absent = [folder.name for folder in folders if not folder.is_dir()]
     if absent:
+        lacking = f"{root} has no folder {' and no folder '.join(absent)}"
+        other = layout_hint(root, "image_folder")
+        if other:
+            raise DatasetError(f"{lacking}; {other}")
         raise DatasetError(
-            f"{root} has no folder {' and no folder '.join(absent)}: a recording of one camera "
+            f"{lacking}: a recording of one camera "
             "cannot be used, a stereo pair (left/ and right/) is the least; check dataset.path"
         )
     if use_top and (root / "top").is_dir():

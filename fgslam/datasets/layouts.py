@@ -7,6 +7,12 @@ from pathlib import Path
 from fgslam.core.errors import DatasetError
 
 _KITTI_PARTS = ("image_0", "image_1", "calib.txt", "times.txt")
+_NAMES = {
+    "euroc": "an EuRoC folder",
+    "kitti": "a KITTI odometry folder",
+    "light_field": "a light field",
+    "image_folder": "an image folder",
+}
 
 
 def recognise_layout(folder: Path) -> dict[str, str]:
@@ -40,6 +46,19 @@ def recognise_layout(folder: Path) -> dict[str, str]:
     if stereo or ((folder / "calib.json").is_file() and (folder / "times.txt").is_file()):
         return {"kind": "image_folder", "path": str(folder)}
     raise DatasetError(_unknown(folder))
+
+
+def layout_hint(folder: Path, kind: str) -> str:
+    """What to set where the folder has another layout than that of ``kind``; else empty."""
+    try:
+        found = recognise_layout(folder)
+    except DatasetError:
+        return ""
+    if found["kind"] == kind:
+        return ""
+    changed = {key: value for key, value in found.items() if value != str(folder)}
+    keys = " ".join(f"--set dataset.{key}={value}" for key, value in changed.items())
+    return f"this is {_NAMES[found['kind']]}: {keys}"
 
 
 def kitti_drives(root: Path) -> tuple[str, ...]:

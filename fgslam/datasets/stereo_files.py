@@ -100,4 +100,7 @@ def missing_notes(files: StereoFiles, stamps: FloatArray) -> tuple[str, ...]:
 def require_folder(path: Path, what: str) -> None:
     """Raises DatasetError unless the folder exists."""
     if not path.is_dir():
-        raise DatasetError(f"{what} {path} does not exist; check dataset.path and the layout")
+        raise DatasetError(
+            f"{what} {path} does not exist; check dataset.path and the layout, or say where the "
+            "recording is: --set dataset.path=FOLDER"
+        )

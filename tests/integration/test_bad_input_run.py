@@ -302,6 +302,7 @@ def test_experiments_say_clearly_that_their_data_is_absent(
     assert status == 2
     assert str(absent) in line
     assert "does not exist; check dataset.path" in line
+    assert "is: --set dataset.path=F" in line  # FOLDER or FILE
 
 
 def test_ranges_that_leave_nothing(recording: Path, refusal: Refusal) -> None:

@@ -83,7 +83,10 @@ def read_matlab(path: Path) -> MatlabFile:
         DatasetError: it is missing, truncated, or no MATLAB file of version 5.
     """
     if not path.is_file():
-        raise DatasetError(f"{path} does not exist; check dataset.path, the .mat file itself")
+        raise DatasetError(
+            f"{path} does not exist; check dataset.path, or say where the .mat file is: "
+            "--set dataset.path=FILE"
+        )
     try:
         return MatlabFile(path, loadmat(str(path)))
     except _UNREADABLE as error:

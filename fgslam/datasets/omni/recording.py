@@ -93,7 +93,10 @@ def pictures_in(folder: Path, pattern: str = "*") -> list[Path]:
         DatasetError: the folder is absent or holds no such picture.
     """
     if not folder.is_dir():
-        raise DatasetError(f"{folder} does not exist or is no folder; check dataset.path")
+        raise DatasetError(
+            f"{folder} does not exist or is no folder; check dataset.path, or say where the "
+            "recording is: --set dataset.path=FOLDER"
+        )
     found = [
         path
         for path in folder.iterdir()

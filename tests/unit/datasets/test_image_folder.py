@@ -256,6 +256,14 @@ def calibrated(**changes: object) -> object:
     return lambda root: write_calibration(root, **changes)
 
 
+def renamed_key(old: str, new: str) -> object:
+    def rename(root: Path) -> None:
+        path = root / "calib.json"
+        path.write_text(path.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
+
+    return rename
+
+
 def without_key(root: Path) -> None:
     (root / "calib.json").write_text('{"width": 32}', encoding="utf-8")
 
@@ -298,6 +306,12 @@ BAD_RECORDINGS = [
     (calibrated(bTc=np.diag([1, 1, -1, 1]).tolist()), CalibrationError, ["bTc", "rigid"]),
     (calibrated(rectified=False), CalibrationError, ["not rectified", "rectify them"]),
     (without_key, CalibrationError, ["no 'height'", "add it"]),
+    (
+        renamed_key('"baseline_m"', '"baseline"'),
+        CalibrationError,
+        ["no 'baseline_m'", "if 'baseline' means it, rename it", "metres"],
+    ),
+    (renamed_key('"fx"', '"gx"'), CalibrationError, ["no 'fx'; add it"]),
     (broken_json, CalibrationError, ["not JSON", "correct"]),
     (no_calibration, CalibrationError, ["calib.json", "No such file"]),
 ]

@@ -89,6 +89,23 @@ def test_half_an_image_folder_gets_its_readers_message(tmp_path: Path) -> None:
         inspect_recording(tmp_path)
 
 
+def test_image_folder_reader_names_the_layout_that_it_finds_instead(tmp_path: Path) -> None:
+    cameras = (pose(AHEAD, np.zeros(3)), pose(AHEAD, np.array([0.0, -0.1, 0.0])))
+    flying = euroc(tmp_path / "drone", cameras)
+    driving, _ = kitti(tmp_path / "car", 3, "06")
+    (tmp_path / "nothing").mkdir()
+    expected = {
+        flying: r"no folder left; this is an EuRoC folder: --set dataset\.kind=euroc$",
+        driving: r"this is a KITTI odometry folder: --set dataset\.kind=kitti "
+        r"--set dataset\.sequence=06$",
+        driving / "sequences" / "06": r"--set dataset\.kind=kitti --set dataset\.path=.*/car",
+        tmp_path / "nothing": "no folder left: a recording of one camera cannot be used",
+    }
+    for folder, words in expected.items():
+        with pytest.raises(DatasetError, match=words):
+            open_image_folder(ImageFolderSettings(path=str(folder)))
+
+
 def test_unknown_layout_lists_what_is_missing(tmp_path: Path) -> None:
     (tmp_path / "calib.json").write_text("{}", encoding="utf-8")
     with pytest.raises(DatasetError) as caught:
