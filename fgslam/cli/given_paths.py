@@ -40,6 +40,8 @@ def recording(given: str) -> Path:
 def run_folder(given: str) -> Path:
     """Folder of a run. Raises DatasetError."""
     path = Path(given)
+    if not path.exists():
+        raise DatasetError(f"{path}: no such folder; give a run folder, as fgslam run writes it")
     if not is_run_folder(path):
         raise DatasetError(
             f"{path}: not a run folder (no {RUN_MARKER}); give what fgslam run wrote"

@@ -7,6 +7,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +16,7 @@ import typer
 from fgslam.cli import options
 from fgslam.cli.interruption import Tell, stop_flag, stoppable
 from fgslam.core.errors import FgslamError
-from fgslam.runs.named_experiments import find_experiment
+from fgslam.runs.named_experiments import experiment_names, find_experiment
 
 if TYPE_CHECKING:
     from fgslam.runs.baseline import Results
@@ -27,6 +28,7 @@ EXIT_FAULT = 1
 EXIT_INTERRUPTED = 130  # as a shell reports a process that Ctrl-C ended
 # Typer exports only the child; its parent's home differs from one Typer to the next.
 _UsageError: type[typer.BadParameter] = typer.BadParameter.__bases__[0]
+_CLOSE_OPTIONS = 0.6  # typer offers --out for --foo
 
 app = typer.Typer(
     name="fgslam",
@@ -40,7 +42,7 @@ def _root(version: options.Version = False) -> None:
     """Filters and smoothers on one measurement log."""
 
 
-@app.command()
+@app.command(epilog=f"Experiments that come with fgslam: {', '.join(experiment_names())}.")
 def run(
     config: options.Experiment,
     out: options.RunFolder = None,
@@ -290,6 +292,16 @@ def inspect(
     typer.echo(report)
 
 
+def _keep_close_options(error: Exception) -> None:
+    """Of the options that are offered for an unknown one, keeps those that are spelled alike."""
+    offered, given = getattr(error, "possibilities", None), getattr(error, "option_name", "")
+    if offered:
+        # Without dashes, which make any two options similar.
+        names = {name.lstrip("-"): name for name in offered}
+        close = get_close_matches(given.lstrip("-"), names, cutoff=_CLOSE_OPTIONS)
+        error.possibilities = [names[name] for name in close]  # type: ignore[attr-defined]
+
+
 def main() -> None:
     """Entry point: runs a command, turns a user's mistake into one line and exit status 2."""
     arguments = sys.argv[1:] or ["--help"]
@@ -297,6 +309,7 @@ def main() -> None:
         raise SystemExit(app(arguments, prog_name="fgslam", standalone_mode=False))
     except _UsageError as error:
         command = error.ctx.command_path if error.ctx else "fgslam"
+        _keep_close_options(error)
         message = " ".join(error.format_message().split()).rstrip(".")
         print(f"{command}: {message}; see {command} --help", file=sys.stderr)
         raise SystemExit(EXIT_USER) from None

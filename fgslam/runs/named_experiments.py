@@ -44,4 +44,7 @@ def suggestion(missing: Path) -> str:
     close = get_close_matches(missing.stem, experiment_names(), n=1, cutoff=0.75)
     if close:
         return f"the experiment {close[0]} comes with fgslam: give its name"
-    return "give a YAML file, or the name of an experiment that comes with fgslam, e.g. lab_loop"
+    return (
+        "give a YAML file, or the name of an experiment that comes with fgslam, e.g. lab_loop "
+        "(fgslam run --help lists them)"
+    )

@@ -28,6 +28,7 @@ from fgslam.core.trajectories import read_kitti, read_tum
 from fgslam.report.point_cloud import read_ply
 from fgslam.runs.config_models import Experiment
 from fgslam.runs.engine import RunResult
+from fgslam.runs.named_experiments import experiment_names
 
 Capture = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch
@@ -109,7 +110,10 @@ def test_demo_is_the_loop_of_the_paper(monkeypatch: Patch, tmp_path: Path) -> No
     ("arguments", "expected"),
     [
         (("run",), "fgslam run: Missing argument 'EXPERIMENT'; see fgslam run --help"),
-        (("run", "c.yaml", "--outt", "x"), "fgslam run: No such option: --outt"),
+        (("run", "c.yaml", "--outt", "x"), "No such option: --outt (Possible options: --out)"),
+        (("run", "c.yaml", "--foo"), "fgslam run: No such option: --foo; see fgslam run --help"),
+        (("compare", "nothere"), "nothere: no such folder; give a run folder"),
+        (("run", "nothing"), "e.g. lab_loop (fgslam run --help lists them)"),
         (("rum",), "fgslam: No such command 'rum'"),
         (("--version-please",), "fgslam: No such option: --version-please"),
         (("inspect", "x", "--frames", "many"), "fgslam inspect: Invalid value for '--frames'"),
@@ -122,6 +126,12 @@ def test_mistyped_commands(
     arguments: tuple[str, ...], expected: str, monkeypatch: Patch, capfd: Capture
 ) -> None:
     assert expected in mistake(capfd, monkeypatch, *arguments)
+
+
+def test_help_of_run_lists_every_experiment(monkeypatch: Patch, capfd: Capture) -> None:
+    assert main(monkeypatch, "run", "--help") == 0
+    out = " ".join(capfd.readouterr().out.split())
+    assert f"Experiments that come with fgslam: {', '.join(experiment_names())}." in out
 
 
 # --------------------------------------------------------------------------------------------
@@ -284,7 +294,7 @@ def test_mistakes_of_export(
     line = told(run, "--map", tmp_path / "map.xyz")
     assert all(suffix in line for suffix in (".ply", ".pcd", ".off", "xyz"))
     absent = tmp_path / "absent"
-    assert f"{absent}: not a run folder" in told(absent, "--map", tmp_path / "m.ply")
+    assert f"{absent}: no such folder" in told(absent, "--map", tmp_path / "m.ply")
     line = told(run, "--map", tmp_path / "m.ply", "--estimator", "isam2")
     assert f"no estimator 'isam2'; give --estimator with one of {KIND}" in line
     assert "its folder does not exist" in told(run, "--map", tmp_path / "absent" / "m.ply")
