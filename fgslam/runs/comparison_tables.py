@@ -33,11 +33,12 @@ def comparison_tables(one: Compared) -> tuple[TextTable, ...]:
     """Accuracy, consistency, time and memory of the estimators of one run."""
     values = {title: metrics.as_json() for title, metrics in one.metrics.items()}
     consistency = f"{one.name}: consistency (1 is right; {_band(values)})"
-    return (
+    tables = (
         metrics_table(f"{one.name}: accuracy ({_alignment(values)})", _ACCURACY, values),
         metrics_table(consistency, _CONSISTENCY, values),
         metrics_table(f"{one.name}: time and memory, {one.frames} frames", _COST, values),
     )
+    return tuple(table for table in tables if table.columns)
 
 
 def comparison_particulars(one: Compared) -> tuple[tuple[str, str], ...]:
@@ -61,13 +62,18 @@ def ate_table(compared: Sequence[Compared]) -> TextTable:
 def metrics_table(
     heading: str, columns: Sequence[TextColumn], values: Mapping[str, Any]
 ) -> TextTable:
-    """Values of metrics.json by estimator, as text."""
+    """Values of metrics.json by estimator, as text; without columns that no estimator fills."""
+    columns = [column for column in columns if not _is_empty(column, values)]
     rows = []
     for title, metrics in values.items():
         failed = " (failed)" if value_at(metrics, "failure") else ""
         rows.append((title + failed, tuple(_cell(column, metrics) for column in columns)))
     headings = tuple(Column(column.heading, column.why_unknown) for column in columns)
     return TextTable(heading, heading, "estimator", headings, tuple(rows))
+
+
+def _is_empty(column: TextColumn, values: Mapping[str, Any]) -> bool:
+    return all(_cell(column, metrics) == UNKNOWN for metrics in values.values())
 
 
 def _cell(column: TextColumn, metrics: Mapping[str, Any]) -> str:
@@ -86,21 +92,30 @@ def _alignment(values: Mapping[str, Any]) -> str:
 
 
 def _band(values: Mapping[str, Any]) -> str:
-    bands = dict.fromkeys(
-        f"{value_at(m, 'nees_pose.lower'):.2f}-{value_at(m, 'nees_pose.upper'):.2f}"
-        for m in values.values()
-        if value_at(m, "nees_pose.lower") is not None
-    )
-    return f"95 % band of the pose NEES {', '.join(bands)}" if bands else "no truth to judge by"
+    """The bands of the pose NEES; with the estimators of each where there are several."""
+    bands: dict[str, list[str]] = {}
+    for title, m in values.items():
+        if value_at(m, "nees_pose.lower") is not None:
+            band = f"{value_at(m, 'nees_pose.lower'):.2f}-{value_at(m, 'nees_pose.upper'):.2f}"
+            bands.setdefault(band, []).append(title)
+    if not bands:
+        return "no truth to judge by"
+    if len(bands) == 1:
+        return f"95 % band of the pose NEES {next(iter(bands))}"
+    each = "; ".join(f"{band} of {', '.join(titles)}" for band, titles in bands.items())
+    return f"95 % bands of the pose NEES: {each}"
 
 
 def _reasons(values: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Why values are missing, each reason once with the headings that it empties."""
-    found: dict[str, list[str]] = {}
+    """Why values are missing, each reason once with the headings that it empties or leaves out."""
+    found: dict[tuple[str, str], list[str]] = {}
+    done = [m for m in values.values() if not value_at(m, "failure")]
     for column in (*_ACCURACY, *_CONSISTENCY, *_COST):
-        if any(_cell(column, m) == UNKNOWN for m in values.values() if not value_at(m, "failure")):
-            found.setdefault(column.why_unknown, []).append(column.heading.replace("\n", " "))
-    return [(UNKNOWN, f"{', '.join(headings)}: {why}") for why, headings in found.items()]
+        if any(_cell(column, m) == UNKNOWN for m in done):
+            label = "left out" if _is_empty(column, values) else UNKNOWN
+            headings = found.setdefault((label, column.why_unknown), [])
+            headings.append(column.heading.replace("\n", " "))
+    return [(label, f"{', '.join(headings)}: {why}") for (label, why), headings in found.items()]
 
 
 def _remarks(one: Compared, values: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -172,7 +172,7 @@ def matches_over_time(
 
 def nees_over_time(data: ReportData) -> Figure:
     """NEES of the final poses per degree of freedom, with the band of a consistent estimator."""
-    bands = sorted({e.nees_band for e in data.estimators if e.nees_band is not None})
+    bands = _nees_bands(data)
     end = max((float(e.timestamps[-1]) - data.start for e in data.estimators if len(e)), default=1)
     traces = [_band(band, end) for band in bands]
     for i, estimator in enumerate(data.estimators):
@@ -181,17 +181,35 @@ def nees_over_time(data: ReportData) -> Figure:
         values = np.where(estimator.nees > _LEAST_NEES, estimator.nees, np.nan)
         owner = Owner(estimator.title, i)
         traces += _curve(owner, data, estimator, values, {"width": 1.6}, "%{y:.3g}")
-    known = " and ".join(f"{low:.2f} to {high:.2f}" for low, high in bands) or "not known"
     return Figure(
         "nees",
         "Consistency over time (NEES)",
         "Squared error of each final pose in units of its own claimed covariance, per degree of "
         "freedom: 1 is right on average, more is overconfident, less is conservative. Band: 95 % "
-        f"of the values of a consistent estimator, frame by frame ({known}).",
+        f"of the values of a consistent estimator, frame by frame ({_band_words(bands)}).",
         tuple(traces),
         _layout({"title": {"text": "NEES per degree of freedom"}, "type": "log"}),
         missing=_missing(data),
     )
+
+
+def _nees_bands(data: ReportData) -> dict[tuple[float, float], list[str]]:
+    """Bands of the NEES, ascending, each with the titles of the estimators that it is of."""
+    bands: dict[tuple[float, float], list[str]] = {}
+    for estimator in data.estimators:
+        if estimator.nees_band is not None:
+            bands.setdefault(estimator.nees_band, []).append(estimator.title)
+    return dict(sorted(bands.items()))
+
+
+def _band_words(bands: dict[tuple[float, float], list[str]]) -> str:
+    """The bands in words; with the estimators of each where there are several."""
+    several = len(bands) > 1
+    each = [
+        f"{low:.2f} to {high:.2f}" + (f" of {', '.join(titles)}" if several else "")
+        for (low, high), titles in bands.items()
+    ]
+    return "; ".join(each) or "not known"
 
 
 def time_per_frame(data: ReportData) -> Figure:

@@ -249,6 +249,19 @@ def test_nees_of_exact_poses_is_left_out_of_a_logarithmic_axis() -> None:
     assert "0.07 to 3.12" in figure.description
 
 
+def test_nees_caption_says_which_estimator_each_band_is_of() -> None:
+    data = full_report()
+    titles = [estimator.title for estimator in data.estimators]
+    bands = [(0.07, 3.12), *[(0.21, 2.41)] * (len(titles) - 1)]
+    estimators = tuple(
+        dataclasses.replace(estimator, nees_band=band)
+        for estimator, band in zip(data.estimators, bands, strict=True)
+    )
+    figure = nees_over_time(dataclasses.replace(data, estimators=estimators))
+    words = f"(0.07 to 3.12 of {titles[0]}; 0.21 to 2.41 of {', '.join(titles[1:])})"
+    assert words in figure.description
+
+
 # --------------------------------------------------------------------------------------------
 # The page
 

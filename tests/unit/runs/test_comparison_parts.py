@@ -26,6 +26,8 @@ from fgslam.report.landmark_truth import read_landmark_truth, write_landmark_tru
 from fgslam.report.point_cloud import MapPoints
 from fgslam.runs.baseline import check_baseline, read_baseline, write_baseline
 from fgslam.runs.choosing import Choice, all_kinds, choose
+from fgslam.runs.comparison import Compared
+from fgslam.runs.comparison_tables import comparison_particulars, comparison_tables
 from fgslam.runs.config import ExperimentConfig, parse_config
 from fgslam.runs.estimator_files import points_from_log
 from fgslam.runs.tasks.rendered_truth import points_under
@@ -131,6 +133,42 @@ def test_the_table_has_a_row_for_every_estimator_and_run(tmp_path: Path) -> None
     assert first["failure"] == "frame 3, twice: no"
     assert set(rows[1].values()) == {"a", "y", ""}
     assert value_at(METRICS.as_json(), "online.ate_rmse_m.more") is None
+
+
+def compared(metrics: dict[str, EstimatorMetrics]) -> Compared:
+    return Compared("drive", Path("drive"), Path("drive/compare"), 9, metrics)
+
+
+def consistent(lower: float, upper: float) -> EstimatorMetrics:
+    band = {"lower": lower, "upper": upper, "verdict": "consistent"}
+    return EstimatorMetrics(nees_pose_per_dof=1.1, more={"nees_pose": band})
+
+
+def test_consistency_table_says_which_estimator_each_band_is_of() -> None:
+    three, six = consistent(0.07, 3.12), consistent(0.21, 2.41)
+    (table, *_) = comparison_tables(compared({"ekf": three, "isam2": six, "batch": six}))
+    bands = "95 % bands of the pose NEES: 0.07-3.12 of ekf; 0.21-2.41 of isam2, batch"
+    assert table.heading == f"drive: consistency (1 is right; {bands})"
+    (table, *_) = comparison_tables(compared({"isam2": six, "batch": six}))
+    assert table.heading.endswith("(1 is right; 95 % band of the pose NEES 0.21-2.41)")
+
+
+def test_columns_that_no_estimator_fills_are_left_out_with_the_reason() -> None:
+    untrue = compared({"isam2": EstimatorMetrics(update_ms=UpdateTime(1.0, 2.0, 3.0))})
+    (table,) = comparison_tables(untrue)  # accuracy and consistency would be empty
+    assert [column.name.split("\n")[0] for column in table.columns] == ["update ms"]
+    assert table.rows == (("isam2", ("1.00 2.00 3.0",)),)
+    reasons = [text for label, text in comparison_particulars(untrue) if label == "left out"]
+    assert any(r.startswith("ATE final cm, ") and "no ground truth" in r for r in reasons)
+
+
+def test_a_column_that_one_estimator_fills_stays() -> None:
+    some = compared({"a": EstimatorMetrics(ate_rmse_m=0.01), "b": EstimatorMetrics()})
+    (table,) = comparison_tables(some)
+    assert table.rows == (("a", ("1.00",)), ("b", ("-",)))
+    assert ("-", "ATE final cm: no ground truth, or fewer than three poses matched") in (
+        comparison_particulars(some)
+    )
 
 
 def test_landmark_truth_reads_back(tmp_path: Path, rng: np.random.Generator) -> None:
