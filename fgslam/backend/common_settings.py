@@ -10,7 +10,10 @@ from pydantic.dataclasses import dataclass
 from fgslam.core.settings import STRICT
 
 Family: TypeAlias = Literal["filter", "smoother", "other"]
-"""Whether past poses are revised; paired tests compare smoothers with filters, and no others."""
+"""Whether past poses are revised; paired tests compare smoothers with filters, and no others.
+
+An `other` corrects nothing by landmarks seen again: dead reckoning.
+"""
 
 
 @dataclass(frozen=True, config=STRICT)
