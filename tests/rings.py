@@ -130,7 +130,7 @@ def drive(pipeline: SlamPipeline, frames: Iterable[FeatureFrame]) -> list[FrameR
 
 
 def error_m(report: FrameReport, true: FloatArray) -> float:
-    """Of the position as told with the frame."""
+    """Of the position as given with the frame."""
     return difference(true, report.stats.wTc)[0]
 
 

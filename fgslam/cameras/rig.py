@@ -54,7 +54,7 @@ class StereoRig(CameraRig):
 
     @staticmethod
     def load(path: str | Path, size: tuple[int, int] | None = None) -> StereoRig:
-        """The rig of a calibration file or folder; its format is told from what is in it.
+        """The rig of a calibration file or folder; its format is recognised by its content.
 
         Known are our calib.json; Kalibr's camchain (pinhole, radtan); the files of OpenCV's stereo
         calibration (M1, D1, M2, D2, R, T); a folder with left.yaml and right.yaml of ROS

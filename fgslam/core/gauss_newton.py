@@ -41,7 +41,7 @@ class GaussNewton:
         Args:
             start: (c, k) first guesses.
             linearise: gives Hessians and gradients at unknowns (g, k) of the problems that go on,
-                and is told the iteration, from 0. Robust weights are its own affair: reweighting
+                and is given the iteration, from 0. Robust weights are its own affair: reweighting
                 with every call makes this iteratively reweighted least squares.
 
         Raises:

@@ -75,7 +75,7 @@ class Reader(Generic[Model]):
     def _drop_unknown(self, inner: Any, group: str, given: set[str]) -> None:
         """Drops keys that meant something to the file's kind, not to the one an override chose.
 
-        Keys that are overrides themselves (``given``, dotted) stay: a misspelt one must be told.
+        Keys that are overrides themselves (``given``, dotted) stay: a misspelt one is refused.
         """
         if not isinstance(inner, dict):
             return

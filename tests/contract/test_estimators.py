@@ -411,9 +411,9 @@ def test_a_true_loop_does_no_harm(
     truth = np.array(world.poses)
     errors = np.linalg.norm(estimate.trajectory.poses[:, :3, 3] - truth[:, :3, 3], axis=1)
     assert errors.max() < 0.03
-    told = [words for words in estimate.remarks if "loop closure to frame 3" in words]
-    assert len(told) == 1
-    assert "refused" not in told[0]
+    reported = [words for words in estimate.remarks if "loop closure to frame 3" in words]
+    assert len(reported) == 1
+    assert "refused" not in reported[0]
     ended = increments[FRAMES - 2].loops[0].merged[0, 0]
     assert ended not in estimate.landmarks.ids
     assert ended not in estimator.landmarks().ids

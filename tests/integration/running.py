@@ -78,15 +78,15 @@ def metrics_of(folder: Path) -> dict[str, Any]:
     return document
 
 
-def assert_valid_results(folder: Path, frames: int | None = None, torn: int = 0) -> int:
+def assert_valid_results(folder: Path, frames: int | None = None, split_saves: int = 0) -> int:
     """Every file reads back and they agree on the number of frames, which is returned.
 
-    A kill between two files of one save (``torn`` 1) leaves each whole, but some a frame ahead.
+    A kill between two files of one save (``split_saves`` 1) leaves each whole, some a frame ahead.
     """
     metrics = metrics_of(folder)
     count = int(metrics["frames"])
     assert frames in (None, count)
-    allowed = range(count, count + 1 + torn)
+    allowed = range(count, count + 1 + split_saves)
     log = MeasurementLog.load(folder / "measurements.npz")
     final = read_tum(folder / KIND / "final.tum")
     online = read_tum(folder / KIND / "online.tum")
@@ -96,10 +96,10 @@ def assert_valid_results(folder: Path, frames: int | None = None, torn: int = 0)
     for length in (len(log), len(final), len(online), len(stamps)):
         assert length in allowed
     # Written after the metrics.
-    assert len(rows) in {1 + len(STAGES) * (count - k) for k in range(1 + torn)}
+    assert len(rows) in {1 + len(STAGES) * (count - k) for k in range(1 + split_saves)}
     assert np.isfinite(covariances).all()
     assert len(points) > 100
-    assert torn or len(points) == metrics["estimators"][KIND]["landmarks"]
+    assert split_saves or len(points) == metrics["estimators"][KIND]["landmarks"]
     assert yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))["name"]
     return count
 

@@ -284,20 +284,21 @@ def test_export_of_an_interrupted_run(
 def test_mistakes_of_export(
     finished: Finished, tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:
-    def told(*arguments: object) -> str:
+    def reported(*arguments: object) -> str:
         return mistake(capfd, monkeypatch, "export", *arguments)
 
     run = finished.folder
-    assert "nothing to export; give --map FILE.ply, --trajectory FILE.tum or --graph" in told(run)
-    assert "use .tum or .kitti" in told(run, "--trajectory", tmp_path / "t.csv")
-    assert "use .g2o" in told(run, "--graph", tmp_path / "t.graph")
-    line = told(run, "--map", tmp_path / "map.xyz")
+    nothing = "nothing to export; give --map FILE.ply, --trajectory FILE.tum or --graph"
+    assert nothing in reported(run)
+    assert "use .tum or .kitti" in reported(run, "--trajectory", tmp_path / "t.csv")
+    assert "use .g2o" in reported(run, "--graph", tmp_path / "t.graph")
+    line = reported(run, "--map", tmp_path / "map.xyz")
     assert all(suffix in line for suffix in (".ply", ".pcd", ".off", "xyz"))
     absent = tmp_path / "absent"
-    assert f"{absent}: no such folder" in told(absent, "--map", tmp_path / "m.ply")
-    line = told(run, "--map", tmp_path / "m.ply", "--estimator", "isam2")
+    assert f"{absent}: no such folder" in reported(absent, "--map", tmp_path / "m.ply")
+    line = reported(run, "--map", tmp_path / "m.ply", "--estimator", "isam2")
     assert f"no estimator 'isam2'; give --estimator with one of {KIND}" in line
-    assert "its folder does not exist" in told(run, "--map", tmp_path / "absent" / "m.ply")
+    assert "its folder does not exist" in reported(run, "--map", tmp_path / "absent" / "m.ply")
     assert list(tmp_path.iterdir()) == []
 
 

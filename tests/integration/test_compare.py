@@ -172,7 +172,7 @@ def test_compare_gives_the_runs_own_bytes_and_a_table(
 def test_one_estimator_may_fail(
     plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    """A map too large for the EKF is told; the filter beside it goes on."""
+    """A map too large for the EKF is reported; the filter beside it goes on."""
     out = tmp_path / "out"
     arguments = ("--estimators", f"ekf,{KIND}", "--set", "estimators.ekf.max_landmarks=45")
     assert main(monkeypatch, "compare", plain, "--out", out, *arguments) == 0
@@ -210,7 +210,7 @@ def test_two_runs_are_compared_side_by_side(
         (("--check-baseline", "RUN/config.yaml"), "cannot be read as a baseline"),
     ],
 )
-def test_mistakes_are_told_in_a_line(
+def test_mistakes_are_reported_in_a_line(
     plain: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -227,7 +227,7 @@ def test_mistakes_are_told_in_a_line(
     assert (plain / "measurements.npz").is_file()
 
 
-def test_what_is_no_run_is_told(
+def test_what_is_no_run_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     assert main(monkeypatch, "compare", tmp_path) == 2
@@ -238,7 +238,7 @@ def test_what_is_no_run_is_told(
     assert "give it to fgslam run first, or add --trials" in capsys.readouterr().err
 
 
-def test_a_damaged_truth_is_told_before_anything_is_written(
+def test_a_damaged_truth_is_reported_before_anything_is_written(
     plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     run, out = Path(shutil.copytree(plain, tmp_path / "run")), tmp_path / "out"

@@ -85,10 +85,12 @@ def test_a_follower_commands_what_the_closed_loop_does(tmp_path: Path, world: Om
         command = follower.step(world.image(k * DT), k * DT)
         world.drive(command.v, command.omega, DT)
         assert (row["state"], row["reason"]) == (command.state.value, command.reason)
-        told = [command.v, *np.degrees([command.omega, command.heading]), command.remaining]
+        reported = [command.v, *np.degrees([command.omega, command.heading]), command.remaining]
         names = ("speed_mps", "turn_deg_s", "heading_deg", "remaining")
         # Times are sums in the one and products in the other.
-        np.testing.assert_allclose(told, [float(row[name]) for name in names], rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(
+            reported, [float(row[name]) for name in names], rtol=1e-7, atol=1e-7
+        )
 
 
 def test_followers_side_by_side_do_not_disturb_each_other(world: OmniWorld) -> None:

@@ -229,7 +229,7 @@ def refused(tmp_path: Path, dataset: dict[str, Any], **more: Any) -> Path:
     return write_config(tmp_path / "c.yaml", values)
 
 
-def test_a_missing_folder_is_told_before_anything_is_written(
+def test_a_missing_folder_is_reported_before_anything_is_written(
     tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:
     config = refused(tmp_path, {"kind": "panoramas", "path": str(tmp_path / "absent")})
@@ -239,7 +239,7 @@ def test_a_missing_folder_is_told_before_anything_is_written(
     assert not (tmp_path / "run").exists()
 
 
-def test_an_unreadable_calibration_is_told(
+def test_an_unreadable_calibration_is_reported(
     tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:
     folder = panoramas(tmp_path / "pictures", ((64, 48),))
@@ -251,7 +251,7 @@ def test_an_unreadable_calibration_is_told(
     assert "calib_results.txt" in line
 
 
-def test_an_image_of_another_size_is_told(
+def test_an_image_of_another_size_is_reported(
     tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:
     folder = panoramas(tmp_path / "pictures", ((64, 32), (48, 24)))
@@ -261,7 +261,7 @@ def test_an_image_of_another_size_is_told(
     assert "all must have one size" in capfd.readouterr().err.splitlines()[-1]
 
 
-def test_an_unknown_task_and_an_unknown_route_are_told(
+def test_an_unknown_task_and_an_unknown_route_are_reported(
     tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:
     folder = panoramas(tmp_path / "pictures", ((64, 32), (64, 32)))

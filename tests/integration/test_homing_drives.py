@@ -96,8 +96,8 @@ def test_files_and_numbers_of_drives(record: DriveRecord, tmp_path: Path) -> Non
         ("4", "1", "arrived"),
         ("4", "2", "arrived"),
     ]
-    told = [float(leg["pass_distance_m"]) for leg in legs]
-    np.testing.assert_allclose(told, pass_distances(record), rtol=1e-9)
+    reported = [float(leg["pass_distance_m"]) for leg in legs]
+    np.testing.assert_allclose(reported, pass_distances(record), rtol=1e-9)
     for name in ("commands.csv", "trajectory.csv"):
         assert len((tmp_path / name).read_text(encoding="utf-8").splitlines()) == len(record) + 1
     assert len(load_bearing_logs(tmp_path)) == sum(bool(h.tracks) for h in record.homings)

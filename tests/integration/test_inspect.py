@@ -133,11 +133,14 @@ def test_sound_triple_agrees_in_depth(tmp_path: Path) -> None:
 
 def test_number_of_frames_is_respected(tmp_path: Path) -> None:
     root = write(tmp_path, PAIR)
-    told: list[tuple[str, int, int]] = []
-    report = inspect_recording(root, (), 2, lambda *now: told.append(now))
+    reported: list[tuple[str, int, int]] = []
+    report = inspect_recording(root, (), 2, lambda *now: reported.append(now))
     assert "frames matched 2: 0, 5" in flat(report)
-    assert [now for now in told if now[0] == "matching"] == [("matching", 1, 2), ("matching", 2, 2)]
-    assert told.count(("reading", 6, 6)) == 1
+    assert [now for now in reported if now[0] == "matching"] == [
+        ("matching", 1, 2),
+        ("matching", 2, 2),
+    ]
+    assert reported.count(("reading", 6, 6)) == 1
 
 
 def test_overrides_select_frames_and_cameras(tmp_path: Path) -> None:
@@ -163,18 +166,18 @@ def test_no_line_is_wider_than_a_terminal_unless_a_word_is(tmp_path: Path) -> No
 # Cameras
 
 
-def test_swapped_cameras_are_told_first(tmp_path: Path) -> None:
+def test_swapped_cameras_are_reported_first(tmp_path: Path) -> None:
     report = inspect_recording(write(tmp_path, {"right": (1.0, 0.0), "left": (0.0, 0.0)}), (), 4)
     findings = [line for line in report.splitlines() if line.startswith(("PROBLEM", "WARNING"))]
     assert findings[0].startswith("PROBLEM  epipolar: cameras look swapped: ")
     assert "swap left and right" in flat(report)
     assert "depth unknown: too few matches" in flat(report)
-    # What only follows from the swap is not told again.
+    # What only follows from the swap is not reported again.
     assert len(findings) == 1
     assert report.splitlines()[-1].startswith("1 problem:")
 
 
-def test_shifted_rows_are_told(tmp_path: Path) -> None:
+def test_shifted_rows_are_reported(tmp_path: Path) -> None:
     report = inspected(write(tmp_path, PAIR, {"left": lambda image: np.roll(image, 3, axis=0)}))
     assert "PROBLEM epipolar: rows disagree by +3.0 px: the pair is not rectified" in report
 
@@ -211,23 +214,23 @@ def test_magnified_camera_is_measured(tmp_path: Path) -> None:
     assert numbers(pattern, report)[0] == pytest.approx(4.0, abs=0.6)
 
 
-def test_left_camera_above_is_told(tmp_path: Path) -> None:
+def test_left_camera_above_is_reported(tmp_path: Path) -> None:
     report = inspected(write(tmp_path, {"right": (0.0, 0.0), "left": (0.0, 1.0)}))
     assert "PROBLEM epipolar: the left camera seems to lie above or below the right one" in report
 
 
-def test_top_camera_below_is_told(tmp_path: Path) -> None:
+def test_top_camera_below_is_reported(tmp_path: Path) -> None:
     report = inspected(write(tmp_path, {**PAIR, "top": (0.0, -1.0)}))
     assert "PROBLEM epipolar, top: the top camera looks swapped with the right one, or" in report
     assert "dataset.use_top" in report
 
 
-def test_top_camera_beside_is_told(tmp_path: Path) -> None:
+def test_top_camera_beside_is_reported(tmp_path: Path) -> None:
     report = inspected(write(tmp_path, {**PAIR, "top": (-1.0, 0.0)}))
     assert "PROBLEM epipolar, top: the top camera seems to lie beside the right one" in report
 
 
-def test_wrong_vertical_baseline_is_told(tmp_path: Path) -> None:
+def test_wrong_vertical_baseline_is_reported(tmp_path: Path) -> None:
     root = write(tmp_path, TRIPLE)
     values = json.loads((root / "calib.json").read_text())
     values["vertical_baseline_m"] = 0.08
@@ -248,7 +251,7 @@ def test_cameras_that_are_not_triggered_together(tmp_path: Path) -> None:
     assert "most in frames 3: trigger the cameras together" in report
 
 
-def test_disparities_beyond_the_gate_are_told(tmp_path: Path) -> None:
+def test_disparities_beyond_the_gate_are_reported(tmp_path: Path) -> None:
     report = inspected(write(tmp_path, PAIR), "frontend.stereo.max_disparity_px=10")
     assert "more than frontend.stereo.max_disparity_px = 10 and are lost; raise it to 20" in report
 
@@ -257,7 +260,7 @@ def test_disparities_beyond_the_gate_are_told(tmp_path: Path) -> None:
 # Images and files
 
 
-def test_black_and_missing_images_are_told(tmp_path: Path) -> None:
+def test_black_and_missing_images_are_reported(tmp_path: Path) -> None:
     root = write(tmp_path, PAIR)
     cv2.imwrite(str(root / "right" / "000002.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
     (root / "left" / "000005.png").unlink()
@@ -269,7 +272,7 @@ def test_black_and_missing_images_are_told(tmp_path: Path) -> None:
     assert "2 problems" in report
 
 
-def test_dim_camera_with_few_features_is_told(tmp_path: Path) -> None:
+def test_dim_camera_with_few_features_is_reported(tmp_path: Path) -> None:
     def dim(image: Image) -> Image:
         blurred = cv2.GaussianBlur(image, (0, 0), 6.0)
         return np.asarray(blurred // 3, np.uint8)
@@ -287,7 +290,7 @@ def test_featureless_recording_is_reported_not_crashed(tmp_path: Path) -> None:
     assert "depth unknown: too few matches" in report
 
 
-def test_truth_and_odometry_are_told(tmp_path: Path) -> None:
+def test_truth_and_odometry_are_reported(tmp_path: Path) -> None:
     root = write(tmp_path, PAIR)
     rows = [f"{0.5 * k} {0.2 * k} 0 0 0 0 0 1" for k in range(FRAMES)]
     (root / "gt_right_cam.txt").write_text("\n".join(rows), encoding="utf-8")
@@ -340,9 +343,9 @@ def test_rendered_lab_is_found_sound(
     monkeypatch.setenv("FGSLAM_CACHE", str(tmp_path / "cache"))
     experiment = tmp_path / "lab.yaml"
     experiment.write_text("name: lab\ndataset: {kind: rendered_lab, stop: 3}", encoding="utf-8")
-    told: list[str] = []
-    report = flat(inspect_recording(experiment, (), 3, lambda what, *_: told.append(what)))
-    assert set(told) == {"rendering", "reading", "matching"}
+    reported: list[str] = []
+    report = flat(inspect_recording(experiment, (), 3, lambda what, *_: reported.append(what)))
+    assert set(reported) == {"rendering", "reading", "matching"}
     assert "cameras 3, 320x240" in report
     assert numbers(r"three-camera matches (\d+) ", report)[0] > 60
     assert report.endswith("No problem found.")

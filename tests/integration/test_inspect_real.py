@@ -41,7 +41,7 @@ def test_real_recordings_have_no_problem(shared_data: Path, name: str) -> None:
     assert "matches:" not in report
 
 
-def test_exchanged_folders_are_told(shared_data: Path, tmp_path: Path) -> None:
+def test_exchanged_folders_are_reported(shared_data: Path, tmp_path: Path) -> None:
     recording = source(shared_data, "kitti06")
     swapped = linked(recording, tmp_path / "swapped", left="right", right="left")
     report = inspect_recording(swapped, (), 5)
@@ -60,16 +60,16 @@ def test_turned_left_camera_is_measured(shared_data: Path, tmp_path: Path) -> No
         assert image is not None
         cv2.imwrite(str(root / name), cv2.warpAffine(image, matrix, (376, 240)))
     report = flat(inspect_recording(root, ["dataset.stop=40"], 8))
-    told = report.partition("turned anticlockwise by about ")[2].split(" ", maxsplit=1)[0]
-    assert float(told) == pytest.approx(1.0, abs=0.1)
+    reported = report.partition("turned anticlockwise by about ")[2].split(" ", maxsplit=1)[0]
+    assert float(reported) == pytest.approx(1.0, abs=0.1)
 
 
 def test_clock_of_the_real_odometry(shared_data: Path) -> None:
     """-0.06 s is what the images alone gave (docs/datasets/image_folder.md)."""
     root = source(shared_data, "kitti_raw_0926_5hz")
     assert "stamps are shifted by -0.06 s" in flat(inspect_recording(root, (), 1))
-    mended = inspect_recording(root, ["odometry.time_offset_s=-0.06"], 1)
-    assert "odometry.time_offset_s" not in mended
+    corrected = inspect_recording(root, ["odometry.time_offset_s=-0.06"], 1)
+    assert "odometry.time_offset_s" not in corrected
 
 
 def test_experiment_on_a_real_recording(shared_data: Path, tmp_path: Path) -> None:

@@ -229,12 +229,12 @@ def test_rendering_is_deterministic(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_seeds_share_one_render_but_not_their_noise() -> None:
     settings = replace(QUICK, effects=LabEffectsSettings(noise_grey=2.0))
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     a = opened(settings, (50, 51), seed=1)
     b = RenderedLabSequence(
-        settings, 2, start=50, stop=51, progress=lambda d, n: told.append((d, n))
+        settings, 2, start=50, stop=51, progress=lambda d, n: reported.append((d, n))
     )
-    assert told == []
+    assert reported == []
     assert a.identity != b.identity
     difference = a.frame(0).images[0].astype(float) - b.frame(0).images[0]
     assert difference.std() == pytest.approx(2.0 * np.sqrt(2.0), rel=0.1)
@@ -250,11 +250,11 @@ def test_half_written_cache_is_continued_and_damage_repaired() -> None:
     damaged = bytearray(files[2].read_bytes())
     damaged[-5] ^= 0x40
     files[2].write_bytes(damaged)
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     again = RenderedLabSequence(
-        QUICK, 0, start=70, stop=74, progress=lambda d, n: told.append((d, n))
+        QUICK, 0, start=70, stop=74, progress=lambda d, n: reported.append((d, n))
     )
-    assert told == [(1, 2), (2, 2)]
+    assert reported == [(1, 2), (2, 2)]
     for i in range(4):
         np.testing.assert_array_equal(again.frame(i).images[0], before[i])
     assert files[2].read_bytes() != bytes(damaged)

@@ -47,20 +47,20 @@ def values_of(recording: Path, map_file: Path, **changes: Any) -> dict[str, Any]
     } | changes
 
 
-def test_one_frame_is_told_in_full(
+def test_one_frame_is_reported_in_full(
     monkeypatch: pytest.MonkeyPatch,
     recording: Path,
     map_file: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(monkeypatch, "localize", map_file, recording, "--frame", 5) == 0
-    told = dict(
+    reported = dict(
         line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines() if " " in line
     )
-    assert told["frame"].strip() == "5, from 1 frame"
-    assert told["verdict"].strip() == "found"
-    assert float(told["error"].split()[0]) < 1.0  # centimetres
-    assert {"position", "sigma", "candidates", "inliers", "residual", "why"} <= set(told)
+    assert reported["frame"].strip() == "5, from 1 frame"
+    assert reported["verdict"].strip() == "found"
+    assert float(reported["error"].split()[0]) < 1.0  # centimetres
+    assert {"position", "sigma", "candidates", "inliers", "residual", "why"} <= set(reported)
 
 
 def test_every_frame_with_files_that_repeat_the_run(
@@ -131,7 +131,7 @@ def test_nothing_to_see_is_refused_not_an_error(
         (("--set", "localisation.fame=3"), "unknown key localisation.fame"),
     ],
 )
-def test_wrong_frames_are_told(
+def test_wrong_frames_are_reported(
     options: tuple[object, ...],
     words: str,
     monkeypatch: pytest.MonkeyPatch,
@@ -144,7 +144,7 @@ def test_wrong_frames_are_told(
     assert words in line
 
 
-def test_wrong_maps_and_recordings_are_told(
+def test_wrong_maps_and_recordings_are_reported(
     monkeypatch: pytest.MonkeyPatch,
     own_recording: Path,
     map_file: Path,
@@ -153,8 +153,8 @@ def test_wrong_maps_and_recordings_are_told(
 ) -> None:
     def line(*arguments: object) -> str:
         assert main(monkeypatch, "localize", *arguments) == 2
-        (told,) = capsys.readouterr().err.splitlines()
-        return told
+        (reported,) = capsys.readouterr().err.splitlines()
+        return reported
 
     assert "no such file" in line(tmp_path / "none.fgmap", own_recording)
     foreign = tmp_path / "foreign.fgmap"

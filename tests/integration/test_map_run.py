@@ -234,9 +234,9 @@ def test_replays_of_it_begin_in_the_map_and_give_the_same_bits(
         assert (folder / KIND / name).read_bytes() == (folder / "again" / name).read_bytes()
     failure = metrics_of(folder)["estimators"]["odometry"]["failure"]
     assert "cannot begin in a saved map" in failure
-    told = yaml.safe_load((folder / "config.yaml").read_text())
-    del told["provenance"]["map"]["file"]
-    (folder / "config.yaml").write_text(yaml.safe_dump(told))
+    reported = yaml.safe_load((folder / "config.yaml").read_text())
+    del reported["provenance"]["map"]["file"]
+    (folder / "config.yaml").write_text(yaml.safe_dump(reported))
     with pytest.raises(ConfigError, match="does not say how the run entered its map"):
         arrival_of(folder)
 
@@ -288,8 +288,8 @@ def test_a_map_made_by_the_run_itself(recording: Path, tmp_path: Path) -> None:
 # Refused, before anything is driven
 
 
-def refused(values: dict[str, Any], folder: Path, told: str, kind: type[FgslamError]) -> None:
-    with pytest.raises(kind, match=told) as refusal:
+def refused(values: dict[str, Any], folder: Path, reported: str, kind: type[FgslamError]) -> None:
+    with pytest.raises(kind, match=reported) as refusal:
         run_values(values, folder)
     assert "\n" not in str(refusal.value)
     assert not folder.exists()
@@ -300,7 +300,7 @@ def test_maps_that_cannot_be_used(
 ) -> None:
     run, given = tmp_path / "run", str(map_file)
     other = write_recording(tmp_path / "other", 3, top=False)
-    for values, told in (
+    for values, reported in (
         (mapped(recording, load=str(tmp_path / "none")), "no such file"),
         (mapped(other, load=given), "another rig .vertical_baseline 0.1"),
         (mapped(recording, load=given, start="continue"), "nothing is left to go on with"),
@@ -308,13 +308,13 @@ def test_maps_that_cannot_be_used(
         (mapped(recording, load=given, start="continue", kind="ekf"), "another estimator"),
         (mapped(recording, load=given, start="continue") | {"seed": 4}, "another seed"),
     ):
-        refused(values, run, told, MapError)
-    for values, told in (
+        refused(values, run, reported, MapError)
+    for values, reported in (
         (mapped(recording, load=given, kind="odometry"), "cannot begin in a saved map"),
         (mapped(recording, load=given, kind="fixed_lag"), "cannot begin in a saved map"),
         (mapped(recording, load=given, extend=False, kind="isam2"), "cannot leave a map as it is"),
     ):
-        refused(values, run, told, ConfigError)
+        refused(values, run, reported, ConfigError)
     small = mapped(recording, load=given)
     small["estimator"] = {"kind": "ekf", "max_landmarks": 100}
     refused(small, run, r"the saved map: .* exceed max_landmarks 100", EstimatorError)
@@ -346,8 +346,8 @@ def test_a_map_without_its_session(recording: Path, tmp_path: Path) -> None:
 
 def test_nothing_is_located_in_the_map_of_another_place(map_file: Path, tmp_path: Path) -> None:
     elsewhere = write_recording(tmp_path / "elsewhere", 4, seed=5)
-    told = "none of the first 4 frames of elsewhere could be located"
-    refused(mapped(elsewhere, load=str(map_file)), tmp_path / "run", told, MapError)
+    reported = "none of the first 4 frames of elsewhere could be located"
+    refused(mapped(elsewhere, load=str(map_file)), tmp_path / "run", reported, MapError)
 
 
 # --------------------------------------------------------------------------------------------
@@ -367,9 +367,9 @@ def test_saved_and_used_from_the_command_line(
     assert main(monkeypatch, "run", config, "--out", run, "--map-in", saved) == 0
     assert "extended: located at" in capsys.readouterr().out
     assert main(monkeypatch, "export", saved) == 0
-    told = capsys.readouterr().out
-    assert "12 frames of" in told
-    assert "map.start continue can go on" in told
+    reported = capsys.readouterr().out
+    assert "12 frames of" in reported
+    assert "map.start continue can go on" in reported
 
 
 def test_exported_as_of_a_run(
@@ -385,7 +385,7 @@ def test_exported_as_of_a_run(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "reported"),
     [
         (("--graph", "x.g2o"), "a saved map has landmarks and a trajectory"),
         (("--estimator", "ekf"), "a saved map has landmarks and a trajectory"),
@@ -394,7 +394,7 @@ def test_exported_as_of_a_run(
 )
 def test_what_a_map_cannot_be_exported_to(
     arguments: tuple[str, str],
-    told: str,
+    reported: str,
     map_file: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -402,6 +402,6 @@ def test_what_a_map_cannot_be_exported_to(
     assert main(monkeypatch, "export", map_file, *arguments) == 2
     error = capsys.readouterr().err
     assert error.startswith("fgslam: ")
-    assert told in error
+    assert reported in error
     assert error.count("\n") == 1
     assert main(monkeypatch, "export", map_file, "--map", map_file) == 2

@@ -251,7 +251,7 @@ def test_signals(
     os.kill(process.pid, number)
     out, error = process.communicate(timeout=60)
     assert "Traceback" not in error
-    done = assert_valid_results(folder, torn=int(number == signal.SIGKILL))
+    done = assert_valid_results(folder, split_saves=int(number == signal.SIGKILL))
     assert 5 <= done < 40
     if number == signal.SIGKILL:
         assert process.returncode == -signal.SIGKILL
@@ -277,7 +277,7 @@ def test_a_second_ctrl_c_ends_at_once(long_values: dict[str, Any], tmp_path: Pat
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "Traceback" not in error
-    done = assert_valid_results(folder, torn=1)
+    done = assert_valid_results(folder, split_saves=1)
     resumed = run_values(long_values, folder, "resume", stop_after(1))
     # The state may be one save behind the results.
     assert done <= assert_valid_results(resumed.folder) <= done + 1

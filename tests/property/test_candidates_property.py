@@ -96,8 +96,8 @@ def test_the_mutually_closest_win(found, seed) -> None:
 
     expected = set()
     for x, y in found:
-        rivals = [cost(p, q) for p, q in found if (p == x) != (q == y)]
-        if all(cost(x, y) <= 0.99 * rival for rival in rivals):
+        competing = [cost(p, q) for p, q in found if (p == x) != (q == y)]
+        if all(cost(x, y) <= 0.99 * other for other in competing):
             expected.add((x, y))
     assert set(zip(a.tolist(), b.tolist(), strict=True)) == expected
 

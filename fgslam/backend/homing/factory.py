@@ -1,4 +1,4 @@
-"""Builds homing estimators from their settings; the only place where their kinds are told apart."""
+"""Builds homing estimators from their settings; the only place that tells their kinds apart."""
 
 from __future__ import annotations
 

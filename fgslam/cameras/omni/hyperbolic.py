@@ -69,7 +69,7 @@ class HyperbolicMirror(RadialCamera):
         clockwise: bool = True,
         margin_px: float = 0.0,
     ) -> HyperbolicMirror:
-        """A mirror amid a picture (width, height), whose rim touches the nearest border.
+        """A mirror centred in a picture (width, height), whose rim touches the nearest border.
 
         ``elevations`` in radians are those at the inner and at the outer rim; ``margin_px`` is left
         free around the rim.

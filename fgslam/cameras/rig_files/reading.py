@@ -36,7 +36,7 @@ class RigFile:
 
 
 def read_rig(path: Path, size: Size | None = None) -> RigFile:
-    """The rig of a calibration file or folder, its format told from what is in it.
+    """The rig of a calibration file or folder, its format recognised by its content.
 
     Args:
         path: see :meth:`fgslam.cameras.rig.StereoRig.load`.

@@ -231,7 +231,7 @@ def _once(pixels: FloatArray, scale: FloatArray, period: int | None) -> BoolArra
 
     OpenCV finds some extrema from two neighbouring levels, and a continued panorama shows what is
     near the seam on both sides, a fraction of its scale apart as the pyramid's phase differs. Two
-    such copies would be each other's rivals in the ratio test.
+    such copies would compete with each other in the ratio test.
     """
     keep = np.ones(len(pixels), np.bool_)
     places, box = pixels, None

@@ -11,6 +11,8 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
+from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.worlds.buildings.house import DEPTH, WIDTH, build_house
@@ -19,9 +21,12 @@ from fgslam.worlds.driving.range_scan import RangeSensor
 from fgslam.worlds.driving.reference_paths import PathPlanner
 from fgslam.worlds.driving.wheelchair import RADIUS_M, Wheelchair
 from fgslam.worlds.house import disturbances
-from fgslam.worlds.house.camera import make_house_camera
 from fgslam.worlds.house.people import PERSON_RADIUS, People
-from fgslam.worlds.house.settings import OmniHouseSettings
+from fgslam.worlds.house.settings import (
+    HouseCameraSettings,
+    HousePanoramaSettings,
+    OmniHouseSettings,
+)
 from fgslam.worlds.rendering.colour_textures import build_colour_library
 from fgslam.worlds.rendering.lighting import bake
 from fgslam.worlds.rendering.patches import stack
@@ -43,6 +48,8 @@ CAMERA_HEIGHT_M = 1.2
 _PATH_CLEARANCE_M = 0.55
 # Nearer than this to an obstacle's coarse distance, contact is decided exactly; metres.
 _CONTACT_M = 0.06
+# Between the mirror's rim and the nearest border of the image.
+_MARGIN_PX = 0.5
 
 
 class HouseModel:
@@ -75,6 +82,21 @@ class HouseModel:
 def open_house(seed: int) -> HouseModel:
     """The house, kept for the next world in it (some 100 MB each)."""
     return HouseModel(seed)
+
+
+def make_house_camera(settings: HouseCameraSettings) -> OmniCamera:
+    """The camera model that images of the house obey.
+
+    Raises:
+        CalibrationError: the mirror cannot show what is asked for.
+    """
+    if isinstance(settings, HousePanoramaSettings):
+        return Equirectangular(settings.width, settings.height)
+    bottom, top = np.deg2rad([settings.bottom_elevation_deg, settings.top_elevation_deg])
+    size = (settings.width, settings.height)
+    return HyperbolicMirror.with_view(
+        size, settings.xi, (float(bottom), float(top)), margin_px=_MARGIN_PX
+    )
 
 
 class OmniWorld:

@@ -113,8 +113,8 @@ def test_landmark_without_any_fitting_observation_is_left_out_with_a_remark(
     simulation = drawn(7)
     estimator, _ = run(BatchSettings(), simulation.increments)
     variable = estimator._builder.admission.tracks[3].variable
-    told = [{variable: "has no observation that fits the others"}]
-    monkeypatch.setattr(refinement, "_lost", lambda *given: told.pop() if told else {})
+    reported = [{variable: "has no observation that fits the others"}]
+    monkeypatch.setattr(refinement, "_lost", lambda *given: reported.pop() if reported else {})
     found = estimator.estimate()
     assert_finite(found)
     assert len(found.remarks) == 1

@@ -219,9 +219,9 @@ def test_a_landmark_that_moved_starts_anew(name: str, drive: Simulation) -> None
     increments = moved(drive, OFTEN, 8, place, np.random.default_rng(1))
     estimator, _ = run(SMOOTHERS[name], increments)
     found = estimator.estimate()
-    told = [r for r in found.remarks if r.startswith(f"landmark {OFTEN} (seen ")]
-    assert len(told) == 1
-    assert "moved, started anew" in told[0]
+    reported = [r for r in found.remarks if r.startswith(f"landmark {OFTEN} (seen ")]
+    assert len(reported) == 1
+    assert "moved, started anew" in reported[0]
     offset = found.landmarks.positions[row_of(found, OFTEN)] - place
     covariance = found.landmarks.covariances[row_of(found, OFTEN)]
     assert offset @ np.linalg.solve(covariance, offset) < 16.3

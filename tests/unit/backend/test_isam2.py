@@ -126,10 +126,12 @@ def test_one_taken_out_comes_back_when_it_is_known_twice_as_well() -> None:
 def test_failure_beyond_repair_is_one_clear_line(message: str) -> None:
     simulation, estimator = played(10)
     estimator._solver._isam = Failing(estimator._solver._isam, message)
-    with pytest.raises(EstimatorError, match=r"^isam2: the solver failed at frame 10 \(") as told:
+    with pytest.raises(
+        EstimatorError, match=r"^isam2: the solver failed at frame 10 \("
+    ) as reported:
         play(estimator, simulation.increments[10:11], FREE)
-    assert "\n" not in str(told.value)
-    assert "fgslam inspect" in str(told.value)
+    assert "\n" not in str(reported.value)
+    assert "fgslam inspect" in str(reported.value)
 
 
 def test_a_pose_that_defeats_cholesky_is_solved_by_qr() -> None:

@@ -94,17 +94,17 @@ def test_old_landmarks_stay_and_their_doubles_go(name: str) -> None:
 
 @every
 def test_closure_is_reported(name: str) -> None:
-    told = [words for words in at_end(name)[1].remarks if "loop closure to frame" in words]
-    assert len(told) == 1
-    assert f"frame {returned().increments[CLOSED].index}:" in told[0]
+    reported = [words for words in at_end(name)[1].remarks if "loop closure to frame" in words]
+    assert len(reported) == 1
+    assert f"frame {returned().increments[CLOSED].index}:" in reported[0]
 
 
 @every
 def test_a_wrong_loop_is_refused_and_changes_nothing(name: str) -> None:
     drive, (_, found) = returned(lies=True), at_end(name, lies=True)
-    told = [words for words in found.remarks if "loop closure to frame" in words]
-    assert len(told) == 1
-    assert "refused" in told[0]
+    reported = [words for words in found.remarks if "loop closure to frame" in words]
+    assert len(reported) == 1
+    assert "refused" in reported[0]
     if name not in ("landmark_kalman", "isam2"):
         return
     straight = build(CLOSING[name])
@@ -174,9 +174,9 @@ def test_a_second_closure_that_agrees_moves_nothing(name: str) -> None:
     increments[k] = dataclasses.replace(increments[k], loops=(again,))
     estimator = build(CLOSING[name])
     play(estimator, increments, FREE)
-    told = [words for words in estimator.estimate().remarks if "loop closure" in words]
-    assert len(told) == 2
-    assert "nothing moved" in told[1]
+    reported = [words for words in estimator.estimate().remarks if "loop closure" in words]
+    assert len(reported) == 2
+    assert "nothing moved" in reported[1]
 
 
 def test_batch_solved_in_the_frame_of_a_loop_has_the_loop_in_its_answer() -> None:

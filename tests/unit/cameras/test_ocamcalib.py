@@ -100,7 +100,7 @@ def test_without_a_ring_the_largest_circle_is_taken(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "reported"),
     [
         (text(direct="5 -266 0 1e-3 -5e-7"), "line 3: direct.*states 5 .* has 4"),
         (text(direct="5 -266 0 1e-3 -5e-7 x"), "line 3: direct.*'x' is no finite number"),
@@ -120,8 +120,8 @@ def test_without_a_ring_the_largest_circle_is_taken(tmp_path: Path) -> None:
         ("5 1 2 3 4 5\n", "has 1 entries"),
     ],
 )
-def test_malformed_files_name_the_line(tmp_path: Path, content: str, told: str) -> None:
-    with pytest.raises(CalibrationError, match=told) as caught:
+def test_malformed_files_name_the_line(tmp_path: Path, content: str, reported: str) -> None:
+    with pytest.raises(CalibrationError, match=reported) as caught:
         read(tmp_path, content)
     assert "calib_results.txt" in str(caught.value)
     assert "\n" not in str(caught.value)

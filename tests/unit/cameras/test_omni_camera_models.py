@@ -160,7 +160,7 @@ def test_a_mirror_with_a_given_view_has_that_view() -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "reported"),
     [
         (lambda: mirror(inner_radius=230.0), "radii from 230 to 225"),
         (lambda: mirror(xi=1.2), "xi 1.2 must lie in"),
@@ -174,8 +174,8 @@ def test_a_mirror_with_a_given_view_has_that_view() -> None:
         (lambda: HyperbolicMirror.with_view((9, 9), 0.9, (-1.0, 1.3)), "below arcsin"),
     ],
 )
-def test_impossible_cameras_are_refused(make: object, told: str) -> None:
-    with pytest.raises(CalibrationError, match=told):
+def test_impossible_cameras_are_refused(make: object, reported: str) -> None:
+    with pytest.raises(CalibrationError, match=reported):
         make()  # type: ignore[operator]
 
 

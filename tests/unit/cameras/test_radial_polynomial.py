@@ -73,7 +73,7 @@ def test_noise_of_25_points_gives_the_designs_error() -> None:
 
 
 @pytest.mark.parametrize(
-    ("samples", "told"),
+    ("samples", "reported"),
     [
         ((np.linspace(20, 110, 5), np.linspace(-1, 0.3, 5)), "5 different radii cannot fix degree"),
         ((np.full(9, 30.0), np.linspace(-1, 0.3, 9)), "1 different radii"),
@@ -84,6 +84,6 @@ def test_noise_of_25_points_gives_the_designs_error() -> None:
         ),
     ],
 )
-def test_bad_samples(samples: tuple[np.ndarray, np.ndarray], told: str) -> None:
-    with pytest.raises(CalibrationError, match=told):
+def test_bad_samples(samples: tuple[np.ndarray, np.ndarray], reported: str) -> None:
+    with pytest.raises(CalibrationError, match=reported):
         fit_radial_polynomial(FRAME, (20.0, 110.0), samples)

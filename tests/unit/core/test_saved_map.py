@@ -229,7 +229,7 @@ def _set(name: str, value: Any) -> Callable[[dict[str, Any], dict[str, Any]], No
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         (_drop("landmark_hits"), "array landmark_hits is absent"),
         (_drop("landmark_covariance"), "array landmark_covariance is absent"),
@@ -247,9 +247,9 @@ def _set(name: str, value: Any) -> Callable[[dict[str, Any], dict[str, Any]], No
     ],
 )
 def test_a_file_whose_parts_do_not_fit_is_refused(
-    file: Path, change: Callable[[dict[str, Any], dict[str, Any]], None], told: str
+    file: Path, change: Callable[[dict[str, Any], dict[str, Any]], None], reported: str
 ) -> None:
-    with pytest.raises(MapError, match=told) as refusal:
+    with pytest.raises(MapError, match=reported) as refusal:
         load_map(rewritten(file, change))
     assert str(refusal.value).startswith(str(file))
     assert "\n" not in str(refusal.value)
@@ -285,11 +285,11 @@ def test_saving_into_a_missing_folder_is_refused(saved: SavedMap, tmp_path: Path
 
 def test_only_the_same_rig_is_accepted(saved: SavedMap) -> None:
     require_rig(saved, replace(RIG, fx=RIG.fx * (1.0 + 1e-9)), "m")
-    for other, told in (
+    for other, reported in (
         (replace(RIG, width=640), "width 320, the recording's is 640"),
         (replace(RIG, baseline=0.101), "baseline 0.1, the recording's is 0.101"),
         (replace(RIG, vertical_baseline=None), "vertical_baseline 0.1, the recording's is None"),
         (replace(RIG, bTc=g.se3_exp(np.full(6, 0.01))), "mounted otherwise"),
     ):
-        with pytest.raises(MapError, match=told):
+        with pytest.raises(MapError, match=reported):
             require_rig(saved, other, "m")

@@ -46,7 +46,7 @@ def blas_threads() -> list[int]:
 
 
 def digest_with(threads: int) -> tuple[int, str]:
-    """What a process of its own says that was told to use so many threads."""
+    """What a process of its own says that was set to use so many threads."""
     found = subprocess.run(  # noqa: S603  our own program, above
         [sys.executable, "-c", EKF_DIGEST],
         cwd=ROOT,

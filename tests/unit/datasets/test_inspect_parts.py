@@ -177,7 +177,7 @@ def test_ambiguous_and_absent_descriptors_do_not_match(rng: np.random.Generator)
 # Causes
 
 
-def told(findings: tuple[Finding, ...], level: Level) -> str:
+def reported(findings: tuple[Finding, ...], level: Level) -> str:
     return " | ".join(f.text for f in findings if f.level is level)
 
 
@@ -213,14 +213,14 @@ def test_small_turns_warn_and_large_ones_are_problems(
 def test_scatter_without_a_pattern_is_not_called_a_turn(rng: np.random.Generator) -> None:
     places = rng.uniform(0.0, 300.0, (400, 2))
     offsets = rng.uniform(-6.0, 6.0, 400)
-    found = told(check_epipolar(offsets, np.full(400, 9.0), LEFT_RIGHT, places), Level.PROBLEM)
+    found = reported(check_epipolar(offsets, np.full(400, 9.0), LEFT_RIGHT, places), Level.PROBLEM)
     assert "turned clockwise" not in found
     assert "lens distortion" in found
 
 
 def test_crossed_disparity_is_not_called_unrectified(rng: np.random.Generator) -> None:
     found = check_epipolar(rng.uniform(3.0, 30.0, 200), rng.normal(0.0, 0.2, 200), TOP_RIGHT)
-    problems = told(found, Level.PROBLEM)
+    problems = reported(found, Level.PROBLEM)
     assert "the top camera seems to lie beside the right one" in problems
     assert "rectified" not in problems
 
@@ -229,7 +229,7 @@ def test_steady_offsets_are_no_finding_and_jumps_name_their_frames() -> None:
     frames = np.array([0, 5, 10, 15, 20])
     steady = np.array([0.1, 0.2, np.nan, 0.1, 0.15])
     assert check_steadiness(steady, frames) == ()
-    found = told(check_steadiness(steady + np.array([0, 0, 0, 2, 0]), frames), Level.WARNING)
+    found = reported(check_steadiness(steady + np.array([0, 0, 0, 2, 0]), frames), Level.WARNING)
     assert "(+0.10 to +2.10 px), most in frames 15:" in found
     assert check_steadiness(np.array([0.0, 9.0]), frames[:2]) == ()
 
@@ -237,16 +237,16 @@ def test_steady_offsets_are_no_finding_and_jumps_name_their_frames() -> None:
 def test_disparities_of_three_cameras(rng: np.random.Generator) -> None:
     horizontal = rng.uniform(3.0, 30.0, 300)
     vertical = horizontal + rng.normal(0.0, 0.2, 300)
-    assert told(check_disparity_agreement(horizontal, vertical), Level.WARNING) == ""
-    found = told(check_disparity_agreement(horizontal, 0.9 * vertical), Level.WARNING)
+    assert reported(check_disparity_agreement(horizontal, vertical), Level.WARNING) == ""
+    found = reported(check_disparity_agreement(horizontal, 0.9 * vertical), Level.WARNING)
     assert "is 0.90" in found
-    few = told(check_disparity_agreement(horizontal[:9], vertical[:9]), Level.WARNING)
+    few = reported(check_disparity_agreement(horizontal[:9], vertical[:9]), Level.WARNING)
     assert "only 9 features are matched in all three images" in few
 
 
 def test_feature_counts() -> None:
     assert check_features(np.array([[300, 320], [310, 290]])) == ()
-    found = told(check_features(np.array([[300, 20], [310, 30]])), Level.WARNING)
+    found = reported(check_features(np.array([[300, 20], [310, 30]])), Level.WARNING)
     assert "the left images have only 25 SIFT features" in found
     assert "the right images have 305 features but the left ones 25" in found
 
@@ -254,17 +254,17 @@ def test_feature_counts() -> None:
 def test_too_few_stereo_matches_name_their_frames() -> None:
     frames = np.array([3, 6, 9])
     assert check_stereo_counts(np.array([15, 90, 40]), frames) == ()
-    found = told(check_stereo_counts(np.array([15, 14, 0]), frames), Level.WARNING)
+    found = reported(check_stereo_counts(np.array([15, 14, 0]), frames), Level.WARNING)
     assert "2 of 3 frames have fewer than 15 matches: 6, 9" in found
 
 
 def test_disparity_gates() -> None:
     disparities = np.linspace(2.0, 38.0, 100)
     assert check_disparity_gates(disparities, 1.0, 40.0) == ()
-    near = told(check_disparity_gates(disparities, 1.0, 30.0), Level.WARNING)
+    near = reported(check_disparity_gates(disparities, 1.0, 30.0), Level.WARNING)
     assert "22 % of matches have more than frontend.stereo.max_disparity_px = 30" in near
     assert "raise it to 40" in near
-    far = told(check_disparity_gates(disparities, 25.0, 40.0), Level.WARNING)
+    far = reported(check_disparity_gates(disparities, 25.0, 40.0), Level.WARNING)
     assert "64 % of matches have less than frontend.stereo.min_disparity_px = 25" in far
 
 
@@ -289,7 +289,7 @@ def winding_drive(root: Path, late: float, turning: float = 1.0) -> Path:
 def clock(root: Path, offset: float = 0.0) -> str:
     odometry = RecordedOdometrySettings(time_offset_s=offset)
     recording = open_image_folder(ImageFolderSettings(path=str(root)), odometry)
-    return told(check_clock(recording), Level.WARNING)
+    return reported(check_clock(recording), Level.WARNING)
 
 
 @pytest.mark.parametrize("late", [0.06, -0.12])

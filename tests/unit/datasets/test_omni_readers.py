@@ -156,7 +156,7 @@ def test_reduced_panoramas(home: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "reported"),
     [
         ("", "line 1: no column id, file"),
         ("id,file,x_m,y_m\n1,a.png,0,0\n", "no column heading_deg"),
@@ -171,9 +171,9 @@ def test_reduced_panoramas(home: Path) -> None:
         (HEADER + '3,"b.png,1,2,3\n', "line 2"),
     ],
 )
-def test_bad_pose_tables(home: Path, content: str, told: str) -> None:
+def test_bad_pose_tables(home: Path, content: str, reported: str) -> None:
     (home / "poses.csv").write_text(content, encoding="utf-8")
-    with pytest.raises(DatasetError, match=told) as caught:
+    with pytest.raises(DatasetError, match=reported) as caught:
         panoramas(home)
     assert "poses.csv" in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -348,7 +348,7 @@ def test_a_calibration_file_is_looked_for_beside_the_pictures(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "reported"),
     [
         (BLOGGIE.replace("INPUT_WIDTH, 64\n", ""), "lacks INPUT_WIDTH"),
         (BLOGGIE.replace("0.97", "much"), "line 6: MAX_R_PERCENT is 'much'"),
@@ -358,14 +358,14 @@ def test_a_calibration_file_is_looked_for_beside_the_pictures(tmp_path: Path) ->
         (BLOGGIE.replace("OPTICAL_CENTER_X, 0.5", "OPTICAL_CENTER_X, 5"), "lies outside"),
     ],
 )
-def test_bad_bloggie_files(tmp_path: Path, content: str, told: str) -> None:
+def test_bad_bloggie_files(tmp_path: Path, content: str, reported: str) -> None:
     (tmp_path / "bloggie_settings.txt").write_text(content, encoding="utf-8")
-    with pytest.raises(CalibrationError, match=told):
+    with pytest.raises(CalibrationError, match=reported):
         make_camera(BloggieSettings(), (64, 48), tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "reported"),
     [
         (lambda: HyperbolicMirrorSettings(outer_elevation_deg=80.0), "below arcsin"),
         (lambda: HyperbolicMirrorSettings(inner_elevation_deg=30.0), "must rise"),
@@ -374,6 +374,6 @@ def test_bad_bloggie_files(tmp_path: Path, content: str, told: str) -> None:
         (lambda: RadialPolynomialSettings(coefficients_deg=(0.0, 1.0, 9.0)), "turns back"),
     ],
 )
-def test_impossible_settings(make: Callable[[], HyperbolicMirrorSettings], told: str) -> None:
-    with pytest.raises(CalibrationError, match=told):
+def test_impossible_settings(make: Callable[[], HyperbolicMirrorSettings], reported: str) -> None:
+    with pytest.raises(CalibrationError, match=reported):
         make_camera(make(), (320, 240))

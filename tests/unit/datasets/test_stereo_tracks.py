@@ -1,4 +1,4 @@
-"""GTSAM's stereo tracks: the right camera becomes the reference, bad files are told in one line."""
+"""GTSAM's stereo tracks: the right camera becomes the reference, bad files are refused."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_reference_poses_are_called_estimates_and_may_be_absent(tracks: Path) ->
     assert recording.notes == ()
 
 
-def test_observations_without_disparity_are_left_out_and_told(tracks: Path) -> None:
+def test_observations_without_disparity_are_left_out_and_reported(tracks: Path) -> None:
     lines = tracks.read_text("utf-8").splitlines()
     words = lines[0].split()
     words[3] = words[2]

@@ -69,7 +69,7 @@ def test_nothing_asked_is_nothing_known() -> None:
     assert found.metres == Spread(None, None, None)
 
 
-def test_too_few_landmarks_in_view_are_told_apart_but_unknown_ones_are_not() -> None:
+def test_too_few_landmarks_in_view_are_distinguished_but_unknown_ones_are_not() -> None:
     np.testing.assert_array_equal(
         enough(np.array([-1, 0, 19, 20, 500]), BOUNDS), [True, False, False, True, True]
     )

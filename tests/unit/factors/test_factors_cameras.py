@@ -95,7 +95,7 @@ def test_the_pose_is_the_right_cameras() -> None:
     assert_near(residuals.stereo(RIG, wTc, point, seen), np.zeros(3), 1e-12)
     factor = stereo(RIG, seen, np.eye(3))
     assert_near(factor.unwhitenedError(values_of(wTc, point)), np.zeros(3), 1e-12)
-    # GTSAM's own stereo camera is the left one: told its pose, without the bridge, it agrees.
+    # GTSAM's own stereo camera is the left one: given its pose, without the bridge, it agrees.
     bare = gtsam.StereoCamera(
         gtsam.Pose3(g.left_from_right_camera(wTc, 0.1)),
         gtsam.Cal3_S2Stereo(277.0, 277.0, 0.0, 159.5, 119.5, 0.1),

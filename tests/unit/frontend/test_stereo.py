@@ -133,7 +133,7 @@ def test_descriptors_gate_by_distance_and_ratio() -> None:
     assert (
         len(match(right, features((110, 80), descriptors=far), rig=two, appearance=appearance)) == 1
     )
-    # Two candidates at distances 79 and 100 are told apart, 81 and 100 are not.
+    # Two candidates at distances 79 and 100 are distinguished, 81 and 100 are not.
     for distance, count in ((79, 1), (81, 0)):
         candidates = np.zeros((2, 128), np.uint8)
         candidates[0, 0], candidates[1, 0] = distance, 100
@@ -192,7 +192,7 @@ def test_wider_gates_need_not_give_more_matches() -> None:
 
 
 def test_the_top_image_removes_wrong_matches() -> None:
-    """Features whose left partner was not found meet a stranger in the left image."""
+    """Features whose left partner was not found meet another one in the left image."""
     rng = np.random.default_rng(4)
     right, left, top = crowd(rng, 250, noise=0.2)
     true_left = left.xy.copy()

@@ -62,7 +62,7 @@ def start_at(time: float, vector: TwoViewVector) -> HomingStart:
 
 
 class OracleEstimator:
-    """Believes what it is told: ``robot`` is set from outside."""
+    """Believes what it is given: ``robot`` is set from outside."""
 
     kind = "oracle"
 
@@ -76,7 +76,7 @@ class OracleEstimator:
         self.time = tracked.time
 
     def estimate(self, landmarks: bool = True) -> HomingEstimate:
-        """As told; the map is exact."""
+        """As given; the map is exact."""
         covariance = np.eye(6) * self.sigma**2  # NaN where sigma is
         many = np.tile(np.eye(2) * 1e-6, (20, 1, 1))
         n = self.mapped

@@ -107,7 +107,7 @@ def test_truncated_file_is_refused(tmp_path: Path, kept: int) -> None:
 
 
 def test_every_flipped_bit_is_detected_or_harmless(tmp_path: Path) -> None:
-    """The archive's CRCs: damage is told, and never gives other features."""
+    """The archive's CRCs: damage is reported, and never gives other features."""
     path = tmp_path / "path.npz"
     whole = written(path)
     good = pack_features(PathMemory.load(path).images)

@@ -37,6 +37,6 @@ def test_what_is_not_finite_is_null(tmp_path: Path) -> None:
     assert json.loads(text) == {"a": None, "b": [1.5, None]}
 
 
-def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_there_is_reported(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="does not exist"):
         write_csv(tmp_path / "no" / "t.csv", ("a",), [])

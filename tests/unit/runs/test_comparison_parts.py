@@ -92,7 +92,7 @@ def test_overrides_that_are_none(override: str, words: str) -> None:
         choose(config(compare=["isam2"]), Choice(None, (override,)))
 
 
-def test_overrides_of_estimators_and_of_the_experiment_are_told_apart() -> None:
+def test_overrides_of_estimators_and_of_the_experiment_are_distinguished() -> None:
     of_estimators = ("estimators.isam2.update_every=7", " estimators.batch.method=gnc")
     choice = Choice(("isam2",), (of_estimators[0], "dataset.stop=3", of_estimators[1], "seed=1"))
     assert choice.of_experiment == ("dataset.stop=3", "seed=1")

@@ -1,4 +1,4 @@
-"""The configuration: strict at every depth, messages that name the mend, overrides, round trip."""
+"""The configuration: strict at every depth, messages that name the fix, overrides, round trip."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_an_unknown_key_like_nothing_lists_the_known_ones(tmp_path: Path) -> Non
     assert "unknown key output.zzz; known here: checkpoint_seconds, pictures" in message
 
 
-def test_a_misspelt_required_key_is_told_as_such(tmp_path: Path) -> None:
+def test_a_misspelt_required_key_is_reported_as_such(tmp_path: Path) -> None:
     values = {"name": "x", "dataset": {"kind": "image_folder", "paht": "there"}}
     message = message_of(values, tmp_path)
     assert "unknown key dataset.paht; did you mean path? (and 1 more)" in message
@@ -411,7 +411,7 @@ def test_every_estimator_has_a_folder_of_its_own(tmp_path: Path) -> None:
         ("estimator.miss_growth_m", "much", "give a number"),
     ],
 )
-def test_wrong_types_are_told_in_plain_words(
+def test_wrong_types_are_reported_in_plain_words(
     key: str, value: object, words: str, tmp_path: Path
 ) -> None:
     message = message_of(nested(MINIMAL, key, value), tmp_path)

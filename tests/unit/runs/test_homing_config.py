@@ -1,4 +1,4 @@
-"""Configurations of homing: told apart by their task, as strict as those of SLAM."""
+"""Configurations of homing: distinguished by their task, as strict as those of SLAM."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_the_task_tells_which(tmp_path: Path) -> None:
         ({"task": "homing_trials"}, (), "key name is missing"),
     ],
 )
-def test_mistakes_are_told(
+def test_mistakes_are_reported(
     values: dict[str, Any], overrides: tuple[str, ...], words: str, tmp_path: Path
 ) -> None:
     assert words in message_of(values, tmp_path, *overrides)

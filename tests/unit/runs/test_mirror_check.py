@@ -1,4 +1,4 @@
-"""A mirror that lies off the stated centre is told with the measured offset."""
+"""A mirror that lies off the stated centre is reported with the measured offset."""
 
 from __future__ import annotations
 
@@ -57,18 +57,18 @@ def test_a_mirror_in_its_place_is_not_worth_a_note(
 
 @pytest.mark.parametrize("holder", [False, True])
 @pytest.mark.parametrize("off", [(3.0, 4.0), (-24.0, 18.0)])
-def test_a_mirror_off_its_place_is_told_with_the_offset(
+def test_a_mirror_off_its_place_is_reported_with_the_offset(
     tmp_path: Path, off: tuple[float, float], holder: bool
 ) -> None:
     stated = (CENTRE[0] + off[0], CENTRE[1] + off[1])
     (note,) = notes(tmp_path, picture(holder), stated)
-    told = re.search(r"lies ([\d.]+) px off .* rim's is \(([\d.]+), ([\d.]+)\)", note)
-    assert told is not None
-    found = [float(number) for number in told.groups()]
+    reported = re.search(r"lies ([\d.]+) px off .* rim's is \(([\d.]+), ([\d.]+)\)", note)
+    assert reported is not None
+    found = [float(number) for number in reported.groups()]
     np.testing.assert_allclose(found, [np.hypot(*off), *CENTRE], atol=0.5)
 
 
-def test_a_rim_that_cannot_be_found_is_told(tmp_path: Path) -> None:
+def test_a_rim_that_cannot_be_found_is_reported(tmp_path: Path) -> None:
     (note,) = notes(tmp_path, np.full((*SIZE[::-1], 3), 90, np.uint8), CENTRE)
     assert note == "the mirror's rim is not found in m1.png, so its centre is unchecked"
 

@@ -58,7 +58,7 @@ def test_a_users_mistake_is_raised_here() -> None:
 
 
 def clear_up(path: str) -> None:
-    """Leaves a mark when told to end."""
+    """Leaves a mark when asked to end."""
     try:
         Path(path, "begun").touch()
         time.sleep(60.0)

@@ -54,8 +54,10 @@ def test_a_replay_gives_what_the_loop_gives() -> None:
     log = a_log()
     estimator = factory.make_estimator(RIG, SETTINGS)
     stats = play(estimator, log.increments)
-    told: list[tuple[int, int]] = []
-    replayed = replay(log, SETTINGS, EgoMotionSettings(), lambda done, of: told.append((done, of)))
+    reported: list[tuple[int, int]] = []
+    replayed = replay(
+        log, SETTINGS, EgoMotionSettings(), lambda done, of: reported.append((done, of))
+    )
     assert_same_bits(replayed.estimate, estimator.estimate())
     np.testing.assert_array_equal(replayed.online.poses, [s.wTc for s in stats])
     np.testing.assert_array_equal(replayed.online_covariances, [s.covariance for s in stats])
@@ -67,7 +69,7 @@ def test_a_replay_gives_what_the_loop_gives() -> None:
     assert (replayed.column("update_ms") > 0.0).all()
     assert replayed.column("solve_ms")[1:].min() > 0.0
     assert (replayed.title, replayed.kind, replayed.failure) == ("named", "landmark_kalman", "")
-    assert told == [(k + 1, 8) for k in range(8)]
+    assert reported == [(k + 1, 8) for k in range(8)]
     assert "closures" not in judge_replay(replayed, Truth()).metrics.more, "the log has none"
 
 

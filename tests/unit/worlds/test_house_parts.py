@@ -12,7 +12,6 @@ from fgslam.worlds.driving.floor_space import FloorSpace
 from fgslam.worlds.driving.range_scan import RangeSensor
 from fgslam.worlds.driving.reference_paths import PathPlanner
 from fgslam.worlds.driving.wheelchair import Wheelchair
-from fgslam.worlds.house.camera import make_house_camera
 from fgslam.worlds.house.disturbances import CameraTilt, camera_pose, exposed, noisy
 from fgslam.worlds.house.people import Walker
 from fgslam.worlds.house.settings import (
@@ -21,6 +20,7 @@ from fgslam.worlds.house.settings import (
     HouseTiltSettings,
     WheelchairSettings,
 )
+from fgslam.worlds.house.world import make_house_camera
 from fgslam.worlds.rendering.patches import PatchArrays, Surface, Thing, box, stack
 from fgslam.worlds.rendering.raycaster import RayCaster
 

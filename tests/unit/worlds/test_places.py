@@ -1,4 +1,4 @@
-"""Places beside the lab: plans, their drives, corridors that look alike, twin posters."""
+"""Places beside the lab: plans, their drives, corridors that look alike, identical posters."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -205,16 +205,16 @@ def test_drives_of_the_corridors() -> None:
         assert space.clearance(drive.planar(drive.timestamps)[::3, :2]).min() > 0.6
 
 
-# ---------------------------------------------------------------- twin posters
+# ---------------------------------------------------------------- identical posters
 
 
 def test_identical_posters_change_one_poster_and_nothing_else() -> None:
     plain = build_lab(np.random.default_rng([0, 2]), 1)
-    twins = build_lab(np.random.default_rng([0, 2]), 1, identical_posters=True)
-    different = [k for k, (a, b) in enumerate(zip(plain, twins, strict=True)) if not same(a, b)]
+    alike = build_lab(np.random.default_rng([0, 2]), 1, identical_posters=True)
+    different = [k for k, (a, b) in enumerate(zip(plain, alike, strict=True)) if not same(a, b)]
     assert [plain[k].name for k in different] == ["poster_8"]
-    copy = twins[different[0]].patches[0]
-    original = next(t for t in twins if t.name == "poster_2").patches[0]
+    copy = alike[different[0]].patches[0]
+    original = next(t for t in alike if t.name == "poster_2").patches[0]
     assert copy.surface is original.surface
     for edge in ("edge_u", "edge_v"):
         sizes = [np.linalg.norm(getattr(p, edge)) for p in (copy, original)]

@@ -182,7 +182,7 @@ def test_few_segments_match_nothing() -> None:
     assert len(match_columns(none, some, OmniMatchingSettings())) == 0
 
 
-def test_two_equal_segments_are_rivals_of_a_third_equal_one() -> None:
+def test_two_equal_segments_compete_for_a_third_equal_one() -> None:
     one = np.array([[1.0, 2.0], [5.0, 5.0]])
     i, j, distance, ratio = nearest_segments(one, np.array([[1.0, 2.0], [1.0, 2.0], [5.0, 6.0]]))
     assert i.tolist() == [0, 1]

@@ -214,7 +214,7 @@ def test_decoys_of_another_colour_are_discarded() -> None:
     assert len(match_sift(a, b, blind)) == 40
 
 
-def test_rivals_that_no_planar_motion_explains_do_not_count() -> None:
+def test_competing_matches_that_no_planar_motion_explains_do_not_count() -> None:
     a = made()
     # The target shows each thing twice: at its place, and mirrored in the floor.
     image = replace(a, elevation=-a.elevation)

@@ -45,7 +45,7 @@ def test_median_error_at_half_a_degree(count: int, wrong: float) -> None:
     assert direction <= 0.8
     assert rotation <= 0.4
     assert len(errors) >= 95
-    # Some wrong matches agree by chance and none is told apart: the share inside is not exact.
+    # Some wrong matches agree by chance and none is distinguished: the share inside is not exact.
     assert np.mean(np.array(nees) < chi2.ppf(0.95, 2)) > 0.85
 
 
@@ -115,7 +115,7 @@ def test_both_views_from_one_place() -> None:
 
 @pytest.mark.parametrize("half_width_deg", [2.0, 8.0])
 def test_one_thing_of_the_same_kind_elsewhere_is_no_arrival(half_width_deg: float) -> None:
-    """A poster that hangs in another room, too, amid wrong matches: that looks like a turn."""
+    """A poster that hangs in another room, too, among wrong matches: that looks like a turn."""
     reasons = []
     for seed in range(40):
         rng = np.random.default_rng(seed)

@@ -61,7 +61,7 @@ def test_nothing_in_common_is_an_empty_map(rng: np.random.Generator) -> None:
     assert len(known.in_view(RIG, np.eye(4))[0]) == 0
 
 
-def test_views_of_landmarks_are_told_landmark_by_landmark(
+def test_views_of_landmarks_are_reported_landmark_by_landmark(
     known: KnownMap, rng: np.random.Generator
 ) -> None:
     rows = np.sort(rng.choice(2000, 70, replace=False))

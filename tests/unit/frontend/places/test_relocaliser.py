@@ -1,4 +1,4 @@
-"""The kidnapped robot: found where it is, refused where it cannot be told."""
+"""The kidnapped robot: found where it is, refused where it cannot be known."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_alike_places_that_fill_the_view_are_ambiguous(rng: np.random.Generator)
         assert found.second > 20
 
 
-def test_alike_places_are_told_apart_by_their_surroundings(rng: np.random.Generator) -> None:
+def test_alike_places_are_distinguished_by_their_surroundings(rng: np.random.Generator) -> None:
     west, east = _two_posters(rng)
     place = west.join(east).join(room(rng, 900))
     made = _relocaliser(place)
