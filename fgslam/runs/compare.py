@@ -135,7 +135,9 @@ def _open_slam(run: Path, choice: Choice) -> tuple[ExperimentConfig, Task[RunRes
 
 def _open_homing(run: Path, choice: Choice) -> tuple[HomingExperiment, Task[RunResult]]:
     config, logs = load_homing(run / RUN_MARKER), load_bearing_logs(run)
-    return config, open_homing_comparison(config, logs, choose(config, choice), run)
+    first, *others = estimators = choose(config, choice)
+    now = config.model_copy(update={"estimator": first, "compare": tuple(others)})
+    return now, open_homing_comparison(config, logs, estimators, run)
 
 
 def _compare(

@@ -144,7 +144,11 @@ def _checked(found: Features) -> Features:
         raise ConfigError(
             f"features: the extractor returned {type(found).__name__}; return fgslam.Features"
         )
-    n = len(found.scale)
+    for name in ("xy", "scale", "orientation", "descriptors"):
+        value: object = getattr(found, name)
+        if not isinstance(value, np.ndarray):
+            raise ConfigError(f"features: {name} is a {type(value).__name__}; give an array")
+    n = found.scale.size
     shapes = {"xy": (n, 2), "scale": (n,), "orientation": (n,), "descriptors": (n, 128)}
     for name, shape in shapes.items():
         if np.shape(getattr(found, name)) != shape:

@@ -114,6 +114,8 @@ def test_logs_are_compared(
     arguments = ("compare", trials, "--estimators", "paper_ekf", "--set", override, "--out", out)
     assert main(monkeypatch, *arguments) == 0
     assert "paper_ekf" in capfd.readouterr().out
+    (compared,) = load_homing(out / RUN_MARKER).estimators
+    assert (compared.title, compared.gate_sigmas) == ("paper_ekf", 2.5)
     rows = list(csv.DictReader((out / "estimates.csv").read_text(encoding="utf-8").splitlines()))
     log = BearingLog.load(trials / "logs" / "outliers_00_trial_0000.npz")
     assert [float(row["time"]) for row in rows] == [image.time for image in log.images]

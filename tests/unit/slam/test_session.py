@@ -343,6 +343,8 @@ def test_what_is_no_rig_is_refused() -> None:
             "give uint8",
         ),
         (lambda f: dataclasses.replace(f, xy=f.xy[:-1]), "xy has shape"),
+        (lambda f: dataclasses.replace(f, scale=None), "scale is a NoneType"),
+        (lambda f: dataclasses.replace(f, xy=f.xy.tolist()), "xy is a list; give an array"),
     ],
 )
 def test_features_of_another_form_are_refused_and_the_session_goes_on(
