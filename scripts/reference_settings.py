@@ -15,15 +15,18 @@ Node: TypeAlias = dict[str, Any]
 _UNWRITTEN = ("kind", "task", "provenance")
 _DESCRIBED_ELSEWHERE = ("map.made_from.dataset", "map.made_from.odometry")
 FIRST = {
-    "dataset.kind, dataset.path": "the recording: its layout and its folder",
+    "dataset.kind, dataset.path, dataset.start, dataset.stop": "the recording: its layout, its "
+    "folder, and which part of it",
     "odometry.kind": "`recorded`, `constant_velocity`, or `synthetic` (truth plus stated noise)",
-    "estimator.kind": "the estimator that steers the run",
-    "compare": "estimators that replay the measurements of the run",
+    "estimator.kind, compare": "the estimator that steers the run, and those that replay its "
+    "measurements",
     "seed": "of everything random in the run",
     "frontend.ego_motion.dof": "3 on a flat floor, 5 at a fixed height, 6 for a rig in the hand",
-    "frontend.stereo.pixel_sigma": "standard deviation of a feature's place in the image",
-    "frontend.stereo.max_disparity_px": "what is nearer than this disparity is not matched",
+    "frontend.stereo.pixel_sigma, frontend.stereo.max_disparity_px": "standard deviation of a "
+    "feature's place in the image; what is nearer than this disparity is not matched",
     "estimator.noise_factor": "above 1 on images, whose errors persist from frame to frame",
+    "estimator.lag_frames, estimator.keyframe_every": "how far back `fixed_lag` looks; every how "
+    "many frames `isam2` keeps one",
     "frontend.loops": "`{}` switches loop closing on",
     "map.load, map.save": "saved maps: begin in one, write one",
 }
@@ -63,7 +66,7 @@ def settings_page() -> str:
     """The whole page, in Markdown."""
     schema = ExperimentConfig.model_json_schema()
     first = [line for key, described in FIRST.items() for line in item(f"`{key}`: {described}")]
-    sections = [_INTRODUCTION, "## The keys that matter first\n\n" + "\n".join(first)]
+    sections = [_INTRODUCTION, "## The ten that matter first\n\n" + "\n".join(first)]
     sections += ["## The experiment\n\n" + "\n".join(_keys(schema, schema))]
     for name, node in schema["properties"].items():
         if name not in _UNWRITTEN:

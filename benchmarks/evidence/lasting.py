@@ -140,7 +140,7 @@ class Lives:
         """One frame; ``places`` (m, 3) are where the missed ones were expected."""
         increment = report.increment
         ids = increment.missed_ids
-        against = seen_past(places, report.stereo.measurement, self.settings)
+        against = seen_past(places, report.stereo.measurement)
         against |= np.isin(ids, increment.observations.ids[increment.rejected])
         known = ids < self.count
         self.misses[ids[known]] += 1

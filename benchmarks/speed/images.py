@@ -28,6 +28,7 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame, Sequence
 from fgslam.core.sensors import CameraRig
+from fgslam.frontend.features.sift import EDGE_THRESHOLD
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.opening import open_sequence
 from fgslam.slam.factory import make_pipeline, make_stream
@@ -121,7 +122,7 @@ def raw_sift(config: ExperimentConfig) -> list[Callable[[Iterable[Frame]], None]
         s.max_features,
         s.octave_layers,
         s.contrast_threshold,
-        s.edge_threshold,
+        EDGE_THRESHOLD,
         s.base_sigma_px,
         cv2.CV_8U,
         True,

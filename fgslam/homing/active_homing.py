@@ -28,6 +28,7 @@ _MAX_RESIDUAL_DEG = 5.0
 """Median difference of the bearings from the estimate's prediction beyond which the estimate counts
 as diverged."""
 
+_MIN_TRACKS = 10  # with fewer the target is matched anew, while the estimate is still used
 _FEWEST_TRACKS = 4
 """With fewer than this the estimate is not used any more (a third view needs three
 bearings)."""
@@ -145,8 +146,8 @@ class ActiveHoming:
         return None
 
     def _weakness(self) -> Fault | None:
-        s, count = self._settings, len(self.tracked)
-        if count < min(s.min_tracks, _KEPT_SHARE * len(self.start.matches)):
+        count = len(self.tracked)
+        if count < min(_MIN_TRACKS, _KEPT_SHARE * len(self.start.matches)):
             return Fault(f"{count} tracks left", True)
         if self._maps and not self._determined:
             return Fault("target uncertain: the estimator has no covariance", True)

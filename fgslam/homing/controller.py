@@ -25,6 +25,11 @@ _FARTHER_S = 2.5
 """Drive straight on, at reduced speed, to look for a refused target from elsewhere; 0.4 m with the
 default steering."""
 
+_NEAR_FRACTION = 0.3
+"""From this part of the leg on, another look must show the target where the estimate has it before
+it counts as reached."""
+
+_MAX_STALLS = 3  # so often without progress, or with an estimate given up, ends the homing
 _BLIND_HEADING_DEG = 20.0  # without tracks the robot drives on only if home was so nearly ahead
 _PASS_FRACTION = 0.25
 """A target nearer than this part of the leg that has fallen behind the robot counts as reached:
@@ -64,7 +69,7 @@ class HomingController:
         self._next_try = -np.inf
         self._blind_until = -np.inf
         self._search_until, self._searches = -np.inf, 0
-        self._recognised = settings.near_fraction == 0.0
+        self._recognised = False
         self._next_look = -np.inf
         self._ambiguous = False
         self._standing_since: float | None = None
@@ -122,7 +127,7 @@ class HomingController:
             fault = Fault(f"no track confirms it: {arrival}", True)
         if self._progress.stalled(self.remaining, time):
             fault = Fault(f"no progress for {self._settings.stall_s:g} s", True)
-            if self._progress.stalls >= self._settings.max_stalls:
+            if self._progress.stalls >= _MAX_STALLS:
                 return self._refuse(time, Refusal(RefusalReason.NO_PROGRESS, fault.reason))
         if fault is None:
             return self._drive(homing, time, f"{len(homing.tracked)} tracks")
@@ -148,7 +153,7 @@ class HomingController:
         A homing vector may be wrong and sure of itself: where things repeat, its tracks fit a
         target that is not there. So near, right matches are many: the look is a test of its own.
         """
-        due = time >= self._next_look and self.remaining <= self._settings.near_fraction
+        due = time >= self._next_look and self.remaining <= _NEAR_FRACTION
         if self._recognised or not (due or arrival):
             return None
         self._next_look = time + self._settings.retry_s
@@ -190,9 +195,9 @@ class HomingController:
         """
         self.active, self._pending, self._next_try = None, vector, time
         self.remaining, self._was_ahead, self._obstacle = left, False, why
-        self._recognised = self._settings.near_fraction == 0.0
+        self._recognised = False
         self._progress.begin_anew(time)
-        if self._progress.stalls >= self._settings.max_stalls:
+        if self._progress.stalls >= _MAX_STALLS:
             return self._refuse(time, Refusal(RefusalReason.LOST, why))
         return self._hold(time, why)
 

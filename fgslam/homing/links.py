@@ -11,9 +11,9 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
-from fgslam.homing.settings import TopologicalMapSettings
 
 _MUTUAL_DEG = 5.0  # largest difference between the answers there and back, beyond three deviations
+_MIN_SUPPORT = 12  # inliers of an edge, in either answer
 _ONE_WAY_SUPPORT = 25
 """Inliers of an edge that is answered in one direction and ambiguous in the other."""
 
@@ -57,9 +57,7 @@ class Link:
         )  # fmt: skip
 
 
-def link_pair(
-    pair: Pair, there: Answer, back: Answer, settings: TopologicalMapSettings
-) -> Link | str:
+def link_pair(pair: Pair, there: Answer, back: Answer) -> Link | str:
     """The link of two answers, or why there is none.
 
     Both directions must be answered with enough inliers, and one motion must explain both:
@@ -68,12 +66,12 @@ def link_pair(
     other may, with more inliers.
     """
     if isinstance(there, Refusal) and isinstance(back, Refusal):
-        return _same_place(pair, there, back, settings)
+        return _same_place(pair, there, back)
     if isinstance(there, Refusal) or isinstance(back, Refusal):
-        return _one_way(pair, there, back, settings)
+        return _one_way(pair, there, back)
     support = min(there.support, back.support)
-    if support < settings.min_support:
-        return f"{support} inliers, of {settings.min_support} needed"
+    if support < _MIN_SUPPORT:
+        return f"{support} inliers, of {_MIN_SUPPORT} needed"
     gap = np.array(
         [
             there.rotation + back.rotation,
@@ -90,9 +88,7 @@ def link_pair(
     )  # fmt: skip
 
 
-def _one_way(
-    pair: Pair, there: Answer, back: Answer, settings: TopologicalMapSettings
-) -> Link | str:
+def _one_way(pair: Pair, there: Answer, back: Answer) -> Link | str:
     """One direction is answered, the other cannot decide: what holds there holds back.
 
     Which of the two solutions the few decisive features support, or which minimum of a
@@ -127,9 +123,7 @@ def _opposite(vector: TwoViewVector) -> TwoViewVector:
     )
 
 
-def _same_place(
-    pair: Pair, there: Refusal, back: Refusal, settings: TopologicalMapSettings
-) -> Link | str:
+def _same_place(pair: Pair, there: Refusal, back: Refusal) -> Link | str:
     """Images from one place are linked, too: by a turn without a direction."""
     if RefusalReason.AT_TARGET not in (there.reason, back.reason):
         return there.details
@@ -141,20 +135,18 @@ def _same_place(
     nowhere = np.full((2, 2), np.nan)
     nowhere[1, 1] = np.deg2rad(_MUTUAL_DEG / _SIGMAS) ** 2
     return Link(
-        *pair, float("nan"), there.rotation, float("nan"), nowhere, nowhere, settings.min_support,
+        *pair, float("nan"), there.rotation, float("nan"), nowhere, nowhere, _MIN_SUPPORT,
     )  # fmt: skip
 
 
-def link_pairs(
-    answers: Mapping[Pair, Answer], settings: TopologicalMapSettings
-) -> tuple[list[Link], dict[Pair, str]]:
+def link_pairs(answers: Mapping[Pair, Answer]) -> tuple[list[Link], dict[Pair, str]]:
     """Links of all pairs a < b that were answered in both directions, and why others are none."""
     links: list[Link] = []
     refused: dict[Pair, str] = {}
     for a, b in sorted(answers):
         if a >= b or (b, a) not in answers:
             continue
-        made = link_pair((a, b), answers[a, b], answers[b, a], settings)
+        made = link_pair((a, b), answers[a, b], answers[b, a])
         if isinstance(made, str):
             refused[a, b] = made
         else:

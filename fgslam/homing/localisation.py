@@ -19,6 +19,8 @@ from fgslam.homing.topological_map import TopologicalMap
 
 _BACKGROUND = 4.0  # inliers that a wrong place may get, on average
 
+_STAY = 0.5  # chance to be still at the node of the last image
+
 
 class Localiser:
     """Tells at which node the robot is, or nearest to it.
@@ -46,7 +48,7 @@ class Localiser:
         self._words = words
         self._linker = linker
         self._settings = settings
-        self._transition = _transition(topology, settings)
+        self._transition = _transition(topology)
         self.belief: FloatArray = np.full(len(topology), 1.0 / max(len(topology), 1))
         self._fresh = True
 
@@ -105,12 +107,12 @@ def likelihoods(supports: IntArray, background: float) -> FloatArray:
     return np.asarray(supports, dtype=np.float64) + background
 
 
-def _transition(topology: TopologicalMap, settings: LocalisationSettings) -> FloatArray:
+def _transition(topology: TopologicalMap) -> FloatArray:
     """(n, n) chances to go from row to column between two images, without leaps."""
     graph = topology.graph()
     graph.data = 1.0 / graph.data
     out = np.asarray(graph.sum(axis=1)).ravel()
     alone = out == 0.0
-    moves = diags(np.where(alone, 0.0, (1.0 - settings.stay) / np.where(alone, 1.0, out))) @ graph
-    stay = np.where(alone, 1.0, settings.stay)
+    moves = diags(np.where(alone, 0.0, (1.0 - _STAY) / np.where(alone, 1.0, out))) @ graph
+    stay = np.where(alone, 1.0, _STAY)
     return np.asarray(moves.toarray() + np.diag(stay))

@@ -17,6 +17,8 @@ from fgslam.homing.settings import HomingControlSettings, PathFollowingSettings
 
 LegResult: TypeAlias = Literal["arrived", "skipped", "refused", "unfinished"]
 
+_MAX_SKIPS = 1  # targets left out one after another, at most
+
 
 @dataclass(frozen=True, slots=True)
 class LegOutcome:
@@ -128,7 +130,7 @@ class HomingChain:
         return True
 
     def _may_skip(self) -> bool:
-        return self._settings.skip_unmatched and len(self._skipped) < self._settings.max_skips
+        return self._settings.skip_unmatched and len(self._skipped) < _MAX_SKIPS
 
     def _new_controller(self) -> HomingController:
         return HomingController(

@@ -26,9 +26,6 @@ class HomingControlSettings:
             description="part of the leg that may be left when the target counts as reached",
         ),
     ] = 0.07
-    min_tracks: Annotated[
-        int, Field(ge=3, description="with fewer tracks than this, the target is matched anew")
-    ] = 10
     max_turn_deg_s: Annotated[
         float,
         Field(
@@ -54,15 +51,6 @@ class HomingControlSettings:
     farther_tries: Annotated[
         int, Field(ge=0, description="such drives for one target; 0: refused is refused")
     ] = 3
-    near_fraction: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            lt=1.0,
-            description="from this part of the leg on, another look must show the target where the "
-            "estimate has it before it counts as reached; 0: it need not",
-        ),
-    ] = 0.3
     stall_s: Annotated[
         float,
         Field(gt=0.0, description="without progress for so long, the target is matched anew"),
@@ -74,13 +62,6 @@ class HomingControlSettings:
             description="on one leg the robot waits so long, on top, for a blocked way to clear",
         ),
     ] = 60.0
-    max_stalls: Annotated[
-        int,
-        Field(
-            ge=1,
-            description="so often without progress, or with an estimate given up, ends the homing",
-        ),
-    ] = 3
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -89,9 +70,6 @@ class SteeringSettings:
 
     max_speed_mps: Annotated[float, Field(gt=0.0, description="on the open way")] = 0.4
     max_turn_deg_s: Annotated[float, Field(gt=0.0, description="largest turning rate")] = 40.0
-    gain_per_s: Annotated[
-        float, Field(gt=0.0, description="turning rate over the direction of home")
-    ] = 1.2
     acceleration_mps2: Annotated[float, Field(gt=0.0, description="largest change of speed")] = 0.5
     turn_acceleration_deg_s2: Annotated[
         float, Field(gt=0.0, description="largest change of the turning rate")
@@ -132,9 +110,6 @@ class PathFollowingSettings:
         bool,
         Field(description="a target that is refused is skipped if the one after it can be matched"),
     ] = True
-    max_skips: Annotated[
-        int, Field(ge=0, description="targets left out one after another, at most")
-    ] = 1
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -185,25 +160,6 @@ class TopologicalMapSettings:
         ),
     ] = 0
     retrieval: RetrievalSettings = RetrievalSettings()
-    min_support: Annotated[int, Field(ge=3, description="inliers of an edge, in either answer")] = (
-        12
-    )
-    order_reach: Annotated[
-        int,
-        Field(
-            ge=1,
-            description="ordered sets: images farther apart than this in the order need third "
-            "views, these neighbours of theirs, that confirm their link's features",
-        ),
-    ] = 3
-    third_views: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="such confirmations an inlier, on average, that a link so far needs; "
-            "`docs/concepts/homing.md` has what true and false ones got",
-        ),
-    ] = 1.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -213,9 +169,6 @@ class LocalisationSettings:
     candidates: Annotated[
         int, Field(ge=0, description="nodes that an image is matched with; 0: all")
     ] = 10
-    stay: Annotated[
-        float, Field(ge=0.0, le=1.0, description="chance to be still at the node of the last image")
-    ] = 0.5
     leap: Annotated[
         float,
         Field(gt=0.0, le=1.0, description="chance to be anywhere at all: carried off, or wrong"),

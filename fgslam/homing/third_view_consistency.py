@@ -19,12 +19,19 @@ from fgslam.core.arrays import IntArray
 from fgslam.core.homing import OmniFeatures
 from fgslam.core.planar import wrap
 from fgslam.homing.links import Link, Pair
-from fgslam.homing.settings import TopologicalMapSettings
 
 InlierRows: TypeAlias = Mapping[Pair, IntArray]
 """Of pairs (from, to): (k, 2) rows of the SIFT features of both images that are inliers."""
 
 _SAME = 0.02  # radians, in bearing and elevation: one thing has several features side by side
+
+_ORDER_REACH = 3
+"""Images farther apart than this in the order need third views, these neighbours of theirs, that
+confirm their link's features."""
+
+_THIRD_VIEWS = 1.0
+"""Such confirmations an inlier, on average, that a link so far needs; `docs/concepts/homing.md` has
+what true and false ones got."""
 
 
 class ThirdViewConsistency:
@@ -35,11 +42,9 @@ class ThirdViewConsistency:
         images: Sequence[OmniFeatures],
         links: Iterable[Link],
         rows: InlierRows,
-        settings: TopologicalMapSettings,
     ) -> None:
         """Takes links of images in the order of the walk, and the inliers of their answers."""
         self._images = images
-        self._settings = settings
         self._links = list(links)
         self._maps: dict[Pair, IntArray] = {}
         for link in self._links:
@@ -56,12 +61,12 @@ class ThirdViewConsistency:
         rejected: dict[Pair, str] = {}
         for link in self._links:
             share = self.share(link)
-            if share >= self._settings.third_views:
+            if share >= _THIRD_VIEWS:
                 seen.add((link.a, link.b))
             elif not self._walked(link):
                 rejected[link.a, link.b] = (
                     f"{share:.2f} confirmations an inlier by third views, of "
-                    f"{self._settings.third_views:g} needed so far apart"
+                    f"{_THIRD_VIEWS:g} needed so far apart"
                 )
                 continue
             kept.append(link)
@@ -73,7 +78,7 @@ class ThirdViewConsistency:
         Where neighbours do not match, the walk may have gone on anywhere.
         """
         steps = ((k, k + 1) for k in range(link.a, link.b))
-        near = link.b - link.a <= self._settings.order_reach
+        near = link.b - link.a <= _ORDER_REACH
         return near and all(step in self._maps for step in steps)
 
     def share(self, link: Link) -> float:
@@ -83,9 +88,8 @@ class ThirdViewConsistency:
 
     def _confirmations(self, a: int, b: int) -> int:
         """How often a feature of a is the same one in a neighbour of b, directly and by b."""
-        reach = self._settings.order_reach
         count = 0
-        for c in range(max(0, b - reach), min(len(self._images), b + reach + 1)):
+        for c in range(max(0, b - _ORDER_REACH), min(len(self._images), b + _ORDER_REACH + 1)):
             if c in (a, b) or (b, c) not in self._maps or (a, c) not in self._maps:
                 continue
             direct = self._maps[a, c]

@@ -206,10 +206,10 @@ def map_of_answers(
         rows: inliers of the answers; with them, far links of an ordered set need third views.
     """
     memory = PathMemory.of(images, names)
-    links, refused = link_pairs(answers, settings)
+    links, refused = link_pairs(answers)
     seen: set[Pair] = set()
     if ordered and rows is not None:
-        links, seen, unseen = ThirdViewConsistency(images, links, rows, settings).confirmed()
+        links, seen, unseen = ThirdViewConsistency(images, links, rows).confirmed()
         refused |= unseen
     checks = LinkConsistency(len(images), links, settings)
     believed, rejected = checks.believed(ordered=ordered, confirmed=seen)

@@ -24,6 +24,7 @@ RETIRED: dict[str, dict[str, Any]] = {
     },
     "ColourMomentSettings": {
         "mean_floor": 8.0,
+        "patch_sigmas": 6.0,
     },
     "ColumnSegmentSettings": {
         "max_width": 2048,
@@ -36,6 +37,14 @@ RETIRED: dict[str, dict[str, Any]] = {
         "max_run_deg": 8.0,
         "run_step_px": 1.5,
         "sigma_run": 0.15,
+        "min_gradient": 4.0,
+    },
+    "DatabaseSettings": {
+        "cone_deg": 30.0,
+    },
+    "EgoMotionSettings": {
+        "max_iterations": 15,
+        "kernel_width": 2.0,
     },
     "EkfSettings": {
         "loop_gate_sigmas": 10.0,
@@ -61,12 +70,17 @@ RETIRED: dict[str, dict[str, Any]] = {
         "blind_heading_deg": 20.0,
         "farther_s": 2.5,
         "contradiction_deg": 30.0,
+        "max_stalls": 3,
+        "near_fraction": 0.3,
+        "min_tracks": 10,
     },
     "HomingGraphSettings": {
         "prior_distances": 2.0,
         "relinearize_threshold": 0.01,
         "trust_radius": 1.0,
         "max_iterations": 50,
+        "match_limit": 13.8,
+        "max_steps": 1,
     },
     "HomingVectorSettings": {
         "inlier_sigmas": 3.0,
@@ -89,6 +103,7 @@ RETIRED: dict[str, dict[str, Any]] = {
     },
     "LocalisationSettings": {
         "background": 4.0,
+        "stay": 0.5,
     },
     "LoopCorrectionSettings": {
         "submap_frames": 10,
@@ -100,6 +115,10 @@ RETIRED: dict[str, dict[str, Any]] = {
         "agreement_deg": 2.0,
         "least_offset_m": 0.03,
         "least_offset_deg": 0.3,
+    },
+    "MapMatchingSettings": {
+        "orientation_deg": 20.0,
+        "scale_ratio": 1.5,
     },
     "OmniHouseSettings": {
         "camera_height_m": 1.2,
@@ -115,6 +134,7 @@ RETIRED: dict[str, dict[str, Any]] = {
         "horizon_margin_deg": 3.0,
         "max_scale_ratio": 2.0,
         "max_column_distance": 4.4,
+        "column_ratio": 0.7,
     },
     "OmniTrackingSettings": {
         "pyramid_levels": 2,
@@ -129,6 +149,16 @@ RETIRED: dict[str, dict[str, Any]] = {
         "search_px": 3.0,
         "plane_error": 0.2,
         "distinct_px": 3.0,
+        "patch_noise_grey": 4.0,
+        "min_correlation": 0.7,
+        "window_px": 9,
+    },
+    "PathFollowingSettings": {
+        "max_skips": 1,
+    },
+    "PermanenceSettings": {
+        "apart_px": 2.0,
+        "near_px": 40.0,
     },
     "RecordedOdometrySettings": {
         "translation_floor_m": 0.002,
@@ -166,6 +196,9 @@ RETIRED: dict[str, dict[str, Any]] = {
         "sample": 10000,
         "iterations": 6,
     },
+    "SiftSettings": {
+        "edge_threshold": 10.0,
+    },
     "SimulatedBearingsSettings": {
         "lowest_m": 0.2,
         "highest_m": 1.5,
@@ -181,6 +214,7 @@ RETIRED: dict[str, dict[str, Any]] = {
         "least_share": 0.25,
         "passing_share": 0.6,
         "blind_share": 0.4,
+        "gain_per_s": 1.2,
     },
     "SyntheticOdometrySettings": {
         "translation_floor_m": 0.001,
@@ -193,6 +227,9 @@ RETIRED: dict[str, dict[str, Any]] = {
         "loop_deg": 6.0,
         "heading_deg": 15.0,
         "doubling_support": 25.0,
+        "third_views": 1.0,
+        "order_reach": 3,
+        "min_support": 12,
     },
     "UprightSiftSettings": {
         "octave_layers": 3,

@@ -29,6 +29,7 @@ from fgslam.core.sensors import CameraRig
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.noise import Whitening
 from fgslam.factors.stereo import FROM_MEASUREMENT, StereoFactors
+from fgslam.frontend.tracking.ego_motion import MAX_ITERATIONS
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 
 _POSE = pose_key(0)
@@ -61,7 +62,7 @@ class FixedMapPose:
             values.insert(landmark_key(i), position)
         values.insert(_POSE, gtsam.Pose3(weighted_at))
         wTc = weighted_at
-        for _ in range(self._settings.max_iterations):
+        for _ in range(MAX_ITERATIONS):
             basis = self._floor.basis(wTc)
             step, covariance = _solved(_pose_columns(graph.linearize(values)), basis)
             if np.abs(step).max() < _CONVERGED:

@@ -21,6 +21,14 @@ _STILL = 0.3  # deviations, of all variables together: a shorter step ends the i
 _FIRST_DAMPING, _MORE, _MOST = 1e-3, 10.0, 1e6
 _ROUNDING = 1e-9
 _EVERY = 4  # images: a doubt costs half as much as an update
+_STEPS = 1
+"""Gauss-Newton steps with an image, at most: what is left after one is gone with the next image."""
+
+_MATCH_LIMIT = 13.8
+"""What the target saw of a landmark is dropped where everything else contradicts it by more than
+this squared Mahalanobis distance: one in a thousand of right matches, by chi-square of two degrees
+of freedom."""
+
 _FIRST_STEPS = 20  # with start and target alone, whose first guess is the initialisation's
 
 
@@ -29,8 +37,6 @@ class SchurSolver:
 
     def __init__(self, settings: HomingGraphSettings) -> None:
         """Empty."""
-        self._steps = settings.max_steps
-        self._limit = settings.match_limit
         self._model = SchurModel(settings)
         numbers = self._model.numbers
         self._state = State(np.empty((0, 6)), np.zeros(3), np.empty((0, numbers)))
@@ -39,12 +45,12 @@ class SchurSolver:
     def add(self, new: NewPart, time: float) -> None:
         """See :class:`Solver`."""
         self._state = self._model.take(new, self._state)
-        look = self._go_on(_FIRST_STEPS if new.image == 0 else self._steps)
+        look = self._go_on(_FIRST_STEPS if new.image == 0 else _STEPS)
         if not np.isfinite(look.cost):
             raise EstimatorError(
                 "the homing graph cannot be solved (its cost is no number); start the homing anew"
             )
-        if new.image % _EVERY == 0 and self._limit > 0.0:
+        if new.image % _EVERY == 0:
             self._doubt(look)
 
     def move(self, points: dict[int, FloatArray], time: float) -> None:
@@ -91,9 +97,9 @@ class SchurSolver:
             return
         far = self._model.contradictions(look, self._factored.border_covariance())
         worst = int(np.argmax(far))
-        if far[worst] > self._limit:
+        if far[worst] > _MATCH_LIMIT:
             self._model.drop_match(worst)
-            self._go_on(self._steps)
+            self._go_on(_STEPS)
 
     def _go_on(self, steps: int) -> Look:
         """Up to so many steps; what is left of the way is gone with the next image."""

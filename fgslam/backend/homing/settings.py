@@ -164,23 +164,6 @@ class HomingGraphSettings(NamedSettings):
     lag_s: Annotated[
         float, Field(gt=0.0, description="fixed_lag: how long poses stay variables, seconds")
     ] = 1.0
-    max_steps: Annotated[
-        int,
-        Field(
-            ge=1,
-            description="schur: most Gauss-Newton steps with an image; what is left, 0.3 "
-            "deviations over all variables together, is gone with the next one",
-        ),
-    ] = 1
-    match_limit: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="schur: what the target saw of a landmark is dropped where everything else "
-            "contradicts it by more than this squared Mahalanobis distance, chi-square of two "
-            "degrees of freedom where the match is right (13.8: one in a thousand). 0: never",
-        ),
-    ] = 13.8
     motion: GraphMotionSettings = GraphMotionSettings()
 
 

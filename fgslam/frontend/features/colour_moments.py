@@ -23,6 +23,8 @@ _MEAN_FLOOR = 8.0
 """Grey values; means (and deviations) below it count as it, so that the noise of dark patches is no
 colour."""
 
+PATCH_SIGMAS = 6.0  # half side of the square of a feature, in SIFT scales: as its descriptor's
+
 Float32Image: TypeAlias = npt.NDArray[np.float32]
 
 PAIRS = ((0, 2), (0, 1), (1, 2))
@@ -68,7 +70,7 @@ class PatchColours:
 
     def around(self, pixels: FloatArray, scale_px: FloatArray) -> FloatArray:
         """(n, 3) over squares around pixels (n, 2), as wide as scales (n,) ask for."""
-        half = np.maximum(self._settings.patch_sigmas * scale_px, 1.0)[:, None]
+        half = np.maximum(PATCH_SIGMAS * scale_px, 1.0)[:, None]
         low = np.floor(pixels - half + 0.5).astype(np.int64)
         high = np.floor(pixels + half + 0.5).astype(np.int64) + 1
         limit = np.array([self._shape[1], self._shape[0]])

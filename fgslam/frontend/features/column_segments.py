@@ -40,6 +40,7 @@ _MIN_LENGTH_PX = 8.0  # shorter segments have no profile to tell them by
 _SMOOTHING_PX = 1.2  # Gaussian before the gradient is taken
 PROFILE_SAMPLES = 32
 COEFFICIENTS = 7
+_MIN_GRADIENT = 4.0  # of the three bands together, grey values a pixel, at a segment's ends
 _RIM_SIGMAS = 3.0
 """Of the smoothing: so far the end of the picture reaches into it."""
 
@@ -101,7 +102,7 @@ class ColumnSegmentFinder:
         """Between consecutive maxima of the colour gradient along each column."""
         gradient = self._gradient(image)
         before, middle, after = gradient[:-2], gradient[1:-1], gradient[2:]
-        peak = (middle > before) & (middle >= after) & (middle > self._settings.min_gradient**2)
+        peak = (middle > before) & (middle >= after) & (middle > _MIN_GRADIENT**2)
         # Transposed, so that a column's maxima come one after the other.
         column, row = np.nonzero(np.ascontiguousarray(peak.T))
         at = row + _summit(before[row, column], middle[row, column], after[row, column]) + 1.0

@@ -25,10 +25,6 @@ class ColourMomentSettings:
             "`correlation`: Pearson's, blind to gain and offset"
         ),
     ] = "ratio"
-    patch_sigmas: Annotated[
-        float,
-        Field(gt=0.0, description="half side of a feature's patch, in SIFT scales; 6 is SIFT's"),
-    ] = 6.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -68,13 +64,6 @@ class UprightSiftSettings:
 class ColumnSegmentSettings:
     """Invariant column segments (III-A2)."""
 
-    min_gradient: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="of the three bands together, grey values a pixel, at a segment's ends",
-        ),
-    ] = 4.0
     sigma_px: Annotated[
         float, Field(gt=0.0, description="position of an end, and of a run of one column")
     ] = 1.8
@@ -108,9 +97,6 @@ class OmniMatchingSettings:
             "of opposite sign, apparent sizes against elevations"
         ),
     ] = True
-    column_ratio: Annotated[
-        float, Field(gt=0.0, le=1.0, description="column segments: nearest over second nearest")
-    ] = 0.7
 
 
 @dataclass(frozen=True, config=STRICT)

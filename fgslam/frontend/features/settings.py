@@ -28,9 +28,6 @@ class SiftSettings:
         float,
         Field(ge=0.0, description="OpenCV's contrast threshold, divided by octave_layers inside"),
     ] = 0.03
-    edge_threshold: Annotated[
-        float, Field(gt=1.0, description="ratio of principal curvatures above which edges go")
-    ] = 10.0
     base_sigma_px: Annotated[
         float, Field(gt=0.5, le=3.0, description="Gaussian of the first level, doubled image")
     ] = 1.6

@@ -12,6 +12,8 @@ from fgslam.core.arrays import ByteArray, Image, IntArray
 from fgslam.core.features import Features
 from fgslam.frontend.features.settings import Appearance, SiftSettings
 
+EDGE_THRESHOLD = 10.0  # ratio of principal curvatures above which edges go: OpenCV's own
+
 
 class SiftExtractor:
     """Finds SIFT features; keeps the finest ``scale_levels`` levels of the pyramid.
@@ -30,7 +32,7 @@ class SiftExtractor:
             settings.max_features,
             settings.octave_layers,
             settings.contrast_threshold,
-            settings.edge_threshold,
+            EDGE_THRESHOLD,
             settings.base_sigma_px,
             cv2.CV_8U,
             True,

@@ -30,6 +30,12 @@ _MAX_DEFORMATION = 1.0
 is lost."""
 
 _PATCH_DEFORMATION = 0.05  # sigma of its stretching and shearing from image to image
+WINDOW_PX = 9  # side of the tracked window, in the view
+_MIN_CORRELATION = 0.7
+"""Of a point's patch with its first one, gain and offset taken out; a point that looks less like it
+is lost."""
+
+_PATCH_NOISE_GREY = 4.0  # sigma of its grey values: noise, and what no affine map does
 PATCH_PX = 13  # side of the patch that holds a point in place
 MIN_EIGENVALUE = 1e-4  # smaller eigenvalue of eq. 2 over the window, a pixel, grey values 0 to 1
 _MAX_BACK_PX = 1.0  # a point tracked back that misses its origin by more is lost
@@ -69,7 +75,7 @@ class BearingTracker:
     def __init__(self, camera: OmniCamera, settings: OmniTrackingSettings) -> None:
         self._settings = settings
         self.stabilised = StabilisedView(
-            camera, settings.max_view_width, settings.window_px, _PYRAMID_LEVELS
+            camera, settings.max_view_width, WINDOW_PX, _PYRAMID_LEVELS
         )
         self._last: StabilisedImage | None = None
         self._places: FloatArray = np.empty((0, 2))
@@ -149,16 +155,14 @@ class BearingTracker:
         return self.stabilised.from_stabilised(self._places, self._last)
 
     def _anchored(self, image: StabilisedImage, places: FloatArray) -> ReferencePatches:
-        s = self._settings
-        return anchor(image.grey, places, PATCH_PX, s.patch_noise_grey, _PATCH_DEFORMATION)
+        return anchor(image.grey, places, PATCH_PX, _PATCH_NOISE_GREY, _PATCH_DEFORMATION)
 
     def _settle(
         self, now: StabilisedImage, places: FloatArray, ids: IntArray, patches: ReferencePatches
     ) -> None:
         """Aligns each point with its first patch, and keeps those that look like it."""
         patches, places, correlation = align(patches, now.grey, places)
-        s = self._settings
-        kept = (correlation >= s.min_correlation) & (patches.deformation() <= _MAX_DEFORMATION)
+        kept = (correlation >= _MIN_CORRELATION) & (patches.deformation() <= _MAX_DEFORMATION)
         kept &= self._inside(places)
         self._places, self._ids = self._centred(places[kept]), ids[kept]
         self._patches = patches.select(kept)
@@ -172,9 +176,8 @@ class BearingTracker:
         self, before: StabilisedImage, now: StabilisedImage
     ) -> tuple[FloatArray, BoolArray]:
         """(n, 2) places in the new view, and (n,) whether they are to be trusted."""
-        s = self._settings
         origin = self._places.astype(np.float32)
-        window = (s.window_px, s.window_px)
+        window = (WINDOW_PX, WINDOW_PX)
         kinds = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT
         criteria = (kinds, _ITERATIONS, _PRECISION_PX)
         start = np.empty_like(origin)  # not read without the flag
@@ -196,7 +199,7 @@ class BearingTracker:
 
     def _inside(self, places: Float32 | FloatArray) -> BoolArray:
         """(n,) whether a point's window lies mostly in the view; rows have no continuation."""
-        rim, rows = self._settings.window_px / 4.0, self.stabilised.view.height
+        rim, rows = WINDOW_PX / 4.0, self.stabilised.view.height
         good = (places[:, 1] >= rim) & (places[:, 1] <= rows - 1 - rim)
         columns = 2 * self.stabilised.margin + self.stabilised.period
         return np.asarray(good & (places[:, 0] >= 0.0) & (places[:, 0] <= columns - 1.0))

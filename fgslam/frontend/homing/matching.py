@@ -26,6 +26,7 @@ from fgslam.frontend.features.column_whitening import whitened
 from fgslam.frontend.features.omni_settings import OmniMatchingSettings
 
 _MAX_COLUMN_DISTANCE = 4.4  # Mahalanobis, of 11 elements; 4.4 is exceeded by 5 % if normal
+_COLUMN_RATIO = 0.7  # column segments: nearest over second nearest distance below this
 _MAX_SCALE_RATIO = 2.0  # factor between the ratio of scales and that of the sines of the elevations
 _HORIZON_MARGIN_DEG = 3.0  # elevations nearer to the horizon may have either sign
 
@@ -159,7 +160,7 @@ def match_columns(
     if len(a) < 2 or len(b) < 2:
         return _column_matches(a, b, none, none, np.zeros(0))
     i, j, distance, ratio = nearest_segments(whitened(a.descriptors), whitened(b.descriptors))
-    keep = (ratio < settings.column_ratio) & (distance < _MAX_COLUMN_DISTANCE)
+    keep = (ratio < _COLUMN_RATIO) & (distance < _MAX_COLUMN_DISTANCE)
     return _column_matches(a, b, i[keep], j[keep], 1.0 - ratio[keep])
 
 

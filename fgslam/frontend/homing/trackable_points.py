@@ -17,7 +17,7 @@ from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.homing import BearingMatches, FeatureKind, OmniFeatures
 from fgslam.core.planar import wrap
-from fgslam.frontend.homing.bearing_tracking import MIN_EIGENVALUE, PATCH_PX
+from fgslam.frontend.homing.bearing_tracking import MIN_EIGENVALUE, PATCH_PX, WINDOW_PX
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 
 DISTINCT_PX = 3.0  # of two trackable points nearer than this one is kept
@@ -54,9 +54,9 @@ def move_to_trackable(
         return np.empty(0, dtype=np.int64), np.empty((0, 2)), matches
     radius = _search_radius(matches, features[0], view, settings)
     centres = _in_view(matches, view)
-    strength = _strength(grey, settings.window_px)
+    strength = _strength(grey, WINDOW_PX)
     points, strongest = _best_near(strength, centres, radius)
-    rim = max(settings.window_px, PATCH_PX) / 2.0
+    rim = max(WINDOW_PX, PATCH_PX) / 2.0
     good = (strongest >= MIN_EIGENVALUE) & (points[:, 1] >= rim)
     good &= points[:, 1] <= view.height - 1 - rim
     good &= _distinct(points, strongest, DISTINCT_PX)

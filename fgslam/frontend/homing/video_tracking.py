@@ -10,7 +10,7 @@ import numpy as np
 from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.homing import TrackedBearings
-from fgslam.frontend.homing.bearing_tracking import BearingTracker, TrackerState
+from fgslam.frontend.homing.bearing_tracking import WINDOW_PX, BearingTracker, TrackerState
 from fgslam.frontend.homing.trackable_points import DISTINCT_PX
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 
@@ -51,7 +51,7 @@ class ReplenishedTracker:
     ) -> None:
         """Fills up to ``most`` points whenever fewer than ``least`` are left."""
         self._tracker = BearingTracker(camera, settings)
-        self._settings, self._least, self._most = settings, least, most
+        self._least, self._most = least, most
         self._next = 0
         self._started = False
 
@@ -104,17 +104,16 @@ class ReplenishedTracker:
 
     def _corners(self, grey: Image, present: FloatArray) -> FloatArray:
         """(k, 2) in the view; k fills up what is missing, where there is so much to see."""
-        s = self._settings
         mask = np.full(grey.shape, 255, np.uint8)
-        rim = s.window_px // 2 + 1
+        rim = WINDOW_PX // 2 + 1
         mask[:rim] = mask[-rim:] = 0
         for column, row in np.round(present).astype(int).tolist():
-            cv2.circle(mask, (column, row), s.window_px // 2, 0, -1)
+            cv2.circle(mask, (column, row), WINDOW_PX // 2, 0, -1)
         wanted = self._most - len(present)
         if wanted <= 0:
             return np.empty((0, 2))
         found = cv2.goodFeaturesToTrack(
-            grey, wanted, 0.005, max(DISTINCT_PX, s.window_px / 3.0), mask=mask,
-            blockSize=s.window_px,
+            grey, wanted, 0.005, max(DISTINCT_PX, WINDOW_PX / 3.0), mask=mask,
+            blockSize=WINDOW_PX,
         )  # fmt: skip
         return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)

@@ -134,7 +134,7 @@ class LandmarkDatabase(LandmarkTable):
             return
         ids = missing[self.permanent[self.rows(missing)]]
         places = expected.measurement[np.searchsorted(expected.ids, ids)]
-        against = seen_past(places, seen, permanence) | np.isin(ids, rejected)
+        against = seen_past(places, seen) | np.isin(ids, rejected)
         ids = ids[against]
         rows = self.rows(ids)
         self.contradicted[rows] += 1

@@ -42,6 +42,8 @@ _STEP_TOLERANCE = 1e-9  # radians and metres; far below anything measurable
 _ROBUST_TOLERANCE = 1e-5  # the robust minimum only chooses the inliers for the exact one
 _REPEATS = 10  # minimisations with the remaining matches; two suffice on all recordings tried
 _EXACT_SIGMA = 1e-6  # radians and metres; stands for zero where a covariance is singular
+_KERNEL_WIDTH = 2.0  # standard deviations of a residual at which the robust kernel bends
+MAX_ITERATIONS = 15  # Newton steps of a minimisation, at most
 _MAX_DAMPING = 1e8
 _LEAST_CURVATURE = 1e-10  # of the Hessian with unit diagonal; below it the pose is undetermined
 
@@ -137,7 +139,7 @@ class EgoMotionSolver:
         tolerance = _ROBUST_TOLERANCE if robust else _STEP_TOLERANCE
         wTc = best = start
         hessian, gradient = np.eye(6), np.zeros(6)
-        for iteration in range(1, self._settings.max_iterations + 1):
+        for iteration in range(1, MAX_ITERATIONS + 1):
             cost, h, g = self._linearise(wTc, problem, information, robust)
             if prior is not None:
                 cost, h, g = _add_prior(wTc, prediction.wTc, prior, (cost, h, g))
@@ -202,7 +204,7 @@ class EgoMotionSolver:
         """Robust cost and weight (k,) of squared normalised residuals."""
         if not robust:
             return squared, np.ones_like(squared)
-        width = self._settings.kernel_width
+        width = _KERNEL_WIDTH
         if self._settings.kernel == "cauchy":
             ratio = squared / width**2
             return width**2 * np.log1p(ratio), 1.0 / (1.0 + ratio)

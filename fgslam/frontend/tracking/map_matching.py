@@ -13,6 +13,11 @@ from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.tracking.settings import MapMatchingSettings
 from fgslam.frontend.tracking.visibility import ExpectedLandmarks
 
+_SCALE_RATIO = 1.5
+"""Largest ratio to the predicted scale: one level of the scale space (Se et al., IJRR 2002)."""
+
+_ORIENTATION_DEG = 20.0  # largest difference to the predicted orientation, as between images
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapMatches:
@@ -81,7 +86,6 @@ class MapMatcher:
     def _match_within(
         self, expected: ExpectedLandmarks, features: StereoFeatures, reach: FloatArray
     ) -> MapMatches:
-        s = self._settings
         i, j = pairs_within(expected.measurement[:, 1], reach[:, 1], features.measurement[:, 1])
         offset = np.abs(features.measurement[j] - expected.measurement[i])
         near = (offset <= reach[i]).all(axis=1)
@@ -89,8 +93,8 @@ class MapMatcher:
         same = alike(
             (expected.scale[i], features.scale[j]),
             (expected.orientation[i], features.orientation[j]),
-            s.scale_ratio,
-            np.deg2rad(s.orientation_deg),
+            _SCALE_RATIO,
+            np.deg2rad(_ORIENTATION_DEG),
         )
         descriptors = (expected.descriptors, features.descriptors)
         pairs = resembling(i[same], j[same], descriptors, self._appearance)

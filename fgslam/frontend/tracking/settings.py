@@ -21,12 +21,6 @@ class MapMatchingSettings:
     disparity_px: Annotated[
         float, Field(gt=0.0, description="largest difference from the predicted disparity")
     ] = 2.0
-    scale_ratio: Annotated[
-        float, Field(gt=1.0, description="largest ratio to the predicted scale")
-    ] = 1.5
-    orientation_deg: Annotated[
-        float, Field(gt=0.0, le=180.0, description="largest difference of orientations")
-    ] = 20.0
     widen_sigmas: Annotated[
         float,
         Field(
@@ -96,14 +90,6 @@ class PermanenceSettings:
             "ordinary one again; null: never",
         ),
     ] = 20
-    near_px: Annotated[
-        float,
-        Field(gt=0.0, description="what is seen past a place is this near to it in the image"),
-    ] = 40.0
-    apart_px: Annotated[
-        float,
-        Field(gt=0.0, description="before or behind it: a disparity that differs by more"),
-    ] = 2.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -150,9 +136,6 @@ class DatabaseSettings:
             "30 degrees on both axes (4.4), which exceeds a 320x240 image's height"
         ),
     ] = "image"
-    cone_deg: Annotated[
-        float, Field(gt=0.0, lt=90.0, description="half angle of the cone; 30 in 4.4")
-    ] = 30.0
     border_px: Annotated[
         float,
         Field(
@@ -165,8 +148,8 @@ class DatabaseSettings:
         Field(
             gt=0.0,
             description="landmarks that would look smaller than this are not expected: SIFT's "
-            "finest scale over matching.scale_ratio, 0.8 where base_sigma_px is 2, loses no match "
-            "and keeps large maps fast; null expects them at any distance",
+            "finest scale over 1.5, the largest ratio matched. 0.8 where base_sigma_px is 2 loses "
+            "no match and keeps large maps fast; null expects them at any distance",
         ),
     ] = None
     permanence: Annotated[
@@ -217,9 +200,6 @@ class EgoMotionSettings:
         Literal["none", "huber", "cauchy"],
         Field(description="robust kernel on the normalised residual before outliers are dropped"),
     ] = "cauchy"
-    kernel_width: Annotated[
-        float, Field(gt=0.0, description="its width, in standard deviations")
-    ] = 2.0
     min_matches: Annotated[
         int, Field(ge=1, description="fewer inliers than this: the odometry is the pose (4.1)")
     ] = 6
@@ -229,4 +209,3 @@ class EgoMotionSettings:
     max_correction_deg: Annotated[
         float, Field(gt=0.0, description="cap on the correction of the odometry (5)")
     ] = 6.0
-    max_iterations: Annotated[int, Field(ge=1, description="Newton steps a minimisation")] = 15

@@ -24,6 +24,7 @@ from fgslam.frontend.tracking.settings import DatabaseSettings
 
 Wanted: TypeAlias = Callable[[IntArray, FloatArray], BoolArray]
 """Of rows (k,) of the map and their depths: which (k,) to consider at all."""
+_CONE_DEG = 30.0  # half angle of the cone in which the paper expects landmarks (4.4)
 _NEAREST_DEPTH_M = 0.1
 _SLACK_PX = 1e-6  # of the rough test before the exact one; far above rounding
 
@@ -81,7 +82,7 @@ class FieldOfView:
         self._rig = rig
         self._border = settings.border_px
         self._cone = settings.field_of_view == "cone"
-        self._tangent = np.tan(np.deg2rad(settings.cone_deg))
+        self._tangent = np.tan(np.deg2rad(_CONE_DEG))
         self._max_disparity = max_disparity_px
 
     def select(

@@ -20,7 +20,7 @@ from fgslam.frontend.tracking.visibility import predicted_covariance
 
 NO_BORDER = DatabaseSettings(border_px=0.0)
 BORDER = DatabaseSettings(border_px=8.0)
-CONE = DatabaseSettings(field_of_view="cone", cone_deg=30.0)
+CONE = DatabaseSettings(field_of_view="cone")
 TWO_CAMERAS = dataclasses.replace(RIG, vertical_baseline=None)
 
 

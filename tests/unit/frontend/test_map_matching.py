@@ -19,8 +19,6 @@ DESCRIPTOR = AppearanceSettings(mode="descriptor", max_distance=250.0, ratio=0.8
 FIXED = MapMatchingSettings(
     window_px=5.0,
     disparity_px=2.0,
-    scale_ratio=1.5,
-    orientation_deg=20.0,
     widen_sigmas=0.0,
     max_window_px=30.0,
 )

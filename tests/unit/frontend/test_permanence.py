@@ -50,7 +50,6 @@ def test_a_view_in_which_nothing_is_expected_is_not_blocked() -> None:
     assert not is_blind(expected_landmarks([]), nothing, PermanenceSettings())
 
 
-NEAR = PermanenceSettings(near_px=20.0, apart_px=2.0)
 PLACE = (100.0, 80.0, 10.0)
 SEEN = {
     # what the frame shows: (column, row, disparity)
@@ -69,13 +68,14 @@ SEEN = {
 
 
 @pytest.mark.parametrize("what", SEEN)
-def test_what_contradicts_a_missed_landmark(what: str) -> None:
+def test_what_contradicts_a_missed_landmark(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fgslam.frontend.tracking.permanence._NEAR_PX", 20.0)
     shown, past = SEEN[what]
-    found = seen_past(np.array([PLACE]), np.array(shown, np.float64).reshape(-1, 3), NEAR)
+    found = seen_past(np.array([PLACE]), np.array(shown, np.float64).reshape(-1, 3))
     assert found.tolist() == [past]
 
 
 def test_each_place_is_judged_by_what_is_near_to_it() -> None:
     places = np.array([PLACE, (200.0, 80.0, 10.0), (200.0, 82.0, 4.0), (20.0, 20.0, 3.0)])
     seen = np.array([(101.0, 81.0, 4.0), (201.0, 81.0, 14.0), (50.0, 50.0, 1.0)])
-    assert seen_past(places, seen, NEAR).tolist() == [True, False, False, False]
+    assert seen_past(places, seen).tolist() == [True, False, False, False]

@@ -15,7 +15,7 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.features import Features
 from fgslam.core.geometry import wrap_angle
 from fgslam.frontend.features.settings import SiftSettings
-from fgslam.frontend.features.sift import SiftExtractor
+from fgslam.frontend.features.sift import EDGE_THRESHOLD, SiftExtractor
 
 SETTINGS = SiftSettings()
 ALL_LEVELS = SiftSettings(scale_levels=64)
@@ -96,7 +96,7 @@ def test_the_finest_levels_are_kept(levels: int, layers: int) -> None:
     detector = cv2.SIFT_create(
         nOctaveLayers=layers,
         contrastThreshold=SETTINGS.contrast_threshold,
-        edgeThreshold=SETTINGS.edge_threshold,
+        edgeThreshold=EDGE_THRESHOLD,
         sigma=SETTINGS.base_sigma_px,
         enable_precise_upscale=True,
     )

@@ -13,7 +13,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.tracking.settings import DatabaseSettings
-from fgslam.frontend.tracking.visibility import FieldOfView, directions_to
+from fgslam.frontend.tracking.visibility import _CONE_DEG, FieldOfView, directions_to
 
 MAX_DISPARITY = 40.0
 TWO_CAMERAS = dataclasses.replace(RIG, vertical_baseline=None)
@@ -37,7 +37,7 @@ def full_scan(
         if disparity > MAX_DISPARITY:
             continue
         if settings.field_of_view == "cone":
-            tangent = np.tan(np.deg2rad(settings.cone_deg))
+            tangent = np.tan(np.deg2rad(_CONE_DEG))
             possible[k] = certain[k] = bool((np.abs(point[:2]) < tangent * point[2]).all())
             continue
         for out, border in ((possible, -settings.border_px), (certain, settings.border_px)):

@@ -29,10 +29,10 @@ from fgslam.core.homing import (
     TwoViewVector,
 )
 from fgslam.core.planar import bearings, between, unit, wrap
-from fgslam.homing.active_homing import _MAX_ACROSS, ActiveHoming
+from fgslam.homing.active_homing import _MAX_ACROSS, _MIN_TRACKS, ActiveHoming
 from fgslam.homing.bearing_consistency import parallax
 from fgslam.homing.command import Command, HomingState
-from fgslam.homing.controller import _FARTHER_S, HomingController
+from fgslam.homing.controller import _FARTHER_S, _MAX_STALLS, _NEAR_FRACTION, HomingController
 from fgslam.homing.front_end import Sighting
 from fgslam.homing.settings import HomingControlSettings
 from tests.homing import make_matches
@@ -243,7 +243,7 @@ def test_few_tracks_match_anew_while_driving_on() -> None:
     b.step()
     b.at(0.4)
     b.step()
-    b.front_end.tracks = SETTINGS.min_tracks - 1
+    b.front_end.tracks = _MIN_TRACKS - 1
     refused = b.step(SETTINGS.retry_s)
     assert refused.state is HomingState.DRIVE
     assert FEW.details in refused.reason
@@ -453,7 +453,7 @@ def test_no_progress_is_noticed() -> None:
     assert commands[-1].state is HomingState.REFUSED
     assert commands[-1].refusal is not None
     assert commands[-1].refusal.reason is RefusalReason.NO_PROGRESS
-    assert b.controller.initialisations == SETTINGS.max_stalls
+    assert b.controller.initialisations == _MAX_STALLS
 
 
 def test_refused_target_is_looked_for_from_farther_on() -> None:
@@ -498,10 +498,10 @@ def test_near_the_target_one_look_confirms_it() -> None:
     """Not before, and not again once it agreed; the tracks go on."""
     b = bench(vector_to(0.0))
     b.step()
-    b.at(1.0 - 1.1 * SETTINGS.near_fraction)
+    b.at(1.0 - 1.1 * _NEAR_FRACTION)
     b.step()
     assert b.front_end.looked == 0
-    b.at(1.0 - 0.9 * SETTINGS.near_fraction)
+    b.at(1.0 - 0.9 * _NEAR_FRACTION)
     assert b.step().state is HomingState.DRIVE
     b.at(0.95)
     assert b.step().state is HomingState.ARRIVED
@@ -605,9 +605,10 @@ def test_look_from_the_target_itself_is_arrival() -> None:
     assert b.step().state is HomingState.ARRIVED
 
 
-def test_blocked_way_is_waited_for() -> None:
+def test_blocked_way_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Held up by obstacles is no lack of progress, for so long; then it is."""
-    b = bench(vector_to(0.0), stall_s=1.0, wait_s=2.0, max_stalls=1)
+    monkeypatch.setattr("fgslam.homing.controller._MAX_STALLS", 1)
+    b = bench(vector_to(0.0), stall_s=1.0, wait_s=2.0)
     ended = []
     for _ in range(60):
         b.controller.held_up(0.1)

@@ -149,9 +149,12 @@ class Doorkeeper:
 
 
 @pytest.mark.parametrize(("wait_s", "result"), [(10.0, "arrived"), (0.0, "refused")])
-def test_way_that_is_blocked_for_a_while_is_driven_on(wait_s: float, result: str) -> None:
+def test_way_that_is_blocked_for_a_while_is_driven_on(
+    wait_s: float, result: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What avoidance takes does not count as lack of progress, as long as one may wait."""
-    control = replace(HomingControlSettings(), stall_s=2.0, max_stalls=1, wait_s=wait_s)
+    monkeypatch.setattr("fgslam.homing.controller._MAX_STALLS", 1)
+    control = replace(HomingControlSettings(), stall_s=2.0, wait_s=wait_s)
     behaviour = replace(HomingBehaviourSettings(), control=control)
     record = drive_path(winding_path(7, 1, 2.0), behaviour, avoider=Doorkeeper(20, 70))
     assert [leg.result for leg in record.legs] == [result]
@@ -159,7 +162,7 @@ def test_way_that_is_blocked_for_a_while_is_driven_on(wait_s: float, result: str
 
 @pytest.mark.parametrize(
     ("count", "path"),
-    [(1, PathFollowingSettings(skip_unmatched=False)), (2, PathFollowingSettings(max_skips=1))],
+    [(1, PathFollowingSettings(skip_unmatched=False)), (2, PathFollowingSettings())],
 )
 def test_skipping_has_its_bounds(count: int, path: PathFollowingSettings) -> None:
     """Not allowed, or not so many: the path ends with the refusal, standing."""

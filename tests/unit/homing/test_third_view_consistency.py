@@ -49,7 +49,7 @@ def checked(far: list[Pair], seed: int | None) -> ThirdViewConsistency:
     """A walk, and links from one end of it to the other whose matches are true or by lot."""
     walk = [(k, k + 1) for k in range(COUNT - 1)]
     rows = rows_of(walk) | rows_of(far, seed)
-    return ThirdViewConsistency([view()] * COUNT, [link(p) for p in (*walk, *far)], rows, SETTINGS)
+    return ThirdViewConsistency([view()] * COUNT, [link(p) for p in (*walk, *far)], rows)
 
 
 NEIGHBOURS = [FAR, (1, 8), (1, 10), (2, 9), (0, 9)]
@@ -91,7 +91,7 @@ def test_walk_vouches_for_a_few_steps_but_not_across_a_gap() -> None:
     by_lot = rows_of([short], 1)
     for steps, believed in ((walk, True), ([p for p in walk if p != (4, 5)], False)):
         links = [link(p) for p in (*steps, short)]
-        views = ThirdViewConsistency([view()] * COUNT, links, rows_of(steps) | by_lot, SETTINGS)
+        views = ThirdViewConsistency([view()] * COUNT, links, rows_of(steps) | by_lot)
         assert (short not in views.confirmed()[2]) is believed
 
 

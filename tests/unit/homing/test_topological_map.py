@@ -21,7 +21,7 @@ from fgslam.homing.link_consistency import (
     between_misfit,
     heading_residuals,
 )
-from fgslam.homing.links import _MUTUAL_DEG, _ONE_WAY_SUPPORT, Answer, Link, link_pair
+from fgslam.homing.links import _MIN_SUPPORT, _MUTUAL_DEG, _ONE_WAY_SUPPORT, Answer, Link, link_pair
 from fgslam.homing.localisation import Localiser
 from fgslam.homing.retrieval import VisualWords, candidate_pairs
 from fgslam.homing.settings import LocalisationSettings, RetrievalSettings, TopologicalMapSettings
@@ -47,7 +47,7 @@ def true_vector(one: FloatArray, other: FloatArray, support: int = 60) -> TwoVie
 def true_link(poses: FloatArray, a: int, b: int, support: int = 60) -> Link:
     """As both directions' answers make it."""
     there, back = true_vector(poses[a], poses[b], support), true_vector(poses[b], poses[a], support)
-    link = link_pair((a, b), there, back, SETTINGS)
+    link = link_pair((a, b), there, back)
     assert isinstance(link, Link)
     return link
 
@@ -85,17 +85,17 @@ def test_answers_that_disagree_are_no_link() -> None:
     """Rotation not opposite; direction not where one came from; a refusal; few inliers."""
     a, b = random_poses(1, 2)
     there, back = true_vector(a, b), true_vector(b, a)
-    assert isinstance(link_pair((0, 1), there, back, SETTINGS), Link)
+    assert isinstance(link_pair((0, 1), there, back), Link)
     off = np.deg2rad(_MUTUAL_DEG + 1.0)
     for wrong in (
         vector(back.direction, back.rotation + off),
         vector(back.direction + off, back.rotation),
     ):
-        assert "disagree" in str(link_pair((0, 1), there, wrong, SETTINGS))
-    assert "3 matches" in str(link_pair((0, 1), there, NONE, SETTINGS))
-    assert "3 matches" in str(link_pair((0, 1), NONE, NONE, SETTINGS))
-    few = true_vector(b, a, SETTINGS.min_support - 1)
-    assert "inliers" in str(link_pair((0, 1), there, few, SETTINGS))
+        assert "disagree" in str(link_pair((0, 1), there, wrong))
+    assert "3 matches" in str(link_pair((0, 1), there, NONE))
+    assert "3 matches" in str(link_pair((0, 1), NONE, NONE))
+    few = true_vector(b, a, _MIN_SUPPORT - 1)
+    assert "inliers" in str(link_pair((0, 1), there, few))
 
 
 def test_ambiguous_in_one_direction_is_decided_by_the_other() -> None:
@@ -103,24 +103,24 @@ def test_ambiguous_in_one_direction_is_decided_by_the_other() -> None:
     a, b = random_poses(2, 2)
     there, back = true_vector(a, b), true_vector(b, a)
     unsure = Refusal(RefusalReason.AMBIGUOUS, "30 inliers, 29 for a different solution")
-    one, other = (link_pair((0, 1), *pair, SETTINGS) for pair in ((there, unsure), (unsure, back)))
+    one, other = (link_pair((0, 1), *pair) for pair in ((there, unsure), (unsure, back)))
     assert isinstance(one, Link)
     assert isinstance(other, Link)
     gap = [one.direction - other.direction, one.rotation - other.rotation, one.back - other.back]
     assert np.abs(wrap(np.array(gap))).max() < 1e-12
     few = true_vector(a, b, _ONE_WAY_SUPPORT - 1)
-    assert "one way" in str(link_pair((0, 1), few, unsure, SETTINGS))
+    assert "one way" in str(link_pair((0, 1), few, unsure))
 
 
 def test_one_place_is_linked_by_its_turn() -> None:
     """No direction, but a rotation that both must tell alike."""
     here = Refusal(RefusalReason.AT_TARGET, "parallax 0.1 deg", 0.7)
     back = Refusal(RefusalReason.AT_TARGET, "parallax 0.1 deg", -0.7)
-    link = link_pair((0, 1), here, back, SETTINGS)
+    link = link_pair((0, 1), here, back)
     assert isinstance(link, Link)
     assert np.isnan(link.direction)
     assert link.rotation == pytest.approx(0.7)
-    assert "disagree" in str(link_pair((0, 1), here, here, SETTINGS))
+    assert "disagree" in str(link_pair((0, 1), here, here))
 
 
 @pytest.mark.parametrize("seed", range(8))

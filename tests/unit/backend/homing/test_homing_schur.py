@@ -26,7 +26,14 @@ NONE, CAUCHY, HUBER = (
     KernelSettings("cauchy", 2.0),
     KernelSettings("huber", 1.0),
 )
-EXACT = HomingGraphSettings(max_steps=30, match_limit=0.0)
+EXACT = HomingGraphSettings()
+
+
+@pytest.fixture(autouse=True)
+def exact(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every image is solved to convergence, and no match is doubted."""
+    monkeypatch.setattr("fgslam.backend.homing.schur_solver._STEPS", 30)
+    monkeypatch.setattr("fgslam.backend.homing.schur_solver._MATCH_LIMIT", np.inf)
 
 
 @cache
@@ -118,13 +125,16 @@ def test_the_factored_system_is_solved() -> None:
     np.testing.assert_allclose(factored.border_covariance(), inverse[n:, n:], rtol=1e-5, atol=1e-12)
 
 
-def test_wrong_matches_are_found_by_what_contradicts_them() -> None:
+def test_wrong_matches_are_found_by_what_contradicts_them(
+    exact: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A wrong match that RANSAC let pass, and that no kernel tells from the others."""
     settings = SimulatedBearingsSettings(images_per_s=5.0, part=0.6, wrong_matches=0.3)
     given = trial(3, settings)
     wrong = np.flatnonzero(~given.correct)
     assert len(wrong) == 1
     assert without_target(solver_of(given, EXACT)) == []
+    monkeypatch.undo()
     assert without_target(solver_of(given, HomingGraphSettings())) == wrong.tolist()
 
 

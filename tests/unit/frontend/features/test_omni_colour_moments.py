@@ -64,9 +64,9 @@ def test_dark_patches_are_grey() -> None:
     np.testing.assert_allclose(whole(image, "correlation"), 0.0, atol=0.02)
 
 
-def test_patches_are_clipped_at_the_border() -> None:
-    image = patch()
-    settings = ColourMomentSettings(patch_sigmas=2.0)
+def test_patches_are_clipped_at_the_border(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fgslam.frontend.features.colour_moments.PATCH_SIGMAS", 2.0)
+    image, settings = patch(), ColourMomentSettings()
     colours = PatchColours(image, settings)
     found = colours.around(np.array([[0.0, 0.0], [15.0, 10.0]]), np.array([2.0, 2.0]))
     for at, rows, columns in ((0, slice(0, 5), slice(0, 5)), (1, slice(6, 15), slice(11, 20))):
