@@ -10,7 +10,7 @@ from typing import TypeAlias, cast
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.errors import ConfigError, FrameError, MeasurementLogError
+from fgslam.core.errors import ConfigError, DatasetError, FrameError, MeasurementLogError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
@@ -22,7 +22,7 @@ from fgslam.runs.config import ExperimentConfig, load_experiment, make_config
 from fgslam.runs.engine import RunResult
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.live import Overrides, override_texts, slam_config
-from fgslam.runs.named_experiments import find_experiment
+from fgslam.runs.named_experiments import find_experiment, suggestion
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.run import run_experiment
 from fgslam.slam.choosing import chosen_estimator, is_settings
@@ -143,6 +143,10 @@ def rendered_recording(world: str = "lab", frames: int | None = None) -> Recorde
 
 def _recording_config(path: Path, overrides: Overrides) -> ExperimentConfig:
     if not path.is_dir():
+        if not find_experiment(path).is_file():
+            raise DatasetError(
+                f"{path}: no such folder of a recording; check the path, or {suggestion(path)}"
+            )
         return slam_config(path, overrides)
     values = {"name": "recording", "dataset": dict(recognise_layout(path))}
     return make_config(values, override_texts(overrides), str(path))
