@@ -60,10 +60,19 @@ def load_camera(
             images of another size; no size is given and the calibration has none.
         ConfigError: a key or its value is wrong.
     """
+    _require_size(size)
     if isinstance(source, str | Path):
         source, folder = _read(source)
         return make_camera(source, size, folder)
     return make_camera(_settings_of(source), size)
+
+
+def _require_size(size: object) -> None:
+    pair = size if isinstance(size, list | tuple) and len(size) == 2 else ()
+    if size is not None and not (pair and all(isinstance(one, int | np.integer) for one in pair)):
+        raise CalibrationError(
+            f"camera: size is {size!r}; give (width, height) of the images in pixels"
+        )
 
 
 def make_camera(

@@ -103,6 +103,11 @@ WRONG: dict[str, tuple[Callable[[], object], type[FgslamError], str]] = {
     ),
     "no camera file": (lambda: fg.load_camera("absent.txt"), CalibrationError, "absent.txt"),
     "no size": (lambda: fg.load_camera("mirror"), CalibrationError, "size=(width, height)"),
+    "size of words": (
+        lambda: fg.load_camera("mirror", ("wide", 3)),  # type: ignore[arg-type]
+        CalibrationError,
+        "give (width, height)",
+    ),
     "no kind": (lambda: fg.load_camera({"xi": 1.0}), CalibrationError, "equirectangular"),
     "camera's key": (
         lambda: fg.load_camera({"kind": "mirror", "x": 1.0}, (320, 240)), ConfigError, "setting x"
