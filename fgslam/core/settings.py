@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from difflib import get_close_matches
+from numbers import Integral
 from typing import Annotated, Any, TypeVar
 
-import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
@@ -49,7 +49,7 @@ def make_settings(kind: type[S], values: Mapping[str, Any], where: str) -> S:
 
 def require_seed(seed: object, where: str) -> None:
     """Raises ConfigError where a random generator cannot begin with it."""
-    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
+    if not isinstance(seed, Integral) or isinstance(seed, bool) or seed < 0:
         raise ConfigError(f"{where}: seed is {seed!r}; give a whole number, 0 or larger")
 
 
