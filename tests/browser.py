@@ -5,13 +5,14 @@ from __future__ import annotations
 import base64
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 from selenium import webdriver
+from selenium.common.exceptions import TimeoutException
 from selenium.webdriver.chrome.options import Options
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.chrome.webdriver import WebDriver
@@ -84,6 +85,20 @@ class Browser:
     def wait(self, condition: str) -> None:
         """Until a JavaScript expression is true."""
         WebDriverWait(self.driver, 60.0, 0.05).until(lambda _: self.js(condition))
+
+    def repeat(self, gesture: Callable[[], None], condition: str) -> None:
+        """A gesture again and again until a JavaScript expression is true.
+
+        A busy machine may lose a movement of the mouse or a key.
+        """
+        for _ in range(12):
+            gesture()
+            try:
+                WebDriverWait(self.driver, 5.0, 0.05).until(lambda _: self.js(condition))
+            except TimeoutException:
+                continue
+            return
+        raise AssertionError(f"the gesture has no effect: not {condition}")
 
     def complaints(self) -> list[str]:
         """Errors in the console, of scripts and of the page's policy; reported once each."""

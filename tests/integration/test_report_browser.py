@@ -173,34 +173,43 @@ def test_scales_are_linear_or_logarithmic(browser: Browser) -> None:
     browser.wait(f"{kind} === 'log'")
 
 
-def test_the_map_turns_by_mouse_and_stays_turned(browser: Browser) -> None:
-    scene_of = "document.getElementById('plot-map')._fullLayout.scene"
-    eye, saved = f"{scene_of}._scene.getCamera().eye", f"{scene_of}.camera.eye"
-    before = browser.js(eye)
+SCENE = "document.getElementById('plot-map')._fullLayout.scene"
+DRAWN_EYE, KEPT_EYE = f"{SCENE}._scene.getCamera().eye", f"{SCENE}.camera.eye"
+AT_REST = f"['x', 'y', 'z'].every(k => Math.abs({DRAWN_EYE}[k] - {KEPT_EYE}[k]) < 1e-6)"
+
+
+def test_the_map_turns_by_mouse_and_stays_turned(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    before = browser.js(KEPT_EYE)
     scene = browser.driver.find_element(By.ID, "plot-map")
     browser.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", scene)
-    drag = ActionChains(browser.driver).move_to_element_with_offset(scene, 40, 60).click_and_hold()
-    drag.move_by_offset(120, 30).move_by_offset(80, 10).release().perform()
-    browser.wait(f"Math.abs({eye}.x - ({before['x']})) > 0.05")
-    # Released, and come to rest: what is drawn is what the figure keeps.
-    browser.wait(f"['x', 'y', 'z'].every(k => Math.abs({eye}[k] - {saved}[k]) < 1e-9)")
-    turned = browser.js(eye)
-    assert abs(turned["x"] - before["x"]) > 0.05
+
+    def drag() -> None:
+        held = ActionChains(browser.driver).move_to_element_with_offset(scene, 40, 60)
+        held.click_and_hold().move_by_offset(120, 30).move_by_offset(80, 10).release().perform()
+
+    browser.repeat(drag, f"Math.abs({KEPT_EYE}.x - ({before['x']})) > 0.05")
     drawn = f"{DRAWN.format('map')}.filter(t => t.visible === true).length"
     shown = browser.js(drawn)
+    turned = browser.js(KEPT_EYE)
     switch(browser, figure_switch("map", "truth"))
     browser.wait(f"{drawn} !== {shown}")
-    assert browser.js(eye) == pytest.approx(turned, abs=1e-6)
+    browser.wait(AT_REST)
+    assert browser.js(KEPT_EYE) == pytest.approx(turned, abs=1e-6)
 
 
-def test_the_map_turns_by_arrow_keys(browser: Browser) -> None:
-    eye = "document.getElementById('plot-map')._fullLayout.scene._scene.getCamera().eye"
-    before = browser.js(eye)
+def test_the_map_turns_by_arrow_keys(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    before = browser.js(KEPT_EYE)
     scene = browser.driver.find_element(By.ID, "plot-map")
-    browser.driver.execute_script("arguments[0].focus()", scene)
-    ActionChains(browser.driver).send_keys(Keys.ARROW_LEFT).perform()
-    browser.wait(f"Math.abs({eye}.x - ({before['x']})) > 0.02")
-    turned = browser.js(eye)
+
+    def press() -> None:
+        browser.driver.execute_script("arguments[0].focus()", scene)
+        ActionChains(browser.driver).send_keys(Keys.ARROW_LEFT).perform()
+
+    browser.repeat(press, f"Math.abs({KEPT_EYE}.x - ({before['x']})) > 0.02")
+    browser.wait(AT_REST)
+    turned = browser.js(KEPT_EYE)
     radius = np.hypot(before["x"], before["y"])
     assert np.hypot(turned["x"], turned["y"]) == pytest.approx(radius, rel=1e-3)
     assert turned["z"] == pytest.approx(before["z"], abs=1e-6)
