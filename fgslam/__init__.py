@@ -20,8 +20,7 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from fgslam.core import errors
-from fgslam.core.version import __version__
+from fgslam.core import __version__, errors
 
 if TYPE_CHECKING:
     from fgslam.backend.protocol import Estimator

@@ -9,9 +9,9 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
+from fgslam.core.files import read_lines
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
 from fgslam.core.sensors import CameraRig
-from fgslam.core.text_files import read_lines
 
 
 @dataclass(frozen=True, slots=True)

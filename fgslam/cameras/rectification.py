@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.brief import Brief
+from fgslam.core.arrays import Brief, FloatArray, Image
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import inverse
 from fgslam.core.sensors import CameraRig

@@ -12,7 +12,7 @@ from fgslam.cli import given_paths
 
 def _version(wanted: bool) -> None:
     if wanted:
-        from fgslam.core.version import __version__
+        from fgslam.core import __version__
 
         typer.echo(f"fgslam {__version__}")
         raise typer.Exit

@@ -9,3 +9,5 @@ Values are frozen dataclasses of plain NumPy arrays. Frames and units, everywher
 * Tangent vectors and 6x6 covariances are ordered [rotation, translation] and live in the
   tangent space at the estimate: ``T = T_estimate * Exp(xi)``, as in GTSAM.
 """
+
+__version__ = "0.1.0"

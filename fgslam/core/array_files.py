@@ -18,8 +18,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from fgslam.core.arrays import IntArray, StateArrays
-from fgslam.core.atomic_files import replacing
 from fgslam.core.errors import FgslamError, MeasurementLogError
+from fgslam.core.files import replacing
 
 Items: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
 """Arrays by name: their kind (of ``numpy.dtype.kind``) and the shape of one row."""

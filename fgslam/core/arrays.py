@@ -1,8 +1,12 @@
-"""Names for the arrays that values are made of."""
+"""Names for arrays, and values made of them: a brief ``repr``, rows, columns that grow."""
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import fields
+from functools import cache
+from typing import Any, ClassVar, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -13,3 +17,161 @@ BoolArray: TypeAlias = npt.NDArray[np.bool_]
 ByteArray: TypeAlias = npt.NDArray[np.uint8]
 Image: TypeAlias = npt.NDArray[np.uint8]
 StateArrays: TypeAlias = dict[str, npt.NDArray[Any]]
+
+
+# --------------------------------------------------------------------------------------------
+# Short texts for values that hold large arrays
+
+
+_LONGEST = 60
+
+
+class Brief:
+    """A ``repr`` of one line for a dataclass: shapes for arrays, lengths for long lists."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        owner: Any = self
+        parts = (f"{f.name}={_brief(getattr(owner, f.name))}" for f in dataclasses.fields(owner))
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+
+def _brief(value: object) -> str:
+    if isinstance(value, np.ndarray) and value.size > 1:
+        return f"array{value.shape}".replace(",)", ")")
+    if isinstance(value, list | tuple | dict) and len(repr(value)) > _LONGEST:
+        return f"{type(value).__name__} of {len(value)}"
+    text = repr(value)
+    return (
+        text if len(text) <= _LONGEST or isinstance(value, Brief) else f"{text[: _LONGEST - 3]}..."
+    )
+
+
+# --------------------------------------------------------------------------------------------
+# Values whose arrays all have one row an item: features, matches, landmarks
+
+
+class Rows(Brief):
+    """Length, choice and concatenation of a frozen dataclass of arrays (n, ...).
+
+    Fields may be rows themselves, or None where they are not known.
+    """
+
+    __slots__ = ()
+
+    SHARED: ClassVar[frozenset[str]] = frozenset()
+    """Names of the fields that are no rows but hold for all of them, such as a time."""
+
+    def __len__(self) -> int:
+        return len(getattr(self, self._columns()[0]))
+
+    def select(self, keep: BoolArray | IntArray) -> Self:
+        """The chosen rows, by mask (n,) or by index in the order given, as a new value."""
+        chosen: dict[str, Any] = {}
+        for name in self._columns():
+            value = getattr(self, name)
+            if value is not None:
+                value = value.select(keep) if isinstance(value, Rows) else value[keep]
+            chosen[name] = value
+        return self._with(chosen)
+
+    def join(self, other: Self) -> Self:
+        """Both, one after the other; shared fields are those of the first."""
+        joined: dict[str, Any] = {}
+        for name in self._columns():
+            a, b = getattr(self, name), getattr(other, name)
+            if a is None or b is None:
+                joined[name] = None
+            else:
+                joined[name] = a.join(b) if isinstance(a, Rows) else np.concatenate([a, b])
+        return self._with(joined)
+
+    def _columns(self) -> tuple[str, ...]:
+        kind: Any = self.__class__
+        return _row_fields(kind)
+
+    def _with(self, rows: dict[str, Any]) -> Self:
+        for name in self.SHARED:
+            rows[name] = getattr(self, name)
+        return type(self)(**rows)
+
+
+@cache
+def _row_fields(kind: Any) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(kind) if field.name not in kind.SHARED)
+
+
+# --------------------------------------------------------------------------------------------
+# Arrays of equal length that grow and shrink together, without being copied whole each time
+
+
+_GROWTH = 1.5
+_LEAST = 64
+
+
+class GrowingColumns:
+    """Named arrays (n, ...) of fixed types; rows are appended at the end and dropped anywhere.
+
+    Appending costs what is appended (the buffers grow by a factor), dropping what lies behind the
+    first row dropped. ``columns[name]`` is a view of the present rows: it may be written to, and
+    is good until the next change of length.
+    """
+
+    def __init__(self, **like: npt.NDArray[Any]) -> None:
+        """Starts empty; each column has the type and the trailing shape of the array given."""
+        self._length = 0
+        self._buffers = {
+            name: np.zeros((_LEAST, *array.shape[1:]), array.dtype) for name, array in like.items()
+        }
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, name: str) -> npt.NDArray[Any]:
+        return self._buffers[name][: self._length]
+
+    def append(self, values: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Adds rows (k, ...): one array for every column."""
+        count = len(next(iter(values.values())))
+        self._reserve(self._length + count)
+        for name, buffer in self._buffers.items():
+            buffer[self._length : self._length + count] = values[name]
+        self._length += count
+
+    def drop(self, gone: BoolArray) -> None:
+        """Removes the rows that are marked (n,); the others keep their order."""
+        if not gone.any():
+            return
+        first = int(np.argmax(gone))
+        self.take(first, np.flatnonzero(~gone[first:]) + first)
+
+    def take(self, start: int, rows: IntArray) -> None:
+        """Puts these rows, in this order, from row ``start`` on; they are the last ones then."""
+        stop = start + len(rows)
+        for buffer in self._buffers.values():
+            buffer[start:stop] = buffer[rows]
+        self._length = stop
+
+    def state(self) -> StateArrays:
+        """A snapshot of all columns."""
+        return {name: self[name].copy() for name in self._buffers}
+
+    def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Continues from :meth:`state`."""
+        self._length = 0
+        self.append({name: state[name] for name in self._buffers})
+
+    def bytes_per_row(self) -> int:
+        """Memory of a row, without the room kept for growth."""
+        return sum(b.itemsize * int(np.prod(b.shape[1:])) for b in self._buffers.values())
+
+    def _reserve(self, rows: int) -> None:
+        have = len(next(iter(self._buffers.values())))
+        if rows <= have:
+            return
+        room = max(rows, int(_GROWTH * have))
+        for name, buffer in self._buffers.items():
+            larger = np.zeros((room, *buffer.shape[1:]), buffer.dtype)
+            larger[: self._length] = buffer[: self._length]
+            self._buffers[name] = larger

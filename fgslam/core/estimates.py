@@ -7,9 +7,7 @@ from enum import Enum
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.brief import Brief
-from fgslam.core.rows import Rows
+from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray, Rows
 from fgslam.core.trajectories import Trajectory
 
 __all__ = [

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import ByteArray, FloatArray, IntArray
+from fgslam.core.arrays import ByteArray, FloatArray, IntArray, Rows
 from fgslam.core.measurements import Observations
-from fgslam.core.rows import Rows
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -12,10 +12,18 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from fgslam.core import range_bearing
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.measurements import Odometry
-from fgslam.core.sensors import CameraRig, Sensor
+from fgslam.core.planar import wrap
+from fgslam.core.sensors import (
+    CameraRig,
+    Sensor,
+    level_distance,
+    project_range_bearing,
+    range_bearing_jacobian,
+    range_bearing_point_jacobian,
+    triangulate_range_bearing,
+)
 
 # Below this rotation angle the series of sin and cos are exact to double precision.
 _SMALL_ANGLE = 1e-4
@@ -261,13 +269,6 @@ def yaw_pitch_roll(wTc: FloatArray) -> tuple[float, float, float]:
     return yaw, pitch, roll
 
 
-def wrap_angle(angle: FloatArray) -> FloatArray:
-    """Angles wrapped to [-pi, pi)."""
-    wrapped = (angle + np.pi) % (2.0 * np.pi) - np.pi
-    # The remainder of a tiny negative number rounds up to the divisor itself.
-    return np.asarray(np.where(wrapped >= np.pi, -np.pi, wrapped))
-
-
 # --------------------------------------------------------------------------------------------
 # The sensors: stereo camera and range-bearing
 
@@ -289,7 +290,7 @@ def in_front(sensor: Sensor, points: FloatArray, nearest_m: float = 1e-3) -> Boo
     """
     if isinstance(sensor, CameraRig):
         return np.asarray(points[:, 2] > nearest_m)
-    return np.asarray(range_bearing.level_distance(points) > nearest_m)
+    return np.asarray(level_distance(points) > nearest_m)
 
 
 def project(sensor: Sensor, points: FloatArray) -> FloatArray:
@@ -298,7 +299,7 @@ def project(sensor: Sensor, points: FloatArray) -> FloatArray:
     (column, row, disparity) of the reference camera, or (azimuth, elevation, range).
     """
     if not isinstance(sensor, CameraRig):
-        return range_bearing.project(points)
+        return project_range_bearing(points)
     inverse_depth = 1.0 / points[:, 2]
     out = np.empty_like(points)
     out[:, 0] = sensor.cx + sensor.fx * points[:, 0] * inverse_depth
@@ -311,14 +312,14 @@ def measurement_difference(sensor: Sensor, a: FloatArray, b: FloatArray) -> Floa
     """``a - b`` of measurements (n, 3), the azimuth of a range-bearing sensor wrapped."""
     out = np.asarray(a - b)
     if not isinstance(sensor, CameraRig):
-        out[:, 0] = wrap_angle(out[:, 0])
+        out[:, 0] = wrap(out[:, 0])
     return out
 
 
 def projection_jacobian(sensor: Sensor, points: FloatArray) -> FloatArray:
     """d(measurement)/d(point) (n, 3, 3) at points (n, 3) in the sensor's frame."""
     if not isinstance(sensor, CameraRig):
-        return range_bearing.projection_jacobian(points)
+        return range_bearing_jacobian(points)
     inverse_depth = 1.0 / points[:, 2]
     inverse_depth2 = inverse_depth * inverse_depth
     out = np.zeros((len(points), 3, 3))
@@ -344,7 +345,7 @@ def triangulate(sensor: Sensor, measurement: FloatArray) -> FloatArray:
     Of a camera rig (Se et al. 2.2) the disparity must be positive.
     """
     if not isinstance(sensor, CameraRig):
-        return range_bearing.triangulate(measurement)
+        return triangulate_range_bearing(measurement)
     depth = sensor.fx * sensor.baseline / measurement[:, 2]
     out = np.empty(measurement.shape)
     out[:, 0] = (measurement[:, 0] - sensor.cx) * depth / sensor.fx
@@ -366,7 +367,7 @@ def triangulation_covariance(
         covariance: (n, 3, 3) of the measurement, its units squared.
     """
     if not isinstance(sensor, CameraRig):
-        return congruence(range_bearing.triangulation_jacobian(measurement), covariance)
+        return congruence(range_bearing_point_jacobian(measurement), covariance)
     d, fx, fy, baseline = measurement[:, 2], sensor.fx, sensor.fy, sensor.baseline
     jacobian = np.zeros((len(d), 3, 3))
     jacobian[:, 0, 0] = baseline / d

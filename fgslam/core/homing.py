@@ -15,9 +15,8 @@ from typing import Literal
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
 from fgslam.core.planar import between, rotation, wrap
-from fgslam.core.rows import Rows
 
 
 def among(ids: IntArray, others: IntArray) -> BoolArray:

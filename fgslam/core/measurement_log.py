@@ -27,8 +27,7 @@ from fgslam.core.array_files import (
     split,
     write_arrays,
 )
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
-from fgslam.core.brief import Brief
+from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
 from fgslam.core.sensors import CameraRig, RangeBearingSensor, Sensor

@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.brief import Brief
-from fgslam.core.rows import Rows
+from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray, Rows
 
 
 class MeasurementType(str, Enum):

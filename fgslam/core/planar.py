@@ -16,7 +16,9 @@ from fgslam.core.arrays import FloatArray
 
 def wrap(angle: FloatArray) -> FloatArray:
     """Angles in radians, wrapped to [-pi, pi)."""
-    return (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
+    wrapped = (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
+    # The remainder of a tiny negative number rounds up to the divisor itself.
+    return np.asarray(np.where(wrapped >= np.pi, -np.pi, wrapped))
 
 
 def unit(angle: FloatArray) -> FloatArray:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.arrays import FloatArray, Image, IntArray, Rows
 from fgslam.core.estimates import Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
-from fgslam.core.rows import Rows
 from fgslam.core.sensors import CameraRig
 
 

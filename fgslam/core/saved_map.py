@@ -18,10 +18,10 @@ import numpy as np
 
 from fgslam.core.array_files import ArrayFile, Items, of_rows
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, StateArrays
-from fgslam.core.atomic_files import replacing
 from fgslam.core.errors import MapError
 from fgslam.core.estimates import LandmarkMap, Trajectory
 from fgslam.core.features import LandmarkAppearances
+from fgslam.core.files import replacing
 from fgslam.core.sensors import CameraRig
 
 FILE = ArrayFile(

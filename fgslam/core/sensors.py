@@ -1,12 +1,17 @@
-"""Sensors that measure landmarks: rigs of two or three cameras, range-bearing sensors."""
+"""The sensors: rectified camera rigs and range-bearing, and the equations of their measurements.
+
+:mod:`fgslam.core.geometry` chooses between the sensors. Derived in
+docs/derivations/stereo_measurement.md and docs/derivations/range_bearing.md.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from fgslam.core.arrays import FloatArray
-from fgslam.core.brief import Brief
+import numpy as np
+
+from fgslam.core.arrays import Brief, FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -59,3 +64,109 @@ class RangeBearingSensor(Brief):
 
 Sensor: TypeAlias = CameraRig | RangeBearingSensor
 """What measures landmarks; each by three numbers."""
+
+
+# --------------------------------------------------------------------------------------------
+# Range-bearing: points (n, 3) in the sensor's frame, measured as (azimuth, elevation, range)
+
+
+def project_range_bearing(points: FloatArray) -> FloatArray:
+    """(azimuth, elevation, range) (n, 3) of points off the sensor's vertical axis."""
+    x, y, z = points.T
+    level = np.hypot(x, z)
+    return np.column_stack([np.arctan2(x, z), np.arctan2(-y, level), np.hypot(level, y)])
+
+
+def range_bearing_jacobian(points: FloatArray) -> FloatArray:
+    """d(azimuth, elevation, range)/d(point) (n, 3, 3), off the sensor's vertical axis."""
+    x, y, z = points.T
+    level2 = x * x + z * z
+    level = np.sqrt(level2)
+    distance2 = level2 + y * y
+    distance = np.sqrt(distance2)
+    out = np.zeros((len(points), 3, 3))
+    out[:, 0, 0] = z / level2
+    out[:, 0, 2] = -x / level2
+    out[:, 1, 0] = x * y / (level * distance2)
+    out[:, 1, 1] = -level / distance2
+    out[:, 1, 2] = z * y / (level * distance2)
+    out[:, 2] = points / distance[:, None]
+    return out
+
+
+def triangulate_range_bearing(measurement: FloatArray) -> FloatArray:
+    """Points (n, 3) of (azimuth, elevation, range) (n, 3); see :func:`project_range_bearing`."""
+    azimuth, elevation, distance = measurement.T
+    level = distance * np.cos(elevation)
+    return np.column_stack(
+        [level * np.sin(azimuth), -distance * np.sin(elevation), level * np.cos(azimuth)]
+    )
+
+
+def range_bearing_point_jacobian(measurement: FloatArray) -> FloatArray:
+    """d(point)/d(azimuth, elevation, range) (n, 3, 3)."""
+    azimuth, elevation, distance = measurement.T
+    sin_a, cos_a = np.sin(azimuth), np.cos(azimuth)
+    sin_e, cos_e = np.sin(elevation), np.cos(elevation)
+    out = np.zeros((len(measurement), 3, 3))
+    out[:, 0, 0], out[:, 2, 0] = distance * cos_e * cos_a, -distance * cos_e * sin_a
+    out[:, 0, 1], out[:, 2, 1] = -distance * sin_e * sin_a, -distance * sin_e * cos_a
+    out[:, 1, 1] = -distance * cos_e
+    out[:, 0, 2], out[:, 1, 2], out[:, 2, 2] = cos_e * sin_a, -sin_e, cos_e * cos_a
+    return out
+
+
+def level_distance(points: FloatArray) -> FloatArray:
+    """Distances (n,) from the sensor's vertical axis, on which the azimuth is undefined."""
+    return np.hypot(points[:, 0], points[:, 2])
+
+
+# --------------------------------------------------------------------------------------------
+# The rig's linear model: raw pixels of its images and (column, row, disparity)
+
+
+def vertical_to_horizontal(rig: CameraRig) -> float:
+    """What vertical disparity is multiplied by to give horizontal; 1 for the paper's rig."""
+    if rig.vertical_baseline is None:
+        return 1.0
+    return rig.fx * rig.baseline / (rig.fy * rig.vertical_baseline)
+
+
+def pixel_model(cameras: int, ratio: float) -> FloatArray:
+    """Linear map (2 * cameras, 3) from (column, row, disparity) to pixels (c, r) per camera.
+
+    ``ratio`` is :func:`vertical_to_horizontal`.
+    """
+    model = np.zeros((2 * cameras, 3))
+    model[0::2, 0] = 1.0  # columns of right, left, top
+    model[1::2, 1] = 1.0  # rows
+    model[2, 2] = 1.0  # the left camera's column grows by the disparity
+    if cameras == 3:
+        model[5, 2] = 1.0 / ratio  # and the top camera's row
+    return model
+
+
+def measurement_map(kind: str, cameras: int, ratio: float) -> FloatArray:
+    """Linear map (3, 2 * cameras) from pixels (c, r) per camera to (column, row, disparity).
+
+    The covariance of the measurement follows as ``sigma^2 M M^T`` for equal independent noise on
+    all coordinates. For `paper`, d is the mean of both disparities, which correlates with row and
+    column; `fused` is the least-squares solution of the rig's linear model, which
+    for three cameras has variances 5/12, 5/12 and 3/4 against the paper's 1, 1 and 1.
+    """
+    if kind == "fused":
+        return np.asarray(np.linalg.pinv(pixel_model(cameras, ratio)), np.float64)
+    out = np.zeros((3, 2 * cameras))
+    out[0, 0] = out[1, 1] = 1.0
+    # Weights inverse to the variances; one half each where both baselines are equal.
+    weight = 1.0 if cameras == 2 else _horizontal_weight(ratio)
+    out[2, 2], out[2, 0] = weight, -weight
+    if cameras == 3:
+        out[2, 5] = (1.0 - weight) * ratio
+        out[2, 1] = -out[2, 5]
+    return out
+
+
+def _horizontal_weight(ratio: float) -> float:
+    squared = ratio**2
+    return squared / (1.0 + squared)

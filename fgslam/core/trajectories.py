@@ -12,10 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.atomic_files import write_text
-from fgslam.core.brief import Brief
+from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray
 from fgslam.core.errors import DatasetError, OutputError
+from fgslam.core.files import write_text
 from fgslam.core.geometry import pose, quaternion_from_rotation, rotation_from_quaternion
 
 _TUM_FORMAT = "%.9f" + 7 * " %.12f"

@@ -11,8 +11,8 @@ from fgslam.cameras.asl import read_mounting
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory
+from fgslam.core.files import read_lines
 from fgslam.core.geometry import inverse
-from fgslam.core.text_files import read_lines
 from fgslam.datasets.tables import Table, read_table, require_increasing
 from fgslam.datasets.trajectories import (
     nearest_rows,

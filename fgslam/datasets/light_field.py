@@ -22,9 +22,9 @@ from fgslam.cameras.calibration import pixels, read_json_object
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.estimates import Trajectory
+from fgslam.core.files import read_lines
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
 from fgslam.core.sensors import CameraRig
-from fgslam.core.text_files import read_lines
 from fgslam.datasets.images import read_grey_image
 from fgslam.datasets.recording import Recording, recording_identity
 from fgslam.datasets.selection import select_frames

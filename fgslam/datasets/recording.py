@@ -9,8 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TypeAlias
 
-from fgslam.core.arrays import FloatArray, Image, IntArray
-from fgslam.core.brief import Brief
+from fgslam.core.arrays import Brief, FloatArray, Image, IntArray
 from fgslam.core.estimates import Trajectory
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame

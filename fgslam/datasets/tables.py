@@ -9,7 +9,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
-from fgslam.core.text_files import read_lines
+from fgslam.core.files import read_lines
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
 from fgslam.core.geometry import inverse
 from fgslam.core.quantiles import chi_square_quantile
-from fgslam.core.rows import Rows
 from fgslam.evaluation.consistency import pose_nees
 from fgslam.evaluation.trajectory import rotation_angles
 

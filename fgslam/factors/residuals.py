@@ -23,9 +23,13 @@ from fgslam.core.geometry import (
     so3_log,
     transform_to_camera,
 )
-from fgslam.core.range_bearing import triangulate, triangulation_jacobian
-from fgslam.core.sensors import CameraRig, RangeBearingSensor
-from fgslam.core.stereo_model import vertical_to_horizontal
+from fgslam.core.sensors import (
+    CameraRig,
+    RangeBearingSensor,
+    range_bearing_point_jacobian,
+    triangulate_range_bearing,
+    vertical_to_horizontal,
+)
 
 # --------------------------------------------------------------------------------------------
 # Cameras
@@ -114,7 +118,7 @@ def range_bearing_on_sphere(wTc: FloatArray, point: FloatArray, measured: FloatA
     local = transform_to_camera(wTc, point[None, :])[0]
     distance = float(np.linalg.norm(local))
     unit = np.array([measured[0], measured[1], 1.0])
-    turn = turn_between(triangulate(unit[None, :])[0], local / distance)
+    turn = turn_between(triangulate_range_bearing(unit[None, :])[0], local / distance)
     return np.append(turn, distance - measured[2])
 
 
@@ -130,7 +134,7 @@ def range_bearing_as_image(wTc: FloatArray, point: FloatArray, measured: FloatAr
         point: world point.
         measured: (3,) azimuth, elevation, range.
     """
-    sensor_axes = triangulation_jacobian(np.array([[measured[0], measured[1], 1.0]]))[0]
+    sensor_axes = range_bearing_point_jacobian(np.array([[measured[0], measured[1], 1.0]]))[0]
     axes = sensor_axes / np.linalg.norm(sensor_axes, axis=0)
     azimuth, elevation, ahead = axes.T @ transform_to_camera(wTc, point[None, :])[0]
     if ahead <= 0.0:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fgslam.core.atomic_files import write_text
+from fgslam.core.files import write_text
 from fgslam.evaluation.metrics import EstimatorMetrics, value_at
 
 RESULT_COLUMNS: tuple[tuple[str, str], ...] = (

@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.atomic_files import write_text
 from fgslam.core.errors import OutputError
+from fgslam.core.files import write_text
 from fgslam.core.geometry import congruence, quaternion_from_rotation
 
 SUFFIX = ".g2o"

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.atomic_files import write_text
 from fgslam.core.errors import DatasetError
+from fgslam.core.files import write_text
 from fgslam.core.recordings import LandmarkTruth
 
 LANDMARK_TRUTH_FILE = "ground_truth_landmarks.csv"

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.core.atomic_files import write_text
 from fgslam.core.errors import DatasetError
+from fgslam.core.files import write_text
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
 
 

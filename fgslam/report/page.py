@@ -16,7 +16,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fgslam.core.atomic_files import write_text
+from fgslam.core.files import write_text
 from fgslam.report.content import Page
 from fgslam.report.figures import palette
 

@@ -15,10 +15,9 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
-from fgslam.core.atomic_files import write_bytes
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
 from fgslam.core.errors import DatasetError, OutputError
-from fgslam.core.rows import Rows
+from fgslam.core.files import write_bytes
 
 Records: TypeAlias = npt.NDArray[np.void]
 

@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.core.atomic_files import write_text
+from fgslam.core.files import write_text
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.metrics import plain
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from fgslam.core.atomic_files import write_text
 from fgslam.core.errors import ConfigError
+from fgslam.core.files import write_text
 from fgslam.evaluation.metrics import value_at
 from fgslam.report.comparison_table import RESULT_COLUMNS
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from fgslam.core.arrays import IntArray
-from fgslam.core.atomic_files import make_subfolder, write_text
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
+from fgslam.core.files import make_subfolder, write_text
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.trajectories import write_covariances, write_tum
 from fgslam.report.point_cloud import MapPoints, write_ply

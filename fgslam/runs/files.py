@@ -10,9 +10,9 @@ from typing import Any
 
 import yaml
 
-from fgslam.core.atomic_files import write_text
+from fgslam.core import __version__
 from fgslam.core.errors import DatasetError
-from fgslam.core.version import __version__
+from fgslam.core.files import write_text
 from fgslam.runs.config_models import Experiment
 from fgslam.runs.folder import RUN_MARKER
 

@@ -1,6 +1,6 @@
 """The run folder: what it may hold, and how one is begun, resumed or replaced.
 
-Its files are written whole or not at all: :mod:`fgslam.core.atomic_files`.
+Its files are written whole or not at all: :mod:`fgslam.core.files`.
 """
 
 from __future__ import annotations
@@ -8,7 +8,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-from fgslam.core.atomic_files import (
+from fgslam.core.errors import OutputError
+from fgslam.core.files import (
     clear_output_errors,
     is_unfinished_file,
     make_subfolder,
@@ -17,7 +18,6 @@ from fgslam.core.atomic_files import (
     write_bytes,
     write_text,
 )
-from fgslam.core.errors import OutputError
 
 __all__ = [
     "RUN_MARKER",

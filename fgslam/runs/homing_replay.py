@@ -12,9 +12,9 @@ import numpy as np
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.backend.homing.settings import HomingEstimatorSettings
 from fgslam.core.arrays import FloatArray
-from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.bearing_log import BearingLog
 from fgslam.core.errors import DatasetError, EstimatorError
+from fgslam.core.files import make_subfolder
 from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings
 
 LOG_FOLDER = "logs"

@@ -10,9 +10,9 @@ from typing import Any, Self
 import numpy as np
 import yaml
 
+from fgslam.core import __version__
 from fgslam.core.errors import ConfigError
 from fgslam.core.sensors import CameraRig
-from fgslam.core.version import __version__
 from fgslam.runs.comparison import remark_of
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.maps import Map, map_points

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeAlias, TypeVar
 
-from fgslam.core.atomic_files import clear_output_errors, make_subfolder
+from fgslam.core.files import clear_output_errors, make_subfolder
 from fgslam.runs.processes import WorkerEnded, run_apart
 from fgslam.runs.stored import load_value, save_value
 

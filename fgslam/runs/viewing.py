@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.atomic_files import replacing
 from fgslam.core.errors import MissingDependencyError, OutputError
+from fgslam.core.files import replacing
 from fgslam.core.geometry import quaternion_from_rotation
 from fgslam.report.figures.ellipses import world_position_covariances
 from fgslam.report.figures.palette import COUNT, ON_DARK

@@ -16,8 +16,7 @@ import numpy.typing as npt
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
-from fgslam.core.arrays import FloatArray
-from fgslam.core.brief import Brief
+from fgslam.core.arrays import Brief, FloatArray
 from fgslam.core.errors import ConfigError, FgslamError, MeasurementLogError
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog

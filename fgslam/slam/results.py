@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import BoolArray, FloatArray
-from fgslam.core.brief import Brief
+from fgslam.core.arrays import BoolArray, Brief, FloatArray
 from fgslam.core.estimates import EgoMotionStatus, Estimate, Trajectory
 from fgslam.core.measurements import Observations
 from fgslam.slam.pipeline import FrameReport, SlamPipeline

@@ -26,7 +26,7 @@ import yaml
 from PIL import Image as PictureFile
 from recordings import experiment
 
-from fgslam.core import atomic_files
+from fgslam.core import files
 from fgslam.runs.config import parse_experiment
 from fgslam.runs.engine import RunResult
 from fgslam.runs.folder import ExistingFolder
@@ -173,9 +173,9 @@ def renames(monkeypatch: pytest.MonkeyPatch, most: float, *, after: bool) -> lis
         elif path.is_file():
             os.truncate(path, path.stat().st_size // 2)
 
-    real_remove = atomic_files._remove_quietly
-    monkeypatch.setattr("fgslam.core.atomic_files.os.replace", replace)
-    monkeypatch.setattr("fgslam.core.atomic_files._remove_quietly", remove_quietly)
+    real_remove = files._remove_quietly
+    monkeypatch.setattr("fgslam.core.files.os.replace", replace)
+    monkeypatch.setattr("fgslam.core.files._remove_quietly", remove_quietly)
     return seen
 
 

@@ -11,6 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
+from fgslam.core.planar import wrap
 from fgslam.core.sensors import CameraRig
 
 SINGULAR_ANGLES = [0.0, 1e-12, 1e-9, 1e-5, 0.99e-4, 1.01e-4, np.pi - 1e-6, np.pi - 1e-9, np.pi]
@@ -166,18 +167,18 @@ def test_yaw_pitch_roll_are_the_angles_that_made_the_pose(
     about_z = g.so3_exp(np.array([0.0, 0.0, roll]))
     wTc = g.pose(about_y @ about_x @ about_z, np.zeros(3))
     difference = np.array(g.yaw_pitch_roll(wTc)) - [yaw, pitch, roll]
-    np.testing.assert_allclose(g.wrap_angle(difference), 0.0, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(wrap(difference), 0.0, rtol=0, atol=1e-9)
 
 
 @given(st.lists(st.floats(-1e4, 1e4), min_size=1, max_size=20), st.integers(-50, 50))
 @example([-np.pi, np.pi], 0)
 def test_wrapping_forgets_whole_turns(angles: list[float], turns: int) -> None:
     angle = np.array(angles)
-    wrapped = g.wrap_angle(angle)
+    wrapped = wrap(angle)
     assert ((wrapped >= -np.pi) & (wrapped < np.pi)).all()
     np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * angle), rtol=0, atol=1e-10)
     np.testing.assert_allclose(
-        np.exp(1j * g.wrap_angle(angle + 2 * np.pi * turns)),
+        np.exp(1j * wrap(angle + 2 * np.pi * turns)),
         np.exp(1j * wrapped),
         rtol=0,
         atol=1e-10,

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray
 from fgslam.core.estimates import LandmarkMap
-from fgslam.core.growing_arrays import GrowingColumns
 
 
 class LandmarkRows:

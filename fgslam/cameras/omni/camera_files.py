@@ -26,8 +26,8 @@ from fgslam.cameras.omni.settings import (
     RadialPolynomialSettings,
 )
 from fgslam.core.errors import CalibrationError
+from fgslam.core.files import read_lines
 from fgslam.core.settings import make_settings
-from fgslam.core.text_files import read_lines
 
 Size = tuple[int, int]
 

@@ -15,8 +15,8 @@ from fgslam.cameras.rig_files.camera_info import read_camera_info_pair
 from fgslam.cameras.rig_files.kalibr import read_camchain
 from fgslam.cameras.rig_files.opencv import read_opencv_pair
 from fgslam.core.errors import CalibrationError
+from fgslam.core.files import read_lines
 from fgslam.core.sensors import CameraRig
-from fgslam.core.text_files import read_lines
 
 Size: TypeAlias = tuple[int, int]
 _KITTI_RAW = ("P_rect_00", "P_rect_01")

@@ -21,8 +21,7 @@ from fgslam.core.geometry import (
     right_from_left_camera,
 )
 from fgslam.core.recordings import MeasurementRecording
-from fgslam.core.sensors import CameraRig
-from fgslam.core.stereo_model import measurement_map
+from fgslam.core.sensors import CameraRig, measurement_map
 from fgslam.datasets.measurements.files import (
     MeasuredFrame,
     files_identity,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
-from fgslam.core.geometry import wrap_angle
+from fgslam.core.planar import wrap
 from fgslam.frontend.features.settings import AppearanceSettings
 
 
@@ -41,7 +41,7 @@ def alike(
     """Whether the pairs' scales and orientations agree within the gates (Se et al. 2.2)."""
     a, b = scale
     close = (a <= b * max_scale_ratio) & (b <= a * max_scale_ratio)
-    return np.asarray(close & (np.abs(wrap_angle(orientation[0] - orientation[1])) <= max_angle))
+    return np.asarray(close & (np.abs(wrap(orientation[0] - orientation[1])) <= max_angle))
 
 
 def descriptor_distance(a: ByteArray, b: ByteArray) -> FloatArray:

@@ -20,9 +20,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from fgslam.cameras.omni.protocol import OmniCamera
-from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows
 from fgslam.core.homing import ColumnSegments
-from fgslam.core.rows import Rows
 from fgslam.frontend.features.colour_moments import colour_from_means, moment_images
 from fgslam.frontend.features.colour_sift import inner_part, wrapping_period
 from fgslam.frontend.features.omni_settings import ColourMomentSettings, ColumnSegmentSettings

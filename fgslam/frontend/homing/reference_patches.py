@@ -17,8 +17,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
-from fgslam.core.rows import Rows
+from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows
 
 Float32 = npt.NDArray[np.float32]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
 from fgslam.core.errors import MapError
 from fgslam.core.geometry import (
     congruence,
@@ -22,7 +22,6 @@ from fgslam.core.geometry import (
     so3_log,
     transform_to_world,
 )
-from fgslam.core.rows import Rows
 from fgslam.core.saved_map import SavedMap
 from fgslam.frontend.places.relocalisation.alignment import align_in_space
 from fgslam.frontend.places.relocalisation.appearance_index import AppearanceIndex

@@ -11,8 +11,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.geometry import triangulate, triangulation_covariance
-from fgslam.core.sensors import CameraRig
-from fgslam.core.stereo_model import measurement_map, vertical_to_horizontal
+from fgslam.core.sensors import CameraRig, measurement_map, vertical_to_horizontal
 from fgslam.frontend.features.candidates import alike, choose, pairs_within
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.stereo.settings import StereoSettings

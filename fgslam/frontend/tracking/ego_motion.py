@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.arrays import BoolArray, FloatArray, Rows
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
@@ -34,7 +34,6 @@ from fgslam.core.geometry import (
     transform_to_camera,
 )
 from fgslam.core.measurements import Observations
-from fgslam.core.rows import Rows
 from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 

@@ -5,10 +5,16 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import (
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    GrowingColumns,
+    IntArray,
+    StateArrays,
+)
 from fgslam.core.errors import MapError
 from fgslam.core.features import LandmarkAppearances
-from fgslam.core.growing_arrays import GrowingColumns
 from fgslam.core.saved_map import SavedMap
 from fgslam.frontend.tracking.views import Places, ViewPool, Views
 

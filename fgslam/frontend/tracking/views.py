@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
 from fgslam.core.features import StereoFeatures, Words
-from fgslam.core.rows import Rows
 from fgslam.frontend.features.vocabulary import words_of
 
 Places = npt.NDArray[np.int32]

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
 from fgslam.core.estimates import Prediction
 from fgslam.core.geometry import (
     congruence,
@@ -18,7 +18,6 @@ from fgslam.core.geometry import (
     rotate_covariances,
     transform_to_camera,
 )
-from fgslam.core.rows import Rows
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.tracking.settings import DatabaseSettings
 

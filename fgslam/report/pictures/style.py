@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.atomic_files import replacing
+from fgslam.core.files import replacing
 
 # Okabe and Ito's colours, which the colour-blind can tell apart.
 ORANGE = "#E69F00"

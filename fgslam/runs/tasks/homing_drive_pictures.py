@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from fgslam.core.arrays import ByteArray, FloatArray
-from fgslam.core.atomic_files import make_subfolder
+from fgslam.core.files import make_subfolder
 from fgslam.core.homing import TrackedBearings
 from fgslam.homing.active_homing import ActiveHoming
 from fgslam.homing.command import Command

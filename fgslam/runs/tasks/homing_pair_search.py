@@ -11,7 +11,7 @@ import numpy as np
 
 from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.atomic_files import make_subfolder
+from fgslam.core.files import make_subfolder
 from fgslam.core.homing import (
     BearingMatches,
     FeatureKind,

@@ -10,7 +10,7 @@ from time import perf_counter
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.atomic_files import make_subfolder
+from fgslam.core.files import make_subfolder
 from fgslam.datasets.omni.recording import OmniRecording
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
 from fgslam.frontend.homing.video_tracking import ReplenishedTracker, TrackedImage, VideoState

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from fgslam.core.atomic_files import make_subfolder
+from fgslam.core.files import make_subfolder
 from fgslam.core.geometry import yaw_pitch_roll
 from fgslam.evaluation.localisation import Bounds, LocalisationScore, Spread
 from fgslam.evaluation.metrics import JsonValue

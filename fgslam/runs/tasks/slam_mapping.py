@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.core import __version__
 from fgslam.core.arrays import StateArrays
-from fgslam.core.atomic_files import require_writable
 from fgslam.core.errors import ConfigError, MapError, MeasurementLogError
 from fgslam.core.estimates import Estimate
+from fgslam.core.files import require_writable
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap, require_rig, save_map
-from fgslam.core.version import __version__
 from fgslam.runs.config import ExperimentConfig, parse_config
 from fgslam.runs.tasks import slam_checkpoint as checkpoint
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, entry_of

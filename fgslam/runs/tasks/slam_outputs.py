@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.estimates import Estimate, Trajectory
+from fgslam.core.files import make_subfolder
 from fgslam.core.recordings import Sequence
 from fgslam.core.trajectories import write_tum
 from fgslam.evaluation.judging import Truth, closure_counts

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.atomic_files import make_subfolder
 from fgslam.core.estimates import Estimate, Trajectory
+from fgslam.core.files import make_subfolder
 from fgslam.core.measurements import Increment
 from fgslam.report.figures.over_time import error_by_axis, matches_over_time
 from fgslam.report.figures.trajectory import ON_PAPER, drive_from_above, map_to_turn

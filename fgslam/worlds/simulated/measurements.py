@@ -17,8 +17,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.measurements import Increment, Observations, Odometry
-from fgslam.core.sensors import CameraRig
-from fgslam.core.stereo_model import measurement_map, pixel_model, vertical_to_horizontal
+from fgslam.core.sensors import CameraRig, measurement_map, pixel_model, vertical_to_horizontal
 from fgslam.worlds.lab.world import make_rig
 from fgslam.worlds.simulated.drives import plan_measured_drive
 from fgslam.worlds.simulated.identities import IdentityBook, Sightings

@@ -12,6 +12,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.core.measurements import Increment, Observations
+from fgslam.core.planar import wrap
 from fgslam.core.sensors import RangeBearingSensor
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.settings import EgoMotionSettings
@@ -110,7 +111,7 @@ def drive(rng: np.random.Generator, noise: float) -> tuple[FloatArray, FloatArra
         measured = g.project(SENSOR, local[ids]) + noise * SIGMA * rng.standard_normal(
             (len(ids), 3)
         )
-        measured[:, 0] = g.wrap_angle(measured[:, 0])
+        measured[:, 0] = wrap(measured[:, 0])
         is_new = np.array([i not in known for i in ids.tolist()], np.bool_)
         known.update(ids.tolist())
         seen = Observations(

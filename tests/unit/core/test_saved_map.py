@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgslam.core import atomic_files as whole_files
+from fgslam.core import files as whole_files
 from fgslam.core import geometry as g
 from fgslam.core import saved_map as map_file
 from fgslam.core.array_files import load_arrays

@@ -15,6 +15,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Prediction, Trajectory
+from fgslam.core.planar import wrap
 from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.sensors import CameraRig, RangeBearingSensor
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
@@ -87,7 +88,7 @@ def woods(rng: np.random.Generator) -> dict[str, Any]:
         laser = pose[:2, 3] + ahead * np.array([np.cos(heading), np.sin(heading)])
         away = landmarks - laser
         ranges[k] = np.hypot(*away.T)
-        bearings[k] = g.wrap_angle(np.arctan2(away[:, 1], away[:, 0]) - heading)
+        bearings[k] = wrap(np.arctan2(away[:, 1], away[:, 0]) - heading)
         pose = pose @ g.se3_exp(0.1 * np.array([0, 0, om[k], v[k], 0, 0]))
     ranges[3, 2] = bearings[3, 2] = 0.0
     valid = np.ones((N, 1), np.uint8)

@@ -24,8 +24,7 @@ from simulated import RIG
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.sensors import CameraRig
-from fgslam.core.stereo_model import measurement_map, pixel_model, vertical_to_horizontal
+from fgslam.core.sensors import CameraRig, measurement_map, pixel_model, vertical_to_horizontal
 from fgslam.factors import residuals
 from fgslam.factors.cameras import RawPixelFactors
 from fgslam.factors.noise import Whitening

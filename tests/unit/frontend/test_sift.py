@@ -13,7 +13,7 @@ from simulated import assert_same_bits
 
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.features import Features
-from fgslam.core.geometry import wrap_angle
+from fgslam.core.planar import wrap
 from fgslam.frontend.features.settings import SiftSettings
 from fgslam.frontend.features.sift import EDGE_THRESHOLD, SiftExtractor
 
@@ -243,6 +243,6 @@ def test_features_move_with_the_image(
     # A key point may have two orientations: two features at one place, the better one counts.
     turned = after.orientation - before.orientation[inside, None] - np.deg2rad(angle_deg)
     here = np.linalg.norm(moved[inside, None] - after.xy, axis=2) < 1.5
-    best = np.where(here, np.abs(np.rad2deg(wrap_angle(turned))), np.inf).min(axis=1)[same]
+    best = np.where(here, np.abs(np.rad2deg(wrap(turned))), np.inf).min(axis=1)[same]
     assert np.median(best) < 5.0
     assert (best < 10.0).mean() > 0.8

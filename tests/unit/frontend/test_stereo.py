@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from simulated import RIG
 
-from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.features import Features, StereoFeatures
+from fgslam.core.planar import wrap
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.stereo.matching import StereoMatcher, measurement_map
@@ -238,7 +238,7 @@ def test_orientation_is_averaged_around_the_circle(angles: tuple, mean: float) -
     ]
     found = match(*images)
     assert found.scale[0] == pytest.approx(2.3)
-    difference = np.rad2deg(g.wrap_angle(found.orientation - np.deg2rad(mean)))
+    difference = np.rad2deg(wrap(found.orientation - np.deg2rad(mean)))
     np.testing.assert_allclose(difference, 0.0, atol=0.05)
     assert 0.0 <= found.orientation[0] < 2 * np.pi
 

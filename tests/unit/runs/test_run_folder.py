@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.core import atomic_files as whole_files
-from fgslam.core.atomic_files import make_subfolder, replacing, write_bytes, write_text
+from fgslam.core import files as whole_files
 from fgslam.core.errors import OutputError
+from fgslam.core.files import make_subfolder, replacing, write_bytes, write_text
 from fgslam.runs.folder import create_run_folder, is_run_folder
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import ConfigError
-from fgslam.core.geometry import wrap_angle
+from fgslam.core.planar import wrap
 from fgslam.worlds.buildings import corridors as alike
 from fgslam.worlds.buildings import office
 from fgslam.worlds.buildings.lab import build_lab
@@ -118,7 +118,7 @@ def test_tour_of_three_rounds_is_long_and_slow_enough() -> None:
     assert drive.path.length > 200.0
     planar = drive.planar(drive.timestamps)
     assert np.linalg.norm(np.diff(planar[:, :2], axis=0), axis=1).max() <= 0.2
-    turned = wrap_angle(np.diff(planar[:, 2]))
+    turned = wrap(np.diff(planar[:, 2]))
     assert np.rad2deg(np.abs(turned)).max() <= 5.0
     assert len(planned(ROOMS, "tour", 4).timestamps) * 0.9 <= 2500
 

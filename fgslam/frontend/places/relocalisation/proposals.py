@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray
-from fgslam.core.rows import Rows
+from fgslam.core.arrays import BoolArray, FloatArray, Rows
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.places.relocalisation.residuals import Pairs, log_likelihoods, residuals
 from fgslam.frontend.places.relocalisation.tentative import Tentative

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import inverse_spd3, point_pose_jacobian, project, projection_jacobian
-from fgslam.core.rows import Rows
 from fgslam.core.sensors import CameraRig
 
 _NEAREST_DEPTH_M = 0.1

@@ -10,7 +10,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.floor import Floor
-from fgslam.core.geometry import wrap_angle
+from fgslam.core.planar import wrap
 from fgslam.frontend.features.candidates import pairs_within
 from fgslam.frontend.places.relocalisation.appearance_index import Neighbours
 
@@ -67,7 +67,7 @@ def gated(
     keep = ratio <= np.log(_SIZE_RATIO) + _GATE_SIGMAS * sigma
     if floor.rigid_dof != 3:
         return np.asarray(keep)
-    turn = np.abs(wrap_angle(features.orientation[i] - views.orientation[v]))
+    turn = np.abs(wrap(features.orientation[i] - views.orientation[v]))
     keep &= turn <= np.deg2rad(_ORIENTATION_DEG)
     return np.asarray(keep & _heights_agree(features, i, landmarks, owners[v], floor))
 

@@ -1,4 +1,4 @@
-"""Files that are either whole or absent.
+"""Files: written whole or not at all, and texts of other tools read line by line.
 
 Every file is written beside its place and then renamed over it, which POSIX does in one step: an
 interrupted run leaves the previous version or none, never half a file.
@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from fgslam.core.errors import OutputError
+from fgslam.core.errors import DatasetError, OutputError
 
 _REMEDIES = {
     errno.ENOSPC: "the disk is full; free some space or choose another folder",
@@ -101,3 +101,18 @@ def make_subfolder(run: Path, name: str) -> Path:
     with clear_output_errors(folder):
         folder.mkdir(exist_ok=True)
     return folder
+
+
+# --------------------------------------------------------------------------------------------
+# Text files of other tools, line by line
+
+
+def read_lines(path: Path, error: type[DatasetError] = DatasetError) -> list[tuple[int, str]]:
+    """Numbered lines, without blank ones and comments (``#``). Raises ``error`` if unreadable."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as cause:
+        reason = "it is not text" if isinstance(cause, UnicodeDecodeError) else cause.strerror
+        raise error(f"cannot read {path}: {reason}; restore the file") from cause
+    stripped = ((k, line.strip()) for k, line in enumerate(text.splitlines(), 1))
+    return [(k, line) for k, line in stripped if line and not line.startswith("#")]
