@@ -17,7 +17,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from fgslam.runs.files import METRICS_FILE, REPORT_FILE
+from fgslam.runs.folder import METRICS_FILE, REPORT_FILE
 
 if TYPE_CHECKING:
     from fgslam.report.content import TextTable

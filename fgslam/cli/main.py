@@ -253,7 +253,7 @@ def merge(
     overwrite: options.Overwrite = False,
 ) -> None:
     """Make two saved maps of one place into one; refuses what does not overlap beyond doubt."""
-    from fgslam.runs.map_merging import merge_files
+    from fgslam.runs.maps import merge_files
 
     for line in merge_files(first, second, out, overwrite):
         typer.echo(line)

@@ -27,8 +27,13 @@ from fgslam.runs.comparison_tables import ate_table, comparison_particulars, com
 from fgslam.runs.config import is_homing, load_homing
 from fgslam.runs.config_models import Experiment, ExperimentConfig, HomingExperiment
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, run_task
-from fgslam.runs.files import COMPARISON_FILE, METRICS_FILE
-from fgslam.runs.folder import RUN_MARKER, ExistingFolder, is_run_folder
+from fgslam.runs.folder import (
+    COMPARISON_FILE,
+    METRICS_FILE,
+    RUN_MARKER,
+    ExistingFolder,
+    is_run_folder,
+)
 from fgslam.runs.homing_compare import open_homing_comparison
 from fgslam.runs.homing_replay import load_bearing_logs
 from fgslam.runs.report import report_from_folder

@@ -20,8 +20,7 @@ from fgslam.report.point_cloud import MapPoints, read_ply
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import Context
 from fgslam.runs.estimator_files import write_replay
-from fgslam.runs.files import LOG_FILE
-from fgslam.runs.folder import RUN_MARKER, is_run_folder
+from fgslam.runs.folder import LOG_FILE, RUN_MARKER, is_run_folder
 from fgslam.runs.tasks.slam_map_entry import arrival_of
 from fgslam.runs.units import Stage, one_by_one
 from fgslam.slam.replay import replay

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -20,14 +20,15 @@ from pydantic_core import ErrorDetails
 
 from fgslam.core.errors import ConfigError
 from fgslam.runs.named_experiments import suggestion
-from fgslam.runs.override_values import Schema, accepted_at, typed_value
 from fgslam.runs.retired_settings import RETIRED
 
 Model = TypeVar("Model", bound=BaseModel)
+Schema: TypeAlias = Mapping[str, Any]
+"""A node of a JSON schema, as pydantic makes it."""
 
 
 @cache
-def _schema_of(model: type[BaseModel]) -> dict[str, Any]:
+def _schema_of(model: type[BaseModel]) -> Schema:
     """JSON schema of a model, read only; it takes a tenth of a second to make."""
     return model.model_json_schema()
 
@@ -210,7 +211,7 @@ class _Override:
 
 
 def _without_retired(
-    values: Mapping[str, Any], errors: list[ErrorDetails], schema: dict[str, Any]
+    values: Mapping[str, Any], errors: list[ErrorDetails], schema: Schema
 ) -> dict[str, Any] | None:
     """The values without keys that are constants now and agree with these; None: there are none."""
     retired = [tuple(e["loc"]) for e in errors if e["type"] in _UNKNOWN and _is_retired(e, schema)]
@@ -224,7 +225,7 @@ def _without_retired(
     return kept if retired else None
 
 
-def _is_retired(error: ErrorDetails, schema: dict[str, Any]) -> bool:
+def _is_retired(error: ErrorDetails, schema: Schema) -> bool:
     *group, key = (str(name) for name in error["loc"])
     _, nodes = _descend(schema, group)
     constants = [RETIRED.get(node.get("title", ""), {}) for node in nodes]
@@ -255,7 +256,7 @@ _PLAIN_WORDS = {
 """What a value must be, by pydantic's type of error; others speak for themselves."""
 
 
-def _describe(errors: list[ErrorDetails], where: str, schema: dict[str, Any]) -> str:
+def _describe(errors: list[ErrorDetails], where: str, schema: Schema) -> str:
     # A misspelt key also leaves the right one missing; the misspelling is the cause.
     first = sorted(errors, key=lambda e: e["type"] not in _UNKNOWN)[0]
     names = [str(part) for part in first["loc"]]
@@ -274,29 +275,30 @@ def _describe(errors: list[ErrorDetails], where: str, schema: dict[str, Any]) ->
     return f"{where}: {key} = {first['input']!r} is not usable: {words}{more}"
 
 
-def _kinds(schema: dict[str, Any], names: list[str]) -> str:
+def _kinds(schema: Schema, names: list[str]) -> str:
     _, nodes = _descend(schema, names)
     return ", ".join(str(n["properties"]["kind"]["const"]) for n in nodes)
 
 
-def _nodes(schema: dict[str, Any], node: dict[str, Any]) -> list[dict[str, Any]]:
-    """The object schemas that a schema node may stand for."""
-    if "$ref" in node:
-        return _nodes(schema, schema["$defs"][node["$ref"].rsplit("/", 1)[-1]])
-    inner = [*node.get("oneOf", []), *node.get("anyOf", []), *node.get("allOf", [])]
-    if isinstance(node.get("items"), dict):
-        inner.append(node["items"])
-    if inner:
-        return [found for part in inner for found in _nodes(schema, part)]
-    return [node]
+def _nodes(schema: Schema, node: Schema) -> list[Schema]:
+    """The object schemas that a schema node may stand for; of a list those of its items."""
+    return [
+        inner
+        for one in _alternatives(schema, node)
+        for inner in (_nodes(schema, one["items"]) if _is_list(one) else [one])
+    ]
 
 
-def _descend(schema: dict[str, Any], names: list[str]) -> tuple[list[str], list[dict[str, Any]]]:
+def _is_list(node: Schema) -> bool:
+    return isinstance(node.get("items"), Mapping)
+
+
+def _descend(schema: Schema, names: list[str]) -> tuple[list[str], list[Schema]]:
     """Follows a location through the schema, dropping the tags of unions on the way.
 
     Items of lists are written `key[3]`.
     """
-    nodes: list[dict[str, Any]] = [schema]
+    nodes: list[Schema] = [schema]
     kept: list[str] = []
     for name in names:
         if name.isdigit() and kept:  # an item of a list; `_nodes` has looked inside already
@@ -314,20 +316,107 @@ def _descend(schema: dict[str, Any], names: list[str]) -> tuple[list[str], list[
     return kept, nodes
 
 
-def _has_tag(node: dict[str, Any], tag: str) -> bool:
+def _has_tag(node: Schema, tag: str) -> bool:
     kind = node.get("properties", {}).get("kind", {})
     return bool(kind.get("const") == tag)
 
 
-def _without_tags(schema: dict[str, Any], names: list[str]) -> list[str]:
+def _without_tags(schema: Schema, names: list[str]) -> list[str]:
     kept, nodes = _descend(schema, names[:-1])
     if names and names[-1].isdigit():
         return _descend(schema, names)[0]
     return kept if any(_has_tag(n, names[-1]) for n in nodes) else [*kept, names[-1]]
 
 
-def _suggestion(schema: dict[str, Any], names: list[str]) -> str:
+def _suggestion(schema: Schema, names: list[str]) -> str:
     _, nodes = _descend(schema, names[:-1])
     known = sorted({key for node in nodes for key in node.get("properties", {})})
     close = difflib.get_close_matches(names[-1], known, n=1, cutoff=0.5)
     return f"; did you mean {close[0]}?" if close else f"; known here: {', '.join(known)}"
+
+
+# --------------------------------------------------------------------------------------------
+# Values of --set a.b=VALUE
+#
+# A value takes the type of its setting. Text is text as typed, whatever YAML would make of it (01,
+# no, a: b); numbers, booleans, lists, groups and null are YAML.
+
+_QUOTES = ("'", '"')
+
+
+def typed_value(text: str, accepted: Sequence[Schema]) -> Any:
+    """What ``text`` means for a setting.
+
+    Args:
+        text: as typed, without the key.
+        accepted: what the setting may be (:func:`accepted_at`); empty where that is not known.
+
+    Raises:
+        yaml.YAMLError: the setting is no text, and this is not valid YAML.
+    """
+    try:
+        node = yaml.SafeLoader(text).get_single_node()
+    except yaml.YAMLError:
+        if _is_text(accepted):
+            return text.strip()
+        raise
+    if _is_text(accepted) and not isinstance(node, yaml.ScalarNode):
+        return text.strip()  # a comment, a list, a group: not to a setting that is text
+    value = _value(node, accepted)
+    plain = isinstance(node, yaml.ScalarNode) and node.style not in _QUOTES
+    return text.strip() if plain and isinstance(value, str) else value
+
+
+def accepted_at(schema: Schema, keys: Sequence[str], values: Any) -> list[Schema]:
+    """Alternatives that the setting at ``keys`` may be; empty for an unknown one.
+
+    Args:
+        schema: of the whole configuration.
+        keys: from the top down.
+        values: the configuration's plain values: where a group is a union, its `kind` chooses.
+    """
+    nodes = _alternatives(schema, schema)
+    for key in keys:
+        kind = values.get("kind") if isinstance(values, dict) else None
+        chosen = [n for n in nodes if n.get("properties", {}).get("kind", {}).get("const") == kind]
+        inner = [n["properties"][key] for n in chosen or nodes if key in n.get("properties", {})]
+        nodes = [found for node in inner for found in _alternatives(schema, node)]
+        values = values.get(key) if isinstance(values, dict) else None
+    return [_with_items(schema, node) for node in nodes]
+
+
+def _value(node: yaml.Node | None, accepted: Sequence[Schema]) -> Any:
+    """Value of a YAML node; scalars where text alone is accepted stay text."""
+    if node is None:
+        return "" if _is_text(accepted) and "null" not in _types(accepted) else None
+    if isinstance(node, yaml.SequenceNode):
+        items = [item for one in accepted for item in one.get("items", ())]
+        return [_value(item, items) for item in node.value]
+    value = yaml.SafeLoader("").construct_object(node, deep=True)
+    if not isinstance(node, yaml.ScalarNode) or not _is_text(accepted):
+        return value
+    return None if value is None and "null" in _types(accepted) else node.value
+
+
+def _is_text(accepted: Sequence[Schema]) -> bool:
+    """True if the setting is text, or text or null."""
+    return _types(accepted) in ({"string"}, {"string", "null"})
+
+
+def _types(accepted: Sequence[Schema]) -> set[Any]:
+    return {node.get("type") for node in accepted}
+
+
+def _alternatives(schema: Schema, node: Schema) -> list[Schema]:
+    """What a schema node may stand for: references resolved, unions opened."""
+    if "$ref" in node:
+        return _alternatives(schema, schema["$defs"][node["$ref"].rsplit("/", 1)[-1]])
+    inner = [*node.get("oneOf", ()), *node.get("anyOf", ()), *node.get("allOf", ())]
+    return [found for part in inner for found in _alternatives(schema, part)] if inner else [node]
+
+
+def _with_items(schema: Schema, node: Schema) -> Schema:
+    """A list's node with the alternatives of its items in place of their schema."""
+    items = [*node.get("prefixItems", ()), *([node["items"]] if "items" in node else ())]
+    found = [_with_items(schema, one) for item in items for one in _alternatives(schema, item)]
+    return {**node, "items": found}

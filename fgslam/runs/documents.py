@@ -10,8 +10,7 @@ from fgslam.report.content import Page
 from fgslam.report.page import write_html
 from fgslam.report.tables import write_json
 from fgslam.runs.engine import RunResult
-from fgslam.runs.files import METRICS_FILE, REPORT_FILE, versions
-from fgslam.runs.folder import RUN_MARKER
+from fgslam.runs.folder import METRICS_FILE, REPORT_FILE, RUN_MARKER, versions
 
 
 def write_document(

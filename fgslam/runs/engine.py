@@ -19,8 +19,16 @@ from fgslam.core.threads import one_blas_thread
 from fgslam.report.content import TextTable
 from fgslam.runs.config import load_experiment
 from fgslam.runs.config_models import Experiment
-from fgslam.runs.files import METRICS_FILE, STATE_FILE, read_document, versions, write_config
-from fgslam.runs.folder import RUN_MARKER, ExistingFolder, create_run_folder
+from fgslam.runs.folder import (
+    METRICS_FILE,
+    RUN_MARKER,
+    STATE_FILE,
+    ExistingFolder,
+    create_run_folder,
+    read_document,
+    versions,
+    write_config,
+)
 from fgslam.runs.units import (
     UNITS_FOLDER,
     Argument,

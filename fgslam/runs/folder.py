@@ -5,50 +5,48 @@ Its files are written whole or not at all: :mod:`fgslam.core.files`.
 
 from __future__ import annotations
 
+import json
+import platform
+from importlib import metadata
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from fgslam.core.errors import OutputError
+from fgslam.core import __version__
+from fgslam.core.errors import DatasetError, OutputError
 from fgslam.core.files import (
     clear_output_errors,
     is_unfinished_file,
-    make_subfolder,
-    replacing,
     require_writable,
-    write_bytes,
     write_text,
 )
 
-__all__ = [
-    "RUN_MARKER",
-    "ExistingFolder",
-    "clear_output_errors",
-    "create_run_folder",
-    "is_run_folder",
-    "make_subfolder",
-    "replacing",
-    "write_bytes",
-    "write_text",
-]
+if TYPE_CHECKING:
+    from fgslam.runs.config_models import Experiment
 
 ExistingFolder: TypeAlias = Literal["refuse", "overwrite", "resume"]
 
 RUN_MARKER = "config.yaml"
 """The file that every run folder holds; it is written first."""
 
+METRICS_FILE = "metrics.json"
+REPORT_FILE = "report.html"
+LOG_FILE = "measurements.npz"
+STATE_FILE = "checkpoint.npz"
+COMPARISON_FILE = "comparison.csv"
+
 _ESTIMATOR_FILES = ("online.tum", "final.tum", "covariance.csv", "map.ply", "frames.csv")
 _RESULT_FILES = (
     RUN_MARKER,
-    "measurements.npz",
-    "checkpoint.npz",
+    LOG_FILE,
+    STATE_FILE,
     "ground_truth.tum",
     "ground_truth_landmarks.csv",
-    "metrics.json",
+    METRICS_FILE,
     "timing.csv",
-    "comparison.csv",
+    COMPARISON_FILE,
     "trials.csv",
     "trials_timing.csv",
-    "report.html",
+    REPORT_FILE,
     "view.rrd",
     "map.fgmap",
     # of homing runs
@@ -146,3 +144,41 @@ def _delete_run_files(path: Path) -> None:
     for folder in sorted({file.parent for file in files} - {path}, reverse=True):
         if not any(folder.iterdir()):
             folder.rmdir()
+
+
+# --------------------------------------------------------------------------------------------
+# Files of every task's run folder
+
+_VERSIONS_OF = ("numpy", "scipy", "opencv-python-headless", "gtsam", "open3d")
+
+
+def write_config(folder: Path, config: Experiment, provenance: dict[str, Any]) -> None:
+    """config.yaml: every default filled in, with the versions and where the data came from."""
+    import yaml  # not before: a wrong path is answered without it
+
+    values = config.as_values() | {"provenance": {"versions": versions()} | provenance}
+    write_text(folder / RUN_MARKER, yaml.safe_dump(values, sort_keys=False))
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of this program, of Python and of the packages that shape the numbers."""
+    own = {"fgslam": __version__, "python": platform.python_version()}
+    return own | {name: _version(name) for name in _VERSIONS_OF}
+
+
+def read_document(path: Path) -> dict[str, Any]:
+    """A run's metrics.json. Raises DatasetError where it is none."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise DatasetError(f"{path}: cannot be read ({error}); run the experiment again") from None
+    if not isinstance(document, dict):
+        raise DatasetError(f"{path}: holds no metrics; run the experiment again")
+    return document
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None

@@ -21,7 +21,7 @@ from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.config_models import HomingExperiment
 from fgslam.runs.documents import write_document, write_page
 from fgslam.runs.engine import Context, RunResult, Status, Task
-from fgslam.runs.files import COMPARISON_FILE
+from fgslam.runs.folder import COMPARISON_FILE
 from fgslam.runs.homing_replay import ReplayedHoming, replay_homing
 from fgslam.runs.tasks.homing_trial_results import TRIAL_COLUMNS, summary_numbers, trial_row
 from fgslam.runs.units import Stage, one_by_one

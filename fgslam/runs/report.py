@@ -26,12 +26,10 @@ from fgslam.report.run_results import (
     truth_in_their_world,
 )
 from fgslam.report.slam_page import write_report
-from fgslam.runs.files import LOG_FILE
-from fgslam.runs.folder import RUN_MARKER
+from fgslam.runs.folder import LOG_FILE, REPORT_FILE, RUN_MARKER
 from fgslam.runs.report_parts import comparison_table, sample_pictures
 from fgslam.runs.tasks.slam_places import LOOPS_FILE, read_closures
 
-REPORT = "report.html"
 _UP = np.array([0.0, -1.0, 0.0])
 _TIMED_STAGES = ("predict", "update")
 
@@ -50,7 +48,7 @@ def report_from_folder(folder: Path, run: Path | None = None) -> Path:
     Raises:
         FgslamError: there are no results, one of the files is damaged, or writing failed.
     """
-    page = folder / REPORT
+    page = folder / REPORT_FILE
     write_report(page, load_report(folder, run))
     return page
 

@@ -21,10 +21,13 @@ from fgslam.runs.choosing import EVERY, Choice, choose
 from fgslam.runs.comparison import load_truth
 from fgslam.runs.comparison_tables import TRIAL_COLUMNS, metrics_table
 from fgslam.runs.config import load_experiment
-from fgslam.runs.config_models import Experiment, ExperimentConfig, HomingTrialsConfig
+from fgslam.runs.config_models import (
+    Experiment,
+    ExperimentConfig,
+    HomingTrialsConfig,
+)
 from fgslam.runs.engine import Context, Opener, Opening, RunResult, Status, Task, run_task
-from fgslam.runs.files import LOG_FILE
-from fgslam.runs.folder import RUN_MARKER, ExistingFolder, is_run_folder
+from fgslam.runs.folder import LOG_FILE, RUN_MARKER, ExistingFolder, is_run_folder
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.settings import OutputSettings
 from fgslam.runs.tasks.slam import open_slam

@@ -9,7 +9,7 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import require_rig
 from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.engine import Context, Opening, Task
-from fgslam.runs.files import write_config
+from fgslam.runs.folder import write_config
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.tasks.localisation_files import write_results
 from fgslam.runs.tasks.localisation_queries import ask_all, nothing_asked

@@ -21,8 +21,7 @@ from fgslam.runs.config import (
 )
 from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.engine import Context
-from fgslam.runs.files import write_config
-from fgslam.runs.folder import ExistingFolder, create_run_folder, is_run_folder
+from fgslam.runs.folder import ExistingFolder, create_run_folder, is_run_folder, write_config
 from fgslam.runs.tasks.localisation import open_queries, provenance_of
 from fgslam.runs.tasks.localisation_files import write_results
 from fgslam.runs.tasks.localisation_queries import ask_all

@@ -15,7 +15,7 @@ from fgslam.report.figures.located import Located, located_figure
 from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv, write_json
 from fgslam.runs.documents import write_page
-from fgslam.runs.files import METRICS_FILE
+from fgslam.runs.folder import METRICS_FILE
 from fgslam.runs.tasks.localisation_results import (
     LOCALISATION_FILE,
     LocalisationResult,

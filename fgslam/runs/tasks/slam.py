@@ -19,8 +19,7 @@ from fgslam.runs.comparison import Compared, replay_apart, tasks_of
 from fgslam.runs.comparison_tables import comparison_particulars, comparison_tables
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, run_task
-from fgslam.runs.files import COMPARISON_FILE
-from fgslam.runs.folder import ExistingFolder, is_run_folder
+from fgslam.runs.folder import COMPARISON_FILE, ExistingFolder, is_run_folder
 from fgslam.runs.report import report_from_folder
 from fgslam.runs.tasks import slam_checkpoint as checkpoint
 from fgslam.runs.tasks import slam_map_entry as map_entry

@@ -11,7 +11,7 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.recordings import Sequence
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Opening
-from fgslam.runs.files import write_config
+from fgslam.runs.folder import write_config
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.tasks import slam_checkpoint as checkpoint
 from fgslam.runs.tasks import slam_map_entry as map_entry

@@ -9,7 +9,7 @@ from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import OutputError
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.runs.files import LOG_FILE, STATE_FILE
+from fgslam.runs.folder import LOG_FILE, STATE_FILE
 from fgslam.slam.pipeline import SlamPipeline
 from fgslam.slam.recorder import RunRecorder
 

@@ -31,7 +31,7 @@ from fgslam.runs.comparison_tables import comparison_particulars, comparison_tab
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task
 from fgslam.runs.estimator_files import FRAMES_FILE, read_frames
-from fgslam.runs.files import write_config
+from fgslam.runs.folder import write_config
 from fgslam.runs.tasks.slam_checkpoint import save_log
 from fgslam.runs.tasks.slam_pictures import RunFigures, draw_run
 from fgslam.runs.tasks.slam_summary import spread

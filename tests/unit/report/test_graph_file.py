@@ -22,7 +22,7 @@ from fgslam.report.graph_file import (
     information_of,
     write_g2o,
 )
-from fgslam.runs.graph_export import build_graph
+from fgslam.runs.exporting import build_graph
 
 Lines = dict[str, list[list[float]]]
 

@@ -14,8 +14,7 @@ from fgslam.datasets.settings import ImageFolderSettings
 from fgslam.frontend.places.settings import LoopSettings
 from fgslam.runs.config import ExperimentConfig, load_config, parse_config
 from fgslam.runs.config_models import TASKS
-from fgslam.runs.config_reading import read_mapping
-from fgslam.runs.override_values import accepted_at, typed_value
+from fgslam.runs.config_reading import accepted_at, read_mapping, typed_value
 from fgslam.worlds.lab.settings import RenderedLabSettings
 
 EXPERIMENTS = [

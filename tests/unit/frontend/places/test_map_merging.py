@@ -18,7 +18,7 @@ from fgslam.core.sensors import CameraRig
 from fgslam.frontend.places import map_alignment
 from fgslam.frontend.places.map_alignment import Alignment, align_maps, tentative_pairs
 from fgslam.frontend.places.map_fusion import merge_maps
-from fgslam.runs.map_merging import merge_files
+from fgslam.runs.maps import merge_files
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 BTA = g.se3_exp(np.array([0.02, 0.7, -0.01, 1.5, 0.1, -2.0]))
