@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.asl import read_mounting
+from fgslam.cameras.calibration_formats import read_asl_mounting
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory
@@ -113,7 +113,7 @@ def read_body_truth(folder: Path) -> Trajectory | None:
     poses = _sensor_poses(table)
     if (folder / "sensor.yaml").is_file():
         mounting = folder / "sensor.yaml"
-        poses = poses @ inverse(read_mounting(mounting))
+        poses = poses @ inverse(read_asl_mounting(mounting))
     return Trajectory(stamps, poses)
 
 

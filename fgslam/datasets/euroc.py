@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.asl import read_camera
+from fgslam.cameras.calibration_formats import read_asl_camera
 from fgslam.cameras.rectification import RawCamera, Rectifier, rectifier, right_and_left
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.estimates import Trajectory
@@ -73,7 +73,7 @@ def open_euroc(settings: EurocSettings) -> Recording:
 
 def _right_and_left(folders: list[Path]) -> tuple[RawCamera, RawCamera, Path, Path]:
     """Cameras and folders, right first."""
-    first, second = (read_camera(folder / "sensor.yaml") for folder in folders)
+    first, second = (read_asl_camera(folder / "sensor.yaml") for folder in folders)
     right, left = right_and_left(first, second)
     swapped = right is second
     return right, left, folders[swapped], folders[not swapped]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.kitti_calibration import read_projections
+from fgslam.cameras.calibration_formats import read_projections
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory

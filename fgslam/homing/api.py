@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from fgslam.backend.homing.factory import homing_settings_of, make_homing_estimator
 from fgslam.backend.homing.settings import HomingEstimatorKind
-from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.core.errors import CalibrationError, EstimatorError, SessionError, StoredMapError
 from fgslam.core.homing import Refusal, TwoViewVector
 from fgslam.core.settings import make_settings, require_seed

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray
 from fgslam.core.homing import (
     BearingMatches,

@@ -6,11 +6,9 @@ import numpy as np
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from fgslam.cameras.omni.bearing_measurement import angles_of, measure
-from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.camera import OmniCamera, angles_of, measure
+from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame
 from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
-from fgslam.cameras.omni.protocol import OmniCamera
-from fgslam.cameras.omni.radial import MirrorFrame
 from fgslam.core.planar import wrap
 
 frames = st.builds(

@@ -10,12 +10,15 @@ from typing import Any, TypeAlias
 import numpy as np
 import yaml
 
-from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni.mirrors import (
+    HyperbolicMirror,
+    MirrorFrame,
+    RadialPolynomial,
+    fit_radial_polynomial,
+)
 from fgslam.cameras.omni.ocamcalib import read_ocamcalib
 from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
-from fgslam.cameras.omni.protocol import OmniCamera
-from fgslam.cameras.omni.radial import MirrorFrame
-from fgslam.cameras.omni.radial_polynomial import RadialPolynomial, fit_radial_polynomial
 from fgslam.cameras.omni.settings import (
     BloggieSettings,
     CylinderSettings,

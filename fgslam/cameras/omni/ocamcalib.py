@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.polynomial import polynomial
 
-from fgslam.cameras.omni.monotone_inverse import MonotoneInverse
-from fgslam.cameras.omni.radial import AHEAD_IS_UP, MirrorFrame, RadialCamera
+from fgslam.cameras.omni.mirrors import AHEAD_IS_UP, MirrorFrame, MonotoneInverse, RadialCamera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.cameras.omni.bearing_measurement import unit_rays
-from fgslam.cameras.omni.image_bounds import inside, require_size
+from fgslam.cameras.omni.camera import inside, require_size, unit_rays
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 
@@ -52,14 +51,14 @@ class Equirectangular:
         return (self.top_elevation - self.bottom_elevation) / (self.height - 1)
 
     def rays(self, pixels: FloatArray) -> FloatArray:
-        """(n, 3) unit rays; see :class:`fgslam.cameras.omni.protocol.OmniCamera`."""
+        """(n, 3) unit rays; see :class:`fgslam.cameras.omni.camera.OmniCamera`."""
         pixels = inside(np.asarray(pixels, dtype=np.float64), self.width, self.height)
         bearing = _bearing(pixels[:, 0], self.width)
         elevation = self.top_elevation - pixels[:, 1] * self._per_row()
         return unit_rays(bearing, elevation)
 
     def pixels(self, rays: FloatArray) -> FloatArray:
-        """(n, 2) pixels; see :class:`fgslam.cameras.omni.protocol.OmniCamera`."""
+        """(n, 2) pixels; see :class:`fgslam.cameras.omni.camera.OmniCamera`."""
         rays = np.asarray(rays, dtype=np.float64)
         elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
         rows = (self.top_elevation - elevation) / self._per_row()
@@ -94,7 +93,7 @@ class Cylinder:
         return np.asarray(self.tan_top - np.asarray(rows, dtype=np.float64) * per_row)
 
     def rays(self, pixels: FloatArray) -> FloatArray:
-        """(n, 3) unit rays; see :class:`fgslam.cameras.omni.protocol.OmniCamera`."""
+        """(n, 3) unit rays; see :class:`fgslam.cameras.omni.camera.OmniCamera`."""
         pixels = inside(np.asarray(pixels, dtype=np.float64), self.width, self.height)
         bearing = _bearing(pixels[:, 0], self.width)
         tangent = self.tangents(pixels[:, 1])
@@ -102,7 +101,7 @@ class Cylinder:
         return np.column_stack([level * np.cos(bearing), level * np.sin(bearing), level * tangent])
 
     def pixels(self, rays: FloatArray) -> FloatArray:
-        """(n, 2) pixels; see :class:`fgslam.cameras.omni.protocol.OmniCamera`."""
+        """(n, 2) pixels; see :class:`fgslam.cameras.omni.camera.OmniCamera`."""
         rays = np.asarray(rays, dtype=np.float64)
         per_row = (self.tan_top - self.tan_bottom) / (self.height - 1)
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -11,8 +11,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.omni.radial import MirrorFrame, RadialCamera
-from fgslam.cameras.omni.radial_polynomial import PAPER_DEGREE, RadialFit, fit_radial_polynomial
+from fgslam.cameras.omni.mirrors import (
+    PAPER_DEGREE,
+    MirrorFrame,
+    RadialCamera,
+    RadialFit,
+    fit_radial_polynomial,
+)
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError
 

@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.datasets.images import IMAGE_SUFFIXES

@@ -5,10 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from fgslam.cameras.omni.bearing_measurement import unit_rays
+from fgslam.cameras.omni.camera import OmniCamera, unit_rays, unwrap_maps
 from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
-from fgslam.cameras.omni.protocol import OmniCamera
-from fgslam.cameras.omni.unwrapping import unwrap_maps
 from fgslam.core.arrays import Image
 from fgslam.core.errors import FrameError
 from fgslam.core.homing import ColumnSegments, OmniFeatures, UprightFeatures

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.cameras.omni.bearing_measurement import unit_rays
+from fgslam.cameras.omni.camera import unit_rays
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.homing import BearingMatches
 from fgslam.core.planar import wrap

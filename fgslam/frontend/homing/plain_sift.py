@@ -5,8 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from fgslam.cameras.omni.bearing_measurement import measure
-from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.cameras.omni.camera import OmniCamera, measure
 from fgslam.core.arrays import Image
 from fgslam.core.homing import BearingMatches, UprightFeatures
 from fgslam.frontend.features.colour_sift import up_in_image

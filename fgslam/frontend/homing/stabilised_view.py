@@ -15,9 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import next_fast_len
 
+from fgslam.cameras.omni.camera import Float32, OmniCamera, unwrap_maps
 from fgslam.cameras.omni.panoramas import Equirectangular
-from fgslam.cameras.omni.protocol import OmniCamera
-from fgslam.cameras.omni.unwrapping import Float32, unwrap_maps
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import FrameError
 from fgslam.frontend.features.colour_sift import wrapping_period

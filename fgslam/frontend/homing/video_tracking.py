@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.homing import TrackedBearings
 from fgslam.frontend.homing.bearing_tracking import WINDOW_PX, BearingTracker, TrackerState

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.files import make_subfolder
 from fgslam.core.homing import (

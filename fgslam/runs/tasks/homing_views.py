@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.cameras.omni.radial import RadialCamera
+from fgslam.cameras.omni.mirrors import RadialCamera
 from fgslam.cameras.omni.ring_calibration import MirrorCircle, find_mirror_circle
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, OutputError

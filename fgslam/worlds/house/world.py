@@ -11,9 +11,9 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni.mirrors import HyperbolicMirror
 from fgslam.cameras.omni.panoramas import Equirectangular
-from fgslam.cameras.omni.protocol import OmniCamera
 from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.worlds.buildings.house import DEPTH, WIDTH, build_house
 from fgslam.worlds.driving.floor_space import FloorSpace

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.worlds.rendering.scene import Body, Layer
 from fgslam.worlds.rendering.texture_bank import TextureBank

@@ -12,7 +12,7 @@ from typing import Protocol, Self
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.worlds.rendering.scene import Body
 

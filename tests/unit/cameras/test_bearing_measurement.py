@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.bearing_measurement import angles_of, measure
-from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.camera import OmniCamera, angles_of, measure
+from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame
 from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
-from fgslam.cameras.omni.protocol import OmniCamera
-from fgslam.cameras.omni.radial import MirrorFrame
 from fgslam.core.planar import wrap
 
 MIRROR = HyperbolicMirror.with_view((640, 480), 0.92, (np.radians(-70), np.radians(25)))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import polynomial
 
-from fgslam.cameras.omni.bearing_measurement import angles_of
+from fgslam.cameras.omni.camera import angles_of
 from fgslam.cameras.omni.ocamcalib import OCamCalibration, read_ocamcalib
 from fgslam.core.errors import CalibrationError
 

@@ -5,18 +5,16 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from edge_straightness import upright_edges
 
-from fgslam.cameras.omni.edge_straightness import upright_edges
-from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.camera import OmniCamera, unwrap_maps
+from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame
 from fgslam.cameras.omni.panoramas import Cylinder
-from fgslam.cameras.omni.protocol import OmniCamera
-from fgslam.cameras.omni.radial import MirrorFrame
 from fgslam.cameras.omni.ring_calibration import (
     calibrate_from_rings,
     find_mirror_circle,
     mirror_offset,
 )
-from fgslam.cameras.omni.unwrapping import unwrap_maps
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError
 

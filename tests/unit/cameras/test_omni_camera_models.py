@@ -6,11 +6,9 @@ import gtsam
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.bearing_measurement import angles_of
-from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.camera import OmniCamera, angles_of
+from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame
 from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
-from fgslam.cameras.omni.protocol import OmniCamera
-from fgslam.cameras.omni.radial import MirrorFrame
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.planar import wrap
@@ -102,7 +100,9 @@ def test_the_unified_model_is_reflection_on_the_hyperboloid(a: float, b: float) 
 
     size = 2 * int(radius[-1]) + 3
     frame = MirrorFrame(size, size, (size / 2.0, size / 2.0))
-    camera = HyperbolicMirror.from_semi_axes(frame, (0.0, radius[-1]), (a, b), focal)
+    both = 2.0 * a * a + b * b  # docs/derivations/omni_cameras.md
+    xi, unified = 2.0 * a * float(np.hypot(a, b)) / both, focal * b * b / both
+    camera = HyperbolicMirror(frame, 0.0, radius[-1], xi=xi, focal_px=unified)
     np.testing.assert_allclose(camera.elevation(radius), expected, atol=1e-9)
     np.testing.assert_allclose(camera.radius(expected), radius, rtol=1e-9)
 

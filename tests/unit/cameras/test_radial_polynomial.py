@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
-from fgslam.cameras.omni.radial import MirrorFrame
-from fgslam.cameras.omni.radial_polynomial import RadialPolynomial, fit_radial_polynomial
+from fgslam.cameras.omni.mirrors import (
+    HyperbolicMirror,
+    MirrorFrame,
+    RadialPolynomial,
+    fit_radial_polynomial,
+)
 from fgslam.core.errors import CalibrationError
 
 FRAME = MirrorFrame(320, 240, (159.5, 119.5))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.camera import OUTSIDE, unwrap_maps
+from fgslam.cameras.omni.mirrors import HyperbolicMirror
 from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
-from fgslam.cameras.omni.unwrapping import OUTSIDE, unwrap_maps
 
 MIRROR = HyperbolicMirror.with_view((320, 240), 0.92, (np.radians(-65), np.radians(25)))
 

@@ -18,7 +18,7 @@ from dataset_builders import (
     write_euroc_truth,
 )
 
-from fgslam.cameras.asl import read_camera
+from fgslam.cameras.calibration_formats import read_asl_camera
 from fgslam.cameras.rectification import RawCamera, rectifier
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
@@ -61,7 +61,7 @@ def test_rectified_pixels_look_where_the_raw_cameras_saw_the_points(tmp_path: Pa
     the pixels where the raw, distorted cameras saw it.
     """
     root = euroc(tmp_path, (LEFT, RIGHT))
-    left, right = (read_camera(root / "mav0" / f"cam{k}" / "sensor.yaml") for k in (0, 1))
+    left, right = (read_asl_camera(root / "mav0" / f"cam{k}" / "sensor.yaml") for k in (0, 1))
     raw = rectifier(right, left, 0.0)
     rng = np.random.default_rng(7)
     points = np.column_stack(
@@ -92,7 +92,7 @@ def test_left_and_right_are_found_whatever_their_numbers(tmp_path: Path, swapped
 
 def test_images_are_the_raw_ones_remapped(tmp_path: Path) -> None:
     root = euroc(tmp_path, (LEFT, RIGHT))
-    left, right = (read_camera(root / "mav0" / f"cam{k}" / "sensor.yaml") for k in (0, 1))
+    left, right = (read_asl_camera(root / "mav0" / f"cam{k}" / "sensor.yaml") for k in (0, 1))
     maps = rectifier(right, left, 0.0).maps
     frame = opened(root).frame(2)
     for k, code in enumerate((52, 2)):
@@ -103,7 +103,7 @@ def test_images_are_the_raw_ones_remapped(tmp_path: Path) -> None:
 def test_rectified_images_of_a_scene_agree_row_by_row(tmp_path: Path) -> None:
     """Bright points rendered into the raw images appear on one row, at the right disparity."""
     root = euroc(tmp_path, (LEFT, RIGHT), frames=1)
-    cameras = {k: read_camera(root / "mav0" / f"cam{k}" / "sensor.yaml") for k in (0, 1)}
+    cameras = {k: read_asl_camera(root / "mav0" / f"cam{k}" / "sensor.yaml") for k in (0, 1)}
     point = np.array([[4.0, 0.1, -0.2]])
     for k, camera in cameras.items():
         column, row = seen_raw(camera, point)[0]

@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.bearing_measurement import angles_of
+from fgslam.cameras.omni.camera import angles_of
 from fgslam.cameras.omni.camera_files import make_camera
-from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
+from fgslam.cameras.omni.mirrors import HyperbolicMirror, RadialPolynomial
 from fgslam.cameras.omni.ocamcalib import OCamCamera
 from fgslam.cameras.omni.panoramas import Equirectangular
-from fgslam.cameras.omni.radial_polynomial import RadialPolynomial
 from fgslam.cameras.omni.settings import (
     BloggieSettings,
     EquirectangularSettings,

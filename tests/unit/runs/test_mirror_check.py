@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
-from fgslam.cameras.omni.radial import MirrorFrame
+from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame
 from fgslam.cameras.omni.settings import EquirectangularSettings, HyperbolicMirrorSettings
 from fgslam.core.arrays import Image
 from fgslam.datasets.omni.settings import OmniPathSettings

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.hyperbolic import HyperbolicMirror
-from fgslam.cameras.omni.protocol import OmniCamera
+from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni.mirrors import HyperbolicMirror
 from fgslam.worlds.house.disturbances import camera_pose
 from fgslam.worlds.rendering.lighting import flat_light
 from fgslam.worlds.rendering.patches import Surface, Thing, box, stack
