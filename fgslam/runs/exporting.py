@@ -18,7 +18,8 @@ from fgslam.core.trajectories import read_tum, write_trajectory
 from fgslam.report.graph_file import PoseLandmarkGraph, require_graph_suffix, write_g2o
 from fgslam.report.metrics import read_metrics
 from fgslam.report.point_cloud import read_ply, write_map
-from fgslam.runs.config import is_homing, load_config
+from fgslam.runs.config import load_config
+from fgslam.runs.config_reading import read_mapping
 from fgslam.runs.folder import LOG_FILE, RUN_MARKER, is_run_folder
 from fgslam.runs.maps import drives_of, points_of, remark_of_map, valid_of
 
@@ -86,10 +87,10 @@ def _require_elsewhere(run: Path, targets: tuple[Path | None, ...]) -> None:
 def _estimator_of(run: Path, wanted: str | None) -> str:
     if not is_run_folder(run):
         raise DatasetError(f"{run}: not a run folder (no config.yaml); give what fgslam run wrote")
-    if is_homing(run / RUN_MARKER):
+    if (task := read_mapping(run / RUN_MARKER).get("task")) is not None:
         raise DatasetError(
-            f"{run}: is a homing run, and has no graph of SLAM to export; its tables are "
-            "trajectory.csv and logs/*.npz"
+            f"{run}: is a run of task {task}, not of SLAM: it has no map, trajectory or graph to "
+            f"export; take its tables and arrays as they are: {', '.join(_plain_files(run))}"
         )
     found = sorted(path.parent.name for path in run.glob("*/final.tum"))
     if not found:
@@ -102,6 +103,12 @@ def _estimator_of(run: Path, wanted: str | None) -> str:
             f"{run}: no estimator {chosen!r}; give --estimator with one of {', '.join(found)}"
         )
     return chosen
+
+
+def _plain_files(run: Path) -> list[str]:
+    """The files of a run that other programs read without an export, as one would name them."""
+    found = [path.name for pattern in ("*.csv", "*.npz", "*.json") for path in run.glob(pattern)]
+    return sorted(found) + (["logs/*.npz"] if any(run.glob("logs/*.npz")) else [])
 
 
 def export_map(

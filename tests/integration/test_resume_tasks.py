@@ -295,6 +295,54 @@ def test_killed_at_ten_moments_a_run_resumes_to_the_same_bytes(
     killed_and_resumed(task, 10, straight, values_of, tmp_path)
 
 
+@pytest.mark.parametrize("task", ["slam_compared", "localisation"])
+def test_killed_while_it_tidies_up_a_run_tracks_at_most_its_last_frame_again(
+    task: str,
+    straight: Straight,
+    values_of: Callable[[str], dict[str, Any]],
+    tmp_path: Path,
+) -> None:
+    values, folder = values_of(task), tmp_path / "run"
+    expected, _ = straight.of(task, folder)
+    kept = before_each_deletion(values, folder, tmp_path / "kept")
+    assert len(kept) >= 4  # a checkpoint, two files of units and their folder
+    for moment in kept[::2]:  # the first one, and one with half of the units
+        shutil.rmtree(folder)
+        moment.rename(folder)
+        steps: list[tuple[str, int, int]] = []
+        ended = run(values, folder, "resume", progress=lambda *step: steps.append(step))
+        assert ended.status == "finished", moment.name
+        assert sum(what == "tracking" for what, _, _ in steps) <= 1, moment.name
+        found = content_of(folder)
+        assert found.keys() == expected.keys(), moment.name
+        assert [n for n in found if found[n] != expected[n]] == [], moment.name
+
+
+def before_each_deletion(values: dict[str, Any], folder: Path, kept: Path) -> list[Path]:
+    """The run folder as a kill would leave it, just before each part of its state is deleted."""
+
+    def keep(deleted: Path) -> None:
+        if deleted.exists() and (deleted.name == "checkpoint.npz" or "units" in deleted.parts):
+            found.append(kept / f"{len(found)}_{deleted.name}")
+            shutil.copytree(folder, found[-1])
+
+    def unlink(path: Path, missing_ok: bool = False) -> None:
+        keep(path)
+        real_unlink(path, missing_ok)
+
+    def rmdir(path: Path) -> None:
+        keep(path)
+        real_rmdir(path)
+
+    found: list[Path] = []
+    real_unlink, real_rmdir = Path.unlink, Path.rmdir
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Path, "unlink", unlink)
+        patch.setattr(Path, "rmdir", rmdir)
+        assert run(values, folder).status == "finished"
+    return found
+
+
 @pytest.mark.parametrize("task", ["homing_pairs", "homing_trials"])
 def test_a_command_killed_by_a_signal_resumes_to_the_same_bytes(
     task: str,

@@ -201,11 +201,13 @@ def _answered(
     asker: Asker, config: LocalisationConfig, sequence: Sequence, queries: int, context: Context
 ) -> dict[int, tuple[Attempt, ...]]:
     """Answers by number of the query, in the order asked; kept in the run folder now and then."""
-    done: dict[int, tuple[Attempt, ...]] = context.store.load(_STAGE, _ANSWERS)
-    fresh: dict[int, tuple[Attempt, ...]] = {}
+    kept: dict[int, tuple[Attempt, ...]] = context.store.load(_STAGE, _ANSWERS)
+    # Killed while it tidied up, a run has lost the first answers, but not the last ones.
+    first = next(k for k in range(queries + 1) if k not in kept)
+    done, fresh = {k: kept[k] for k in range(first)}, dict[int, tuple[Attempt, ...]]()
     context.progress("localising", len(done), queries)
     saved = time.perf_counter()
-    for k, found in _queries(config, sequence, first=len(done)):
+    for k, found in _queries(config, sequence, first):
         sighted = asker.sighted(found[-1].i)
         frames = config.localisation.frames
         fresh[k] = tuple(asker.ask(found[len(found) - n :], sighted) for n in frames)

@@ -81,7 +81,9 @@ def drive_first(config: ExperimentConfig, context: Context) -> SlamResult | None
     """
     folder = context.folder / map_entry.FIRST_FOLDER
     first = mapping.first_config(config, folder)
-    if first is None or (context.resumed and (folder / map_entry.MAP_FILE).is_file()):
+    made = context.resumed and (folder / map_entry.MAP_FILE).is_file()
+    # Killed after writing the map, the drive has yet to draw, to report and to tidy up.
+    if first is None or (made and not checkpoint.exists(folder)):
         return None
     existing: ExistingFolder = "overwrite"
     if context.resumed and is_run_folder(folder):
@@ -167,6 +169,8 @@ def _finish(begun: BegunRun, context: Context) -> SlamResult:
     if compared is not None and context.stopped():
         status = "interrupted"  # the replays that are missing are for the next session
     else:
+        # The checkpoint goes last: while anything is left, a run goes on from its last frames.
+        context.store.remove()
         checkpoint.remove(outputs.folder)
     return _result(outputs, status, live, pictures, compared, about_map)
 
