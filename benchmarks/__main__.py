@@ -1,7 +1,8 @@
-"""Measures speed or accuracy, or writes the pages of results.
+"""Measures speed or accuracy, stores what was measured, writes the pages of results.
 
 `python -m benchmarks NAME` prints one set of tables as Markdown; `speed` and `long_drive` write
-`bench.json` and `bench_long.json`; `pages` writes docs/results from benchmarks/results.
+`bench.json` and `bench_long.json`; `keep PATH` stores such a file, or the numbers of a run folder,
+in benchmarks/measured; `pages` writes docs/results from benchmarks/results and benchmarks/measured.
 """
 
 from __future__ import annotations
@@ -9,30 +10,53 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from benchmarks.bounds import BOUNDS
-from benchmarks.catalogue import EVIDENCE
-from benchmarks.pages import bounds, write_pages
-from benchmarks.rows import Section, section_as_json
+from benchmarks.evidence import (
+    chess,
+    lasting,
+    noise,
+    paper_loop,
+    paper_views,
+    person,
+    real,
+    recognised,
+    seeds,
+    unmapped,
+    variants,
+    visits,
+)
+from benchmarks.measured import keep
+from benchmarks.pages import write_pages
 from benchmarks.runs import DATA, say
 from benchmarks.speed import long_drive, parts
-from fgslam.core.errors import FgslamError
+from benchmarks.tables import Table
+from fgslam.core.errors import ConfigError, FgslamError
+
+EVIDENCE: dict[str, Callable[[Path], Iterable[Table]]] = {
+    "paper_tables": lambda data: [*paper_views.tables(), *paper_loop.tables()],
+    "seeds": lambda data: [seeds.table()],
+    "person": lambda data: person.tables(),
+    "chess": chess.tables,
+    "variants": lambda data: [variants.table(data)],
+    "paired": lambda data: [variants.paired_table()],
+    "real": lambda data: [real.table(data)],
+    "noise": lambda data: noise.tables(),
+    "lasting": lambda data: lasting.tables(),
+    "visits": lambda data: visits.tables(),
+    "unmapped": lambda data: unmapped.tables(),
+    "recognised": recognised.tables,
+}
+"""Sets of tables by name; each is called with the folder of the real recordings."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit status: 0, or 2 on a user's mistake."""
     given = _parser().parse_args(arguments)
     try:
-        if given.what == "pages":
-            write_pages()
-        elif given.what == "speed":
-            _write_ratios(parts.measure(given.part, given.frames), given.out or "bench.json")
-        elif given.what == "long_drive":
-            _write_ratios(long_drive.ratios_beside_batch(), given.out or "bench_long.json")
-        else:
-            _print_tables(given.what, given.data, given.out)
+        _do(given)
     except FgslamError as error:
         say(f"error: {error}")
         return 2
@@ -41,8 +65,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    names = ("pages", "speed", "long_drive", *sorted(EVIDENCE))
+    names = ("pages", "keep", "speed", "long_drive", *sorted(EVIDENCE))
     parser.add_argument("what", choices=names, metavar="NAME", help=", ".join(names))
+    parser.add_argument("path", type=Path, nargs="?", help="keep: run folder or file of --out")
     parser.add_argument("--out", type=Path, help="write the numbers as JSON to this file")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
     parser.add_argument("--frames", type=int, default=2000, help="speed: frames over images")
@@ -51,19 +76,35 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _write_ratios(ratios: Mapping[str, float], path: str | Path) -> None:
-    Path(path).write_text(json.dumps(ratios, indent=2) + "\n", encoding="utf-8")
+def _do(given: argparse.Namespace) -> None:
+    if given.what == "pages":
+        write_pages()
+    elif given.what == "keep":
+        if given.path is None:
+            raise ConfigError("keep what? give a run folder, or a file that --out has written")
+        say(f"kept {keep(given.path)}; now `python -m benchmarks pages`")
+    elif given.what == "speed":
+        _write_ratios(parts.measure(given.part, given.frames), given.out or Path("bench.json"))
+    elif given.what == "long_drive":
+        _write_ratios(long_drive.ratios_beside_batch(), given.out or Path("bench_long.json"))
+    else:
+        _print_tables(given.what, given.data, given.out)
+
+
+def _write_ratios(ratios: Mapping[str, float], path: Path) -> None:
+    _write(path, ratios)
     parts.show(ratios)
 
 
 def _print_tables(name: str, data: Path, out: Path | None) -> None:
     tables = tuple(EVIDENCE[name](data))
-    rows = tuple(BOUNDS[name](tables)) if name in BOUNDS else ()
-    parts_shown = [table.markdown() for table in tables]
-    sys.stdout.write("\n".join([*parts_shown, *(bounds(rows) if rows else ())]) + "\n")
+    sys.stdout.write("\n".join(table.markdown() for table in tables))
     if out is not None:
-        section = Section(name, (f"python -m benchmarks {name}",), rows=rows, tables=tables)
-        out.write_text(json.dumps(section_as_json(section), indent=1) + "\n", encoding="utf-8")
+        _write(out, {table.title: table.as_columns() for table in tables})
+
+
+def _write(path: Path, numbers: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

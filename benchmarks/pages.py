@@ -6,12 +6,14 @@ import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+from benchmarks.measured import stored
 from benchmarks.rows import RESULTS, Record, Row, Section, load_record, shown_bound, shown_number
 from benchmarks.tables import Cell, Table, shown
 
 PAGES = Path(__file__).parents[1] / "docs" / "results"
 WIDTH = 118
 _NOTE = "<!-- Made by `python -m benchmarks pages` from benchmarks/results/{}.json: edit that. -->"
+_BY_HAND = "by hand"
 _WORDS = {True: "met", False: "**missed**", None: ""}
 
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -86,33 +88,54 @@ def _overview(record: Record) -> list[str]:
 
 def page(record: Record) -> str:
     """One page: each section with its command, bounds and tables."""
-    lines = [f"# {record.title}", "", _NOTE.format(record.name), ""]
+    lines = [f"# {record.title}", "", _NOTE.format(record.name)]
     for paragraph in record.text:
-        lines += [*_wrapped(paragraph), ""]
-    lines.append(f"Measured with fgslam {record.version} on {record.date}.")
+        lines += ["", *_wrapped(paragraph)]
     for section in record.sections:
-        lines += ["", f"## {section.title}", "", *_section(section)]
+        lines += ["", f"## {section.title}", "", *_section(section, record)]
     return _joined(lines)
 
 
-def _section(section: Section) -> Iterator[str]:
+def _section(section: Section, record: Record) -> Iterator[str]:
     for paragraph in section.text:
         yield from (*_wrapped(paragraph), "")
+    yield from (*_wrapped(_how(section, record)), "")
     if section.commands:
         yield from ("```sh", *_continued(section.commands), "```", "")
+    mixed = any(section.sources)
     if section.rows:
-        yield from (*bounds(section.rows), "")
+        yield from (*_bounds(section.rows, mixed), "")
     for table in section.tables:
-        if table.title:
-            yield from (f"**{table.title}**", "")
+        marked = f" ({_BY_HAND})" if mixed and "" in table.sources else ""
+        if table.title or marked:
+            yield from (f"**{table.title}{marked}**".replace("** (", "**("), "")
         yield from (*fitted(table), "")
         for note in table.notes:
             yield from (*_wrapped(note), "")
 
 
-def bounds(rows: Iterable[Row]) -> list[str]:
+def _how(section: Section, record: Record) -> str:
+    """When the numbers were measured, and whether the page computes them or a person wrote them."""
+    by_hand = f"{_BY_HAND} on {record.date} with fgslam {record.version}"
+    kept = {name: stored(name) for name in section.sources if name}
+    if not kept:
+        return f"Measured {by_hand}:" if section.commands else f"Measured {by_hand}."
+    files = ", ".join(f"`{name}` ({kept[name].date})" for name in kept)
+    rest = f" What is marked was measured {by_hand}." if "" in section.sources else ""
+    return f"Computed from `benchmarks/measured`: {files}.{rest}"
+
+
+def _bounds(rows: Iterable[Row], mixed: bool) -> list[str]:
     """Numbers beside their bounds, met or missed, as a Markdown table."""
-    cells = [(r.name, shown_number(r), shown_bound(r), _WORDS[r.met]) for r in rows]
+    cells = [
+        (
+            r.name,
+            shown_number(r) + (f" ({_BY_HAND})" if mixed and not r.source else ""),
+            shown_bound(r),
+            _WORDS[r.met],
+        )
+        for r in rows
+    ]
     return grid(("", "measured", "bound", ""), cells)
 
 

@@ -1,16 +1,18 @@
-"""What a benchmark measured: numbers beside their bounds, tables, and the command of each."""
+"""Pages of results before they are written: numbers beside their bounds, tables, commands."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from benchmarks.tables import Table, shown
+from benchmarks.measured import FORMULA, computed, value_at
+from benchmarks.tables import Cell, Table, shown
 
 RESULTS = Path(__file__).parent / "results"
-"""Folder of the committed measurements, one file a page."""
+"""Folder of what pages say and of their bounds, one file a page."""
 
 Relation: TypeAlias = Literal["<=", "<", ">=", ">"]
 
@@ -29,6 +31,7 @@ class Row:
         unit: of number and bound; empty for ratios and counts.
         relation: how the number must stand to the bound.
         bound: None where nothing is required.
+        source: the stored measurement that it is computed from; empty for one written down by hand.
     """
 
     name: str
@@ -36,6 +39,7 @@ class Row:
     unit: str = ""
     relation: Relation = "<="
     bound: float | None = None
+    source: str = ""
 
     def __post_init__(self) -> None:
         """Raises TypeError where the measured value is not a number."""
@@ -73,6 +77,12 @@ class Section:
     text: tuple[str, ...] = ()
     rows: tuple[Row, ...] = ()
     tables: tuple[Table, ...] = ()
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Stored measurements that rows and tables are computed from; empty ones by hand."""
+        given = [row.source for row in self.rows] + [s for t in self.tables for s in t.sources]
+        return tuple(dict.fromkeys(given))
 
 
 @dataclass(frozen=True)
@@ -117,29 +127,39 @@ def load_record(path: Path) -> Record:
 
 
 def _section(given: dict[str, Any]) -> Section:
-    rows = tuple(Row(**row) for row in given.pop("rows", ()))
-    tables = tuple(
-        Table(
-            table.get("title", ""),
-            tuple(table["columns"]),
-            [tuple(row) for row in table["rows"]],
-            tuple(table.get("notes", ())),
-        )
-        for table in given.pop("tables", ())
-    )
+    rows = tuple(map(_row, given.pop("rows", ())))
+    tables = tuple(map(_table, given.pop("tables", ())))
     lists: dict[str, Any] = {key: tuple(given.pop(key, ())) for key in ("commands", "text")}
     return Section(rows=rows, tables=tables, **lists, **given)
 
 
-def section_as_json(section: Section) -> dict[str, Any]:
-    """The form in which :func:`load_record` reads a section."""
-    rows = [{k: v for k, v in vars(row).items() if v not in ("", None)} for row in section.rows]
-    return {
-        "title": section.title,
-        "commands": list(section.commands),
-        "rows": rows,
-        "tables": [table.as_json() for table in section.tables],
-    }
+def _row(given: dict[str, Any]) -> Row:
+    if "from" not in given:
+        return Row(**given)
+    rest = {key: value for key, value in given.items() if key not in FORMULA}
+    return Row(measured=computed(given), source=_source(given), **rest)
+
+
+def _table(given: dict[str, Any]) -> Table:
+    """A table: whole from a measurement (`from`, perhaps some `columns` only), or cell by cell."""
+    title, notes = given.get("title", ""), tuple(given.get("notes", ()))
+    if "from" in given:
+        stored = value_at(given["from"])
+        columns = tuple(given.get("columns", stored))
+        rows = list(zip(*(stored[column] for column in columns), strict=True))
+        return Table(title, columns, rows, notes, (_source(given),))
+    cells = [cell for row in given["rows"] for cell in row if isinstance(cell, dict)]
+    rows = [tuple(map(_cell, row)) for row in given["rows"]]
+    sources = tuple(dict.fromkeys(map(_source, cells))) or ("",)
+    return Table(title, tuple(given["columns"]), rows, notes, sources)
+
+
+def _cell(given: Cell | dict[str, Any]) -> Cell:
+    return computed(given) if isinstance(given, dict) else given
+
+
+def _source(given: Mapping[str, Any]) -> str:
+    return str(given["from"].split("/")[0])
 
 
 def shown_bound(row: Row) -> str:
@@ -150,11 +170,11 @@ def shown_bound(row: Row) -> str:
 
 
 def shown_number(row: Row) -> str:
-    """Measured number with its unit."""
-    number = f"{row.measured:,.0f}" if abs(row.measured) >= 1e4 else shown_exactly(row.measured)
+    """Measured number with its unit: as it was written down, or three digits of a computed one."""
+    if abs(row.measured) >= 1e4:
+        number = f"{row.measured:,.0f}"
+    elif isinstance(row.measured, int) or (row.source and abs(row.measured) >= 1e-3):
+        number = shown(row.measured)
+    else:
+        number = f"{row.measured:.12g}"
     return f"{number} {row.unit}".strip()
-
-
-def shown_exactly(value: float) -> str:
-    """The number as it was written down, with no digit added or lost."""
-    return shown(value) if isinstance(value, int) else f"{value:.12g}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 Cell: TypeAlias = str | int | float | None
 
@@ -14,12 +14,16 @@ _DIGITS = 3
 
 @dataclass(frozen=True)
 class Table:
-    """One table: floats are kept in full for JSON and shown with three digits."""
+    """One table: floats are kept in full for JSON and shown with three digits.
+
+    ``sources`` names the stored measurements that a page's table is computed from.
+    """
 
     title: str
     columns: tuple[str, ...]
     rows: list[tuple[Cell, ...]]
     notes: tuple[str, ...] = ()
+    sources: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Every row fills every column. Raises ValueError otherwise."""
@@ -41,15 +45,9 @@ class Table:
         lines += [""] + [f"- {note}" for note in self.notes]
         return "\n".join(lines).rstrip() + "\n"
 
-    def as_json(self) -> dict[str, Any]:
-        """Rows as lists, not finite numbers as null."""
-        rows = [[_finite(cell) for cell in row] for row in self.rows]
-        return {
-            "title": self.title,
-            "columns": list(self.columns),
-            "rows": rows,
-            "notes": list(self.notes),
-        }
+    def as_columns(self) -> dict[str, list[Cell]]:
+        """Cells of each column, not finite numbers as None."""
+        return {name: [_finite(cell) for cell in self.column(name)] for name in self.columns}
 
 
 def shown(cell: Cell) -> str:

@@ -196,20 +196,20 @@ def _jump_table(run: PersonRun, without: tuple[FloatArray, float]) -> Table:
     plain = np.linalg.norm(np.diff(errors, axis=0), axis=1)
     first = min(life.born for life in run.lives)
     walk = slice(max(first - 1, 0), run.last + 1)
-    columns = ("", "with the person", "without", "bound")
+    columns = ("", "with the person", "without")
     rows: list[tuple[Cell, ...]] = [
         _centimetres("largest jump, whole drive, cm", run.jumps_m, plain, slice(None)),
         _centimetres(
             f"largest jump, frames {first} to {run.last + 1}, cm", run.jumps_m, plain, walk
         ),
-        ("ATE cm", 100.0 * run.ate_m, 100.0 * ate, "-"),
+        ("ATE cm", 100.0 * run.ate_m, 100.0 * ate),
     ]
     note = "a jump is the change of the position error from one frame to the next"
     return Table("Pose while a person walks through the view", columns, rows, (note,))
 
 
 def _centimetres(name: str, jumps: FloatArray, plain: FloatArray, part: slice) -> tuple[Cell, ...]:
-    return (name, 100.0 * float(jumps[part].max()), 100.0 * float(plain[part].max()), "<= 5")
+    return (name, 100.0 * float(jumps[part].max()), 100.0 * float(plain[part].max()))
 
 
 def _life_table(runs: dict[str, PersonRun]) -> Table:

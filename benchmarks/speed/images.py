@@ -23,6 +23,7 @@ import numpy as np
 from benchmarks.runs import EXPERIMENTS
 from fgslam.cli.console import progress_bar
 from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
@@ -38,6 +39,9 @@ from fgslam.slam.pipeline import SlamPipeline
 from fgslam.slam.recorder import RunRecorder
 
 BLOCK = 40
+LEAST = 3 * BLOCK + 1
+"""Frames that fill four blocks: two of either kind, the first of which warms up."""
+
 LIMITS = {
     "whole_loop_over_sift": 1.3,
     "all_but_sift_over_sift": 0.2,
@@ -254,7 +258,15 @@ def ratios_of(series: Series) -> dict[str, float]:
 
 
 def over_images(frames: int) -> dict[str, float]:
-    """The whole system over images, beside raw SIFT."""
+    """The whole system over images, beside raw SIFT.
+
+    Raises:
+        ConfigError: there are too few frames to compare early blocks with late ones.
+    """
+    if frames < LEAST:
+        raise ConfigError(
+            f"{frames} frames over images are too few to compare; give {LEAST} or more"
+        )
     config = load_config(EXPERIMENTS / "lab_laps.yaml", [f"dataset.stop={frames}"])
     with progress_bar() as tell:
         sequence = open_sequence(config, lambda done, total: tell("rendering", done, total))

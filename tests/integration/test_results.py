@@ -27,7 +27,7 @@ from fgslam.evaluation.trajectory import Alignment
 # The instruments themselves: fast
 
 
-def test_table_as_markdown_and_json() -> None:
+def test_table_as_markdown_and_columns() -> None:
     table = Table("T", ("what", "value"), [("a", 0.01234), ("b", None), ("c", 7)], ("why",))
     assert table.markdown().splitlines() == [
         "### T", "", "| what | value |", "| --- | --- |", "| a | 0.0123 |", "| b | - |",
@@ -35,8 +35,8 @@ def test_table_as_markdown_and_json() -> None:
     ]  # fmt: skip
     assert table.column("value") == [0.01234, None, 7]
     nan = Table("N", ("value",), [(float("nan"),)])
-    assert table.as_json()["rows"] == [["a", 0.01234], ["b", None], ["c", 7]]
-    assert nan.as_json()["rows"] == [[None]]
+    assert table.as_columns() == {"what": ["a", "b", "c"], "value": [0.01234, None, 7]}
+    assert nan.as_columns() == {"value": [None]}
 
 
 def test_table_refuses_a_row_of_another_length() -> None:

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 import benchmarks.__main__ as runner
-from benchmarks.bounds import BOUNDS
-from benchmarks.catalogue import EVIDENCE
-from benchmarks.pages import PAGES, WIDTH, all_pages, fitted
+from benchmarks.__main__ import EVIDENCE
+from benchmarks.measured import keep, stored
+from benchmarks.pages import PAGES, WIDTH, all_pages, fitted, page
 from benchmarks.rows import (
     RESULTS,
     RecordError,
@@ -20,7 +20,7 @@ from benchmarks.rows import (
     shown_bound,
     shown_number,
 )
-from benchmarks.speed import parts
+from benchmarks.speed import images, parts
 from benchmarks.tables import Table
 
 
@@ -87,14 +87,11 @@ def test_every_name_prints_its_tables_and_writes_them(
         return [Table("T", ("what", "value"), [("a", 0.5)])]
 
     monkeypatch.setitem(EVIDENCE, name, measured)
-    monkeypatch.delitem(runner.BOUNDS, name, raising=False)
     out = tmp_path / "t.json"
     assert runner.main([name, "--data", str(tmp_path), "--out", str(out)]) == 0
     assert given == [tmp_path]
     assert "| a | 0.500 |" in capsys.readouterr().out
-    written = json.loads(out.read_text())
-    assert written["commands"] == [f"python -m benchmarks {name}"]
-    assert written["tables"][0]["rows"] == [["a", 0.5]]
+    assert json.loads(out.read_text()) == {"T": {"what": ["a"], "value": [0.5]}}
 
 
 def test_a_missing_recording_is_one_line_and_status_2(
@@ -127,18 +124,96 @@ def test_overview_counts_what_is_missed() -> None:
     )
 
 
-def test_bounds_of_the_paper_s_drive_are_read_from_its_tables() -> None:
-    ends = Table("End pose", ("distance cm", "yaw deg", "ATE cm"), [(4.4, 0.3, None), (6, -0.6, 1)])
-    columns = ("landmarks", "matched to the map: 5 %", "stereo precision")
-    landmarks = Table("Landmarks and matches", columns, [(3590, "40", None), (2001, 39, 0.97)])
-    rows = BOUNDS["paper_tables"]([ends, landmarks])
-    assert [row.met for row in rows] == [False, False, True, False, True, True]
+@pytest.fixture
+def measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the stored numbers of one run and of one set of tables."""
+    run = tmp_path / "lab"
+    run.mkdir()
+    metrics = {"estimators": {"isam2": {"ate_rmse_m": 0.0123456, "update_ms": {"median": 3.0}}},
+               "name": "lab", "frames": 3, "remark": None, "notes": ["a folder"]}  # fmt: skip
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    tables = tmp_path / "seeds.json"
+    tables.write_text(json.dumps({"Seeds": {"seed": [1, "worst"], "ATE cm": [-0.5, 2.0]}}))
+    folder = tmp_path / "measured"
+    folder.mkdir()
+    monkeypatch.setattr("benchmarks.measured.MEASURED", folder)
+    for path in (run, tables):
+        keep(path)
+    return folder
 
 
-def test_bounds_of_the_seeds_take_the_worst() -> None:
-    columns = ("seed", "ATE cm", "end cm", "yaw deg", "matched, 5 %", "landmarks", "precision")
-    table = Table("seeds", columns, [
-        (1, 0.1, 0.1, 0.1, 90, 9000, 1.0), ("worst", 2.0, 5.0, 0.6, 40, 2000, 0.97),
-        ("bound", "a", "b", "c", "d", "e", "f"),
-    ])  # fmt: skip
-    assert [row.met for row in BOUNDS["seeds"]([table])] == [False, True, False, True, False, True]
+def test_of_a_run_its_repeatable_numbers_are_kept(measured: Path) -> None:
+    assert stored("lab").numbers == {
+        "estimators": {"isam2": {"ate_rmse_m": 0.0123456}},
+        "frames": 3,
+    }
+
+
+def written(path: Path, section: dict[str, object]) -> Path:
+    record = {"title": "T", "version": "1", "date": "2026-01-01", "sections": [section]}
+    path.write_text(json.dumps(record))
+    return path
+
+
+def test_pages_compute_numbers_from_stored_measurements(measured: Path, tmp_path: Path) -> None:
+    ate = "lab/estimators/isam2/ate_rmse_m"
+    section = {
+        "title": "S", "commands": ["measure"],
+        "rows": [
+            {"name": "ATE", "from": ate, "times": 100, "unit": "cm", "relation": "<", "bound": 1},
+            {"name": "ratio", "from": ate, "over": ate, "relation": "<=", "bound": 1},
+            {"name": "size", "from": "seeds/Seeds/ATE cm/0", "size": True},
+            {"name": "written down", "measured": 7.25},
+        ],
+        "tables": [{"from": "seeds/Seeds", "columns": ["ATE cm", "seed"]},
+                   {"columns": ["", "cm"], "rows": [["lab", {"from": ate, "times": 100}]]}],
+    }  # fmt: skip
+    record = load_record(written(tmp_path / "page.json", section))
+    rows = record.sections[0].rows
+    assert [row.measured for row in rows] == [1.23456, 1.0, 0.5, 7.25]
+    assert [row.met for row in rows[:2]] == [False, True]
+    text = page(record)
+    assert "| ATE | 1.23 cm | < 1 cm | **missed** |" in text
+    assert "| written down | 7.25 (by hand) |" in text
+    assert "| 2.00 | worst |" in text
+    assert "| lab | 1.23 |" in text
+    assert "Computed from `benchmarks/measured`: `lab` (" in text
+    assert "measured by hand on 2026-01-01 with fgslam 1." in " ".join(text.split())
+
+
+def test_numbers_without_a_measurement_are_said_to_be_by_hand(tmp_path: Path) -> None:
+    section = {"title": "S", "rows": [{"name": "ATE", "measured": 1.0}]}
+    text = page(load_record(written(tmp_path / "page.json", section)))
+    assert "Measured by hand on 2026-01-01 with fgslam 1." in text
+    assert "| ATE | 1 |" in text
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("lab/estimators/ekf", "has no 'ekf'"),
+        ("lab/estimators", "is not a number"),
+        ("seeds/Seeds/ATE cm/2", "has no '2'"),
+        ("nothing/x", "no measurement .*nothing.json"),
+    ],
+)
+def test_a_number_that_is_not_stored_is_refused(
+    measured: Path, tmp_path: Path, path: str, message: str
+) -> None:
+    section = {"title": "S", "rows": [{"name": "ATE", "from": path}]}
+    with pytest.raises(RecordError, match=message):
+        load_record(written(tmp_path / "page.json", section))
+
+
+def test_keep_needs_something_to_keep(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert runner.main(["keep"]) == 2
+    assert runner.main(["keep", str(tmp_path / "none.json")]) == 2
+    assert capsys.readouterr().err.count("error: ") == 2
+
+
+def test_too_few_frames_over_images_are_refused_in_one_line(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    asked = ["speed", "--part", "images", "--frames", str(images.LEAST - 1)]
+    assert runner.main(asked) == 2
+    assert f"give {images.LEAST} or more" in capsys.readouterr().err
