@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fgslam.core import __version__
 from fgslam.core.errors import DatasetError
-from fgslam.core.version import __version__
 
 MEASURED = Path(__file__).parent / "measured"
 """Folder of the stored measurements."""
