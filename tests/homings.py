@@ -11,8 +11,8 @@ from fgslam.core.homing import HomingStart, HomingTruth, TrackedBearings, TwoVie
 from fgslam.frontend.homing.local_map import make_local_map
 from fgslam.frontend.homing.ransac import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.worlds.simulated.bearing_settings import SimulatedBearingsSettings
 from fgslam.worlds.simulated.bearings import simulate_homing
+from fgslam.worlds.simulated.settings import SimulatedBearingsSettings
 
 LEVEL = HomingVectorSettings(tilt_sigma_deg=0.0, height_sigma=0.0, max_direction_sigma_deg=15.0)
 """The simulated camera neither tilts nor rises; sparse rooms are to be answered, too."""

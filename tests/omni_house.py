@@ -6,10 +6,8 @@ import numpy as np
 
 from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.arrays import FloatArray
-from fgslam.worlds.rendering.lighting import flat_light
-from fgslam.worlds.rendering.patches import Surface, Thing, rectangle, stack
-from fgslam.worlds.rendering.raycaster import RayCaster
-from fgslam.worlds.rendering.scene import Layer
+from fgslam.worlds.rendering.patches import RayCaster, Surface, Thing, rectangle, stack
+from fgslam.worlds.rendering.scene import Layer, flat_light
 from fgslam.worlds.rendering.texture_bank import ColourBank
 
 PANORAMA = Equirectangular(512, 256)

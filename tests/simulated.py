@@ -24,7 +24,7 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import replay_step
-from fgslam.worlds.simulated.identities import IdentityBook
+from fgslam.worlds.simulated.landmarks import IdentityBook
 
 RIG = CameraRig(
     width=320,

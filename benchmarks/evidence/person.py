@@ -20,7 +20,7 @@ from fgslam.core.recordings import Sequence
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.evaluation.trajectory import to_estimate_world
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
-from fgslam.worlds.lab.settings import RenderedLabSettings
+from fgslam.worlds.lab_settings import RenderedLabSettings
 
 JUMP_BOUND_M = 0.05
 _NAME = "person"

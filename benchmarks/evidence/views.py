@@ -17,9 +17,8 @@ from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.runs.config import ExperimentConfig
 from fgslam.worlds.driving import wheel_odometry
-from fgslam.worlds.lab.places import PlaceChoice
-from fgslam.worlds.lab.settings import RenderedLabSettings
-from fgslam.worlds.lab.world import World, camera_offsets, open_room
+from fgslam.worlds.lab import PlaceChoice, World, camera_offsets, open_room
+from fgslam.worlds.lab_settings import RenderedLabSettings
 from fgslam.worlds.rendering.image_effects import apply_effects
 
 FORWARD_M = 0.10

@@ -31,8 +31,8 @@ from fgslam.homing.controller import HomingController
 from fgslam.homing.front_end import HomingFrontEnd
 from fgslam.homing.image_front_end import FrontEndSettings, ImageFrontEnd
 from fgslam.homing.settings import HomingControlSettings
-from fgslam.worlds.house.settings import HousePathSettings, OmniHouseSettings
-from fgslam.worlds.house.world import OmniWorld
+from fgslam.worlds.house import OmniWorld
+from fgslam.worlds.house_settings import HousePathSettings, OmniHouseSettings
 
 LIMITS = {
     "homing_track_over_raw_klt": 2.0,

@@ -23,10 +23,17 @@ from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
 from fgslam.worlds.driving import wheel_odometry
 from fgslam.worlds.driving.paths import PosesInTime
-from fgslam.worlds.lab.person import Stance, make_walk
-from fgslam.worlds.lab.places import PlaceChoice, first_pose, plan_in_place
-from fgslam.worlds.lab.settings import LabSettings, RenderedLabSettings
-from fgslam.worlds.lab.world import World, camera_offsets, make_rig, open_room
+from fgslam.worlds.lab import (
+    PlaceChoice,
+    World,
+    camera_offsets,
+    first_pose,
+    make_rig,
+    open_room,
+    plan_in_place,
+)
+from fgslam.worlds.lab_settings import LabSettings, RenderedLabSettings
+from fgslam.worlds.people import Stance, make_walk
 from fgslam.worlds.rendering.cache import RenderCache, content_hash
 from fgslam.worlds.rendering.image_effects import apply_effects, is_blocked
 from fgslam.worlds.rendering.scene import Body

@@ -11,7 +11,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT, FrameSelection
-from fgslam.worlds.lab.settings import RenderedLabSettings
+from fgslam.worlds.lab_settings import RenderedLabSettings
 from fgslam.worlds.simulated.settings import Correlation, SimulatedMeasurementsSettings
 
 __all__ = [

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.worlds.simulated.bearing_settings import SimulatedBearingsSettings, with_outliers
 from fgslam.worlds.simulated.bearings import SimulatedHoming, simulate_homing
+from fgslam.worlds.simulated.settings import SimulatedBearingsSettings, with_outliers
 
 
 def open_simulated_homing(

@@ -16,8 +16,8 @@ from fgslam.cli.main import app
 from fgslam.datasets.omni.house import open_house
 from fgslam.homing.image_front_end import DRIVING
 from fgslam.homing.settings import AvoidanceSettings, HomingBehaviourSettings
-from fgslam.worlds.house.settings import HousePanoramaSettings, HousePathSettings, OmniHouseSettings
-from fgslam.worlds.house.world import OmniWorld
+from fgslam.worlds.house import OmniWorld
+from fgslam.worlds.house_settings import HousePanoramaSettings, HousePathSettings, OmniHouseSettings
 
 STEPS, DT, SEED = 10, 0.1, 0
 QUIET = {"pictures": 0, "report": False}

@@ -19,7 +19,7 @@ from fgslam.backend.homing.settings import (
     HomingGraphSettings,
 )
 from fgslam.evaluation.homing import HomingErrors, homing_errors, summarise_homings
-from fgslam.worlds.simulated.bearing_settings import SimulatedBearingsSettings, with_outliers
+from fgslam.worlds.simulated.settings import SimulatedBearingsSettings, with_outliers
 
 GRAPH = HomingGraphSettings()
 

@@ -14,7 +14,7 @@ from fgslam.core.errors import ConfigError, FrameError, MissingDependencyError
 from fgslam.core.recordings import Sequence
 from fgslam.datasets import rendered_lab
 from fgslam.datasets.rendered_lab import RenderedLabSequence
-from fgslam.worlds.lab.settings import (
+from fgslam.worlds.lab_settings import (
     LabBlurSettings,
     LabDriveSettings,
     LabEffectsSettings,

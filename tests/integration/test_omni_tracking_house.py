@@ -14,8 +14,8 @@ from fgslam.frontend.homing.bearing_tracking import BearingTracker
 from fgslam.frontend.homing.matching import match_features
 from fgslam.frontend.homing.trackable_points import move_to_trackable
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
-from fgslam.worlds.house.settings import HousePathSettings, OmniHouseSettings
-from fgslam.worlds.house.world import CAMERA_HEIGHT_M, OmniWorld
+from fgslam.worlds.house import CAMERA_HEIGHT_M, OmniWorld
+from fgslam.worlds.house_settings import HousePathSettings, OmniHouseSettings
 
 SETTINGS = OmniTrackingSettings()
 STEPS = 20

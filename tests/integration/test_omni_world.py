@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from fgslam.worlds.driving.wheelchair import RADIUS_M
-from fgslam.worlds.house.settings import (
+from fgslam.worlds.house import OmniWorld
+from fgslam.worlds.house_settings import (
     HouseLightSettings,
     HousePanoramaSettings,
     HousePathSettings,
     HouseTiltSettings,
     OmniHouseSettings,
 )
-from fgslam.worlds.house.world import OmniWorld
 
 SETTINGS = OmniHouseSettings(path=HousePathSettings(legs=3, spacing_m=2.0))
 DISTURBED = replace(SETTINGS, people=3, tilt=HouseTiltSettings(constant_deg=1.0, sway_deg=1.0))

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from fgslam.core.errors import ConfigError
 from fgslam.worlds.driving.paths import plan_drive
-from fgslam.worlds.lab.settings import LabDriveSettings
+from fgslam.worlds.lab_settings import LabDriveSettings
 
 coordinate = st.floats(-3.5, 3.5, allow_nan=False, width=32)
 points = st.lists(st.tuples(coordinate, coordinate), min_size=3, max_size=6)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from fgslam.worlds.house.settings import OmniHouseSettings
-from fgslam.worlds.house.world import OmniWorld
+from fgslam.worlds.house import OmniWorld
+from fgslam.worlds.house_settings import OmniHouseSettings
 
 
 def open_house(settings: OmniHouseSettings, seed: int) -> OmniWorld:

@@ -12,7 +12,6 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.worlds.buildings import furniture
-from fgslam.worlds.buildings.fitting import FittingStyle, RoomFitter
 from fgslam.worlds.buildings.floor_plan import (
     HALF_WALL,
     HEIGHT,
@@ -24,9 +23,9 @@ from fgslam.worlds.buildings.floor_plan import (
     lamp_things,
     shell,
 )
-from fgslam.worlds.rendering.colour_textures import PAINTINGS
+from fgslam.worlds.buildings.furniture import FittingStyle, RoomFitter
 from fgslam.worlds.rendering.patches import Patch, Surface, Thing, placed
-from fgslam.worlds.rendering.texture_library import PHOTOGRAPHS, POSTERS
+from fgslam.worlds.rendering.texture_library import PAINTINGS, PHOTOGRAPHS, POSTERS
 
 _FLOOR_TILE_M = 5.3
 """No whole number of legs: with tiles of 4 m a leg of 4 m shows the same floor at the same place,

@@ -11,7 +11,6 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.worlds.buildings import furniture
-from fgslam.worlds.buildings.fitting import FittingStyle, RoomFitter
 from fgslam.worlds.buildings.floor_plan import (
     FloorPlan,
     Opening,
@@ -21,8 +20,9 @@ from fgslam.worlds.buildings.floor_plan import (
     lamp_things,
     shell,
 )
-from fgslam.worlds.buildings.wall_textures import PICTURES
+from fgslam.worlds.buildings.furniture import FittingStyle, RoomFitter
 from fgslam.worlds.rendering.patches import Patch, Surface, Thing, placed
+from fgslam.worlds.rendering.texture_library import PICTURES
 
 WIDTH, DEPTH = 36.0, 24.0
 _DOOR_WIDTH, _FIRE_DOOR_WIDTH = 1.3, 1.9

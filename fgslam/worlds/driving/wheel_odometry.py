@@ -17,7 +17,7 @@ import numpy as np
 from fgslam.core import geometry
 from fgslam.core.arrays import FloatArray
 from fgslam.core.measurements import Odometry
-from fgslam.worlds.lab.settings import WheelOdometrySettings
+from fgslam.worlds.lab_settings import WheelOdometrySettings
 
 _YAW, _ALONG = 2, 3
 

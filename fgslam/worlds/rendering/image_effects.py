@@ -1,6 +1,6 @@
 """Effects of a real camera on rendered images: gain, noise, and a cover before the lens.
 
-Each frame has its own random generator, so that any frame can be had alone and always the same.
+Each image has its own random generator, so that any can be had alone and always the same.
 """
 
 from __future__ import annotations
@@ -9,9 +9,22 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.core.arrays import Image
-from fgslam.worlds.lab.settings import LabEffectsSettings, LabExposureSettings
+from fgslam.worlds.lab_settings import LabEffectsSettings, LabExposureSettings
+
+Float32 = npt.NDArray[np.float32]
 
 _COVER_SEED = 7
+
+
+def noisy(levels: Float32, sigma: float, seed: tuple[int, ...]) -> Float32:
+    """Levels with Gaussian noise; the seed names the image, so that it is always the same."""
+    if sigma == 0.0:
+        return levels
+    rng = np.random.Generator(np.random.SFC64(seed))
+    noise = rng.standard_normal(levels.shape, dtype=np.float32)
+    noise *= np.float32(sigma)
+    noise += levels
+    return noise
 
 
 def exposure_gain(settings: LabExposureSettings | None, index: int) -> float:
@@ -28,7 +41,7 @@ def is_blocked(settings: LabEffectsSettings, index: int) -> bool:
     return blocked is not None and blocked[0] <= index < blocked[1]
 
 
-def cover(shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
+def cover(shape: tuple[int, ...]) -> Float32:
     """A dark cloth right before the lens: nearly black, blurred blotches; images (k, h, w)."""
     rng = np.random.default_rng(_COVER_SEED)
     coarse = rng.random((shape[0], 4, 5)).astype(np.float32)
@@ -61,11 +74,7 @@ def apply_effects(
         grey = clean.astype(np.float32)
     if gain != 1.0:
         grey *= np.float32(gain)
-    if settings.noise_grey > 0.0:
-        rng = np.random.Generator(np.random.SFC64([seed, index, 0]))
-        noise = rng.standard_normal(grey.shape, dtype=np.float32)
-        noise *= np.float32(settings.noise_grey)
-        grey += noise
+    grey = noisy(grey, settings.noise_grey, (seed, index, 0))
     # Adding one half before the cut to integers rounds; it is faster than np.rint and clip.
     grey += np.float32(0.5)
     np.clip(grey, 0.0, 255.0, out=grey)

@@ -15,7 +15,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.homing import BearingMatches, FeatureKind, HomingTruth, TrackedBearings
 from fgslam.core.planar import bearings, rotation, wrap
-from fgslam.worlds.simulated.bearing_settings import SimulatedBearingsSettings
+from fgslam.worlds.simulated.settings import SimulatedBearingsSettings
 
 _CORRELATION_S = 0.5  # of the disturbances of the drive
 _LOWEST_M, _HIGHEST_M = 0.2, 1.5  # of points above or below the camera: furniture and ceiling

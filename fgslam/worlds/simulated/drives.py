@@ -19,7 +19,7 @@ from fgslam.worlds.driving.paths import (
     planar_poses,
     straights_and_turns,
 )
-from fgslam.worlds.lab.settings import LabDriveSettings
+from fgslam.worlds.lab_settings import LabDriveSettings
 from fgslam.worlds.simulated.settings import MeasurementDriveSettings
 
 CORRIDOR_WIDTH_M = 2.4

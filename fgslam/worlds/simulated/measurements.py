@@ -18,11 +18,10 @@ from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.measurements import Increment, Observations, Odometry
 from fgslam.core.sensors import CameraRig, measurement_map, pixel_model, vertical_to_horizontal
-from fgslam.worlds.lab.world import make_rig
+from fgslam.worlds.driving import wheel_odometry
+from fgslam.worlds.lab import make_rig
 from fgslam.worlds.simulated.drives import plan_measured_drive
-from fgslam.worlds.simulated.identities import IdentityBook, Sightings
-from fgslam.worlds.simulated.landmarks import LandmarkWorld, build_world
-from fgslam.worlds.simulated.odometry import simulate_odometry
+from fgslam.worlds.simulated.landmarks import IdentityBook, LandmarkWorld, Sightings, build_world
 from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 
 # Streams of random numbers, apart so that one imperfection does not redraw another's.
@@ -288,3 +287,29 @@ def _moved_points(settings: SimulatedMeasurementsSettings, world: LandmarkWorld)
     angle = rng.uniform(0.0, 2.0 * np.pi, size=len(world))
     shift = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(world))])
     return np.asarray(world.points + moved.distance_m * gone[:, None] * shift)
+
+
+# --------------------------------------------------------------------------------------------
+# Wheel odometry
+
+
+def simulate_odometry(
+    settings: SimulatedMeasurementsSettings, body: FloatArray, rng: np.random.Generator
+) -> list[Odometry]:
+    """Body motions between consecutive true poses (n, 4, 4): n - 1 of them.
+
+    Noise as stated times ``detection.noise_scale``; while ``odometry_fault`` lasts, true motions
+    are reported scaled (along their screw) under the same covariance.
+    """
+    noise_scale, fault = settings.detection.noise_scale, settings.odometry_fault
+    true = g.inverse(body[:-1]) @ body[1:]
+    out = []
+    for i, step in enumerate(wheel_odometry.simulate(settings.odometry, body, rng)):
+        noise = g.inverse(true[i]) @ step.motion
+        if noise_scale != 1.0:
+            noise = g.se3_exp(noise_scale * g.se3_log(noise))
+        motion = true[i]
+        if fault is not None and 0 <= i + 1 - fault.start < fault.frames:
+            motion = g.se3_exp(fault.scale * g.se3_log(motion))
+        out.append(Odometry(np.asarray(motion @ noise), step.covariance))
+    return out

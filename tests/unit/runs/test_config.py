@@ -15,7 +15,7 @@ from fgslam.frontend.places.settings import LoopSettings
 from fgslam.runs.config import ExperimentConfig, load_config, parse_config
 from fgslam.runs.config_models import TASKS
 from fgslam.runs.config_reading import accepted_at, read_mapping, typed_value
-from fgslam.worlds.lab.settings import RenderedLabSettings
+from fgslam.worlds.lab_settings import RenderedLabSettings
 
 EXPERIMENTS = [
     path

@@ -9,20 +9,18 @@ from fgslam.core.planar import between, wrap
 from fgslam.worlds.buildings.house import DEPTH, WIDTH, House, build_house, house_plan
 from fgslam.worlds.driving import wheelchair
 from fgslam.worlds.driving.floor_space import FloorSpace
-from fgslam.worlds.driving.range_scan import RangeSensor
 from fgslam.worlds.driving.reference_paths import PathPlanner
-from fgslam.worlds.driving.wheelchair import Wheelchair
-from fgslam.worlds.house.disturbances import CameraTilt, camera_pose, exposed, noisy
-from fgslam.worlds.house.people import Walker
-from fgslam.worlds.house.settings import (
+from fgslam.worlds.driving.wheelchair import RangeSensor, Wheelchair
+from fgslam.worlds.house import CameraTilt, camera_pose, exposed, make_house_camera
+from fgslam.worlds.house_settings import (
     HouseExposureSettings,
     HouseMirrorSettings,
     HouseTiltSettings,
     WheelchairSettings,
 )
-from fgslam.worlds.house.world import make_house_camera
-from fgslam.worlds.rendering.patches import PatchArrays, Surface, Thing, box, stack
-from fgslam.worlds.rendering.raycaster import RayCaster
+from fgslam.worlds.people import Walker
+from fgslam.worlds.rendering.image_effects import noisy
+from fgslam.worlds.rendering.patches import PatchArrays, RayCaster, Surface, Thing, box, stack
 
 EXACT = WheelchairSettings(
     speed_scale=0.0, turn_scale=0.0, pull_deg_m=0.0, slip_m_sqrt_m=0.0, slip_deg_sqrt_m=0.0

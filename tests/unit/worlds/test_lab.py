@@ -5,11 +5,10 @@ import pytest
 
 from fgslam.worlds.buildings.lab import HALF_SIDE, HEIGHT, build_lab
 from fgslam.worlds.driving.paths import plan_drive
-from fgslam.worlds.lab.person import across_view, person
-from fgslam.worlds.lab.settings import LabDriveSettings, LabPersonSettings, LabRigSettings
-from fgslam.worlds.lab.world import make_rig
-from fgslam.worlds.rendering.patches import Thing, stack
-from fgslam.worlds.rendering.raycaster import RayCaster
+from fgslam.worlds.lab import make_rig
+from fgslam.worlds.lab_settings import LabDriveSettings, LabPersonSettings, LabRigSettings
+from fgslam.worlds.people import across_view, person
+from fgslam.worlds.rendering.patches import RayCaster, Thing, stack
 from fgslam.worlds.rendering.texture_library import PHOTOGRAPHS, build_library, photograph
 from fgslam.worlds.rendering.textures import book_row
 

@@ -5,12 +5,10 @@ import pytest
 
 from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.cameras.omni.mirrors import HyperbolicMirror
-from fgslam.worlds.house.disturbances import camera_pose
-from fgslam.worlds.rendering.lighting import flat_light
-from fgslam.worlds.rendering.patches import Surface, Thing, box, stack
-from fgslam.worlds.rendering.raycaster import RayCaster
+from fgslam.worlds.house import camera_pose
+from fgslam.worlds.rendering.patches import RayCaster, Surface, Thing, box, stack
 from fgslam.worlds.rendering.renderer import Renderer, surface_points, visible
-from fgslam.worlds.rendering.scene import Body, Layer
+from fgslam.worlds.rendering.scene import Body, Layer, flat_light
 from fgslam.worlds.rendering.texture_bank import ColourBank, GreyBank
 from fgslam.worlds.rendering.views import OmniView
 from tests.omni_house import PANORAMA, plain, room

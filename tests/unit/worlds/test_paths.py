@@ -3,7 +3,7 @@ import pytest
 
 from fgslam.core.errors import ConfigError
 from fgslam.worlds.driving.paths import Drive, plan_drive
-from fgslam.worlds.lab.settings import LabDriveSettings
+from fgslam.worlds.lab_settings import LabDriveSettings
 
 SQUARE = ((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0))
 

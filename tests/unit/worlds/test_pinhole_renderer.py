@@ -3,11 +3,18 @@ import pytest
 from scipy import ndimage
 
 from fgslam.core import geometry
-from fgslam.worlds.rendering.lighting import flat_light
-from fgslam.worlds.rendering.patches import Surface, Thing, box, placed, prism, rectangle, stack
-from fgslam.worlds.rendering.raycaster import RayCaster
+from fgslam.worlds.rendering.patches import (
+    RayCaster,
+    Surface,
+    Thing,
+    box,
+    placed,
+    prism,
+    rectangle,
+    stack,
+)
 from fgslam.worlds.rendering.renderer import Renderer
-from fgslam.worlds.rendering.scene import Body, Layer
+from fgslam.worlds.rendering.scene import Body, Layer, flat_light
 from fgslam.worlds.rendering.texture_bank import GreyBank
 from fgslam.worlds.rendering.views import PinholeView
 

@@ -13,26 +13,24 @@ from fgslam.worlds.buildings import office
 from fgslam.worlds.buildings.lab import build_lab
 from fgslam.worlds.driving.floor_space import FloorSpace
 from fgslam.worlds.driving.paths import Drive, round_corners
-from fgslam.worlds.lab.places import (
+from fgslam.worlds.lab import (
     PATHS,
     PlaceChoice,
     build_place,
     first_pose,
+    make_rig,
     place_path,
     plan_in_place,
 )
-from fgslam.worlds.lab.settings import (
+from fgslam.worlds.lab_settings import (
     LabDriveSettings,
     LabRigSettings,
     PathName,
     PlaceName,
 )
-from fgslam.worlds.lab.world import make_rig
-from fgslam.worlds.rendering.lighting import bake
-from fgslam.worlds.rendering.patches import Surface, Thing, box, rectangle, stack
-from fgslam.worlds.rendering.raycaster import RayCaster
+from fgslam.worlds.rendering.patches import RayCaster, Surface, Thing, box, rectangle, stack
 from fgslam.worlds.rendering.renderer import Renderer
-from fgslam.worlds.rendering.scene import Layer
+from fgslam.worlds.rendering.scene import Layer, bake
 from fgslam.worlds.rendering.texture_bank import GreyBank
 from fgslam.worlds.rendering.views import PinholeView
 

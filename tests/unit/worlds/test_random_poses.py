@@ -11,15 +11,14 @@ from fgslam.core.errors import ConfigError
 from fgslam.datasets import rendered_lab
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.worlds.driving.floor_space import FloorSpace
-from fgslam.worlds.lab.places import PlaceChoice, build_place, plan_in_place
-from fgslam.worlds.lab.settings import (
+from fgslam.worlds.lab import PlaceChoice, build_place, make_rig, plan_in_place
+from fgslam.worlds.lab_settings import (
     LabDriveSettings,
     LabRigSettings,
     LabSettings,
     RandomPosesSettings,
     RenderedLabSettings,
 )
-from fgslam.worlds.lab.world import make_rig
 from fgslam.worlds.rendering.cache import content_hash
 from fgslam.worlds.rendering.patches import stack
 

@@ -10,8 +10,8 @@ import pytest
 
 from fgslam.core.errors import ConfigError
 from fgslam.core.planar import bearings, wrap
-from fgslam.worlds.simulated.bearing_settings import SimulatedBearingsSettings, with_outliers
 from fgslam.worlds.simulated.bearings import SimulatedHoming, simulate_homing
+from fgslam.worlds.simulated.settings import SimulatedBearingsSettings, with_outliers
 
 CLEAN = SimulatedBearingsSettings(features=200, lost_per_s=0.0)
 

@@ -26,7 +26,7 @@ from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.runs.config import ExperimentConfig, load_experiment, make_config
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import replay_step
-from fgslam.worlds.simulated.identities import IdentityBook
+from fgslam.worlds.simulated.landmarks import IdentityBook
 from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 
 

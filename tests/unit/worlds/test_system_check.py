@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from fgslam.worlds.rendering import system_check
+from fgslam.worlds.rendering import open3d_library
 
 ROOT = Path(__file__).parents[3]
 # What a surrounding `make test FGSLAM_PYTHON=...` hands down must not steer the runs in here.
@@ -48,22 +48,22 @@ def test_listed_libraries_are_those_that_the_wheel_links() -> None:
     if not libraries:
         pytest.skip(f"this build of open3d has no libOpen3D.so in {folder}")
     needed = {n for n in needed_libraries(libraries[0]) if not n.startswith(PROVIDED_EVERYWHERE)}
-    assert needed == set(system_check.DEBIAN_PACKAGES)
+    assert needed == set(open3d_library.DEBIAN_PACKAGES)
 
 
 def test_no_library_is_reported_where_all_load() -> None:
-    assert system_check.missing_libraries(can_load=lambda _: True) == []
+    assert open3d_library.missing_libraries(can_load=lambda _: True) == []
 
 
 def test_missing_libraries_are_named_in_order() -> None:
     absent = {"libX11.so.6", "libGL.so.1"}
-    missing = system_check.missing_libraries(can_load=lambda name: name not in absent)
+    missing = open3d_library.missing_libraries(can_load=lambda name: name not in absent)
     assert missing == ["libGL.so.1", "libX11.so.6"]
 
 
 @pytest.mark.parametrize(("carried", "expected"), [(True, []), (False, ["libusb-1.0.so.0"])])
 def test_libusb_may_come_from_its_python_package(carried: bool, expected: list[str]) -> None:
-    missing = system_check.missing_libraries(
+    missing = open3d_library.missing_libraries(
         can_load=lambda name: name != "libusb-1.0.so.0",
         has_package=lambda name: carried and name == "libusb_package",
     )
@@ -71,30 +71,30 @@ def test_libusb_may_come_from_its_python_package(carried: bool, expected: list[s
 
 
 def test_the_dynamic_loader_decides() -> None:
-    assert system_check.can_load("libc.so.6")
-    assert not system_check.can_load("libno-such-library-anywhere.so.1")
-    assert system_check.has_package("numpy")
-    assert not system_check.has_package("no_such_package_anywhere")
+    assert open3d_library.can_load("libc.so.6")
+    assert not open3d_library.can_load("libno-such-library-anywhere.so.1")
+    assert open3d_library.has_package("numpy")
+    assert not open3d_library.has_package("no_such_package_anywhere")
 
 
 def test_the_message_names_libraries_consequence_and_remedy(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(system_check, "missing_libraries", lambda: ["libEGL.so.1", "libGL.so.1"])
-    assert system_check.main([]) == 1
+    monkeypatch.setattr(open3d_library, "missing_libraries", lambda: ["libEGL.so.1", "libGL.so.1"])
+    assert open3d_library.main([]) == 1
     line = capsys.readouterr().out
     assert line.count("\n") == 1
     assert "missing libEGL.so.1, libGL.so.1" in line
     assert "apt-get install libegl1 libgl1" in line
-    assert system_check.main(["--packages"]) == 1
+    assert open3d_library.main(["--packages"]) == 1
     assert capsys.readouterr().out == "libegl1 libgl1\n"
 
 
 def test_a_complete_machine_gets_no_message(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(system_check, "missing_libraries", list)
-    assert system_check.main(["--packages"]) == 0
+    monkeypatch.setattr(open3d_library, "missing_libraries", list)
+    assert open3d_library.main(["--packages"]) == 0
     assert capsys.readouterr().out == ""
 
 
@@ -183,8 +183,8 @@ def test_setup_succeeds_without_system_libraries(tmp_path: Path) -> None:
     executable(
         tmp_path / ".venv" / "bin" / "python",
         'case "$*" in\n'
-        '  *"system_check --packages") echo libgl1; exit 1 ;;\n'
-        "  *system_check) echo Open3D cannot load here; exit 1 ;;\n"
+        '  *"open3d_library --packages") echo libgl1; exit 1 ;;\n'
+        "  *open3d_library) echo Open3D cannot load here; exit 1 ;;\n"
         "esac\n",
     )
     done = run_setup(tmp_path, "runtime")

@@ -6,7 +6,7 @@ import pytest
 from fgslam.core import geometry
 from fgslam.worlds.driving import wheel_odometry
 from fgslam.worlds.driving.paths import plan_drive
-from fgslam.worlds.lab.settings import LabDriveSettings, WheelOdometrySettings
+from fgslam.worlds.lab_settings import LabDriveSettings, WheelOdometrySettings
 
 QUIET = WheelOdometrySettings(
     distance_scale=0.0,

@@ -19,7 +19,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import HomingEstimate
 from fgslam.core.planar import wrap
-from fgslam.worlds.simulated.bearing_settings import SimulatedBearingsSettings
+from fgslam.worlds.simulated.settings import SimulatedBearingsSettings
 
 NONE, CAUCHY, HUBER = (
     KernelSettings("none"),

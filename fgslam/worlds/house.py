@@ -10,6 +10,7 @@ from __future__ import annotations
 from functools import cached_property, lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
 from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.cameras.omni.mirrors import HyperbolicMirror
@@ -17,24 +18,26 @@ from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.worlds.buildings.house import DEPTH, WIDTH, build_house
 from fgslam.worlds.driving.floor_space import FloorSpace
-from fgslam.worlds.driving.range_scan import RangeSensor
 from fgslam.worlds.driving.reference_paths import PathPlanner
-from fgslam.worlds.driving.wheelchair import RADIUS_M, Wheelchair
-from fgslam.worlds.house import disturbances
-from fgslam.worlds.house.people import PERSON_RADIUS, People
-from fgslam.worlds.house.settings import (
+from fgslam.worlds.driving.wheelchair import RADIUS_M, RangeSensor, Wheelchair
+from fgslam.worlds.house_settings import (
     HouseCameraSettings,
+    HouseExposureSettings,
+    HouseLightSettings,
     HousePanoramaSettings,
+    HouseTiltSettings,
     OmniHouseSettings,
 )
-from fgslam.worlds.rendering.colour_textures import build_colour_library
-from fgslam.worlds.rendering.lighting import bake
-from fgslam.worlds.rendering.patches import stack
-from fgslam.worlds.rendering.raycaster import RayCaster
+from fgslam.worlds.people import PERSON_RADIUS, People
+from fgslam.worlds.rendering.image_effects import noisy
+from fgslam.worlds.rendering.patches import RayCaster, stack
 from fgslam.worlds.rendering.renderer import Renderer, surface_points, visible
-from fgslam.worlds.rendering.scene import Layer
+from fgslam.worlds.rendering.scene import Layer, bake
 from fgslam.worlds.rendering.texture_bank import ColourBank
+from fgslam.worlds.rendering.texture_library import build_colour_library
 from fgslam.worlds.rendering.views import OmniView
+
+Float32 = npt.NDArray[np.float32]
 
 # Coarser than in the lab: the mirror's pixels are wider.
 _LIGHT_SPACING_M = 0.2
@@ -50,6 +53,8 @@ _PATH_CLEARANCE_M = 0.55
 _CONTACT_M = 0.06
 # Between the mirror's rim and the nearest border of the image.
 _MARGIN_PX = 0.5
+_WAVE_PERIOD_S = 20.0  # automatic exposure follows the scene slowly
+_SWAY_PERIOD_S = 7.0  # of a wheelchair on a soft floor
 
 
 class HouseModel:
@@ -128,9 +133,9 @@ class OmniWorld:
         self._people = People(
             self._people_routes(), self._rng(1), self.model.bank, self._lets_people_stand
         )
-        self._tilt = disturbances.CameraTilt(settings.tilt, self._rng(2))
+        self._tilt = CameraTilt(settings.tilt, self._rng(2))
         self._sensor = RangeSensor(self.model.layer.caster)
-        self._scene = disturbances.lit(self.model.layer, self.model.evening, settings.light)
+        self._scene = lit(self.model.layer, self.model.evening, settings.light)
         self.put(self.reference_poses[0])
 
     # ---------------------------------------------------------------------------- acting
@@ -171,13 +176,10 @@ class OmniWorld:
             time: seconds, for exposure, swaying and noise.
         """
         s = self.settings
-        tilt = self._tilt.angles(time)
-        pose = disturbances.camera_pose(self.wheelchair.pose, CAMERA_HEIGHT_M, tilt)
+        pose = camera_pose(self.wheelchair.pose, CAMERA_HEIGHT_M, self._tilt.angles(time))
         levels = self._renderer.levels(self._scene, pose, self._people.bodies())
-        levels *= disturbances.white_balance(s.light)
-        levels = disturbances.exposed(levels, s.exposure, time)
-        name = (self._seed, 1, round(abs(time) * 1e6))
-        return self._renderer.assemble(disturbances.noisy(levels, s.noise_grey, name))
+        seen = exposed(levels * white_balance(s.light), s.exposure, time)
+        return self._with_noise(seen, 1, round(abs(time) * 1e6))
 
     def scan(self) -> tuple[FloatArray, FloatArray]:
         """Angles (n,) in the robot's axes, radians, and ranges (n,), metres."""
@@ -195,7 +197,7 @@ class OmniWorld:
     @cached_property
     def targets(self) -> tuple[Image, ...]:
         """The target images, taken at another time: other light and noise, nobody about."""
-        tilt = disturbances.CameraTilt(self.settings.tilt, self._rng(5))
+        tilt = CameraTilt(self.settings.tilt, self._rng(5))
         return tuple(
             self.picture(pose, k, tilt.angles(10.0 * k)) for k, pose in enumerate(self.target_poses)
         )
@@ -203,14 +205,16 @@ class OmniWorld:
     def picture(self, pose: FloatArray, number: int, tilt: FloatArray | None = None) -> Image:
         """(h, w, 3) as target images are taken, from any planar pose (3,); ``number`` seeds it."""
         s = self.settings
-        scene = disturbances.lit(self.model.layer, self.model.evening, s.target_light)
+        scene = lit(self.model.layer, self.model.evening, s.target_light)
         upright = np.zeros(2) if tilt is None else tilt
-        seen_from = disturbances.camera_pose(pose, CAMERA_HEIGHT_M, upright)
+        seen_from = camera_pose(pose, CAMERA_HEIGHT_M, upright)
         levels = self._renderer.levels(scene, seen_from)
-        levels *= disturbances.white_balance(s.target_light)
-        levels = disturbances.exposed(levels, s.target_exposure, 0.0)
-        name = (self._seed, 2, number)
-        return self._renderer.assemble(disturbances.noisy(levels, s.noise_grey, name))
+        seen = exposed(levels * white_balance(s.target_light), s.target_exposure, 0.0)
+        return self._with_noise(seen, 2, number)
+
+    def _with_noise(self, levels: Float32, stream: int, number: int) -> Image:
+        name = (self._seed, stream, number)
+        return self._renderer.assemble(noisy(levels, self.settings.noise_grey, name))
 
     # ---------------------------------------------------------------------------- truth
 
@@ -236,7 +240,7 @@ class OmniWorld:
         return self._renderer.distances(self.model.layer, self._untilted(pose))
 
     def _untilted(self, pose: FloatArray) -> FloatArray:
-        return disturbances.camera_pose(pose, CAMERA_HEIGHT_M, np.zeros(2))
+        return camera_pose(pose, CAMERA_HEIGHT_M, np.zeros(2))
 
     def _rng(self, stream: int) -> np.random.Generator:
         return np.random.default_rng([self._seed, 100 + stream])
@@ -266,3 +270,58 @@ class OmniWorld:
             if bool(np.any((away < RADIUS_M + PERSON_RADIUS) & (away < before))):
                 return True
         return self.model.space.touches(place, RADIUS_M, _CONTACT_M)
+
+
+# --------------------------------------------------------------------------------------------
+# Disturbances
+
+
+def lit(layer: Layer, evening: Float32, settings: HouseLightSettings) -> Layer:
+    """The same layer in another light: a mix of its own with the evening's, at some level."""
+    mixed = (1.0 - settings.evening) * layer.light + settings.evening * evening
+    return layer.lit(np.asarray(settings.level * mixed, dtype=np.float32))
+
+
+def white_balance(settings: HouseLightSettings) -> Float32:
+    """(3, 1) factors of red, green, blue."""
+    return np.array([[1.0 + settings.warmth], [1.0], [1.0 - settings.warmth]], dtype=np.float32)
+
+
+def exposed(levels: Float32, settings: HouseExposureSettings, time: float) -> Float32:
+    """(3, n) levels as the camera's exposure makes them at a time in seconds."""
+    wave = 1.0 + settings.wave * np.sin(2.0 * np.pi * time / _WAVE_PERIOD_S)
+    return np.asarray(levels * np.float32(settings.gain * wave))
+
+
+class CameraTilt:
+    """Roll and pitch of the camera over time: a constant part and a slow oscillation."""
+
+    def __init__(self, settings: HouseTiltSettings, rng: np.random.Generator) -> None:
+        """Draws to which side the camera leans, and the swaying's phases."""
+        self._settings = settings
+        side = float(rng.uniform(0.0, 2.0 * np.pi))
+        self._constant = np.deg2rad(settings.constant_deg) * np.array([np.cos(side), np.sin(side)])
+        self._phase = rng.uniform(0.0, 2.0 * np.pi, 2)
+
+    def angles(self, time: float) -> FloatArray:
+        """(2,) roll about the forward axis and pitch about the left one, radians."""
+        s = self._settings
+        turn = 2.0 * np.pi * time / _SWAY_PERIOD_S * np.array([1.0, 0.77]) + self._phase
+        return np.asarray(self._constant + np.deg2rad(s.sway_deg) * np.sin(turn))
+
+
+def camera_pose(pose: FloatArray, height: float, tilt: FloatArray) -> FloatArray:
+    """(4, 4) pose of a camera at ``height`` metres above a planar pose (3,), tilted.
+
+    ``tilt`` (2,) is roll about the robot's forward axis and pitch about its left one, in radians.
+    """
+    (cy, sy), (cr, sr), (cp, sp) = (
+        (np.cos(angle), np.sin(angle)) for angle in (pose[2], tilt[0], tilt[1])
+    )
+    yaw = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    pitch = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    roll = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    out = np.eye(4)
+    out[:3, :3] = yaw @ pitch @ roll
+    out[:3, 3] = pose[0], pose[1], height
+    return out

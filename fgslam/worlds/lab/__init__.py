@@ -1,1 +1,0 @@
-"""A robot with a rig of pinhole cameras in a rendered place: settings, places, images."""
