@@ -48,18 +48,15 @@ class RunRecorder:
 
     def add(self, report: FrameReport, wait_ms: float, stereo_precision: float) -> None:
         """Appends one frame."""
-        self.log.append(report.increment)
-        self.rows.append(_row(report, stereo_precision))
+        beside = {"load": report.found.load_ms, "sift": report.found.sift_ms, "wait": wait_ms}
+        times = beside | report.stage_ms
+        row = _row(report, stereo_precision)
+        self.stage_ms.append(np.array([times[stage] for stage in STAGES]))
         self.tracked_poses.append(report.tracking.wTc)
         self.online_poses.append(report.stats.wTc)
         self.online_covariances.append(report.stats.covariance)
-        beside = {
-            "load": report.found.load_ms,
-            "sift": report.found.sift_ms,
-            "wait": wait_ms,
-        }
-        times = beside | report.stage_ms
-        self.stage_ms.append(np.array([times[stage] for stage in STAGES]))
+        self.log.append(report.increment)
+        self.rows.append(row)
 
     def column(self, name: str) -> npt.NDArray[Any]:
         """One number of all frames."""

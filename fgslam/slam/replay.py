@@ -17,7 +17,7 @@ import numpy.typing as npt
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.arrays import Brief, FloatArray
-from fgslam.core.errors import ConfigError, FgslamError, MeasurementLogError
+from fgslam.core.errors import ConfigError, MeasurementLogError
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, MeasurementType
@@ -30,16 +30,7 @@ from fgslam.slam.arrival import Arrival, take_over
 from fgslam.slam.factory import made_or_given
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import ReplayedFrame, replay_frame
-
-ESTIMATOR_FAULTS = (
-    FgslamError,
-    RuntimeError,
-    ValueError,
-    ArithmeticError,
-    LookupError,
-    MemoryError,
-)
-"""What an estimator may end with: its own errors, GTSAM's (RuntimeError), NumPy's (ValueError)."""
+from fgslam.slam.results import ESTIMATOR_FAULTS, estimate_of_failed, reason
 
 _PROC_STATUS = Path("/proc/self/status")
 
@@ -151,14 +142,6 @@ def replay_motion(log: MeasurementLog) -> ConstantVelocityMotion:
         ) from None
 
 
-def reason(error: BaseException) -> str:
-    """An error in one line; GTSAM's messages have several."""
-    text = " ".join(str(error).split())
-    if isinstance(error, FgslamError):
-        return text
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
-
-
 def memory_mb(name: str) -> float | None:
     """`VmHWM` (peak) or `VmRSS` (now) of this process, mebibytes; None where /proc is missing.
 
@@ -227,47 +210,27 @@ class _Replaying:
     def result(self, estimator: Estimator | None, before_mb: float | None, failure: str) -> Replay:
         """The answer; of an estimator that cannot give one any more, its online poses."""
         start = time.perf_counter()
-        estimate = None
+        stamps = [increment.timestamp for increment in self._log.increments[: len(self._rows)]]
+        online = Trajectory(np.array(stamps), np.array(self._poses).reshape(-1, 4, 4))
+        covariances = np.array(self._covariances).reshape(-1, 6, 6)
+        final_ms = math.nan
         if estimator is not None and self._rows:
-            try:
-                estimate = self._usable(estimator.estimate())
-            except ESTIMATOR_FAULTS as error:
-                why = f"no final estimate: {reason(error)}"
-                failure = f"{failure}; {why}" if failure else why
-        final_ms = math.nan if estimate is None else 1e3 * (time.perf_counter() - start)
+            estimate, why = estimate_of_failed(estimator, online, covariances)
+            final_ms = math.nan if why else 1e3 * (time.perf_counter() - start)
+            failure = "; ".join(filter(None, (failure, why)))
+        else:
+            none = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+            estimate = Estimate(online, covariances, none)
         return Replay(
             title=getattr(self._settings, "title", self._settings.kind),
             kind=self._settings.kind,
-            online=self._online(),
-            online_covariances=np.array(self._covariances).reshape(-1, 6, 6),
-            estimate=estimate or self._online_estimate(),
+            online=online,
+            online_covariances=covariances,
+            estimate=estimate,
             rows=tuple(self._rows),
             final_ms=final_ms,
             memory_before_mb=before_mb,
             peak_memory_mb=peak_memory_mb(),
             failure=failure,
             closed=tuple(self._closed),
-        )
-
-    def _online(self) -> Trajectory:
-        stamps = [increment.timestamp for increment in self._log.increments[: len(self._rows)]]
-        return Trajectory(np.array(stamps), np.array(self._poses).reshape(-1, 4, 4))
-
-    def _online_estimate(self) -> Estimate:
-        none = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
-        covariances = np.array(self._covariances).reshape(-1, 6, 6)
-        remark = ("the final trajectory is the online one: no final estimate could be had",)
-        return Estimate(self._online(), covariances, none, remark if self._rows else ())
-
-    def _usable(self, estimate: Estimate) -> Estimate:
-        """The estimate, up to the last frame that went well. ValueError where it is not finite."""
-        n = len(self._rows)
-        if not np.isfinite(estimate.trajectory.poses[:n]).all():
-            raise ValueError("a pose of the final trajectory is not finite")
-        if not np.isfinite(estimate.landmarks.positions).all():
-            raise ValueError("a landmark of the final map is not finite")
-        stamps, poses = estimate.trajectory.timestamps[:n], estimate.trajectory.poses[:n]
-        covariances = estimate.covariances[:n]
-        return Estimate(
-            Trajectory(stamps, poses), covariances, estimate.landmarks, estimate.remarks
         )

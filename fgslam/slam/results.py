@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.backend.protocol import Estimator
 from fgslam.core.arrays import BoolArray, Brief, FloatArray
-from fgslam.core.estimates import EgoMotionStatus, Estimate, Trajectory
+from fgslam.core.errors import FgslamError
+from fgslam.core.estimates import EgoMotionStatus, Estimate, LandmarkMap, Trajectory
 from fgslam.core.measurements import Observations
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.recorder import STAGES, RunRecorder
+
+ESTIMATOR_FAULTS = (
+    FgslamError,
+    RuntimeError,
+    ValueError,
+    ArithmeticError,
+    LookupError,
+    MemoryError,
+)
+"""What an estimator may end with: its own errors, GTSAM's (RuntimeError), NumPy's (ValueError)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -112,17 +124,62 @@ class SessionResult(Brief):
         return self.frames[name]
 
 
-def result_of(pipeline: SlamPipeline, recorder: RunRecorder) -> SessionResult:
-    """The result of the frames so far; nothing is changed."""
+def result_of(pipeline: SlamPipeline, recorder: RunRecorder, failed: bool = False) -> SessionResult:
+    """The result of the frames so far; nothing is changed.
+
+    Where the estimator ``failed`` in the frame after them, it may have taken in a part of that
+    frame, and may have no answer any more.
+    """
     stamps = np.array([increment.timestamp for increment in recorder.log], np.float64)
+    online = Trajectory(stamps, np.array(recorder.online_poses).reshape(-1, 4, 4))
+    covariances = np.array(recorder.online_covariances).reshape(-1, 6, 6)
+    if failed:
+        estimate, _ = estimate_of_failed(pipeline.estimator, online, covariances)
+        unknown = np.setdiff1d(estimate.landmarks.ids, pipeline.tracker.database.ids)
+        estimate = replace(estimate, landmarks=estimate.landmarks.without(unknown))
+    else:
+        estimate = pipeline.estimator.estimate()
     return SessionResult(
         kind=pipeline.estimator.kind,
-        estimate=pipeline.estimator.estimate(),
-        online=Trajectory(stamps, np.array(recorder.online_poses).reshape(-1, 4, 4)),
-        online_covariances=np.array(recorder.online_covariances).reshape(-1, 6, 6),
+        estimate=estimate,
+        online=online,
+        online_covariances=covariances,
         closed=() if pipeline.places is None else tuple(pipeline.places.taken),
         frames=_columns(recorder),
     )
+
+
+def estimate_of_failed(
+    estimator: Estimator, online: Trajectory, covariances: FloatArray
+) -> tuple[Estimate, str]:
+    """The estimate of the frames that went well; without one the online poses, and the reason.
+
+    Args:
+        estimator: it may hold a part of one more frame.
+        online: the n poses as they were first estimated.
+        covariances: (n, 6, 6) of them.
+    """
+    n = len(online)
+    try:
+        found = estimator.estimate()
+        if not np.isfinite(found.trajectory.poses[:n]).all():
+            raise ValueError("a pose of the final trajectory is not finite")
+        if not np.isfinite(found.landmarks.positions).all():
+            raise ValueError("a landmark of the final map is not finite")
+    except ESTIMATOR_FAULTS as error:
+        remark = ("the final trajectory is the online one: no final estimate could be had",)
+        none = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+        return Estimate(online, covariances, none, remark), f"no final estimate: {reason(error)}"
+    poses = Trajectory(found.trajectory.timestamps[:n], found.trajectory.poses[:n])
+    return replace(found, trajectory=poses, covariances=found.covariances[:n]), ""
+
+
+def reason(error: BaseException) -> str:
+    """An error in one line; GTSAM's messages have several."""
+    text = " ".join(str(error).split())
+    if isinstance(error, FgslamError):
+        return text
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 def _columns(recorder: RunRecorder) -> dict[str, npt.NDArray[Any]]:

@@ -98,6 +98,7 @@ class Session:
         self._odometry = odometry
         self._describer = FrameDescriber(features or make_extractor(frontend))
         self._ended = ""
+        self._failed = False
 
     # -- frames ------------------------------------------------------------------------------
 
@@ -162,12 +163,13 @@ class Session:
         index = first + stride * found.i if index is None else index
         try:
             report = self.pipeline.process(found, index, timestamp, self._usable(body))
+            precision = float("nan") if precision_of is None else precision_of(report)
+            self.recorder.add(report, wait_ms, precision)
         except BaseException as error:
             # Parts of the frame may be booked: going on would estimate something else.
+            self._failed = True
             self._ended = f"it failed at t = {timestamp:.6f} s ({' '.join(str(error).split())})"
             raise
-        precision = float("nan") if precision_of is None else precision_of(report)
-        self.recorder.add(report, wait_ms, precision)
         return report
 
     def __len__(self) -> int:
@@ -190,7 +192,7 @@ class Session:
         if not len(self.recorder):
             raise SessionError("no frame has been tracked yet; call track first")
         with one_blas_thread():
-            return result_of(self.pipeline, self.recorder)
+            return result_of(self.pipeline, self.recorder, self._failed)
 
     def close(self) -> None:
         """Ends the session and its threads; results can still be asked for."""

@@ -19,6 +19,7 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import (
     CalibrationError,
     ConfigError,
+    DatasetError,
     EstimatorError,
     FgslamError,
     FrameError,
@@ -28,7 +29,9 @@ from fgslam.core.errors import (
 from fgslam.core.estimates import EgoMotionStatus, Prediction
 from fgslam.core.features import Features
 from fgslam.core.measurements import Odometry
+from fgslam.core.recordings import Frame
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings
+from fgslam.slam.pipeline import FrameReport
 from fgslam.slam.results import SessionResult
 from fgslam.slam.session import Session
 
@@ -287,6 +290,59 @@ def test_after_a_failure_of_the_estimator_the_results_before_it_remain(views: Vi
     result = slam.result()
     assert isinstance(result, SessionResult)
     assert len(result.trajectory) == len(slam.log) == 3
+
+
+class FailingAfterUpdate(LandmarkKalman):
+    """Takes the fourth frame in, and fails when asked what came of it."""
+
+    answers = True
+
+    def update(self, increment, tracking):  # type: ignore[no-untyped-def]
+        stats = super().update(increment, tracking)
+        if increment.index == 3:
+            raise RuntimeError("the marginals are\nindeterminate")
+        return stats
+
+    def estimate(self):  # type: ignore[no-untyped-def]
+        if not self.answers:
+            raise RuntimeError("indeterminate")
+        return super().estimate()
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_a_frame_that_fails_after_the_update_is_in_no_result(views: Views, answers: bool) -> None:
+    start = Prediction(np.eye(4), np.zeros((6, 6)))
+    estimator = FailingAfterUpdate(RIG, LandmarkKalmanSettings(), start)
+    slam = session(views, estimator)
+    push(slam, views, range(3))
+    before = slam.result()
+    with pytest.raises(RuntimeError, match="marginals"):
+        push(slam, views, range(3, 4))
+    estimator.answers = answers
+    assert len(LandmarkKalman.estimate(estimator).trajectory) == 4
+    result = slam.result()
+    assert len(result.trajectory) == len(result.covariances) == len(result.online) == 3
+    assert len(slam.log) == len(result.column("status")) == 3
+    np.testing.assert_array_equal(result.trajectory.poses, before.trajectory.poses)
+    assert np.isin(result.estimate.landmarks.ids, slam.pipeline.tracker.database.ids).all()
+    assert bool(result.remarks) is not answers
+    with pytest.raises(SessionError, match=r"failed at t = 1\.5.* \(the marginals are indeterm"):
+        push(slam, views, range(4, 5))
+
+
+def test_a_frame_whose_record_fails_is_in_no_result(views: Views) -> None:
+    slam = session(views)
+    push(slam, views, range(3))
+    found = slam._describer.describe(3, Frame(3, 1.5, views.images(3)))
+
+    def unreadable(report: FrameReport) -> float:
+        raise DatasetError("the depth image is missing")
+
+    with pytest.raises(DatasetError):
+        slam.advance(found, 1.5, precision_of=unreadable)
+    assert len(slam.result().trajectory) == len(slam.log) == len(slam) == 3
+    with pytest.raises(SessionError, match="depth image is missing"):
+        push(slam, views, range(4, 5))
 
 
 @pytest.mark.parametrize(
