@@ -6,8 +6,7 @@ import numpy as np
 
 from fgslam.core.homing import HomingEstimate, HomingTruth
 from fgslam.report.content import Column, Page, TextTable
-from fgslam.report.figures.curves import Line, claimed_against_true, curve_figure
-from fgslam.report.figures.local_map import local_map_figure
+from fgslam.report.figures.homing import Line, claimed_against_true, curve_figure, local_map_figure
 from fgslam.report.figures.plan import Drive, catchment_figure, drive_figure
 
 FEATURES = np.array([[0.5, 0.8], [1.2, -0.6], [-0.3, 0.9], [0.7, -1.1]])

@@ -1,20 +1,21 @@
-"""The command line: thin commands, heavy imports inside them, errors caught once."""
+"""The command line: thin commands, heavy imports inside them, errors and Ctrl-C caught once."""
 
 from __future__ import annotations
 
 import json
 import shlex
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from fgslam.cli import options
-from fgslam.cli.interruption import Tell, stop_flag, stoppable
 from fgslam.core.errors import FgslamError
 from fgslam.runs.named_experiments import experiment_names, find_experiment
 
@@ -23,12 +24,15 @@ if TYPE_CHECKING:
     from fgslam.runs.engine import RunResult
     from fgslam.runs.folder import ExistingFolder
 
+Tell = Callable[[str, int, int], None]
+
 EXIT_USER = 2
 EXIT_FAULT = 1
 EXIT_INTERRUPTED = 130  # as a shell reports a process that Ctrl-C ended
 # Typer exports only the child; its parent's home differs from one Typer to the next.
 _UsageError: type[typer.BadParameter] = typer.BadParameter.__bases__[0]
 _CLOSE_OPTIONS = 0.6  # typer offers --out for --foo
+_NOTHING_TO_SAVE = ("rendering", "reading", "matching")
 
 app = typer.Typer(
     name="fgslam",
@@ -321,3 +325,38 @@ def main() -> None:
         raise SystemExit(EXIT_INTERRUPTED) from None
     except BrokenPipeError:
         raise SystemExit(EXIT_FAULT) from None
+
+
+@contextmanager
+def stop_flag() -> Iterator[Callable[[], bool]]:
+    """Turns the first Ctrl-C or TERM into a flag; the second Ctrl-C ends at once."""
+    raised = ending = False
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        nonlocal raised, ending
+        if raised:
+            ending = True
+            # A third one would cut short the end of the threads, which aborts the process.
+            for each in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(each, signal.SIG_IGN)
+            raise KeyboardInterrupt
+        raised = True
+
+    before = {n: signal.signal(n, handle) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: raised
+    finally:
+        if not ending:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def stoppable(progress: Tell, stopped: Callable[[], bool]) -> Tell:
+    """While frames are rendered there is nothing to save yet: stopping just ends it."""
+
+    def tell(what: str, done: int, total: int) -> None:
+        if what in _NOTHING_TO_SAVE and stopped():
+            raise KeyboardInterrupt
+        progress(what, done, total)
+
+    return tell

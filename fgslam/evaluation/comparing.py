@@ -1,20 +1,24 @@
-"""Estimators side by side as a data frame: one row an estimator, one column a number."""
+"""Estimators side by side as a data frame, and paired tests of two over many trials."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Estimate, Trajectory
+from fgslam.core.quantiles import student_quantile
 from fgslam.core.recordings import LandmarkTruth
 from fgslam.evaluation.judging import Answer, Replayed, Truth, judge_answer, judge_replay
 from fgslam.evaluation.metrics import EstimatorMetrics, value_at
 
 if TYPE_CHECKING:
     import pandas
+
 
 Comparable: TypeAlias = Replayed | Answer | Estimate
 """A replayed log, an :class:`~fgslam.evaluation.judging.Answer`, or an estimate alone."""
@@ -136,3 +140,72 @@ def _alone(estimate: Estimate) -> Answer:
     online = Trajectory(np.empty(0), np.empty((0, 4, 4)))
     none = np.empty(0)
     return Answer(estimate, online, np.empty((0, 6, 6)), none, np.empty(0, np.int64), none)
+
+
+@dataclass(frozen=True, slots=True)
+class MeanInterval:
+    """Mean of independent trials and its confidence interval by Student's t.
+
+    Attributes:
+        mean: of the values.
+        lower, upper: of the interval; None for fewer than two values.
+        count: how many values.
+        probability: of the interval.
+    """
+
+    mean: float
+    lower: float | None
+    upper: float | None
+    count: int
+    probability: float
+
+
+@dataclass(frozen=True, slots=True)
+class PairedTest:
+    """Values of A minus values of B, pair by pair; smaller is better.
+
+    Attributes:
+        difference: mean and interval of A - B: below zero, A is better.
+        wins, losses: pairs in which A, B is the smaller; the rest are ties.
+        p_value: Wilcoxon's signed-rank test, two-sided; None where all pairs are ties.
+        ratio: mean of A over mean of B; None where that is zero.
+    """
+
+    difference: MeanInterval
+    wins: int
+    losses: int
+    p_value: float | None
+    ratio: float | None
+
+
+def mean_interval(values: FloatArray, probability: float = 0.95) -> MeanInterval | None:
+    """Mean and interval of finite values (n,); None where there is none."""
+    known = values[np.isfinite(values)]
+    n = len(known)
+    if n == 0:
+        return None
+    mean = float(known.mean())
+    if n == 1:
+        return MeanInterval(mean, None, None, 1, probability)
+    error = float(known.std(ddof=1)) / np.sqrt(n)
+    half = float(student_quantile(0.5 + 0.5 * probability, n - 1)) * error
+    return MeanInterval(mean, mean - half, mean + half, n, probability)
+
+
+def paired_test(a: FloatArray, b: FloatArray, probability: float = 0.95) -> PairedTest | None:
+    """Compares values (n,) of A and B on the same trials; pairs with an unknown value are left out.
+
+    Returns:
+        The comparison, or None where no pair is known.
+    """
+    known = np.isfinite(a) & np.isfinite(b)
+    a, b = a[known], b[known]
+    difference = mean_interval(a - b, probability)
+    if difference is None:
+        return None
+    from scipy.stats import wilcoxon  # a second, and only trials need it
+
+    p_value = float(wilcoxon(a, b).pvalue) if np.any(a != b) else None
+    ratio = float(a.mean() / b.mean()) if b.mean() != 0.0 else None
+    wins, losses = int(np.count_nonzero(a < b)), int(np.count_nonzero(a > b))
+    return PairedTest(difference, wins, losses, p_value, ratio)

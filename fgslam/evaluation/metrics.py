@@ -1,4 +1,4 @@
-"""The numbers of one estimator's result, under the names that metrics.json gives them."""
+"""The numbers of one estimator's result, under the names of metrics.json; times a frame."""
 
 from __future__ import annotations
 
@@ -90,3 +90,33 @@ def value_at(values: Mapping[str, Any], where: str) -> Any:
     for key in where.split("."):
         at = at.get(key) if isinstance(at, Mapping) else None
     return None if isinstance(at, float) and not math.isfinite(at) else at
+
+
+_LEAST_FRAMES = 25  # five a fifth: the median of fewer is noise
+
+
+@dataclass(frozen=True, slots=True)
+class TimeGrowth:
+    """Growth of the time a frame.
+
+    Attributes:
+        ratio: median of the last fifth of the frames over that of the second fifth (the first
+            holds what is slow only once); 1 is flat, 4 is proportional to the frames so far.
+        slope_ms_per_1000: least-squares slope, milliseconds a thousand frames.
+    """
+
+    ratio: float
+    slope_ms_per_1000: float
+
+
+def time_growth(milliseconds: FloatArray) -> TimeGrowth | None:
+    """Growth of times (n,) of consecutive frames; None for fewer than 25 of them."""
+    n = len(milliseconds)
+    if n < _LEAST_FRAMES:
+        return None
+    fifth = n // 5
+    early, late = np.median(milliseconds[fifth : 2 * fifth]), np.median(milliseconds[-fifth:])
+    if not early > 0.0:
+        return None
+    slope = np.polyfit(np.arange(n, dtype=np.float64), milliseconds, 1)[0]
+    return TimeGrowth(float(late / early), float(1000.0 * slope))

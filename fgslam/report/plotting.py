@@ -14,7 +14,7 @@ from fgslam.evaluation.comparing import Comparable, require_named
 from fgslam.evaluation.judging import Answer
 from fgslam.report.figures import palette
 from fgslam.report.figures.over_time import error_over_time, nees_over_time, time_per_frame
-from fgslam.report.figures.printing import printed
+from fgslam.report.figures.palette import printed
 from fgslam.report.figures.traces import Figure
 from fgslam.report.figures.trajectory import drive_from_above
 from fgslam.report.run_results import (

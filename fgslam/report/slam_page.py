@@ -1,7 +1,8 @@
-"""The page of a SLAM run: what :class:`~fgslam.report.run_results.ReportData` looks like."""
+"""The page of a SLAM run: sentences on accuracy and consistency, tables, figures."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from fgslam.report.content import Page
@@ -12,9 +13,16 @@ from fgslam.report.figures.over_time import (
     time_per_frame,
 )
 from fgslam.report.figures.trajectory import drive_from_above, map_to_turn
-from fgslam.report.headline import headline
 from fgslam.report.page import write_html
-from fgslam.report.run_results import ReportData
+from fgslam.report.run_results import EstimatorReport, ReportData
+
+_ABOUT_EQUAL = 1.05
+_ROUND_FROM = 1000.0
+_JUDGED = {
+    "consistent": "errors as large as the covariances say",
+    "overconfident": "errors larger than the covariances say",
+    "conservative": "errors smaller than the covariances say",
+}
 
 
 def write_report(path: Path, data: ReportData) -> None:
@@ -49,3 +57,58 @@ def slam_page(data: ReportData) -> Page:
         config_yaml=data.config_yaml,
         versions=data.versions,
     )
+
+
+def headline(data: ReportData) -> tuple[str, ...]:
+    """Sentences about accuracy, consistency and failures, most important first."""
+    working = [e for e in data.estimators if not e.failure]
+    lines = [_accuracy(data, working)] if working else ["No estimator gave a result."]
+    lines += _consistency(working)
+    lines += [f"{e.title} failed: {e.failure}" for e in data.estimators if e.failure]
+    return tuple(lines)
+
+
+def metres(value: float) -> str:
+    """A length to be read: centimetres below a metre."""
+    return f"{100.0 * value:.2f} cm" if value < 1.0 else f"{value:.3f} m"
+
+
+def _accuracy(data: ReportData, working: list[EstimatorReport]) -> str:
+    ranked = sorted((e.ate_m, e.title) for e in working if e.ate_m is not None)
+    if not ranked:
+        why = "there is no ground truth" if data.truth is None else "too few poses have a truth"
+        return f"How accurate the path is, is not known: {why}."
+    how = f"root mean square position error, {data.alignment}"
+    first, title = ranked[0]
+    if len(ranked) == 1:
+        return f"{title} is off by {metres(first)} ({how})."
+    second, other = ranked[1]
+    if second <= _ABOUT_EQUAL * first:
+        equal = [name for error, name in ranked if error <= _ABOUT_EQUAL * first]
+        return f"{_listed(equal)} are about equally accurate: {metres(first)} ({how})."
+    ratio = f", {second / first:.2g} times as much" if first > 0.0 else ""
+    return (
+        f"{title} is the most accurate: off by {metres(first)} ({how}). "
+        f"The next, {other}, is off by {metres(second)}{ratio}."
+    )
+
+
+def _consistency(working: list[EstimatorReport]) -> Iterator[str]:
+    for word, meaning in _JUDGED.items():
+        found = [e for e in working if e.verdict == word]
+        if found:
+            names = [f"{e.title} ({_nees(e.nees_per_dof)})" for e in found]
+            yield f"{word.capitalize()} ({meaning}): {_listed(names)}."
+    unknown = [e.title for e in working if e.verdict not in _JUDGED]
+    if unknown:
+        yield f"Whether the covariances of {_listed(unknown)} can be believed is not known."
+
+
+def _nees(value: float | None) -> str:
+    if value is None:
+        return "NEES not known"
+    return f"NEES {value:,.0f}" if value >= _ROUND_FROM else f"NEES {value:.3g}"
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 from fgslam.core.errors import ConfigError
 from fgslam.core.files import write_text
 from fgslam.evaluation.metrics import value_at
-from fgslam.report.comparison_table import RESULT_COLUMNS
+from fgslam.report.tables import RESULT_COLUMNS
 
 Results: TypeAlias = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """Numbers as in metrics.json, by the run's name and the estimator's title."""

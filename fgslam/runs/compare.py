@@ -11,9 +11,8 @@ from typing import Any
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
-from fgslam.report.comparison_table import write_comparison_csv
 from fgslam.report.content import TextTable
-from fgslam.report.metrics import read_metrics, write_metrics
+from fgslam.report.tables import read_metrics, write_comparison_csv, write_metrics
 from fgslam.runs.choosing import EVERY, Choice, choose
 from fgslam.runs.comparison import (
     Compared,

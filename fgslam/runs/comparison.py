@@ -15,8 +15,8 @@ from fgslam.core.trajectories import read_tum
 from fgslam.evaluation.judging import Truth, judge_replay, seen_often
 from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.frontend.tracking.settings import EgoMotionSettings
-from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, read_landmark_truth
 from fgslam.report.point_cloud import MapPoints, read_ply
+from fgslam.report.tables import LANDMARK_TRUTH_FILE, read_landmark_truth
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import Context
 from fgslam.runs.estimator_files import write_replay

@@ -16,8 +16,8 @@ from fgslam.core.measurements import Increment
 from fgslam.core.saved_map import SavedMap, load_map
 from fgslam.core.trajectories import read_tum, write_trajectory
 from fgslam.report.graph_file import PoseLandmarkGraph, require_graph_suffix, write_g2o
-from fgslam.report.metrics import read_metrics
 from fgslam.report.point_cloud import read_ply, write_map
+from fgslam.report.tables import read_metrics
 from fgslam.runs.config import load_config
 from fgslam.runs.config_reading import read_mapping
 from fgslam.runs.folder import LOG_FILE, RUN_MARKER, is_run_folder

@@ -14,8 +14,7 @@ from fgslam.core.bearing_log import BearingLog
 from fgslam.evaluation.homing import HomingErrors, homing_errors, summarise_homings
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
 from fgslam.report.content import TextTable
-from fgslam.report.figures.curves import Line, curve_figure
-from fgslam.report.figures.local_map import local_map_figure
+from fgslam.report.figures.homing import Line, curve_figure, local_map_figure
 from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.config_models import HomingExperiment

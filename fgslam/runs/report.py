@@ -16,7 +16,6 @@ from fgslam.core.errors import DatasetError, FgslamError
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.trajectories import read_covariances, read_tum
-from fgslam.report.metrics import read_metrics
 from fgslam.report.point_cloud import MapPoints, read_ply
 from fgslam.report.run_results import (
     EstimatorReport,
@@ -26,6 +25,7 @@ from fgslam.report.run_results import (
     truth_in_their_world,
 )
 from fgslam.report.slam_page import write_report
+from fgslam.report.tables import read_metrics
 from fgslam.runs.folder import LOG_FILE, REPORT_FILE, RUN_MARKER
 from fgslam.runs.report_parts import comparison_table, sample_pictures
 from fgslam.runs.tasks.slam_places import LOOPS_FILE, read_closures

@@ -12,11 +12,10 @@ import numpy as np
 
 from fgslam.backend.settings import family_of
 from fgslam.core.arrays import FloatArray
+from fgslam.evaluation.comparing import MeanInterval, PairedTest, mean_interval, paired_test
 from fgslam.evaluation.consistency import Consistency, Nees, judge
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, value_at
-from fgslam.evaluation.paired import MeanInterval, PairedTest, mean_interval, paired_test
-from fgslam.report.comparison_table import RESULT_COLUMNS, TIME_COLUMNS, write_comparison_csv
-from fgslam.report.metrics import write_metrics
+from fgslam.report.tables import RESULT_COLUMNS, TIME_COLUMNS, write_comparison_csv, write_metrics
 
 TrialRow: TypeAlias = tuple[int, dict[str, EstimatorMetrics], dict[str, dict[str, Nees]]]
 

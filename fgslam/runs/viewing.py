@@ -16,9 +16,8 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import MissingDependencyError, OutputError
 from fgslam.core.files import replacing
 from fgslam.core.geometry import quaternion_from_rotation
-from fgslam.report.figures.ellipses import world_position_covariances
 from fgslam.report.figures.palette import COUNT, ON_DARK
-from fgslam.report.figures.traces import thinned
+from fgslam.report.figures.traces import thinned, world_position_covariances
 from fgslam.report.figures.trajectory import level_axes
 from fgslam.report.run_results import EstimatorReport, ReportData
 from fgslam.runs.report import load_report

@@ -8,22 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray
-from fgslam.report.figures.ellipses import (
-    SIGMAS,
-    exaggeration,
-    in_plane,
-    outlines,
-    world_position_covariances,
-)
 from fgslam.report.figures.traces import (
+    SIGMAS,
     Figure,
     Owner,
     Switch,
     Trace,
     equal_axes,
+    exaggeration,
+    in_plane,
     joined,
+    outlines,
     thinned,
     trace,
+    world_position_covariances,
 )
 from fgslam.report.figures.trajectory import bulk_limits, level_axes
 

@@ -11,8 +11,8 @@ import numpy as np
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import Trajectory
 from fgslam.evaluation.trajectory import to_estimate_world
-from fgslam.report.figures.ellipses import SIGMAS, world_position_covariances
 from fgslam.report.figures.traces import (
+    SIGMAS,
     Figure,
     Owner,
     Switch,
@@ -20,6 +20,7 @@ from fgslam.report.figures.traces import (
     peaks,
     thinned,
     trace,
+    world_position_covariances,
 )
 from fgslam.report.figures.trajectory import level_axes
 from fgslam.report.run_results import EstimatorReport, ReportData

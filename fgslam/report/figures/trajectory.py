@@ -13,24 +13,22 @@ from typing import Any
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.report.figures.ellipses import (
-    SIGMAS,
-    exaggeration,
-    in_plane,
-    outlines,
-    world_position_covariances,
-)
 from fgslam.report.figures.traces import (
+    SIGMAS,
     Figure,
     Owner,
     Paint,
     Switch,
     Trace,
     equal_axes,
+    exaggeration,
+    in_plane,
     joined,
+    outlines,
     packed,
     thinned,
     trace,
+    world_position_covariances,
 )
 from fgslam.report.run_results import EstimatorReport, ReportData
 

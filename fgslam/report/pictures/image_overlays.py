@@ -1,24 +1,28 @@
-"""Pictures on images: features (Fig. 1), disparities (Fig. 2) and flow (Fig. 3) of Se et al."""
+"""Pictures on images: features, disparities, flow (Figs. 1 to 3 of Se et al.), matches, tracks."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.colors import ListedColormap, LogNorm, Normalize
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap, LogNorm, Normalize, hsv_to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
-from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.core.features import Features
 from fgslam.report.pictures.style import (
     INK,
     ORANGE,
     SKY,
+    VERMILLION,
     YELLOW,
     add_segments,
     colour_bar,
@@ -206,3 +210,108 @@ def _size(
 def _heading(figure: Figure, title: str) -> None:
     if title:
         figure.suptitle(title, fontsize=16, fontweight="bold", x=0.01, ha="left")
+
+
+_PAIR_WIDTH_IN = 9.0
+_SHOWN_PX = 1100  # columns of a picture; more would not show
+_PAIR_DIMMED = 0.6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MatchedPixels:
+    """Matches of two pictures.
+
+    Attributes:
+        a, b: (n, 2) column and row in either picture, from centre to centre.
+        columns: (n,) which are column segments: drawn as bars, the others as rings.
+    """
+
+    a: FloatArray
+    b: FloatArray
+    columns: BoolArray
+
+
+def draw_view_matches(
+    path: Path, images: tuple[Image, Image], matches: MatchedPixels, titles: tuple[str, str]
+) -> None:
+    """One picture above the other, each match with a number of its own colour in both.
+
+    Args:
+        path: of the PNG.
+        images: (h, w, 3) red, green, blue.
+        matches: accepted ones.
+        titles: above each picture.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    aspect = images[0].shape[0] / images[0].shape[1]
+    with picture(path, _PAIR_WIDTH_IN, 2.0 * (_PAIR_WIDTH_IN * aspect + 0.4)) as figure:
+        upper, lower = figure.subplots(2, 1)
+        # Neighbours in bearing get neighbouring hues, so that a wrong match stands out.
+        order = np.argsort(np.argsort(matches.a[:, 0]))
+        hue = order / max(len(order), 1)
+        colours = hsv_to_rgb(np.column_stack([hue, np.ones(len(hue)), np.ones(len(hue))]))
+        for axes, image, points, title in (
+            (upper, images[0], matches.a, titles[0]),
+            (lower, images[1], matches.b, titles[1]),
+        ):
+            _show(axes, image, title)
+            _mark(axes, points, matches.columns, colours)
+
+
+def _show(axes: Axes, image: Image, title: str) -> None:
+    step = max(1, image.shape[1] // _SHOWN_PX)
+    height, width = image.shape[:2]
+    dimmed = (_PAIR_DIMMED * image[::step, ::step]).astype(np.uint8)
+    axes.imshow(dimmed, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
+    axes.set_title(title)
+
+
+def _mark(axes: Axes, points: FloatArray, columns: BoolArray, colours: FloatArray) -> None:
+    # Lists of tuples: the drawing library takes arrays, its types do not.
+    tints = [tuple(colour) for colour in colours.tolist()]
+    for number, (point, tint) in enumerate(zip(points.tolist(), tints, strict=True)):
+        if columns[number]:
+            axes.plot(*point, marker="|", markersize=9, markeredgewidth=1.6, color=tint)
+        else:
+            axes.plot(*point, marker="o", markersize=5, fillstyle="none", color=tint)
+        axes.annotate(
+            str(number), point, (3.0, 3.0), textcoords="offset points", color=tint, fontsize=5.5
+        )
+
+
+_VIEW_WIDTH_IN = 11.0
+_VIEW_DIMMED = 0.7
+
+
+def draw_view_tracks(path: Path, view: Image, trails: Sequence[FloatArray], title: str) -> None:
+    """Each point with its trail; those that are new are red.
+
+    Args:
+        path: of the PNG.
+        view: (h, w) grey panorama; its last column is followed by its first.
+        trails: (k, 2) column and row of one point in the last k images, the present one last.
+        title: above it.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    height, width = view.shape
+    with picture(path, _VIEW_WIDTH_IN, _VIEW_WIDTH_IN * height / width + 0.4) as figure:
+        axes = figure.subplots()
+        axes.imshow((_VIEW_DIMMED * view).astype(np.uint8), cmap="gray", vmin=0, vmax=255)
+        for trail in trails:
+            for part in _unbroken(trail, width / 2.0):
+                axes.plot(part[:, 0], part[:, 1], color=YELLOW, linewidth=0.7)
+            tint = SKY if len(trail) > 1 else VERMILLION
+            axes.plot(*trail[-1].tolist(), "o", markersize=3.5, fillstyle="none", color=tint)
+        axes.set(xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+        axes.set_title(title)
+
+
+def _unbroken(trail: FloatArray, most: float) -> list[FloatArray]:
+    """Parts of a trail between crossings of the seam."""
+    return np.split(trail, np.flatnonzero(np.abs(np.diff(trail[:, 0])) > most) + 1)

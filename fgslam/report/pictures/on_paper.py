@@ -19,7 +19,7 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MaxNLocator
 
 from fgslam.core.arrays import FloatArray
-from fgslam.report.figures.printing import printed
+from fgslam.report.figures.palette import printed
 from fgslam.report.figures.traces import Figure, Trace
 from fgslam.report.pictures.style import MAP_COLOURS, colour_bar, picture
 

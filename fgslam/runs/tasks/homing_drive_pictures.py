@@ -92,7 +92,7 @@ class DriveWatcher:
 
 def draw_leg_views(folder: Path, seed: int, views: Sequence[LegView]) -> tuple[Picture, ...]:
     """A picture for each view. Raises OutputError."""
-    from fgslam.report.pictures.view_tracks import draw_view_tracks  # Matplotlib takes a second
+    from fgslam.report.pictures.image_overlays import draw_view_tracks  # Matplotlib takes a second
 
     pictures = []
     for view in views:

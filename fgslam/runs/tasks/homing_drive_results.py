@@ -23,8 +23,7 @@ from fgslam.homing.drive_scores import (
     truly_arrived,
 )
 from fgslam.report.content import Column, TextTable
-from fgslam.report.figures.curves import Line, curve_figure
-from fgslam.report.figures.local_map import local_map_figure
+from fgslam.report.figures.homing import Line, curve_figure, local_map_figure
 from fgslam.report.figures.plan import PASS_RADIUS_M, catchment_figure, drive_figure
 from fgslam.report.figures.traces import Figure
 from fgslam.runs.config_models import DrivingConfig

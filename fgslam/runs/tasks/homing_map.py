@@ -16,7 +16,7 @@ from fgslam.homing.links import Answer, Link, Pair
 from fgslam.homing.third_view_consistency import InlierRows
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
 from fgslam.report.content import Column, Picture, TextTable
-from fgslam.report.figures.network import Links, network_figure, unfolded
+from fgslam.report.figures.plan import Links, network_figure, unfolded
 from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.config_models import TopologicalMapConfig

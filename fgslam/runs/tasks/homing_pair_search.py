@@ -150,7 +150,7 @@ def draw_pairs(
 
 def draw_pair(folder: Path, views: Views, search: PairSearch, answer: PairAnswer) -> Picture:
     """One pair: its accepted matches on both views."""
-    from fgslam.report.pictures.view_matches import MatchedPixels, draw_view_matches
+    from fgslam.report.pictures.image_overlays import MatchedPixels, draw_view_matches
 
     found, matches = answer_pair(search, answer.a, answer.b)
     a, b = views.names[answer.a], views.names[answer.b]

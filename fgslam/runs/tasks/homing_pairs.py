@@ -9,8 +9,8 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.content import Column, TextTable
-from fgslam.report.figures.curves import claimed_against_true, sorted_errors
-from fgslam.report.figures.network import Links, network_figure
+from fgslam.report.figures.homing import claimed_against_true, sorted_errors
+from fgslam.report.figures.plan import Links, network_figure
 from fgslam.report.figures.traces import Figure
 from fgslam.runs.config_models import HomingPairsConfig
 from fgslam.runs.documents import write_document, write_page

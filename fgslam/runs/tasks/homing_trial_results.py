@@ -14,7 +14,7 @@ from fgslam.evaluation.consistency import Consistency, Nees
 from fgslam.evaluation.homing import HomingErrors, HomingSummary, summarise_homings
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
 from fgslam.report.content import Column, TextTable
-from fgslam.report.figures.curves import sorted_errors
+from fgslam.report.figures.homing import sorted_errors
 from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.config_models import HomingTrialsConfig

@@ -15,7 +15,7 @@ from fgslam.datasets.omni.recording import OmniRecording
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
 from fgslam.frontend.homing.video_tracking import ReplenishedTracker, TrackedImage, VideoState
 from fgslam.report.content import Column, Picture, TextTable
-from fgslam.report.figures.curves import Line, curve_figure
+from fgslam.report.figures.homing import Line, curve_figure
 from fgslam.report.tables import write_csv
 from fgslam.runs.config_models import OmniVideoConfig
 from fgslam.runs.documents import write_document, write_page
@@ -146,7 +146,7 @@ def _draw(
     tracks: _Tracks, tracker: ReplenishedTracker, recording: OmniRecording, folder: Path
 ) -> None:
     """The last frame with the ways of its points."""
-    from fgslam.report.pictures.view_tracks import draw_view_tracks  # Matplotlib takes a second
+    from fgslam.report.pictures.image_overlays import draw_view_tracks  # Matplotlib takes a second
 
     i = len(tracks.frames) - 1
     name, _, points, added, _ = tracks.frames[i]

@@ -14,7 +14,7 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.features import StereoFeatures
 from fgslam.core.recordings import Sequence
 from fgslam.evaluation.metrics import EstimatorMetrics
-from fgslam.report.comparison_table import write_comparison_csv
+from fgslam.report.tables import write_comparison_csv
 from fgslam.runs.comparison import Compared, replay_apart, tasks_of
 from fgslam.runs.comparison_tables import comparison_particulars, comparison_tables
 from fgslam.runs.config import ExperimentConfig

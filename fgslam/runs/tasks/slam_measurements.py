@@ -16,9 +16,8 @@ from fgslam.core.trajectories import read_covariances, read_tum, write_tum
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.metrics import JsonValue
-from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
-from fgslam.report.metrics import StageTime, write_timing
 from fgslam.report.point_cloud import read_ply
+from fgslam.report.tables import LANDMARK_TRUTH_FILE, StageTime, write_landmark_truth, write_timing
 from fgslam.runs.compare import write_comparison
 from fgslam.runs.comparison import (
     GROUND_TRUTH_FILE,

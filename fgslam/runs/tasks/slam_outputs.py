@@ -17,8 +17,13 @@ from fgslam.core.trajectories import write_tum
 from fgslam.evaluation.judging import Truth, closure_counts
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
 from fgslam.report.content import Column, TextTable
-from fgslam.report.landmark_truth import LANDMARK_TRUTH_FILE, write_landmark_truth
-from fgslam.report.metrics import StageTime, write_metrics, write_timing
+from fgslam.report.tables import (
+    LANDMARK_TRUTH_FILE,
+    StageTime,
+    write_landmark_truth,
+    write_metrics,
+    write_timing,
+)
 from fgslam.runs.comparison import GROUND_TRUTH_FILE, load_truth, remark_of
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.estimator_files import write_estimate

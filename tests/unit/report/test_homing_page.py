@@ -15,12 +15,21 @@ from reports import HOSTILE
 
 from fgslam.core.arrays import FloatArray
 from fgslam.report.content import Column, TextTable
-from fgslam.report.figures.curves import claimed_against_true, sorted_errors
-from fgslam.report.figures.ellipses import SIGMAS, outlines
-from fgslam.report.figures.local_map import MAX_MOMENTS, local_map_figure, upwards
-from fgslam.report.figures.network import Links, network_figure, unfolded
-from fgslam.report.figures.plan import catchment_figure, drive_figure
-from fgslam.report.figures.traces import Figure, Trace, unpacked
+from fgslam.report.figures.homing import (
+    MAX_MOMENTS,
+    claimed_against_true,
+    local_map_figure,
+    sorted_errors,
+    upwards,
+)
+from fgslam.report.figures.plan import (
+    Links,
+    catchment_figure,
+    drive_figure,
+    network_figure,
+    unfolded,
+)
+from fgslam.report.figures.traces import SIGMAS, Figure, Trace, outlines, unpacked
 from fgslam.report.page import render, write_html
 
 

@@ -19,10 +19,10 @@ from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.features import Features
 from fgslam.core.geometry import pose, se3_exp, so3_exp
 from fgslam.report.figures import palette
-from fgslam.report.figures.ellipses import SIGMAS, exaggeration, world_position_covariances
 from fgslam.report.figures.located import Located, located_figure
 from fgslam.report.figures.over_time import error_by_axis, matches_over_time
-from fgslam.report.figures.printing import printed
+from fgslam.report.figures.palette import printed
+from fgslam.report.figures.traces import SIGMAS, exaggeration, world_position_covariances
 from fgslam.report.figures.trajectory import bulk_limits, drive_from_above, map_to_turn
 from fgslam.report.pictures import style
 from fgslam.report.pictures.image_overlays import (

@@ -21,15 +21,14 @@ from reports import HOSTILE, estimator_report, full_report, loop, picture, witho
 from fgslam.core.errors import OutputError
 from fgslam.core.geometry import so3_exp
 from fgslam.report.content import Column, Picture, TextTable
-from fgslam.report.embedding import BUDGET_BYTES, MAX_WIDTH, embed
 from fgslam.report.figures import palette
 from fgslam.report.figures.over_time import error_over_time, nees_over_time, position_sigma
 from fgslam.report.figures.traces import Figure, Trace, peaks, thinned, unpacked
 from fgslam.report.figures.trajectory import Detail, drive_from_above, level_axes, map_to_turn
-from fgslam.report.headline import headline
+from fgslam.report.page import BUDGET_BYTES, MAX_WIDTH, embed
 from fgslam.report.page import render as render_page
 from fgslam.report.run_results import EstimatorReport, ReportData
-from fgslam.report.slam_page import slam_page, write_report
+from fgslam.report.slam_page import headline, slam_page, write_report
 
 
 class Reader(HTMLParser):

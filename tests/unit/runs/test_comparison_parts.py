@@ -21,9 +21,14 @@ from fgslam.core.recordings import LandmarkTruth
 from fgslam.evaluation.consistency import Nees
 from fgslam.evaluation.judging import seen_often
 from fgslam.evaluation.metrics import EstimatorMetrics, UpdateTime, value_at
-from fgslam.report.comparison_table import RESULT_COLUMNS, TIME_COLUMNS, write_comparison_csv
-from fgslam.report.landmark_truth import read_landmark_truth, write_landmark_truth
 from fgslam.report.point_cloud import MapPoints
+from fgslam.report.tables import (
+    RESULT_COLUMNS,
+    TIME_COLUMNS,
+    read_landmark_truth,
+    write_comparison_csv,
+    write_landmark_truth,
+)
 from fgslam.runs.baseline import check_baseline, read_baseline, write_baseline
 from fgslam.runs.choosing import Choice, all_kinds, choose
 from fgslam.runs.comparison import Compared
