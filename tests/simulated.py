@@ -19,7 +19,7 @@ from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction, Update
 from fgslam.core.features import Features
 from fgslam.core.measurements import Increment, Observations, Odometry
 from fgslam.core.sensors import CameraRig, Sensor
-from fgslam.datasets.odometry_settings import ConstantVelocitySettings
+from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.slam.motion import ConstantVelocityMotion

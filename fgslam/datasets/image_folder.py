@@ -15,21 +15,29 @@ from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import right_from_left_camera
 from fgslam.core.measurements import Odometry
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.images import list_numbered_images
+from fgslam.datasets.images import (
+    StereoFiles,
+    check_sizes,
+    list_numbered_images,
+    missing_notes,
+    require_folder,
+)
 from fgslam.datasets.layouts import layout_hint
-from fgslam.datasets.odometry_settings import RecordedOdometrySettings
-from fgslam.datasets.recorded_odometry import (
+from fgslam.datasets.odometry import (
     motions_from_poses,
     motions_from_speed,
     read_pose_log,
     read_speed_log,
 )
-from fgslam.datasets.recording import OdometrySource, Recording, recording_identity
-from fgslam.datasets.selection import select_frames
-from fgslam.datasets.settings import ImageFolderSettings
-from fgslam.datasets.stereo_files import StereoFiles, check_sizes, missing_notes, require_folder
-from fgslam.datasets.tables import Table, read_table, require_increasing
-from fgslam.datasets.trajectories import read_tum_table, trajectory_at_frames
+from fgslam.datasets.recording import OdometrySource, Recording, recording_identity, select_frames
+from fgslam.datasets.settings import ImageFolderSettings, RecordedOdometrySettings
+from fgslam.datasets.tables import (
+    Table,
+    read_table,
+    read_tum_table,
+    require_increasing,
+    trajectory_at_frames,
+)
 
 TRUTH_LEFT = "gt_left_cam.txt"
 TRUTH_RIGHT = "gt_right_cam.txt"

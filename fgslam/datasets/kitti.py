@@ -16,17 +16,16 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import right_from_left_camera
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.images import list_numbered_images
-from fgslam.datasets.recording import Recording, recording_identity
-from fgslam.datasets.selection import select_frames
-from fgslam.datasets.settings import KittiSettings
-from fgslam.datasets.stereo_files import (
+from fgslam.datasets.images import (
     StereoFiles,
     check_sizes,
+    list_numbered_images,
     missing_notes,
     require_folder,
     size,
 )
+from fgslam.datasets.recording import Recording, recording_identity, select_frames
+from fgslam.datasets.settings import KittiSettings
 from fgslam.datasets.tables import read_table, require_increasing
 
 _POSE_COLUMNS = tuple(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))

@@ -25,11 +25,9 @@ from fgslam.core.estimates import Trajectory
 from fgslam.core.files import read_lines
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.images import read_grey_image
-from fgslam.datasets.recording import Recording, recording_identity
-from fgslam.datasets.selection import select_frames
+from fgslam.datasets.images import read_grey_image, require_folder
+from fgslam.datasets.recording import Recording, recording_identity, select_frames
 from fgslam.datasets.settings import LightFieldSettings
-from fgslam.datasets.stereo_files import require_folder
 
 _POSITION_COLUMNS = "file, row, column, v, u"
 

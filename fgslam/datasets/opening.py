@@ -1,12 +1,13 @@
-"""Functions that open any recording by its settings: of images, or of measurements.
+"""Functions that open any recording by its settings: of images, of measurements, for homing.
 
 A reader is imported when its kind is opened: what one needs takes others a second to load.
 """
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from fgslam.core.recordings import MeasurementRecording
-from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import (
     EurocSettings,
@@ -15,11 +16,17 @@ from fgslam.datasets.settings import (
     KittiSettings,
     LightFieldSettings,
     MeasurementDatasetSettings,
+    OdometrySettings,
+    RecordedOdometrySettings,
     SimulatedMeasurementsSettings,
     StereoTracksSettings,
     UtiasRangeBearingSettings,
     UtiasStereoSettings,
 )
+
+if TYPE_CHECKING:
+    from fgslam.datasets.omni_recording import OmniRecording
+    from fgslam.datasets.omni_settings import OmniDatasetSettings
 
 
 def open_recording(
@@ -72,18 +79,34 @@ def open_measurements(
     odometry = odometry or RecordedOdometrySettings()
     match settings:
         case SimulatedMeasurementsSettings():
-            from fgslam.datasets.measurements.simulated import open_simulated_measurements
+            from fgslam.datasets.simulated_measurements import open_simulated_measurements
 
             return open_simulated_measurements(settings, seed, odometry)
         case StereoTracksSettings():
-            from fgslam.datasets.measurements.stereo_tracks import open_stereo_tracks
+            from fgslam.datasets.stereo_tracks import open_stereo_tracks
 
             return open_stereo_tracks(settings, odometry)
         case UtiasStereoSettings():
-            from fgslam.datasets.measurements.utias_stereo import open_starry_night
+            from fgslam.datasets.utias import open_starry_night
 
             return open_starry_night(settings, odometry)
         case UtiasRangeBearingSettings():
-            from fgslam.datasets.measurements.utias_range_bearing import open_lost_in_the_woods
+            from fgslam.datasets.utias import open_lost_in_the_woods
 
             return open_lost_in_the_woods(settings, odometry)
+
+
+def open_omni(settings: OmniDatasetSettings) -> OmniRecording:
+    """Open the recording of an omnidirectional camera that the settings describe.
+
+    Raises:
+        DatasetError: it is missing, malformed or empty; of these CalibrationError, where the
+            camera is concerned, and FrameError, where the first picture cannot be read.
+    """
+    if settings.kind == "panoramas":
+        from fgslam.datasets.panoramas import open_panoramas
+
+        return open_panoramas(settings)
+    from fgslam.datasets.mirror_images import open_omni_path, open_omni_video
+
+    return open_omni_path(settings) if settings.kind == "omni_path" else open_omni_video(settings)

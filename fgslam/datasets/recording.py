@@ -1,4 +1,7 @@
-"""The one implementation of the Sequence protocol that all readers of files return."""
+"""The one implementation of the Sequence protocol that all readers of files return.
+
+Which frames are used: ``start``, ``stop``, ``stride``, as a Python slice.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import TypeAlias
 
+import numpy as np
+
 from fgslam.core.arrays import Brief, FloatArray, Image, IntArray
+from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
+from fgslam.core.settings import FrameSelection
+from fgslam.datasets.settings import RecordingSettings
 
 ImageLoader: TypeAlias = Callable[[int], tuple[Image, ...]]
 """Images (right, left[, top]) of one of the recording's own frames; raises FrameError."""
@@ -86,3 +94,39 @@ def recording_identity(contents: Iterable[Path], listed: Iterable[Path]) -> str:
     for path in sorted(listed):
         digest.update(f"{path.parent.name}/{path.name}\0{path.stat().st_size}\0".encode())
     return digest.hexdigest()
+
+
+# --------------------------------------------------------------------------------------------
+# Which frames are used
+
+
+def select_frames(count: int, settings: RecordingSettings) -> IntArray:
+    """:func:`select_of` the frames in a recording's folder."""
+    return select_of(count, settings, settings.path)
+
+
+def select_of(count: int, settings: FrameSelection, name: str) -> IntArray:
+    """Indices (m,) of the chosen ones of ``count`` frames, increasing, at least one.
+
+    ``name`` is what messages call the recording.
+
+    Raises:
+        DatasetError: the recording is empty, or the range leaves no frame.
+    """
+    if count == 0:
+        raise DatasetError(
+            f"{name} has no frame at all: check that the path is the recording's folder "
+            "and that its list of times is not empty"
+        )
+    if settings.start >= count:
+        raise DatasetError(
+            f"dataset.start is {settings.start} but {name} has only the frames 0 to "
+            f"{count - 1}: choose a smaller start"
+        )
+    if settings.stop is not None and settings.stop <= settings.start:
+        raise DatasetError(
+            f"dataset.stop ({settings.stop}) is not beyond dataset.start ({settings.start}), which "
+            f"leaves no frame of {name}: choose a larger stop"
+        )
+    stop = count if settings.stop is None else min(settings.stop, count)
+    return np.arange(settings.start, stop, settings.stride, dtype=np.int64)

@@ -1,11 +1,16 @@
-"""Simulated homings of bearings alone, as trials of homing estimators."""
+"""Simulated recordings for homing: bearings alone, and the rendered house as a world to act in."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from fgslam.worlds.house import OmniWorld
+from fgslam.worlds.house_settings import OmniHouseSettings
 from fgslam.worlds.simulated.bearings import SimulatedHoming, simulate_homing
-from fgslam.worlds.simulated.settings import SimulatedBearingsSettings, with_outliers
+from fgslam.worlds.simulated.settings import (
+    SimulatedBearingsSettings,
+    with_outliers,
+)
 
 
 def open_simulated_homing(
@@ -23,3 +28,17 @@ def open_simulated_homing(
         ConfigError: there is no such room.
     """
     return simulate_homing(with_outliers(settings, outliers), rng)
+
+
+def open_house(settings: OmniHouseSettings, seed: int) -> OmniWorld:
+    """The house with the wheelchair at the start of its reference path.
+
+    Args:
+        settings: camera, path, wheelchair, people, light and noise.
+        seed: of the path and of everything random on it.
+
+    Raises:
+        DatasetError: no reference path of that kind is found.
+        MissingDependencyError: Open3D cannot be loaded.
+    """
+    return OmniWorld(settings, seed)

@@ -14,13 +14,17 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.backend.homing.settings import HomingEstimatorSettings, HomingGraphSettings
 from fgslam.backend.settings import EstimatorSettings
-from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
-from fgslam.datasets.omni.settings import (
+from fgslam.datasets.omni_settings import (
     OmniDatasetSettings,
     OmniHouseSettings,
     SimulatedBearingsSettings,
 )
-from fgslam.datasets.settings import DatasetSettings, MeasurementDatasetSettings
+from fgslam.datasets.settings import (
+    DatasetSettings,
+    MeasurementDatasetSettings,
+    OdometrySettings,
+    RecordedOdometrySettings,
+)
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings

@@ -6,14 +6,15 @@ from collections.abc import Callable
 
 from fgslam.core.errors import ConfigError
 from fgslam.core.recordings import Sequence
-from fgslam.datasets.odometry_settings import (
+from fgslam.datasets.odometry import SyntheticOdometry
+from fgslam.datasets.opening import open_recording
+from fgslam.datasets.settings import (
+    MeasurementDatasetSettings,
     OdometrySettings,
     RecordedOdometrySettings,
+    RenderedLabSettings,
     SyntheticOdometrySettings,
 )
-from fgslam.datasets.opening import open_recording
-from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
-from fgslam.datasets.synthetic_odometry import SyntheticOdometry
 from fgslam.runs.config import ExperimentConfig
 
 

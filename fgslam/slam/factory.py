@@ -26,7 +26,7 @@ from fgslam.core.floor import DegreesOfFreedom, Floor
 from fgslam.core.measurements import MeasurementType
 from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CameraRig, Sensor
-from fgslam.datasets.odometry_settings import (
+from fgslam.datasets.settings import (
     ConstantVelocitySettings,
     OdometrySettings,
     RecordedOdometrySettings,

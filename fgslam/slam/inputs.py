@@ -15,8 +15,8 @@ from fgslam.core.errors import FrameError, OdometryError
 from fgslam.core.geometry import is_rigid
 from fgslam.core.measurements import Odometry
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
-from fgslam.datasets.recorded_odometry import pose_noise
+from fgslam.datasets.odometry import pose_noise
+from fgslam.datasets.settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.frontend.features.grey import grey_image
 
 Images: TypeAlias = Sequence[npt.ArrayLike]

@@ -8,8 +8,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT
-from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
-from fgslam.datasets.settings import DatasetSettings
+from fgslam.datasets.settings import DatasetSettings, OdometrySettings, RecordedOdometrySettings
 
 
 @dataclass(frozen=True, config=STRICT)

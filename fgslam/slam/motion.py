@@ -11,7 +11,7 @@ from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.geometry import inverse, odometry_of_camera, se3_exp, se3_log
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
-from fgslam.datasets.odometry_settings import ConstantVelocitySettings
+from fgslam.datasets.settings import ConstantVelocitySettings
 
 
 class MotionModel(Protocol):

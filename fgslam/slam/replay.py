@@ -23,7 +23,7 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, MeasurementType
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
-from fgslam.datasets.odometry_settings import ConstantVelocitySettings
+from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.slam.arrival import Arrival, take_over

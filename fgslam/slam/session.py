@@ -19,7 +19,7 @@ from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
 from fgslam.core.settings import require_seed
 from fgslam.core.threads import one_blas_thread
-from fgslam.datasets.odometry_settings import OdometrySettings, RecordedOdometrySettings
+from fgslam.datasets.settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.slam.arrival import Arrival
 from fgslam.slam.choosing import chosen_estimator, chosen_frontend
 from fgslam.slam.factory import make_extractor, make_pipeline

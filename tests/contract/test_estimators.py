@@ -27,7 +27,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction, UpdateStats
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
-from fgslam.datasets.odometry_settings import ConstantVelocitySettings
+from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.slam.factory import make_estimator

@@ -16,14 +16,15 @@ from fgslam.datasets.checks.recording import inspect_sequence
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.kitti import open_kitti
 from fgslam.datasets.light_field import open_light_field
-from fgslam.datasets.odometry_settings import RecordedOdometrySettings, SyntheticOdometrySettings
+from fgslam.datasets.odometry import SyntheticOdometry
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import (
     ImageFolderSettings,
     KittiSettings,
     LightFieldSettings,
+    RecordedOdometrySettings,
+    SyntheticOdometrySettings,
 )
-from fgslam.datasets.synthetic_odometry import SyntheticOdometry
 
 pytestmark = pytest.mark.data
 

@@ -13,7 +13,7 @@ import yaml
 
 import fgslam as fg
 from fgslam.cli.main import app
-from fgslam.datasets.omni.house import open_house
+from fgslam.datasets.simulated_homing import open_house
 from fgslam.homing.image_front_end import DRIVING
 from fgslam.homing.settings import AvoidanceSettings, HomingBehaviourSettings
 from fgslam.worlds.house import OmniWorld

@@ -12,8 +12,8 @@ from fgslam.cameras.omni.ring_calibration import find_mirror_circle
 from fgslam.cameras.omni.settings import HyperbolicMirrorSettings
 from fgslam.core.homing import FeatureKind, TwoViewVector
 from fgslam.datasets.images import read_colour_image
-from fgslam.datasets.omni.opening import open_omni
-from fgslam.datasets.omni.settings import OmniVideoSettings
+from fgslam.datasets.omni_settings import OmniVideoSettings
+from fgslam.datasets.opening import open_omni
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.frontend.homing.matching import match_features

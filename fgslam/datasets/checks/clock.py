@@ -10,7 +10,7 @@ from fgslam.core.geometry import inverse, so3_log
 from fgslam.core.recordings import Sequence
 from fgslam.datasets.checks.findings import Finding, Level
 from fgslam.datasets.recording import OdometrySource, Recording
-from fgslam.datasets.trajectories import rows_at
+from fgslam.datasets.tables import rows_at
 
 _STAMP_TOLERANCE_S = 1e-3
 _RANGE_S, _STEP_S = 0.2, 0.02

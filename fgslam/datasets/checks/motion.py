@@ -12,7 +12,7 @@ from fgslam.core.geometry import inverse, se3_log
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
 from fgslam.datasets.checks.findings import Finding, Level, listed, share
-from fgslam.datasets.trajectories import rows_at
+from fgslam.datasets.tables import rows_at
 
 _STAMP_TOLERANCE_S = 1e-3
 _MAX_JUMP = 8.0

@@ -11,7 +11,7 @@ import numpy as np
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import OutputError
-from fgslam.datasets.omni.house import open_house
+from fgslam.datasets.simulated_homing import open_house
 from fgslam.homing.avoidance import make_avoider
 from fgslam.homing.closed_loop import Driver, World, follow
 from fgslam.homing.front_end import HomingFrontEnd

@@ -11,7 +11,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.files import make_subfolder
-from fgslam.datasets.omni.recording import OmniRecording
+from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
 from fgslam.frontend.homing.video_tracking import ReplenishedTracker, TrackedImage, VideoState
 from fgslam.report.content import Column, Picture, TextTable

@@ -12,9 +12,9 @@ from fgslam.cameras.omni.ring_calibration import MirrorCircle, find_mirror_circl
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, OutputError
 from fgslam.core.homing import OmniFeatures
-from fgslam.datasets.omni.opening import open_omni
-from fgslam.datasets.omni.recording import OmniRecording
-from fgslam.datasets.omni.settings import OmniDatasetSettings
+from fgslam.datasets.omni_recording import OmniRecording
+from fgslam.datasets.omni_settings import OmniDatasetSettings
+from fgslam.datasets.opening import open_omni
 from fgslam.frontend.features.column_segments import empty_segments
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
@@ -33,7 +33,7 @@ def open_checked(settings: OmniDatasetSettings) -> OmniRecording:
     """Opens a recording, with a note where its mirror lies off the stated centre.
 
     Raises:
-        DatasetError: as :func:`fgslam.datasets.omni.opening.open_omni`.
+        DatasetError: as :func:`fgslam.datasets.opening.open_omni`.
     """
     recording = open_omni(settings)
     return replace(recording, notes=recording.notes + mirror_notes(recording))

@@ -22,7 +22,7 @@ from fgslam.core.geometry import (
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame, Sequence
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.odometry_settings import OdometrySettings
+from fgslam.datasets.settings import OdometrySettings
 from fgslam.slam.factory import make_pipeline
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.frontend_settings import FrontendSettings

@@ -19,10 +19,13 @@ from fgslam.datasets.checks.matches import check_epipolar
 from fgslam.datasets.checks.motion import check_odometry, check_odometry_against_truth, check_truth
 from fgslam.datasets.checks.recording import check_calibration, check_timing, inspect_sequence
 from fgslam.datasets.image_folder import open_image_folder
-from fgslam.datasets.odometry_settings import RecordedOdometrySettings, SyntheticOdometrySettings
+from fgslam.datasets.odometry import SyntheticOdometry
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.settings import ImageFolderSettings
-from fgslam.datasets.synthetic_odometry import SyntheticOdometry
+from fgslam.datasets.settings import (
+    ImageFolderSettings,
+    RecordedOdometrySettings,
+    SyntheticOdometrySettings,
+)
 
 
 def opened(root: Path, **settings: object) -> Recording:

@@ -14,8 +14,7 @@ from fgslam.core.errors import DatasetError, OdometryError
 from fgslam.core.geometry import inverse
 from fgslam.core.measurements import Odometry
 from fgslam.datasets.image_folder import open_image_folder
-from fgslam.datasets.odometry_settings import RecordedOdometrySettings
-from fgslam.datasets.recorded_odometry import (
+from fgslam.datasets.odometry import (
     SpeedLog,
     motions_from_speed,
     read_pose_log,
@@ -23,7 +22,7 @@ from fgslam.datasets.recorded_odometry import (
     steps_covered,
 )
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.settings import ImageFolderSettings
+from fgslam.datasets.settings import ImageFolderSettings, RecordedOdometrySettings
 
 DEFAULT = RecordedOdometrySettings()
 

@@ -8,14 +8,16 @@ from dataset_builders import euroc, image_folder, kitti
 from pydantic import TypeAdapter, ValidationError
 
 from fgslam.core.geometry import pose
-from fgslam.datasets.odometry_settings import (
+from fgslam.datasets.opening import open_recording
+from fgslam.datasets.settings import (
     ConstantVelocitySettings,
+    EurocSettings,
+    ImageFolderSettings,
+    KittiSettings,
     OdometrySettings,
     RecordedOdometrySettings,
     SyntheticOdometrySettings,
 )
-from fgslam.datasets.opening import open_recording
-from fgslam.datasets.settings import EurocSettings, ImageFolderSettings, KittiSettings
 
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 

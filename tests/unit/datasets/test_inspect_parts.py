@@ -27,8 +27,7 @@ from fgslam.datasets.checks.matches import (
 )
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.layouts import kitti_drives, recognise_layout
-from fgslam.datasets.odometry_settings import RecordedOdometrySettings
-from fgslam.datasets.settings import ImageFolderSettings
+from fgslam.datasets.settings import ImageFolderSettings, RecordedOdometrySettings
 from fgslam.frontend.features.descriptor_matching import mutual_nearest
 from fgslam.runs.inspection import inspect_recording, render_report
 

@@ -19,9 +19,8 @@ from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.estimates import Prediction
 from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.datasets.opening import open_measurements
-from fgslam.datasets.settings import StereoTracksSettings
+from fgslam.datasets.settings import ConstantVelocitySettings, StereoTracksSettings
 from fgslam.evaluation.trajectory import evaluate_trajectory
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings

@@ -12,12 +12,11 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
-from fgslam.datasets import synthetic_odometry
+from fgslam.datasets import odometry as odometry_module
 from fgslam.datasets.image_folder import open_image_folder
-from fgslam.datasets.odometry_settings import SyntheticOdometrySettings
+from fgslam.datasets.odometry import SyntheticOdometry
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.settings import ImageFolderSettings
-from fgslam.datasets.synthetic_odometry import SyntheticOdometry
+from fgslam.datasets.settings import ImageFolderSettings, SyntheticOdometrySettings
 
 SETTINGS = SyntheticOdometrySettings()
 FRAMES = 300
@@ -93,8 +92,8 @@ def test_standard_deviations_follow_the_settings(folder: Path) -> None:
 def test_without_noise_but_the_floor_it_is_the_truth(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(synthetic_odometry, "_TRANSLATION_FLOOR_M", 1e-9)
-    monkeypatch.setattr(synthetic_odometry, "_ROTATION_FLOOR_DEG", 1e-9)
+    monkeypatch.setattr(odometry_module, "_SYNTHETIC_FLOOR_M", 1e-9)
+    monkeypatch.setattr(odometry_module, "_SYNTHETIC_FLOOR_DEG", 1e-9)
     still = SyntheticOdometrySettings(translation_sigma_fraction=0.0, rotation_sigma_deg=0.0)
     sequence = SyntheticOdometry(opened(folder), still, 1)
     truth = sequence.ground_truth

@@ -18,9 +18,12 @@ from fgslam.core.estimates import Prediction, Trajectory
 from fgslam.core.planar import wrap
 from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.sensors import CameraRig, RangeBearingSensor
-from fgslam.datasets.odometry_settings import ConstantVelocitySettings
 from fgslam.datasets.opening import open_measurements
-from fgslam.datasets.settings import UtiasRangeBearingSettings, UtiasStereoSettings
+from fgslam.datasets.settings import (
+    ConstantVelocitySettings,
+    UtiasRangeBearingSettings,
+    UtiasStereoSettings,
+)
 from fgslam.evaluation.trajectory import evaluate_trajectory
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings

@@ -9,8 +9,7 @@ import pytest
 import yaml
 
 from fgslam.core.errors import ConfigError
-from fgslam.datasets.odometry_settings import ConstantVelocitySettings
-from fgslam.datasets.settings import ImageFolderSettings
+from fgslam.datasets.settings import ConstantVelocitySettings, ImageFolderSettings
 from fgslam.frontend.places.settings import LoopSettings
 from fgslam.runs.config import ExperimentConfig, load_config, parse_config
 from fgslam.runs.config_models import TASKS

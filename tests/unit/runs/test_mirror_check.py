@@ -12,7 +12,7 @@ import pytest
 from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame
 from fgslam.cameras.omni.settings import EquirectangularSettings, HyperbolicMirrorSettings
 from fgslam.core.arrays import Image
-from fgslam.datasets.omni.settings import OmniPathSettings
+from fgslam.datasets.omni_settings import OmniPathSettings
 from fgslam.runs.tasks.homing_views import open_checked
 
 SIZE = (320, 240)

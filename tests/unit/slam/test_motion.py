@@ -14,7 +14,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.measurements import Odometry
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.odometry_settings import ConstantVelocitySettings
+from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.slam.motion import ConstantVelocityMotion, OdometryMotion
 
 SETTINGS = ConstantVelocitySettings()

@@ -17,7 +17,7 @@ from fgslam.backend.smoothers.settings import BatchSettings
 from fgslam.core.errors import EstimatorError, MeasurementLogError
 from fgslam.core.estimates import Estimate, Trajectory, UpdateStats
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.datasets.odometry_settings import ConstantVelocitySettings
+from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.evaluation.judging import Truth, judge_replay
 from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.slam import factory

@@ -30,7 +30,7 @@ from fgslam.core.estimates import EgoMotionStatus, Prediction
 from fgslam.core.features import Features
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
-from fgslam.datasets.odometry_settings import ConstantVelocitySettings
+from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.slam.pipeline import FrameReport
 from fgslam.slam.results import SessionResult
 from fgslam.slam.session import Session

@@ -18,8 +18,8 @@ from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Prediction, Trajectory
 from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.odometry_settings import ConstantVelocitySettings, SyntheticOdometrySettings
 from fgslam.datasets.opening import open_measurements
+from fgslam.datasets.settings import ConstantVelocitySettings, SyntheticOdometrySettings
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.settings import EgoMotionSettings

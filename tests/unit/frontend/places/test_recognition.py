@@ -26,7 +26,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotionStatus
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.datasets.odometry_settings import ConstantVelocitySettings
+from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.places.loops.confirmation import difference
 from fgslam.frontend.places.loops.recognition import PlaceRecognition
 from fgslam.frontend.places.settings import LostSettings

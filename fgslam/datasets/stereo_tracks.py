@@ -22,15 +22,14 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.sensors import CameraRig, measurement_map
-from fgslam.datasets.measurements.files import (
+from fgslam.datasets.measurement_files import (
     MeasuredFrame,
     files_identity,
     make_increments,
     make_log,
 )
-from fgslam.datasets.odometry_settings import OdometrySettings
-from fgslam.datasets.selection import select_of
-from fgslam.datasets.settings import StereoTracksSettings
+from fgslam.datasets.recording import select_of
+from fgslam.datasets.settings import OdometrySettings, StereoTracksSettings
 from fgslam.datasets.tables import Table, read_table
 
 _INSIDE = {"00s": "00s", "00": "00", "large": "_large"}

@@ -9,24 +9,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy import sparse
 
 from fgslam.cameras.omni.camera_files import make_camera
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.planar import wrap
-from fgslam.datasets.images import IMAGE_SUFFIXES, read_colour_image
-from fgslam.datasets.omni.panorama_reduction import PanoramaReduction
-from fgslam.datasets.omni.recording import (
+from fgslam.datasets.images import IMAGE_SUFFIXES, read_colour_image, require_folder
+from fgslam.datasets.omni_recording import (
     ColourLoader,
     OmniRecording,
     ids_of,
     no_times,
     pictures_in,
 )
-from fgslam.datasets.omni.settings import PanoramasSettings
-from fgslam.datasets.recording import recording_identity
-from fgslam.datasets.selection import select_frames
-from fgslam.datasets.stereo_files import require_folder
+from fgslam.datasets.omni_settings import PanoramasSettings
+from fgslam.datasets.recording import recording_identity, select_frames
 
 POSES_FILE = "poses.csv"
 _PICTURES = "panos"
@@ -229,3 +227,52 @@ def _unlisted(root: Path, paths: list[Path]) -> tuple[str, ...]:
         return ()
     extra = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p not in paths]
     return (f"{len(extra)} pictures of {_PICTURES}/ are not in {POSES_FILE}",) if extra else ()
+
+
+# --------------------------------------------------------------------------------------------
+# Smaller pictures
+
+
+class PanoramaReduction:
+    """Averages pictures (height, width, 3) of one size to a smaller one, around the seam.
+
+    Plain resizing keeps the picture's *borders* in place; a panorama's first and last columns (and
+    rows) must keep their *centres*, or bearings would be off by half a pixel at the seam.
+    """
+
+    def __init__(self, before: tuple[int, int], after: tuple[int, int]) -> None:
+        """Sizes are (width, height); ``after`` must not be larger."""
+        self._across = _averaging(before[0], after[0], periodic=True)
+        self._down = _averaging(before[1], after[1], periodic=False)
+
+    def __call__(self, image: Image) -> Image:
+        """The smaller picture, rounded."""
+        height, width, bands = image.shape
+        rows = self._down @ image.reshape(height, -1).astype(np.float32)
+        columns = rows.reshape(-1, width, bands).transpose(1, 0, 2).reshape(width, -1)
+        out = (self._across @ columns).reshape(-1, rows.shape[0], bands).transpose(1, 0, 2)
+        return np.ascontiguousarray(out + np.float32(0.5)).astype(np.uint8)
+
+
+def _averaging(before: int, after: int, periodic: bool) -> sparse.csr_array:
+    """(after, before) weights: each new pixel is the mean over the old ones that it covers."""
+    step = (before - 1) / (after - 1)
+    centres = np.arange(after) * step
+    reach = int(np.ceil(0.5 * step + 0.5))
+    old = np.rint(centres).astype(np.int64)[:, None] + np.arange(-reach, reach + 1)
+    weights: FloatArray = np.clip(
+        np.minimum(centres[:, None] + 0.5 * step, old + 0.5)
+        - np.maximum(centres[:, None] - 0.5 * step, old - 0.5),
+        0.0,
+        None,
+    )
+    if periodic:
+        # The first and the last column look the same way.
+        old = np.mod(old, before - 1)
+    else:
+        weights = np.where((old >= 0) & (old < before), weights, 0.0)
+        old = np.clip(old, 0, before - 1)
+    weights /= weights.sum(axis=1, keepdims=True)
+    new = np.repeat(np.arange(after), old.shape[1])
+    entries = (weights.ravel().astype(np.float32), (new, old.ravel()))
+    return sparse.csr_array(entries, shape=(after, before))

@@ -6,11 +6,13 @@ from collections.abc import Iterator
 from dataclasses import asdict
 
 from fgslam.core.recordings import LandmarkTruth, MeasurementRecording
-from fgslam.datasets.measurements.files import make_log
-from fgslam.datasets.odometry_settings import OdometrySettings
+from fgslam.datasets.measurement_files import make_log
+from fgslam.datasets.settings import OdometrySettings
 from fgslam.worlds.rendering.cache import content_hash
 from fgslam.worlds.simulated.measurements import SimulatedMeasurements, simulate_measurements
-from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
+from fgslam.worlds.simulated.settings import (
+    SimulatedMeasurementsSettings,
+)
 
 SIMULATION_VERSION = 1
 """Part of the identity: raised whenever the same settings and seed give other measurements."""

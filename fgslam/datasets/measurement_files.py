@@ -17,7 +17,7 @@ from fgslam.core.errors import ConfigError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Observations, Odometry
 from fgslam.core.sensors import Sensor
-from fgslam.datasets.odometry_settings import (
+from fgslam.datasets.settings import (
     ConstantVelocitySettings,
     OdometrySettings,
     RecordedOdometrySettings,
