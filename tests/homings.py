@@ -8,9 +8,9 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray
 from fgslam.core.homing import HomingStart, HomingTruth, TrackedBearings, TwoViewVector
-from fgslam.frontend.homing.local_map import make_local_map
-from fgslam.frontend.homing.ransac import estimate_homing_vector
+from fgslam.frontend.homing.homing_vector import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.two_view_geometry import make_local_map
 from fgslam.worlds.simulated.bearings import simulate_homing
 from fgslam.worlds.simulated.settings import SimulatedBearingsSettings
 

@@ -27,14 +27,13 @@ from fgslam.core.homing import (
 )
 from fgslam.core.planar import bearings, compose, wrap
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.homing.avoidance import NoAvoidance, ObstacleAvoider
-from fgslam.homing.bearing_consistency import parallax
+from fgslam.homing.active_homing import parallax
 from fgslam.homing.closed_loop import Driver, follow
 from fgslam.homing.drive_record import DriveRecord
 from fgslam.homing.front_end import Sighting
 from fgslam.homing.path_following import HomingChain
 from fgslam.homing.settings import HomingBehaviourSettings
-from fgslam.homing.steering import Steering
+from fgslam.homing.steering import NoAvoidance, ObstacleAvoider, Steering
 from fgslam.runs.tasks.homing_trials import start_from_matches
 
 DARK = np.zeros((1, 1, 3), dtype=np.uint8)
@@ -288,7 +287,6 @@ def make_follower(
         setting.path(),
         lambda start: make_homing_estimator(start, kind),
         settings.control,
-        settings.path,
     )
 
 

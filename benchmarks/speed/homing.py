@@ -28,9 +28,8 @@ from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
 from fgslam.homing.controller import HomingController
-from fgslam.homing.front_end import HomingFrontEnd
-from fgslam.homing.image_front_end import FrontEndSettings, ImageFrontEnd
-from fgslam.homing.settings import HomingControlSettings
+from fgslam.homing.front_end import HomingFrontEnd, ImageFrontEnd
+from fgslam.homing.settings import FrontEndSettings, HomingControlSettings
 from fgslam.worlds.house import OmniWorld
 from fgslam.worlds.house_settings import HousePathSettings, OmniHouseSettings
 

@@ -22,13 +22,13 @@ from fgslam.core.settings import make_settings, require_seed
 from fgslam.frontend.features.colour_image import colour_image
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
+from fgslam.frontend.homing.homing_vector import pair_generator, vector_between
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.frontend.homing.two_views import pair_generator, vector_between
 from fgslam.homing.command import Drive, DriveCommand
-from fgslam.homing.image_front_end import DRIVING, FrontEndSettings, make_front_end, unusable
+from fgslam.homing.front_end import make_front_end, unusable
 from fgslam.homing.path_following import HomingChain, LegOutcome
 from fgslam.homing.path_memory import PathMemory
-from fgslam.homing.settings import HomingBehaviourSettings
+from fgslam.homing.settings import DRIVING, FrontEndSettings, HomingBehaviourSettings
 from fgslam.homing.steering import Steering
 
 
@@ -168,7 +168,6 @@ class PathFollower:
             path.images,
             lambda start: make_homing_estimator(start, settings),
             behaviour.control,
-            behaviour.path,
         )
         self._steering = Steering(behaviour.steering)
         self._longest_step = 1.0 / behaviour.loop.images_per_s

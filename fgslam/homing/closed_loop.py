@@ -12,12 +12,11 @@ import numpy as np
 from fgslam.core.arrays import ByteArray, FloatArray
 from fgslam.core.homing import HomingEstimate
 from fgslam.homing.active_homing import ActiveHoming
-from fgslam.homing.avoidance import ObstacleAvoider, RangeScan
 from fgslam.homing.command import Command, Drive
 from fgslam.homing.drive_record import STAGES, DriveRecord, HomingLog
 from fgslam.homing.path_following import HomingChain
 from fgslam.homing.settings import ClosedLoopSettings
-from fgslam.homing.steering import Steering
+from fgslam.homing.steering import ObstacleAvoider, RangeScan, Steering
 
 
 class World(Protocol):

@@ -21,6 +21,8 @@ from fgslam.homing.command import Command, HomingState
 from fgslam.homing.front_end import HomingFrontEnd, Sighting
 from fgslam.homing.settings import HomingControlSettings
 
+_BLIND_S = 1.0  # longest drive straight on, at reduced speed, without tracks
+_STALL_S = 15.0  # without progress for so long, the target is matched anew
 _FARTHER_S = 2.5
 """Drive straight on, at reduced speed, to look for a refused target from elsewhere; 0.4 m with the
 default steering."""
@@ -65,7 +67,7 @@ class HomingController:
         self._ended: Command | None = None
         self._heading = 0.0
         self._was_ahead = False
-        self._progress, self._patience = _Progress(settings.stall_s), settings.wait_s
+        self._progress, self._patience = _Progress(_STALL_S), settings.wait_s
         self._next_try = -np.inf
         self._blind_until = -np.inf
         self._search_until, self._searches = -np.inf, 0
@@ -126,7 +128,7 @@ class HomingController:
         if arrival and fault is None:
             fault = Fault(f"no track confirms it: {arrival}", True)
         if self._progress.stalled(self.remaining, time):
-            fault = Fault(f"no progress for {self._settings.stall_s:g} s", True)
+            fault = Fault(f"no progress for {_STALL_S:g} s", True)
             if self._progress.stalls >= _MAX_STALLS:
                 return self._refuse(time, Refusal(RefusalReason.NO_PROGRESS, fault.reason))
         if fault is None:
@@ -135,8 +137,8 @@ class HomingController:
 
     def _arrival(self, unit: float) -> str:
         """Why the target counts as reached; empty if it does not."""
-        s, behind = self._settings, abs(self._heading) > np.pi / 2
-        if self.remaining <= s.switch_fraction:
+        behind = abs(self._heading) > np.pi / 2
+        if self.remaining <= self._settings.switch_fraction:
             return f"reached: {self.remaining:.2f} of the leg left"
         # A renewed homing's own distance counts, too: its unit may be wrong, not its zero.
         near = min(self.remaining, self.remaining / unit) <= _PASS_FRACTION
@@ -218,9 +220,8 @@ class HomingController:
 
     def _lose(self, image: ByteArray, time: float, why: str) -> Command:
         """The estimate is not usable: match anew at once, or drive blind for a while."""
-        s = self._settings
         ahead = abs(self._heading) <= np.deg2rad(_BLIND_HEADING_DEG)
-        self._blind_until = time + s.blind_s if ahead else -np.inf
+        self._blind_until = time + _BLIND_S if ahead else -np.inf
         self.active, self._next_try = None, time
         return self._seek(image, time, why)
 

@@ -1,11 +1,15 @@
-"""What a drive leaves behind: arrays and short texts for files and figures (Figs 4 and 6)."""
+"""What a drive leaves behind (Figs 4 and 6), and how well it kept to its path."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings
+from fgslam.core.planar import wrap
+from fgslam.core.quantiles import student_quantile
 from fgslam.homing.path_following import LegOutcome
 
 STAGES = ("image", "homing", "steering", "drive")
@@ -94,3 +98,121 @@ class DriveRecord:
 
     def __len__(self) -> int:
         return len(self.time)
+
+
+# --------------------------------------------------------------------------------------------
+# How well a drive kept to its path: distances to targets, and if errors build up
+
+
+ARRIVED_M = 0.5
+"""Metres: a robot that claims an arrival and stands farther from the last target has not arrived.
+It stops where the switch fraction of the leg is left, 0.28 m of a leg of 4 m by default."""
+
+
+def end_distance(record: DriveRecord) -> float:
+    """Metres from where the robot stood at last to the last target; NaN where that is unknown."""
+    if len(record.targets) == 0:
+        return float("nan")
+    return float(np.hypot(*(record.end[:2] - record.targets[-1, :2])))
+
+
+def truly_arrived(record: DriveRecord) -> bool:
+    """Whether the robot says that it reached the last target, and stands within ARRIVED_M of it.
+
+    Where the truth is not known, what the robot says has to do.
+    """
+    return record.arrived and not end_distance(record) > ARRIVED_M
+
+
+def pass_distances(record: DriveRecord) -> FloatArray:
+    """(m,) metres to each target where the robot was nearest, on its leg or on the next one.
+
+    Infinite for targets that were never aimed at, NaN where the place is unknown. The next leg
+    counts, as the robot turns away from a target shortly before it is there.
+    """
+    way = np.vstack([record.truth[:, :2], record.end[:2]])
+    aimed = np.append(record.target, record.target[-1:])
+    out = np.full(len(record.targets), np.inf)
+    for k, target in enumerate(record.targets):
+        near = way[np.isin(aimed, (k, k + 1))]
+        if k in aimed:
+            out[k] = np.min(np.hypot(*(near - target[:2]).T))
+    return out
+
+
+def cross_track(record: DriveRecord) -> FloatArray:
+    """(m,) root mean square distance (metres) from the straight line of each leg.
+
+    The line runs from the target before (for the first, from where the robot stood) to the leg's
+    target; NaN for legs that were not driven, or whose line has no direction: two targets in one
+    place.
+    """
+    ends = np.vstack([record.truth[0, :2], record.targets[:, :2]])
+    out = np.full(len(record.targets), np.nan)
+    for k in range(len(record.targets)):
+        rows = record.target == k
+        length = np.hypot(*(ends[k + 1] - ends[k]))
+        if rows.any() and length > 0.0:
+            offsets = record.truth[rows, :2] - ends[k]
+            along = (ends[k + 1] - ends[k]) / length
+            across = offsets[:, 1] * along[0] - offsets[:, 0] * along[1]
+            out[k] = np.sqrt(np.mean(across**2))
+    return out
+
+
+def corners(record: DriveRecord) -> FloatArray:
+    """(m,) how sharply each leg turns off the one before: the angle's sine, 1 beyond 90 degrees.
+
+    The robot turns off where the switch fraction of the leg before is left, and so begins the next
+    leg that part times this beside its line. The first leg begins on its line: 0. NaN for legs that
+    have no direction, two targets in one place, and for those after them.
+    """
+    ends = np.vstack([record.truth[0, :2], record.targets[:, :2]])
+    steps = np.diff(ends, axis=0)
+    angle = np.where(steps.any(axis=1), np.arctan2(steps[:, 1], steps[:, 0]), np.nan)
+    turns = np.abs(wrap(np.diff(angle, prepend=angle[:1])))
+    return np.asarray(np.sin(np.minimum(turns, 0.5 * np.pi)))
+
+
+@dataclass(frozen=True, slots=True)
+class Slope:
+    """A straight line's slope with its confidence interval.
+
+    Attributes:
+        value: of the least squares line, units of the values a leg.
+        low, high: 95 % confidence interval (Student's t).
+    """
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def flat(self) -> bool:
+        """Whether zero lies within the interval."""
+        return self.low <= 0.0 <= self.high
+
+
+def slope_by_leg(legs: IntArray, values: FloatArray, known: FloatArray | None = None) -> Slope:
+    """Whether values (n,), one a leg and run, grow with the leg's number (n,).
+
+    Values that are not finite are left out; with as few as there are unknowns there is no
+    interval: NaN.
+
+    Args:
+        legs: numbers.
+        values: what may grow.
+        known: (n,) another cause, whose share (linear, fitted along) is not counted as growth.
+    """
+    kept = np.isfinite(values) if known is None else np.isfinite(values) & np.isfinite(known)
+    causes = [np.ones(len(legs)), np.asarray(legs, dtype=np.float64)]
+    columns = np.column_stack(causes if known is None else [*causes, known])[kept]
+    y, free = np.asarray(values)[kept], int(np.count_nonzero(kept)) - columns.shape[1]
+    if free < 1 or np.linalg.matrix_rank(columns) < columns.shape[1]:
+        return Slope(float("nan"), float("nan"), float("nan"))
+    fitted, *_ = np.linalg.lstsq(columns, y, rcond=None)
+    residuals = y - columns @ fitted
+    spread = np.linalg.inv(columns.T @ columns)[1, 1]
+    sigma = float(np.sqrt(residuals @ residuals / free * spread))
+    slope, reach = float(fitted[1]), float(student_quantile(0.975, free)) * sigma
+    return Slope(slope, slope - reach, slope + reach)

@@ -13,7 +13,7 @@ from fgslam.homing.active_homing import EstimatorMaker
 from fgslam.homing.command import Command, HomingState
 from fgslam.homing.controller import HomingController
 from fgslam.homing.front_end import HomingFrontEnd
-from fgslam.homing.settings import HomingControlSettings, PathFollowingSettings
+from fgslam.homing.settings import HomingControlSettings
 
 LegResult: TypeAlias = Literal["arrived", "skipped", "refused", "unfinished"]
 
@@ -46,8 +46,8 @@ class HomingChain:
     """Homes to the targets in their order.
 
     A target that is reached hands over to the next one with the same image, so that the robot
-    does not stop in between. One that ends in a refusal is left out, if the settings allow, and
-    the next one tried from where the robot stands: images are sparse, but often two are in reach.
+    does not stop in between. One that ends in a refusal is left out, and the next one tried from
+    where the robot stands: images are sparse, but often two are in reach.
 
     Attributes:
         outcomes: of the legs that ended.
@@ -60,7 +60,6 @@ class HomingChain:
         path: Sequence[OmniFeatures],
         make_estimator: EstimatorMaker,
         control: HomingControlSettings,
-        settings: PathFollowingSettings,
     ) -> None:
         """Begins before the first target.
 
@@ -73,7 +72,6 @@ class HomingChain:
         self._path = tuple(path)
         self._make_estimator = make_estimator
         self._control = control
-        self._settings = settings
         self._target = 0
         self._skipped: list[int] = []
         self._began: float | None = None
@@ -116,7 +114,7 @@ class HomingChain:
         if command.state is HomingState.ARRIVED:
             self._note("arrived", command.time, command.remaining, command.reason)
             self._skipped = []
-        elif last or not self._may_skip():
+        elif last or len(self._skipped) >= _MAX_SKIPS:
             self._note("refused", command.time, command.remaining, command.reason)
             return False
         else:
@@ -128,9 +126,6 @@ class HomingChain:
         self._began = command.time
         self.controller = self._new_controller()
         return True
-
-    def _may_skip(self) -> bool:
-        return self._settings.skip_unmatched and len(self._skipped) < _MAX_SKIPS
 
     def _new_controller(self) -> HomingController:
         return HomingController(

@@ -15,8 +15,8 @@ from scipy.cluster.vq import kmeans2
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.homing import OmniFeatures
-from fgslam.homing.settings import RetrievalSettings
 
+_WORDS = 400  # in the vocabulary
 _ITERATIONS = 6  # of k-means
 _SAMPLE = 10_000  # descriptors that the vocabulary is made of, at most
 
@@ -27,17 +27,15 @@ class VisualWords:
     def __init__(
         self,
         images: Sequence[OmniFeatures],
-        settings: RetrievalSettings,
         rng: np.random.Generator,
     ) -> None:
         """Learns the words from the images themselves.
 
         Args:
             images: any number; those without SIFT features are like no other.
-            settings: size of the vocabulary.
             rng: chooses the sample and the first words.
         """
-        self._words = _vocabulary(images, settings, rng)
+        self._words = _vocabulary(images, rng)
         counts = np.array([self._counts(i) for i in images]).reshape(len(images), -1)
         seen = np.count_nonzero(counts, axis=0)
         self._rarity = np.log((1.0 + len(images)) / (1.0 + seen))
@@ -67,13 +65,11 @@ class VisualWords:
         return np.bincount(words, minlength=len(self._words)).astype(np.float64)
 
 
-def _vocabulary(
-    images: Sequence[OmniFeatures], settings: RetrievalSettings, rng: np.random.Generator
-) -> FloatArray:
+def _vocabulary(images: Sequence[OmniFeatures], rng: np.random.Generator) -> FloatArray:
     everything = np.vstack([np.empty((0, 128)), *(_rooted(i) for i in images)])
     if len(everything) > _SAMPLE:
         everything = everything[np.sort(rng.choice(len(everything), _SAMPLE, False))]
-    words = min(settings.words, len(everything))
+    words = min(_WORDS, len(everything))
     if words < 2:
         return np.empty((0, 128))
     first = everything[np.sort(rng.choice(len(everything), words, replace=False))]

@@ -1,4 +1,4 @@
-"""Settings of the behaviour: homing, steering, avoidance, path following, maps, localisation.
+"""Settings of homing: behaviour, front-end, maps, localisation.
 
 Where the paper leaves a number open, `docs/concepts/homing.md` says where the default comes from.
 *Legs* are distances from start to target: the scale of images is not known.
@@ -12,6 +12,8 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT
+from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
+from fgslam.frontend.homing.settings import HomingVectorSettings
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -36,10 +38,6 @@ class HomingControlSettings:
     retry_s: Annotated[
         float, Field(ge=0.0, description="between two attempts to match the target anew")
     ] = 0.5
-    blind_s: Annotated[
-        float,
-        Field(ge=0.0, description="longest drive straight on, at reduced speed, without tracks"),
-    ] = 1.0
     give_up_s: Annotated[
         float,
         Field(
@@ -51,10 +49,6 @@ class HomingControlSettings:
     farther_tries: Annotated[
         int, Field(ge=0, description="such drives for one target; 0: refused is refused")
     ] = 3
-    stall_s: Annotated[
-        float,
-        Field(gt=0.0, description="without progress for so long, the target is matched anew"),
-    ] = 15.0
     wait_s: Annotated[
         float,
         Field(
@@ -88,28 +82,9 @@ class AvoidanceSettings:
         float,
         Field(gt=0.0, description="of the corridor that the robot needs: its radius and a margin"),
     ] = 0.42
-    look_ahead_m: Annotated[
-        float, Field(gt=0.0, description="length of the corridor that must be free, from standing")
-    ] = 0.6
-    look_ahead_s: Annotated[
-        float, Field(ge=0.0, description="what comes on top at speed, in seconds of driving")
-    ] = 1.5
-    max_turn_deg_s: Annotated[
-        float, Field(gt=0.0, description="largest turning rate of an override")
-    ] = 40.0
     body_m: Annotated[
         float, Field(gt=0.0, description="half width of the bare robot, for ways out of corners")
     ] = 0.37
-
-
-@dataclass(frozen=True, config=STRICT)
-class PathFollowingSettings:
-    """A path is a chain of homings."""
-
-    skip_unmatched: Annotated[
-        bool,
-        Field(description="a target that is refused is skipped if the one after it can be matched"),
-    ] = True
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -131,21 +106,48 @@ class HomingBehaviourSettings:
     control: HomingControlSettings = HomingControlSettings()
     steering: SteeringSettings = SteeringSettings()
     avoidance: AvoidanceSettings = AvoidanceSettings()
-    path: PathFollowingSettings = PathFollowingSettings()
     loop: ClosedLoopSettings = ClosedLoopSettings()
 
 
 # --------------------------------------------------------------------------------------------
-# Maps
+# Front-end
 
 
 @dataclass(frozen=True, config=STRICT)
-class RetrievalSettings:
-    """Which images are worth a homing, by visual words of their descriptors."""
+class FrontEndSettings:
+    """What every stage of the front-end is set to."""
 
-    words: Annotated[int, Field(ge=2, description="in the vocabulary, k-means of descriptors")] = (
-        400
-    )
+    features: OmniFeatureSettings = OmniFeatureSettings()
+    homing_vector: HomingVectorSettings = HomingVectorSettings()
+    wrong_matches: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            lt=0.9,
+            description="share of wrong matches mixed into those of start and target, to test "
+            "robustness; 0 on a robot",
+        ),
+    ] = 0.0
+
+
+DRIVING = FrontEndSettings(
+    OmniFeatureSettings(matching=OmniMatchingSettings(ratio=0.9)),
+    HomingVectorSettings(
+        samples=600,
+        confidence=0.999999,
+        rival_angle_deg=40.0,
+        rival_log_odds=8.0,
+        max_direction_sigma_deg=12.0,
+    ),
+)
+"""For driving: a start that is 10 degrees off does no harm, the estimator corrects it on the way.
+
+Between images that are only compared the defaults are stricter.
+"""
+
+
+# --------------------------------------------------------------------------------------------
+# Maps
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -159,7 +161,6 @@ class TopologicalMapSettings:
             description="images that each one is tried against, the most alike first; 0: all pairs",
         ),
     ] = 0
-    retrieval: RetrievalSettings = RetrievalSettings()
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -11,20 +11,15 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from fgslam.core.array_files import ArrayFile, Items, of_rows, rows_of, write_arrays
+from fgslam.core.array_files import ArrayFile, Items, of_rows, rows_of
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import OmniFeatures
-from fgslam.homing.feature_file import (
-    pack_features,
-    unpack_features,
-)
-from fgslam.homing.link_consistency import LinkConsistency
-from fgslam.homing.links import Answer, Link, Linker, Pair, link_pairs
-from fgslam.homing.path_memory import PathMemory, read_names
+from fgslam.homing.link_consistency import InlierRows, LinkConsistency, ThirdViewConsistency
+from fgslam.homing.links import Answer, Link, Pair, link_pairs
+from fgslam.homing.path_memory import PathMemory, load_images, save_images
 from fgslam.homing.retrieval import VisualWords, candidate_pairs
 from fgslam.homing.settings import TopologicalMapSettings
-from fgslam.homing.third_view_consistency import InlierRows, ThirdViewConsistency
 
 FILE = ArrayFile(
     name="fgslam topological map",
@@ -116,10 +111,8 @@ class TopologicalMap:
         Raises:
             OutputError: it cannot be written.
         """
-        arrays = FILE.header(names=list(self.names)) | pack_features(self.images)
-        arrays |= _link_arrays(self.links, self.costs)
-        size = write_arrays(Path(path), arrays, compressed=True)
-        return size / 1000.0 / max(len(self), 1)
+        links = _link_arrays(self.links, self.costs)
+        return save_images(FILE, path, self.images, self.names, links)
 
     @staticmethod
     def load(path: str | Path) -> TopologicalMap:
@@ -128,43 +121,13 @@ class TopologicalMap:
         Raises:
             StoredMapError: the file is missing, truncated, damaged, foreign or of another version.
         """
-        arrays = FILE.load(Path(path))
-        header = FILE.read_header(arrays, str(path))
-        images = unpack_features(arrays, str(path))
-        names = read_names(header, len(images), str(path))
+        images, names, arrays = load_images(FILE, path)
         links, costs = _read_links(arrays, len(images), str(path))
         return TopologicalMap(images, names, links, costs, {})
 
 
 # --------------------------------------------------------------------------------------------
 # Building
-
-
-def build_map(
-    images: Sequence[OmniFeatures],
-    linker: Linker,
-    settings: TopologicalMapSettings,
-    rng: np.random.Generator,
-    *,
-    ordered: bool = False,
-    names: Sequence[str] | None = None,
-) -> TopologicalMap:
-    """Tries every candidate pair both ways, and keeps the links that are accepted.
-
-    Args:
-        images: features of the nodes.
-        linker: homing vector from one image to another.
-        settings: candidates and checks.
-        rng: for the visual words, which choose the candidates.
-        ordered: the images follow each other on a way.
-        names: of the images; numbered if absent.
-    """
-    pairs = map_candidates(images, settings, rng, ordered=ordered)
-    answers: dict[Pair, Answer] = {}
-    for a, b in pairs:
-        answers[a, b] = linker(images[a], images[b])
-        answers[b, a] = linker(images[b], images[a])
-    return map_of_answers(images, answers, settings, ordered=ordered, names=names)
 
 
 def map_candidates(
@@ -179,7 +142,7 @@ def map_candidates(
     if settings.candidates == 0 or settings.candidates >= n - 1:
         likenesses = np.zeros((n, n))
     else:
-        likenesses = VisualWords(images, settings.retrieval, rng).likenesses()
+        likenesses = VisualWords(images, rng).likenesses()
     pairs = {(int(a), int(b)) for a, b in candidate_pairs(likenesses, settings.candidates)}
     if ordered:
         pairs |= {(k, k + 1) for k in range(n - 1)}
@@ -189,7 +152,6 @@ def map_candidates(
 def map_of_answers(
     images: Sequence[OmniFeatures],
     answers: Mapping[Pair, Answer],
-    settings: TopologicalMapSettings,
     *,
     ordered: bool = False,
     names: Sequence[str] | None = None,
@@ -200,9 +162,8 @@ def map_of_answers(
     Args:
         images: features of the nodes.
         answers: of pairs (from, to), both ways; pairs with one way only are passed over.
-        settings: checks.
-        ordered: as in :func:`build_map`.
-        names: likewise.
+        ordered: the images follow each other on a way.
+        names: of the images; numbered if absent.
         rows: inliers of the answers; with them, far links of an ordered set need third views.
     """
     memory = PathMemory.of(images, names)
@@ -211,13 +172,13 @@ def map_of_answers(
     if ordered and rows is not None:
         links, seen, unseen = ThirdViewConsistency(images, links, rows).confirmed()
         refused |= unseen
-    checks = LinkConsistency(len(images), links, settings)
-    believed, rejected = checks.believed(ordered=ordered, confirmed=seen)
-    costs = np.array([link_cost(link, settings) for link in believed])
-    return TopologicalMap(memory.images, memory.names, tuple(believed), costs, refused | rejected)
+    checks = LinkConsistency(len(images), links)
+    accepted, rejected = checks.accepted(ordered=ordered, confirmed=seen)
+    costs = np.array([link_cost(link) for link in accepted])
+    return TopologicalMap(memory.images, memory.names, tuple(accepted), costs, refused | rejected)
 
 
-def link_cost(link: Link, settings: TopologicalMapSettings) -> float:
+def link_cost(link: Link) -> float:
     """One for a leg, more where few inliers or an unsure direction make it risky.
 
     So a route prefers a few safe legs to many, and two safe ones to one that is not.

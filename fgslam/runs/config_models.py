@@ -27,7 +27,6 @@ from fgslam.datasets.settings import (
 )
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from fgslam.homing.settings import (
     HomingBehaviourSettings,
     LocalisationSettings,
@@ -287,7 +286,6 @@ class OmniVideoConfig(HomingExperiment):
 
     task: Annotated[Literal["omni_video"], _TASK]
     dataset: OmniDatasetSettings
-    tracking: OmniTrackingSettings = OmniTrackingSettings()
     least_points: Annotated[
         int, Field(ge=1, description="with fewer points left, new ones are added")
     ] = 110
@@ -319,7 +317,6 @@ class DrivingConfig(HomingExperiment):
     dataset: OmniHouseSettings = OmniHouseSettings()
     features: OmniFeatureSettings = OmniFeatureSettings()
     homing_vector: HomingVectorSettings = HomingVectorSettings()
-    tracking: OmniTrackingSettings = OmniTrackingSettings()
     behaviour: HomingBehaviourSettings = HomingBehaviourSettings()
     estimator: LiveHoming = HomingGraphSettings()
     compare: ComparedList = ()

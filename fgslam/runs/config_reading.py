@@ -229,7 +229,14 @@ def _is_retired(error: ErrorDetails, schema: Schema) -> bool:
     *group, key = (str(name) for name in error["loc"])
     _, nodes = _descend(schema, group)
     constants = [RETIRED.get(node.get("title", ""), {}) for node in nodes]
-    return any(key in found and found[key] == error["input"] for found in constants)
+    return any(key in found and _agrees(error["input"], found[key]) for found in constants)
+
+
+def _agrees(given: Any, constant: Any) -> bool:
+    """Whether a value is the constant, or a group whose keys are all constants of that group."""
+    if isinstance(given, Mapping) and isinstance(constant, Mapping):
+        return all(key in constant and _agrees(given[key], constant[key]) for key in given)
+    return bool(given == constant)
 
 
 # --------------------------------------------------------------------------------------------

@@ -8,8 +8,33 @@ from __future__ import annotations
 
 from typing import Any
 
+_TRACKING = {
+    "max_points": 50,
+    "max_view_width": 720,
+    "sigma_px": 0.2,
+    "pyramid_levels": 2,
+    "iterations": 15,
+    "precision_px": 0.03,
+    "max_back_px": 1.0,
+    "min_eigenvalue": 0.0001,
+    "patch_px": 13,
+    "patch_deformation": 0.05,
+    "max_deformation": 1.0,
+    "sigma_deformed_px": 1.0,
+    "search_px": 3.0,
+    "plane_error": 0.2,
+    "distinct_px": 3.0,
+    "patch_noise_grey": 4.0,
+    "min_correlation": 0.7,
+    "window_px": 9,
+}
+"""A group of omnidirectional tracking, all of which is constant."""
+
 RETIRED: dict[str, dict[str, Any]] = {
     "AvoidanceSettings": {
+        "look_ahead_m": 0.6,
+        "look_ahead_s": 1.5,
+        "max_turn_deg_s": 40.0,
         "directions": 72,
         "keep_weight": 0.5,
         "gain_per_s": 2.0,
@@ -21,6 +46,10 @@ RETIRED: dict[str, dict[str, Any]] = {
     "BatchSettings": {
         "weak_prior_ranges": 2.0,
         "max_iterations": 100,
+    },
+    "BloggieSettings": {
+        "view_deg": 60.0,
+        "above_horizon": 0.8,
     },
     "ColourMomentSettings": {
         "mean_floor": 8.0,
@@ -62,7 +91,15 @@ RETIRED: dict[str, dict[str, Any]] = {
     "GraphSettings": {
         "weak_prior_ranges": 2.0,
     },
+    "HomingConfig": {
+        "tracking": _TRACKING,
+    },
+    "HomingBehaviourSettings": {
+        "path": {"skip_unmatched": True, "max_skips": 1},
+    },
     "HomingControlSettings": {
+        "blind_s": 1.0,
+        "stall_s": 15.0,
         "pass_fraction": 0.25,
         "fewest_tracks": 4,
         "max_across": 0.1,
@@ -136,25 +173,11 @@ RETIRED: dict[str, dict[str, Any]] = {
         "max_column_distance": 4.4,
         "column_ratio": 0.7,
     },
-    "OmniTrackingSettings": {
-        "pyramid_levels": 2,
-        "iterations": 15,
-        "precision_px": 0.03,
-        "max_back_px": 1.0,
-        "min_eigenvalue": 0.0001,
-        "patch_px": 13,
-        "patch_deformation": 0.05,
-        "max_deformation": 1.0,
-        "sigma_deformed_px": 1.0,
-        "search_px": 3.0,
-        "plane_error": 0.2,
-        "distinct_px": 3.0,
-        "patch_noise_grey": 4.0,
-        "min_correlation": 0.7,
-        "window_px": 9,
+    "OmniVideoConfig": {
+        "tracking": _TRACKING,
     },
-    "PathFollowingSettings": {
-        "max_skips": 1,
+    "PathFollowingConfig": {
+        "tracking": _TRACKING,
     },
     "PermanenceSettings": {
         "apart_px": 2.0,
@@ -192,10 +215,6 @@ RETIRED: dict[str, dict[str, Any]] = {
         "elsewhere_m": 0.5,
         "elsewhere_deg": 15.0,
     },
-    "RetrievalSettings": {
-        "sample": 10000,
-        "iterations": 6,
-    },
     "SiftSettings": {
         "edge_threshold": 10.0,
     },
@@ -221,6 +240,7 @@ RETIRED: dict[str, dict[str, Any]] = {
         "rotation_floor_deg": 0.01,
     },
     "TopologicalMapSettings": {
+        "retrieval": {"words": 400, "sample": 10000, "iterations": 6},
         "one_way_support": 25,
         "lone_support": 50,
         "mutual_deg": 5.0,

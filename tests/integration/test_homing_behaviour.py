@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 
 from fgslam.core.planar import compose
-from fgslam.homing.drive_record import DriveRecord
-from fgslam.homing.drive_scores import cross_track, pass_distances, slope_by_leg, truly_arrived
+from fgslam.homing.drive_record import (
+    DriveRecord,
+    cross_track,
+    pass_distances,
+    slope_by_leg,
+    truly_arrived,
+)
 from tests.landmark_world import drive_path, winding_path
 
 LEGS = 10

@@ -15,13 +15,11 @@ from landmark_world import drive_path, make_follower, winding_path
 from fgslam.backend.homing.settings import HomingGraphSettings
 from fgslam.core.homing import TrackedBearings
 from fgslam.evaluation.homing import homing_errors
-from fgslam.homing.avoidance import NoAvoidance
 from fgslam.homing.closed_loop import Driver, follow
-from fgslam.homing.drive_record import DriveRecord
-from fgslam.homing.drive_scores import cross_track, pass_distances, truly_arrived
+from fgslam.homing.drive_record import DriveRecord, cross_track, pass_distances, truly_arrived
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.settings import HomingBehaviourSettings
-from fgslam.homing.steering import Steering
+from fgslam.homing.steering import NoAvoidance, Steering
 from fgslam.runs.config import parse_homing
 from fgslam.runs.config_models import HomingConfig, PathFollowingConfig
 from fgslam.runs.folder import write_config

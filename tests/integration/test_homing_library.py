@@ -14,8 +14,7 @@ import yaml
 import fgslam as fg
 from fgslam.cli.main import app
 from fgslam.datasets.simulated_homing import open_house
-from fgslam.homing.image_front_end import DRIVING
-from fgslam.homing.settings import AvoidanceSettings, HomingBehaviourSettings
+from fgslam.homing.settings import DRIVING, AvoidanceSettings, HomingBehaviourSettings
 from fgslam.worlds.house import OmniWorld
 from fgslam.worlds.house_settings import HousePanoramaSettings, HousePathSettings, OmniHouseSettings
 

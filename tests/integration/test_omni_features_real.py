@@ -15,9 +15,8 @@ from fgslam.core.homing import BearingMatches
 from fgslam.core.planar import between
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
-from fgslam.frontend.homing.epipolar import EpipolarTest
-from fgslam.frontend.homing.matching import match_features
-from fgslam.frontend.homing.plain_sift import match_plain, plain_sift
+from fgslam.frontend.homing.matching import PLAIN_MATCHING, match_features, match_sift, plain_sift
+from fgslam.frontend.homing.two_view_geometry import EpipolarTest
 
 pytestmark = pytest.mark.data
 
@@ -56,7 +55,7 @@ def right(matches: BearingMatches, a: FloatArray, b: FloatArray) -> BoolArray:
 def test_more_right_matches_and_no_more_wrong_ones(shared_data: Path) -> None:
     (pose_a, image_a), (pose_b, image_b) = (pose_and_image(shared_data, k) for k in (7, 10))
     camera = Equirectangular(image_a.shape[1], image_a.shape[0])
-    plain = match_plain(plain_sift(camera, image_a), plain_sift(camera, image_b))
+    plain = match_sift(plain_sift(camera, image_a), plain_sift(camera, image_b), PLAIN_MATCHING)
     extractor = OmniFeatureExtractor(camera, OmniFeatureSettings())
     a, b = extractor.extract(image_a), extractor.extract(image_b)
     ours = match_features(a, b, OmniFeatureSettings().matching)

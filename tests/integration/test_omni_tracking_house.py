@@ -13,11 +13,9 @@ from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatc
 from fgslam.frontend.homing.bearing_tracking import BearingTracker
 from fgslam.frontend.homing.matching import match_features
 from fgslam.frontend.homing.trackable_points import move_to_trackable
-from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from fgslam.worlds.house import CAMERA_HEIGHT_M, OmniWorld
 from fgslam.worlds.house_settings import HousePathSettings, OmniHouseSettings
 
-SETTINGS = OmniTrackingSettings()
 STEPS = 20
 
 
@@ -36,7 +34,7 @@ class Leg:
             self.poses.append(np.array([*(self.start[:2] + way * (0.02 * k)), turn]))
             self.world.put(self.poses[-1])
             self.images.append(self.world.image(0.1 * k))
-        self.tracker = BearingTracker(self.world.camera, SETTINGS)
+        self.tracker = BearingTracker(self.world.camera)
 
     def matched(
         self, other: Image
@@ -47,7 +45,7 @@ class Leg:
         matches = match_features(*features, OmniMatchingSettings())
         stabilised = self.tracker.stabilised
         rows, pixels, moved = move_to_trackable(
-            stabilised.grey(self.images[0]), stabilised.view, matches, features, SETTINGS
+            stabilised.grey(self.images[0]), stabilised.view, matches, features
         )
         found = self.world.camera.pixels(stabilised.view.rays(pixels))
         return matches.select(rows), moved, pixels, self.world.points(self.poses[0], found)

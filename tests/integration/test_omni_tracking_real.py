@@ -16,11 +16,10 @@ from fgslam.datasets.omni_settings import OmniVideoSettings
 from fgslam.datasets.opening import open_omni
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
+from fgslam.frontend.homing.bearing_tracking import ReplenishedTracker
+from fgslam.frontend.homing.homing_vector import estimate_homing_vector
 from fgslam.frontend.homing.matching import match_features
-from fgslam.frontend.homing.ransac import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
-from fgslam.frontend.homing.video_tracking import ReplenishedTracker
 
 pytestmark = pytest.mark.data
 
@@ -37,7 +36,7 @@ def test_a_hundred_points_through_the_mirror_video(shared_data: Path) -> None:
     """Two seconds of the walk; the whole of it is `experiments/mirror_video.yaml`."""
     video = present(shared_data, "omni_mirror/bloggie_walk.mp4")
     recording = open_omni(OmniVideoSettings(path=str(video)))
-    tracker = ReplenishedTracker(recording.camera, OmniTrackingSettings(), 110, 160)
+    tracker = ReplenishedTracker(recording.camera, 110, 160)
     lives: dict[int, int] = {}
     for i in range(FRAMES):
         found = tracker.take(recording.image(i), float(recording.timestamps[i])).tracked

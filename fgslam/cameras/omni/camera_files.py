@@ -115,7 +115,7 @@ def make_camera(
             coefficients = tuple(np.deg2rad(settings.coefficients_deg).tolist())
             return RadialPolynomial(frame, *settings.ring_px, coefficients=coefficients)
         case BloggieSettings():
-            return _bloggie(settings, _find(settings.file, folder), image_size)
+            return _bloggie(_find(settings.file, folder), image_size)
 
 
 def _read(source: str | Path) -> tuple[OmniCameraKind, Path | None]:
@@ -229,6 +229,8 @@ def _find(file: str, folder: Path | None) -> Path:
 # Radius (0 at the inner, 1 at the outer rim) over the panorama's height (0 above), as measured on a
 # grid by Golan Levin (BloggieUnwarp, 2010): 0.1850 y^2 + 0.8184 y - 0.0028.
 _LEVIN = (-0.0028, 0.8184, 0.1850)
+_BLOGGIE_VIEW_DEG, _ABOVE_HORIZON = 60.0, 0.8
+"""Vertical field of view, and its part above the horizon: assumed, no calibration is published."""
 _BLOGGIE_KEYS = (
     "INPUT_WIDTH",
     "INPUT_HEIGHT",
@@ -240,7 +242,7 @@ _BLOGGIE_KEYS = (
 )
 
 
-def _bloggie(settings: BloggieSettings, path: Path, size: Size | None) -> RadialPolynomial:
+def _bloggie(path: Path, size: Size | None) -> RadialPolynomial:
     """The camera of a settings file of BloggieUnwarp: the panorama's middle is ahead."""
     values = _bloggie_values(path)
     width, height = values["INPUT_WIDTH"], values["INPUT_HEIGHT"]
@@ -260,7 +262,7 @@ def _bloggie(settings: BloggieSettings, path: Path, size: Size | None) -> Radial
     frame = MirrorFrame(*size, centre, math.radians(values["ANGLE_SHIFT"] - 180.0))
     down = np.linspace(0.0, 1.0, 50)
     fraction = np.clip(np.polynomial.polynomial.polyval(down, np.array(_LEVIN)), 0.0, 1.0)
-    elevation = np.radians(settings.view_deg) * (settings.above_horizon - down)
+    elevation = np.radians(_BLOGGIE_VIEW_DEG) * (_ABOVE_HORIZON - down)
     samples = (inner + fraction * (outer - inner), elevation)
     return fit_radial_polynomial(frame, (inner, outer), samples).camera
 

@@ -163,12 +163,6 @@ class BloggieSettings:
             min_length=1, description="settings.txt, looked for beside the video, then from here"
         ),
     ] = "bloggie_settings.txt"
-    view_deg: Annotated[
-        float, Field(gt=10.0, lt=120.0, description="vertical field of view, assumed")
-    ] = 60.0
-    above_horizon: Annotated[
-        float, Field(ge=0.0, le=1.0, description="part of it above the horizon, assumed")
-    ] = 0.8
 
 
 OmniCameraSettings: TypeAlias = Annotated[

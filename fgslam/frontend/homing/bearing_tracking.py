@@ -19,8 +19,9 @@ from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import TrackedBearings
 from fgslam.frontend.homing.reference_patches import ReferencePatches, align, anchor
 from fgslam.frontend.homing.stabilised_view import StabilisedImage, StabilisedView
-from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 
+_MAX_VIEW_WIDTH = 720  # columns: half a degree; coarser cameras get fewer
+SIGMA_PX = 0.2  # of a tracked point, in pixels of the view
 _SIGMA_DEFORMED_PX = 1.0
 """Pixels of sigma for each unit of a patch's deformation, added in squares: measured on the
 rendered house."""
@@ -37,6 +38,7 @@ is lost."""
 
 _PATCH_NOISE_GREY = 4.0  # sigma of its grey values: noise, and what no affine map does
 PATCH_PX = 13  # side of the patch that holds a point in place
+DISTINCT_PX = 3.0  # of two trackable points nearer than this one is kept
 MIN_EIGENVALUE = 1e-4  # smaller eigenvalue of eq. 2 over the window, a pixel, grey values 0 to 1
 _MAX_BACK_PX = 1.0  # a point tracked back that misses its origin by more is lost
 _PRECISION_PX = 0.03  # a smaller step ends the iteration
@@ -72,11 +74,8 @@ class TrackerState:
 class BearingTracker:
     """Tracks points of one camera's images and tells their bearings."""
 
-    def __init__(self, camera: OmniCamera, settings: OmniTrackingSettings) -> None:
-        self._settings = settings
-        self.stabilised = StabilisedView(
-            camera, settings.max_view_width, WINDOW_PX, _PYRAMID_LEVELS
-        )
+    def __init__(self, camera: OmniCamera) -> None:
+        self.stabilised = StabilisedView(camera, _MAX_VIEW_WIDTH, WINDOW_PX, _PYRAMID_LEVELS)
         self._last: StabilisedImage | None = None
         self._places: FloatArray = np.empty((0, 2))
         self._patches: ReferencePatches | None = None
@@ -205,12 +204,12 @@ class BearingTracker:
         return np.asarray(good & (places[:, 0] >= 0.0) & (places[:, 0] <= columns - 1.0))
 
     def _bearings(self, time: float) -> TrackedBearings:
-        s, view = self._settings, self.stabilised.view
+        view = self.stabilised.view
         pixels = self.pixels()
         a_column = 2.0 * np.pi / self.stabilised.period
         a_row = (view.top_elevation - view.bottom_elevation) / (view.height - 1)
         deformation = np.empty(0) if self._patches is None else self._patches.deformation()
-        sigma = np.hypot(s.sigma_px, _SIGMA_DEFORMED_PX * deformation)
+        sigma = np.hypot(SIGMA_PX, _SIGMA_DEFORMED_PX * deformation)
         return TrackedBearings(
             time=time,
             ids=self._ids.copy(),
@@ -235,3 +234,109 @@ def _in_light_of(before: Image, now: Image) -> Image:
         return now
     levels = np.clip(np.round(gain * np.arange(256) + offset), 0, 255).astype(np.uint8)
     return np.asarray(cv2.LUT(now, levels), dtype=np.uint8)
+
+
+# --------------------------------------------------------------------------------------------
+# Tracking through a whole recording: points that are lost are replaced by new ones
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackedImage:
+    """One image of a recording.
+
+    Attributes:
+        tracked: the points after replenishing.
+        survivors: points of the image before that were found again.
+        added: (k,) identities of the new ones.
+    """
+
+    tracked: TrackedBearings
+    survivors: int
+    added: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VideoState:
+    """All that goes over from one image to the next.
+
+    Attributes:
+        tracker: of the points; None before the first image.
+        next: identity of the next new point.
+    """
+
+    tracker: TrackerState | None
+    next: int
+
+
+class ReplenishedTracker:
+    """A tracker that always follows enough points."""
+
+    def __init__(self, camera: OmniCamera, least: int, most: int) -> None:
+        """Fills up to ``most`` points whenever fewer than ``least`` are left."""
+        self._tracker = BearingTracker(camera)
+        self._least, self._most = least, most
+        self._next = 0
+        self._started = False
+
+    def take(self, image: Image, time: float) -> TrackedImage:
+        """Tracks into the next image (h, w, 3), and adds points where too few are left.
+
+        Raises:
+            EstimatorError: time does not increase.
+            FrameError: the image is not the camera's.
+        """
+        if not self._started:
+            none = np.empty(0, np.int64)
+            self._tracker.start(image, time, none, np.empty((0, 2)))
+            self._started = True
+            survivors = 0
+            tracked = None
+        else:
+            tracked = self._tracker.track(image, time)
+            survivors = len(tracked)
+        added = self._fill(image) if survivors < self._least else np.empty(0, np.int64)
+        if tracked is None or len(added):
+            tracked = self._tracker.bearings()
+        return TrackedImage(tracked, survivors, added)
+
+    def state(self) -> VideoState:
+        """What it takes to go on later."""
+        return VideoState(self._tracker.state(), self._next)
+
+    def restore(self, state: VideoState) -> None:
+        """Goes on from :meth:`state`, to the same bits."""
+        self._tracker.restore(state.tracker)
+        self._next, self._started = state.next, state.tracker is not None
+
+    def pixels(self) -> FloatArray:
+        """(n, 2) where the points are in the view (:meth:`view`) of the last image."""
+        return self._tracker.pixels()
+
+    def view(self, image: Image) -> Image:
+        """(height, width) the unwrapped grey view of an image (h, w, 3)."""
+        return self._tracker.stabilised.grey(image)
+
+    def _fill(self, image: Image) -> IntArray:
+        """(k,) identities of the strongest corners away from the points that there are."""
+        present = self._tracker.pixels()
+        corners = self._corners(self._tracker.stabilised.grey(image), present)
+        ids = self._next + np.arange(len(corners), dtype=np.int64)
+        self._next += len(corners)
+        self._tracker.add(ids, corners)
+        return ids
+
+    def _corners(self, grey: Image, present: FloatArray) -> FloatArray:
+        """(k, 2) in the view; k fills up what is missing, where there is so much to see."""
+        mask = np.full(grey.shape, 255, np.uint8)
+        rim = WINDOW_PX // 2 + 1
+        mask[:rim] = mask[-rim:] = 0
+        for column, row in np.round(present).astype(int).tolist():
+            cv2.circle(mask, (column, row), WINDOW_PX // 2, 0, -1)
+        wanted = self._most - len(present)
+        if wanted <= 0:
+            return np.empty((0, 2))
+        found = cv2.goodFeaturesToTrack(
+            grey, wanted, 0.005, max(DISTINCT_PX, WINDOW_PX / 3.0), mask=mask,
+            blockSize=WINDOW_PX,
+        )  # fmt: skip
+        return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)

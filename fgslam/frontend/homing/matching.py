@@ -11,10 +11,12 @@ and sin(elevation) = z/r, so s_a / s_b = sin(e_a) / sin(e_b).
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import ByteArray, FloatArray, IntArray
+from fgslam.cameras.omni.camera import OmniCamera, measure
+from fgslam.core.arrays import ByteArray, FloatArray, Image, IntArray
 from fgslam.core.homing import (
     BearingMatches,
     ColumnSegments,
@@ -22,6 +24,7 @@ from fgslam.core.homing import (
     OmniFeatures,
     UprightFeatures,
 )
+from fgslam.frontend.features.colour_sift import up_in_image
 from fgslam.frontend.features.column_whitening import whitened
 from fgslam.frontend.features.omni_settings import OmniMatchingSettings
 
@@ -235,3 +238,96 @@ def consistent_tangents(a: FloatArray, b: FloatArray) -> tuple[FloatArray, Float
 
 def _far_end(tangents: FloatArray) -> IntArray:
     return np.asarray(np.argmax(np.abs(tangents), axis=1), np.int64)
+
+
+# --------------------------------------------------------------------------------------------
+# How likely a match is right, and what a hypothesis that it agrees with gains by it
+#
+# A match much better than its runner-up is nearly always right, one barely better hardly ever.
+# Counting both alike wastes what matching knows; so a hypothesis is supported by likelihoods
+# (Tordoff and Murray 2005): with probability p of being right, a normalised epipolar residual r has
+# density (1 - p) u + p N(r), u being what wrong matches have.
+
+
+_LOGIT = {FeatureKind.SIFT: (-3.0, 10.5), FeatureKind.COLUMN: (-2.3, 3.5)}
+"""Logit of p as a line over quality: offset and slope, by kind.
+
+Measured on the 22 pairs of ``omni_home`` that were answered rightly, 8,555 SIFT matches and 876
+column matches in bins of quality: SIFT 0.1 at 0.05, 0.4 at 0.22, 0.7 at 0.35, 0.9 at 0.6; columns
+0.2 at 0.22, 0.3 at 0.4, 0.5 at 0.6.
+"""
+_LEAST, _MOST = 0.02, 0.95
+_SCATTER = 1.2  # of right matches' residuals over their stated noise, measured on the same pairs
+COMMON_CHANCE = 0.05
+"""That a wrong match agrees with a hypothesis, while searching; an answer's own is measured."""
+_SHARES = np.array([1.0, 0.5, 0.25, 0.1])
+"""Scenes differ in how many of their matches survive; p is taken times each of these, evenly."""
+
+
+def right_probability(matches: BearingMatches) -> FloatArray:
+    """(n,) probability that a match is right, before any geometry."""
+    p = np.empty(len(matches))
+    for kind, (offset, slope) in _LOGIT.items():
+        of_kind = matches.kind == int(kind)
+        p[of_kind] = 1.0 / (1.0 + np.exp(-offset - slope * matches.quality[of_kind]))
+    return np.clip(p, _LEAST, _MOST)
+
+
+def gain(residuals: FloatArray, sigmas: float, chance: float) -> FloatArray:
+    """N(r) / u: how much denser right residuals are than wrong ones; any shape.
+
+    ``chance`` is the probability that a wrong match keeps within ``sigmas``.
+    """
+    density = np.exp(-0.5 * (residuals / _SCATTER) ** 2) / (_SCATTER * np.sqrt(2.0 * np.pi))
+    return np.asarray(density * (2.0 * sigmas / chance))
+
+
+def log_likelihood_ratio(gains: FloatArray, probability: FloatArray) -> float:
+    """Log of how much better a hypothesis explains the matches than chance does.
+
+    Args:
+        gains: (n,) as from :func:`gain`, zero for matches that contradict it.
+        probability: (n,) of being right.
+
+    If all matches are wrong the ratio's expectation is 1; by Markov's inequality it exceeds x with
+    probability 1 / x at most.
+    """
+    shares = _SHARES[:, None] * probability
+    logs = np.sum(np.log1p(shares * (gains - 1.0)), axis=1)
+    return float(np.logaddexp.reduce(logs) - np.log(len(_SHARES)))
+
+
+# --------------------------------------------------------------------------------------------
+# The baseline of all comparisons: SIFT as OpenCV has it
+
+
+PLAIN_MATCHING = OmniMatchingSettings(
+    ratio=0.8, root=False, max_colour_distance=1e9, planar_gates=False
+)
+"""Lowe's ratio test alone, for :func:`plain_sift`."""
+
+
+def plain_sift(camera: OmniCamera, image: Image, sigma_px: float = 1.2) -> UprightFeatures:
+    """OpenCV's SIFT with its own parameters, orientations and all, on an image (h, w, 3).
+
+    Features that the camera does not see are left out. There is no colour: it is zero.
+    """
+    detector = cv2.SIFT.create(enable_precise_upscale=True)
+    keypoints, descriptors = detector.detectAndCompute(
+        cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None
+    )
+    if descriptors is None:
+        descriptors = np.zeros((0, 128), np.float32)
+    table = np.array([(*k.pt, 0.5 * k.size) for k in keypoints], np.float64).reshape(-1, 3)
+    bearing, elevation, covariance = measure(camera, table[:, :2], sigma_px)
+    up = np.linalg.norm(up_in_image(camera, table[:, :2]), axis=1)
+    seen = np.isfinite(bearing) & np.isfinite(up)
+    return UprightFeatures(
+        pixels=table[seen, :2],
+        bearing=bearing[seen],
+        elevation=elevation[seen],
+        covariance=covariance[seen],
+        scale=table[seen, 2] / up[seen],
+        descriptors=np.asarray(descriptors, np.uint8)[seen],
+        colour=np.zeros((int(seen.sum()), 3)),
+    )

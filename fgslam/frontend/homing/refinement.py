@@ -18,8 +18,8 @@ from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.gauss_newton import GaussNewton, Linearised
 from fgslam.core.homing import BearingMatches
 from fgslam.core.planar import wrap
-from fgslam.frontend.homing.epipolar import in_front, ray_derivatives
-from fgslam.frontend.homing.match_probability import COMMON_CHANCE, gain, right_probability
+from fgslam.frontend.homing.matching import COMMON_CHANCE, gain, right_probability
+from fgslam.frontend.homing.two_view_geometry import in_front, ray_derivatives
 
 _WIDENED = (4.0, 3.0, 2.0, 1.5)
 """Inliers' threshold in the first iterations: a hypothesis from two matches is a few degrees off,

@@ -17,10 +17,14 @@ from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.homing import BearingMatches, FeatureKind, OmniFeatures
 from fgslam.core.planar import wrap
-from fgslam.frontend.homing.bearing_tracking import MIN_EIGENVALUE, PATCH_PX, WINDOW_PX
-from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
+from fgslam.frontend.homing.bearing_tracking import (
+    DISTINCT_PX,
+    MIN_EIGENVALUE,
+    PATCH_PX,
+    SIGMA_PX,
+    WINDOW_PX,
+)
 
-DISTINCT_PX = 3.0  # of two trackable points nearer than this one is kept
 _PLANE_ERROR = 0.2
 """Part of the offset from the feature's centre by which its place in the target view is uncertain:
 features are not flat, nor seen head on."""
@@ -35,7 +39,6 @@ def move_to_trackable(
     view: Equirectangular,
     matches: BearingMatches,
     features: tuple[OmniFeatures, OmniFeatures],
-    settings: OmniTrackingSettings,
 ) -> tuple[IntArray, FloatArray, BearingMatches]:
     """Replaces features by trackable points.
 
@@ -44,7 +47,6 @@ def move_to_trackable(
         view: its camera.
         matches: of start and target.
         features: of start and target, those that the matches index.
-        settings: window, search, uncertainty.
 
     Returns:
         Rows (m,) of ``matches`` that have such a point, the points (m, 2) in the view, and the
@@ -52,7 +54,7 @@ def move_to_trackable(
     """
     if not len(matches):
         return np.empty(0, dtype=np.int64), np.empty((0, 2)), matches
-    radius = _search_radius(matches, features[0], view, settings)
+    radius = _search_radius(matches, features[0], view)
     centres = _in_view(matches, view)
     strength = _strength(grey, WINDOW_PX)
     points, strongest = _best_near(strength, centres, radius)
@@ -62,16 +64,15 @@ def move_to_trackable(
     good &= _distinct(points, strongest, DISTINCT_PX)
     rows = np.flatnonzero(good)
     ratio = _scale_ratio(matches, *features)
-    moved = _moved(matches, points - centres, ratio, view, settings)
+    moved = _moved(matches, points - centres, ratio, view)
     chosen = points[rows]
     chosen[:, 0] %= view.width - 1
     return rows, chosen, moved.select(rows)
 
 
 def _search_radius(
-    matches: BearingMatches, features: OmniFeatures, view: Equirectangular,
-    settings: OmniTrackingSettings,
-) -> FloatArray:  # fmt: skip
+    matches: BearingMatches, features: OmniFeatures, view: Equirectangular
+) -> FloatArray:
     """(n,) pixels: a feature's own size, within bounds."""
     a_radian = (view.width - 1) / (2.0 * np.pi)
     size = np.zeros(len(matches))
@@ -143,7 +144,6 @@ def _moved(
     offset: FloatArray,
     ratio: FloatArray,
     view: Equirectangular,
-    settings: OmniTrackingSettings,
 ) -> BearingMatches:
     """Matches of points at pixel offsets (n, 2) from the features."""
     a_column = 2.0 * np.pi / (view.width - 1)
@@ -153,7 +153,7 @@ def _moved(
     # feature's own uncertainty, and that of its offset.
     off_plane = _PLANE_ERROR * ratio * np.hypot(left, up)
     sigma = matches.sigma.copy()
-    sigma[:, 0], sigma[:, 1] = settings.sigma_px * a_column, settings.sigma_px * a_row
+    sigma[:, 0], sigma[:, 1] = SIGMA_PX * a_column, SIGMA_PX * a_row
     sigma[:, 2:] = np.hypot(sigma[:, 2:], off_plane[:, None])
     return replace(
         matches,

@@ -13,8 +13,7 @@ from fgslam.core.bearing_log import BearingLog
 from fgslam.core.homing import HomingTruth
 from fgslam.core.planar import between, wrap
 from fgslam.homing.command import HomingState
-from fgslam.homing.drive_record import DriveRecord, HomingLog
-from fgslam.homing.drive_scores import cross_track, pass_distances
+from fgslam.homing.drive_record import DriveRecord, HomingLog, cross_track, pass_distances
 from fgslam.homing.path_memory import PathMemory
 from fgslam.report.figures.plan import Drive
 from fgslam.report.tables import Cell, write_csv

@@ -11,9 +11,10 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import between
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
-from fgslam.homing.drive_record import STAGES, DriveRecord
-from fgslam.homing.drive_scores import (
+from fgslam.homing.drive_record import (
     ARRIVED_M,
+    STAGES,
+    DriveRecord,
     Slope,
     corners,
     cross_track,

@@ -12,13 +12,12 @@ from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import OutputError
 from fgslam.datasets.simulated_homing import open_house
-from fgslam.homing.avoidance import make_avoider
 from fgslam.homing.closed_loop import Driver, World, follow
-from fgslam.homing.front_end import HomingFrontEnd
-from fgslam.homing.image_front_end import FrontEndSettings, make_front_end
+from fgslam.homing.front_end import HomingFrontEnd, make_front_end
 from fgslam.homing.path_following import HomingChain
 from fgslam.homing.path_memory import PathMemory
-from fgslam.homing.steering import Steering
+from fgslam.homing.settings import FrontEndSettings
+from fgslam.homing.steering import Steering, make_avoider
 from fgslam.runs.config_models import DrivingConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task
 from fgslam.runs.tasks.homing_drive_files import DrivenSeed
@@ -84,9 +83,7 @@ def drives_task(config: DrivingConfig, opener: Opener) -> Task[RunResult]:
 def open_house_drive(config: DrivingConfig, seed: int) -> Opened:
     """World and front-end of one seed. Raises FgslamError where the house cannot be built."""
     world = open_house(config.dataset, seed)
-    settings = FrontEndSettings(
-        config.features, config.homing_vector, config.tracking, config.wrong_matches
-    )
+    settings = FrontEndSettings(config.features, config.homing_vector, config.wrong_matches)
     return world, make_front_end(world.camera, settings, seed)
 
 
@@ -126,9 +123,9 @@ def perform_drive(task: DriveTask) -> DrivenSeed:
         memory.images,
         lambda start: make_homing_estimator(start, config.estimator),
         behaviour.control,
-        behaviour.path,
     )
-    driver = Driver(Steering(behaviour.steering), make_avoider(behaviour.avoidance))
+    avoider = make_avoider(behaviour.avoidance, behaviour.steering.max_turn_deg_s)
+    driver = Driver(Steering(behaviour.steering), avoider)
     start = np.array(world.true_pose)
     shown = config.output.pictures if task.seed == config.seed else 0
     watcher = (

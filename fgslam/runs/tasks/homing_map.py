@@ -12,8 +12,8 @@ import numpy as np
 from fgslam.core.errors import ConfigError, StoredMapError
 from fgslam.core.homing import OmniFeatures
 from fgslam.evaluation.metrics import JsonValue
+from fgslam.homing.link_consistency import InlierRows
 from fgslam.homing.links import Answer, Link, Pair
-from fgslam.homing.third_view_consistency import InlierRows
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
 from fgslam.report.content import Column, Picture, TextTable
 from fgslam.report.figures.plan import Links, network_figure, unfolded
@@ -87,9 +87,7 @@ def _run(config: TopologicalMapConfig, views: Views, context: Context) -> RunRes
     found, failures = answer_pairs(search, context)
     answers: dict[Pair, Answer] = {(answer.a, answer.b): answer.found for answer in found}
     names, rows = views.names[: len(features)], inlier_rows(found)
-    topology = map_of_answers(
-        features, answers, config.map, ordered=config.ordered, names=names, rows=rows
-    )
+    topology = map_of_answers(features, answers, ordered=config.ordered, names=names, rows=rows)
     kilobytes = topology.save(folder / MAP_FILE)
     routes = [_route(topology, asked) for asked in config.routes]
     located = _localised(config, features, answers, rows, names, context)

@@ -10,11 +10,11 @@ import numpy as np
 
 from fgslam.core.homing import OmniFeatures, Refusal, TwoViewVector
 from fgslam.evaluation.metrics import JsonValue
-from fgslam.frontend.homing.two_views import vector_between
+from fgslam.frontend.homing.homing_vector import vector_between
+from fgslam.homing.link_consistency import InlierRows
 from fgslam.homing.links import Answer, Pair
 from fgslam.homing.localisation import Localiser
 from fgslam.homing.retrieval import VisualWords
-from fgslam.homing.third_view_consistency import InlierRows
 from fgslam.homing.topological_map import map_of_answers
 from fgslam.report.tables import write_csv
 from fgslam.runs.config_models import TopologicalMapConfig
@@ -78,7 +78,6 @@ def localise(
     topology = map_of_answers(
         nodes,
         among,
-        config.map,
         ordered=config.ordered,
         names=[names[k] for k in kept],
         rows=kept_rows,
@@ -88,7 +87,7 @@ def localise(
     def linker(image: OmniFeatures, node: OmniFeatures) -> TwoViewVector | Refusal:
         return vector_between(image, node, config.features.matching, config.homing_vector, rng)[0]
 
-    words = VisualWords(nodes, config.map.retrieval, rng)
+    words = VisualWords(nodes, rng)
     localiser = Localiser(topology, words, linker, config.localisation)
     located = []
     context.progress("localising", 0, len(out))

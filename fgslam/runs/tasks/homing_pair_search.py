@@ -20,18 +20,14 @@ from fgslam.core.homing import (
     TwoViewVector,
 )
 from fgslam.frontend.features.omni_settings import OmniMatchingSettings
+from fgslam.frontend.homing.homing_vector import pair_generator, vector_between
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.frontend.homing.two_views import pair_generator, vector_between
 from fgslam.report.content import Picture
 from fgslam.runs.engine import Context
 from fgslam.runs.tasks.homing_pair_answers import PairAnswer, PairErrors
 from fgslam.runs.tasks.homing_views import Views
 from fgslam.runs.units import Stage, interleaved
 
-PLAIN_MATCHING = OmniMatchingSettings(
-    ratio=0.8, root=False, max_colour_distance=1e9, planar_gates=False
-)
-"""Lowe's ratio test alone."""
 PLAIN_INLIERS = 25
 """A plain answer counts from here on (issue 4, 5.3)."""
 

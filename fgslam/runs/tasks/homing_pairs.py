@@ -8,6 +8,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.evaluation.metrics import JsonValue
+from fgslam.frontend.homing.matching import PLAIN_MATCHING
 from fgslam.report.content import Column, TextTable
 from fgslam.report.figures.homing import claimed_against_true, sorted_errors
 from fgslam.report.figures.plan import Links, network_figure
@@ -27,7 +28,6 @@ from fgslam.runs.tasks.homing_pair_answers import (
 )
 from fgslam.runs.tasks.homing_pair_search import (
     PLAIN_INLIERS,
-    PLAIN_MATCHING,
     PairSearch,
     answer_pairs,
     draw_pairs,

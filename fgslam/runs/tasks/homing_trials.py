@@ -13,9 +13,9 @@ from fgslam.core.bearing_log import BearingLog
 from fgslam.core.homing import BearingMatches, HomingStart, Refusal
 from fgslam.datasets.simulated_homing import open_simulated_homing
 from fgslam.evaluation.homing import homing_errors
-from fgslam.frontend.homing.local_map import make_local_map
-from fgslam.frontend.homing.ransac import estimate_homing_vector
+from fgslam.frontend.homing.homing_vector import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.two_view_geometry import make_local_map
 from fgslam.runs.config_models import HomingTrialsConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task
 from fgslam.runs.homing_replay import replay_homing, save_bearing_logs

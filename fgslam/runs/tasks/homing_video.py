@@ -13,7 +13,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.files import make_subfolder
 from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
-from fgslam.frontend.homing.video_tracking import ReplenishedTracker, TrackedImage, VideoState
+from fgslam.frontend.homing.bearing_tracking import ReplenishedTracker, TrackedImage, VideoState
 from fgslam.report.content import Column, Picture, TextTable
 from fgslam.report.figures.homing import Line, curve_figure
 from fgslam.report.tables import write_csv
@@ -106,9 +106,7 @@ def _run(config: OmniVideoConfig, recording: OmniRecording, context: Context) ->
 
 def _track(config: OmniVideoConfig, recording: OmniRecording, context: Context) -> _Tracks:
     """Goes on after the last frame that was saved."""
-    tracker = ReplenishedTracker(
-        recording.camera, config.tracking, config.least_points, config.most_points
-    )
+    tracker = ReplenishedTracker(recording.camera, config.least_points, config.most_points)
     tracks = _Tracks()
     if saved := context.store.load(_STATE, _Progress).get(0):
         tracks = saved.tracks

@@ -7,9 +7,9 @@ import pytest
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import to_robot, wrap
-from fgslam.homing.avoidance import CorridorAvoidance, RangeScan
 from fgslam.homing.command import Drive
 from fgslam.homing.settings import AvoidanceSettings
+from fgslam.homing.steering import CorridorAvoidance, RangeScan
 
 BEAMS = np.linspace(-np.pi, np.pi, 72, endpoint=False)
 
@@ -37,7 +37,7 @@ def scan_from(pose: FloatArray, points: FloatArray) -> RangeScan:
 
 def drive() -> FloatArray:
     """(k, 2) places while homing points east, through the pocket's end, for 40 s."""
-    avoider = CorridorAvoidance(AvoidanceSettings())
+    avoider = CorridorAvoidance(AvoidanceSettings(), 40.0)
     pose, places = np.array([0.4, 0.0, 0.0]), []
     for _ in range(400):
         heading = float(wrap(np.arctan2(-pose[1], 5.0 - pose[0]) - pose[2]))
@@ -58,6 +58,6 @@ def test_held_up_robot_leaves_the_pocket_and_touches_nothing() -> None:
 
 
 def test_robot_that_does_not_escape_stays_in_the_pocket(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fgslam.homing.avoidance._ESCAPE_AFTER", 10_000)
+    monkeypatch.setattr("fgslam.homing.steering._ESCAPE_AFTER", 10_000)
     places = drive()
     assert np.min(places[:, 0]) > 0.0

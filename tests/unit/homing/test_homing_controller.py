@@ -29,10 +29,15 @@ from fgslam.core.homing import (
     TwoViewVector,
 )
 from fgslam.core.planar import bearings, between, unit, wrap
-from fgslam.homing.active_homing import _MAX_ACROSS, _MIN_TRACKS, ActiveHoming
-from fgslam.homing.bearing_consistency import parallax
+from fgslam.homing.active_homing import _MAX_ACROSS, _MIN_TRACKS, ActiveHoming, parallax
 from fgslam.homing.command import Command, HomingState
-from fgslam.homing.controller import _FARTHER_S, _MAX_STALLS, _NEAR_FRACTION, HomingController
+from fgslam.homing.controller import (
+    _BLIND_S,
+    _FARTHER_S,
+    _MAX_STALLS,
+    _NEAR_FRACTION,
+    HomingController,
+)
 from fgslam.homing.front_end import Sighting
 from fgslam.homing.settings import HomingControlSettings
 from tests.homing import make_matches
@@ -360,7 +365,7 @@ def test_blind_is_short_then_stands_then_refuses() -> None:
     commands = [b.step() for _ in range(60)]
     states = [c.state for c in commands]
     blind = states.count(HomingState.BLIND)
-    assert 0 < blind <= round(SETTINGS.blind_s / 0.1) + 1
+    assert 0 < blind <= round(_BLIND_S / 0.1) + 1
     assert states[:blind] == [HomingState.BLIND] * blind
     assert all(not c.stop and c.heading == 0.0 for c in commands[:blind])
     assert states[blind] is HomingState.WAIT
@@ -446,9 +451,10 @@ def test_vectors_that_keep_contradicting_end_the_homing() -> None:
     assert commands[-1].state is HomingState.REFUSED
 
 
-def test_no_progress_is_noticed() -> None:
+def test_no_progress_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Held up for good: matched anew a few times, then given up with the reason."""
-    b = bench(vector_to(0.0), stall_s=1.0)
+    monkeypatch.setattr("fgslam.homing.controller._STALL_S", 1.0)
+    b = bench(vector_to(0.0))
     commands = [b.step() for _ in range(60)]
     assert commands[-1].state is HomingState.REFUSED
     assert commands[-1].refusal is not None
@@ -551,9 +557,12 @@ def test_how_near_the_target_is_seen_decides(
     assert command.remaining == pytest.approx(1.0 if vector.rotation else part)
 
 
-def test_estimate_in_doubt_is_driven_by_no_more_not_even_blind() -> None:
+def test_estimate_in_doubt_is_driven_by_no_more_not_even_blind(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Matched anew within the time that may be driven blind; then no look shows the target."""
-    b = bench(vector_to(0.0), FEW, vector_to(0.0), FEW, blind_s=5.0)
+    monkeypatch.setattr("fgslam.homing.controller._BLIND_S", 5.0)
+    b = bench(vector_to(0.0), FEW, vector_to(0.0), FEW)
     b.step()
     b.front_end.tracks = 0
     assert b.step().state is HomingState.BLIND
@@ -608,7 +617,8 @@ def test_look_from_the_target_itself_is_arrival() -> None:
 def test_blocked_way_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Held up by obstacles is no lack of progress, for so long; then it is."""
     monkeypatch.setattr("fgslam.homing.controller._MAX_STALLS", 1)
-    b = bench(vector_to(0.0), stall_s=1.0, wait_s=2.0)
+    monkeypatch.setattr("fgslam.homing.controller._STALL_S", 1.0)
+    b = bench(vector_to(0.0), wait_s=2.0)
     ended = []
     for _ in range(60):
         b.controller.held_up(0.1)

@@ -9,12 +9,8 @@ import pytest
 
 from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.homing import FeatureKind, Refusal, RefusalReason
-from fgslam.homing.image_front_end import (
-    FrontEndSettings,
-    ImageFrontEnd,
-    mixed_with_wrong,
-    surest_all_around,
-)
+from fgslam.homing.front_end import ImageFrontEnd, mixed_with_wrong, surest_all_around
+from fgslam.homing.settings import FrontEndSettings
 from tests.homing import two_views
 
 

@@ -11,17 +11,22 @@ from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.backend.homing.settings import HomingEkfSettings, HomingGraphSettings
 from fgslam.core.errors import ConfigError, EstimatorError
 from fgslam.core.planar import between
-from fgslam.homing.avoidance import RangeScan
 from fgslam.homing.command import Drive, HomingState
-from fgslam.homing.drive_record import STAGES, DriveRecord
-from fgslam.homing.drive_scores import corners, cross_track, pass_distances, slope_by_leg
+from fgslam.homing.drive_record import (
+    STAGES,
+    DriveRecord,
+    corners,
+    cross_track,
+    pass_distances,
+    slope_by_leg,
+)
 from fgslam.homing.path_following import HomingChain
 from fgslam.homing.settings import (
     ClosedLoopSettings,
     HomingBehaviourSettings,
     HomingControlSettings,
-    PathFollowingSettings,
 )
+from fgslam.homing.steering import RangeScan
 from tests.landmark_world import DARK, drive_path, make_follower, winding_path
 
 
@@ -103,7 +108,7 @@ def test_graph_drives_as_well() -> None:
     assert pass_distances(record).max() < 0.2
 
 
-def follower_with_unknown(count: int, path: PathFollowingSettings) -> HomingChain:
+def follower_with_unknown(count: int) -> HomingChain:
     """Two targets on a path, the first ``count`` replaced by images from elsewhere."""
     setting = winding_path(9, count + 1, 1.0)
     elsewhere = setting.front_end.features_at(np.array([80.0, 80.0, 0.0]))
@@ -111,13 +116,13 @@ def follower_with_unknown(count: int, path: PathFollowingSettings) -> HomingChai
     kind = HomingEkfSettings()
     control = replace(HomingControlSettings(), give_up_s=0.5, farther_tries=0)
     return HomingChain(
-        setting.front_end, images, lambda start: make_homing_estimator(start, kind), control, path
+        setting.front_end, images, lambda start: make_homing_estimator(start, kind), control
     )
 
 
 def test_target_that_cannot_be_matched_is_skipped() -> None:
     """The next one can: the path goes on, and the record says so."""
-    follower = follower_with_unknown(1, PathFollowingSettings())
+    follower = follower_with_unknown(1)
     commands = [follower.step(DARK, 0.1 * k) for k in range(20)]
     assert commands[0].stop
     assert commands[-1].state is HomingState.DRIVE
@@ -154,19 +159,16 @@ def test_way_that_is_blocked_for_a_while_is_driven_on(
 ) -> None:
     """What avoidance takes does not count as lack of progress, as long as one may wait."""
     monkeypatch.setattr("fgslam.homing.controller._MAX_STALLS", 1)
-    control = replace(HomingControlSettings(), stall_s=2.0, wait_s=wait_s)
+    monkeypatch.setattr("fgslam.homing.controller._STALL_S", 2.0)
+    control = replace(HomingControlSettings(), wait_s=wait_s)
     behaviour = replace(HomingBehaviourSettings(), control=control)
     record = drive_path(winding_path(7, 1, 2.0), behaviour, avoider=Doorkeeper(20, 70))
     assert [leg.result for leg in record.legs] == [result]
 
 
-@pytest.mark.parametrize(
-    ("count", "path"),
-    [(1, PathFollowingSettings(skip_unmatched=False)), (2, PathFollowingSettings())],
-)
-def test_skipping_has_its_bounds(count: int, path: PathFollowingSettings) -> None:
-    """Not allowed, or not so many: the path ends with the refusal, standing."""
-    follower = follower_with_unknown(count, path)
+def test_two_targets_one_after_another_are_not_skipped() -> None:
+    """The path ends with the refusal, standing."""
+    follower = follower_with_unknown(2)
     commands = [follower.step(DARK, 0.1 * k) for k in range(30)]
     assert follower.finished
     assert commands[-1].state is HomingState.REFUSED
@@ -191,7 +193,6 @@ def test_empty_path_and_wrong_times_are_refused() -> None:
     with pytest.raises(ConfigError, match="no target image"):
         HomingChain(
             setting.front_end, [], lambda _: pytest.fail("no start"), HomingControlSettings(),
-            PathFollowingSettings(),
         )  # fmt: skip
     follower = make_follower(setting, HomingBehaviourSettings())
     follower.step(DARK, 1.0)

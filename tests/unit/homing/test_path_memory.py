@@ -11,8 +11,7 @@ import pytest
 
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import ColumnSegments, OmniFeatures, UprightFeatures
-from fgslam.homing.feature_file import pack_features
-from fgslam.homing.path_memory import FILE, PathMemory
+from fgslam.homing.path_memory import FILE, PathMemory, pack_features
 from tests.landmark_world import no_columns
 
 

@@ -7,9 +7,9 @@ import pytest
 
 from fgslam.core.arrays import IntArray
 from fgslam.core.homing import OmniFeatures, TwoViewVector
+from fgslam.homing.link_consistency import ThirdViewConsistency
 from fgslam.homing.links import Answer, Link, Pair
 from fgslam.homing.settings import TopologicalMapSettings
-from fgslam.homing.third_view_consistency import ThirdViewConsistency
 from fgslam.homing.topological_map import TopologicalMap, map_of_answers
 from tests.landmark_world import landmark_features
 
@@ -111,7 +111,7 @@ def test_map_of_a_walk_has_confirmed_far_links_only(monkeypatch: pytest.MonkeyPa
         }
         rows = rows_of(walk) | rows_of(NEIGHBOURS, seed)
         images = [view()] * COUNT
-        return map_of_answers(images, answers, SETTINGS, ordered=True, rows=rows)
+        return map_of_answers(images, answers, ordered=True, rows=rows)
 
     true, false = built(None), built(0)
     assert FAR in {(k.a, k.b) for k in true.links}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import between, wrap
-from fgslam.frontend.homing.ransac import estimate_homing_vector
+from fgslam.frontend.homing.homing_vector import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.homing.link_consistency import (
     _LONE_SUPPORT,
@@ -21,11 +21,19 @@ from fgslam.homing.link_consistency import (
     between_misfit,
     heading_residuals,
 )
-from fgslam.homing.links import _MIN_SUPPORT, _MUTUAL_DEG, _ONE_WAY_SUPPORT, Answer, Link, link_pair
+from fgslam.homing.links import (
+    _MIN_SUPPORT,
+    _MUTUAL_DEG,
+    _ONE_WAY_SUPPORT,
+    Answer,
+    Link,
+    Pair,
+    link_pair,
+)
 from fgslam.homing.localisation import Localiser
 from fgslam.homing.retrieval import VisualWords, candidate_pairs
-from fgslam.homing.settings import LocalisationSettings, RetrievalSettings, TopologicalMapSettings
-from fgslam.homing.topological_map import TopologicalMap, build_map, map_of_answers
+from fgslam.homing.settings import LocalisationSettings, TopologicalMapSettings
+from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
 from tests.landmark_world import landmark_features, match_landmarks, numbers
 
 SETTINGS = TopologicalMapSettings()
@@ -158,7 +166,7 @@ def test_false_links_are_found_and_true_ones_kept(seed: int) -> None:
         turned(link, *rng.uniform(0.6, 2.5, 2) * rng.choice([-1, 1], 2)) if k in wrong else link
         for k, link in enumerate(links)
     ]
-    believed, rejected = LinkConsistency(16, spoiled, SETTINGS).believed(ordered=False)
+    believed, rejected = LinkConsistency(16, spoiled).accepted(ordered=False)
     false = {(links[k].a, links[k].b) for k in wrong}
     assert false == set(rejected)
     assert len(believed) == len(links) - len(false)
@@ -169,10 +177,10 @@ def test_long_link_between_similar_places_needs_a_third_view() -> None:
     poses = np.column_stack([np.arange(8.0), np.zeros(8), np.zeros(8)])
     chain = [true_link(poses, k, k + 1, 20) for k in range(7)]
     long = turned(true_link(poses, 1, 6, _LONE_SUPPORT - 1), 0.0, 1.0)
-    believed, rejected = LinkConsistency(8, [*chain, long], SETTINGS).believed(ordered=True)
+    believed, rejected = LinkConsistency(8, [*chain, long]).accepted(ordered=True)
     assert [(k.a, k.b) for k in believed] == [(k, k + 1) for k in range(7)]
     assert "no third image" in rejected[1, 6]
-    unordered, _ = LinkConsistency(8, chain, SETTINGS).believed(ordered=False)
+    unordered, _ = LinkConsistency(8, chain).accepted(ordered=False)
     assert unordered == []  # nothing but their order confirmed it
 
 
@@ -182,7 +190,7 @@ def test_strong_lone_link_that_is_turned_breaks_a_loop() -> None:
     poses = np.column_stack([4.0 * np.cos(angle), 4.0 * np.sin(angle), angle])
     ring = [true_link(poses, *sorted((k, (k + 1) % 10)), 120) for k in range(10)]
     across = turned(true_link(poses, 2, 7, 110), np.deg2rad(90.0))
-    believed, rejected = LinkConsistency(10, [*ring, across], SETTINGS).believed(ordered=True)
+    believed, rejected = LinkConsistency(10, [*ring, across]).accepted(ordered=True)
     assert set(rejected) == {(2, 7)}
     assert "off all other rotations" in rejected[2, 7]
     assert len(believed) == 10
@@ -234,13 +242,20 @@ def link_by_landmarks(a: OmniFeatures, b: OmniFeatures) -> Answer:
     return estimate_homing_vector(matches, HomingVectorSettings(), rng)
 
 
+def map_of_all(images: Sequence[OmniFeatures], settings: TopologicalMapSettings) -> TopologicalMap:
+    """The map of images that follow each other: every candidate pair is tried both ways."""
+    answers: dict[Pair, Answer] = {}
+    for a, b in map_candidates(images, settings, np.random.default_rng(0), ordered=True):
+        answers[a, b] = link_by_landmarks(images[a], images[b])
+        answers[b, a] = link_by_landmarks(images[b], images[a])
+    return map_of_answers(images, answers, ordered=True)
+
+
 @pytest.fixture(scope="module")
 def built() -> tuple[FloatArray, TopologicalMap]:
     """The hall's map, from candidates by retrieval."""
     poses, images = hall()
-    settings = TopologicalMapSettings(candidates=5, retrieval=RetrievalSettings(words=100))
-    rng = np.random.default_rng(0)
-    return poses, build_map(images, link_by_landmarks, settings, rng, ordered=True)
+    return poses, map_of_all(images, TopologicalMapSettings(candidates=5))
 
 
 def hops(a: int, b: int) -> int:
@@ -282,7 +297,7 @@ def test_impossible_routes_are_refused() -> None:
         pair: true_vector(poses[pair[0]], poses[pair[1]], _LONE_SUPPORT)
         for pair in ((0, 1), (1, 0), (2, 3), (3, 2), (4, 5))
     }
-    topology = map_of_answers(images[:6], answers, SETTINGS)
+    topology = map_of_answers(images[:6], answers)
     assert [len(c) for c in topology.components()] == [2, 2, 1, 1]
     with pytest.raises(StoredMapError, match="no way from 0 to 3"):
         topology.route(0, 3)
@@ -322,7 +337,7 @@ def test_map_survives_its_file(built: tuple[FloatArray, TopologicalMap], tmp_pat
 def test_candidates_by_retrieval_are_the_near_ones() -> None:
     """Places that share landmarks look alike, and hardly any true neighbour is passed over."""
     _, images = hall()
-    words = VisualWords(images, RetrievalSettings(words=100), np.random.default_rng(0))
+    words = VisualWords(images, np.random.default_rng(0))
     likeness = words.likenesses()
     assert np.allclose(likeness, likeness.T)
     assert np.allclose(np.diag(likeness), 1.0)
@@ -338,13 +353,11 @@ def test_images_without_features_are_like_none() -> None:
     """Empty images, and a set of nothing else."""
     _, images = hall()
     empty = landmark_features(np.empty((0, 3)), np.zeros(3), 1.0, 0.01, np.random.default_rng(0))
-    words = VisualWords([*images[:5], empty], RetrievalSettings(), np.random.default_rng(0))
+    words = VisualWords([*images[:5], empty], np.random.default_rng(0))
     assert np.all(words.likeness(empty) == 0.0)
-    nothing = VisualWords([empty, empty], RetrievalSettings(), np.random.default_rng(0))
+    nothing = VisualWords([empty, empty], np.random.default_rng(0))
     assert nothing.likenesses().tolist() == [[0.0, 0.0], [0.0, 0.0]]
-    topology = build_map(
-        [empty, empty], link_by_landmarks, SETTINGS, np.random.default_rng(0), ordered=True
-    )
+    topology = map_of_all([empty, empty], SETTINGS)
     assert topology.links == ()
 
 
@@ -354,7 +367,7 @@ def test_images_without_features_are_like_none() -> None:
 
 def localiser(topology: TopologicalMap, settings: LocalisationSettings) -> Localiser:
     """With a vocabulary of the map's own images."""
-    words = VisualWords(topology.images, RetrievalSettings(words=100), np.random.default_rng(0))
+    words = VisualWords(topology.images, np.random.default_rng(0))
     return Localiser(topology, words, link_by_landmarks, settings)
 
 

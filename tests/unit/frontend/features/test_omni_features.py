@@ -22,8 +22,7 @@ from fgslam.frontend.features.omni_settings import (
     OmniMatchingSettings,
     UprightSiftSettings,
 )
-from fgslam.frontend.homing.matching import match_features, match_sift
-from fgslam.frontend.homing.plain_sift import match_plain, plain_sift
+from fgslam.frontend.homing.matching import PLAIN_MATCHING, match_features, match_sift, plain_sift
 
 PANORAMA = Equirectangular(513, 257)
 MIRROR = HyperbolicMirror.with_view((400, 400), 0.96, (np.radians(-55), np.radians(30)))
@@ -270,7 +269,7 @@ def test_extraction_repeats_itself_and_leaves_the_image() -> None:
 
 def test_the_plain_baseline_finds_and_matches() -> None:
     a, b = (plain_sift(PANORAMA, picture(turn=t)) for t in (0, 40))
-    matches = match_plain(a, b)
+    matches = match_sift(a, b, PLAIN_MATCHING)
     error = np.abs(wrap(matches.bearing_b - matches.bearing_a + 40 * 2 * np.pi / 512))
     assert len(matches) > 50
     assert np.mean(error < 0.02) > 0.95

@@ -11,11 +11,15 @@ from scipy.stats import chi2
 from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import BearingMatches, LocalMap, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
-from fgslam.frontend.homing.epipolar import EpipolarTest
-from fgslam.frontend.homing.local_map import make_local_map, triangulable, triangulate
-from fgslam.frontend.homing.ransac import _cells, estimate_homing_vector
+from fgslam.frontend.homing.homing_vector import _cells, estimate_homing_vector
 from fgslam.frontend.homing.refinement import HomingRefinement, RefinementPrior
 from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.two_view_geometry import (
+    EpipolarTest,
+    make_local_map,
+    triangulable,
+    triangulate,
+)
 from tests.homing import TwoViews, make_matches, two_views
 
 HALF_DEGREE = np.deg2rad(0.5)

@@ -10,10 +10,8 @@ from fgslam.core.errors import EstimatorError, FrameError
 from fgslam.core.homing import TrackedBearings
 from fgslam.core.planar import wrap
 from fgslam.frontend.homing.bearing_tracking import BearingTracker
-from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from tests.textured_room import CAMERA, angles, hits, picture
 
-SETTINGS = OmniTrackingSettings()
 _MODULE = "fgslam.frontend.homing.bearing_tracking"
 START = np.array([-1.2, 0.4, 0.3])
 
@@ -30,8 +28,8 @@ def grid(tracker: BearingTracker) -> FloatArray:
     return np.column_stack([columns.ravel(), np.round(rows.ravel())]).astype(np.float64)
 
 
-def started(image: Image, settings: OmniTrackingSettings = SETTINGS) -> BearingTracker:
-    tracker = BearingTracker(CAMERA, settings)
+def started(image: Image) -> BearingTracker:
+    tracker = BearingTracker(CAMERA)
     pixels = grid(tracker)
     tracker.start(image, 0.0, np.arange(len(pixels)), pixels)
     return tracker
@@ -136,7 +134,7 @@ def test_more_deformed_points_are_less_sure(start_image: Image) -> None:
 
 
 def test_bad_input(start_image: Image) -> None:
-    tracker = BearingTracker(CAMERA, SETTINGS)
+    tracker = BearingTracker(CAMERA)
     with pytest.raises(EstimatorError, match="start"):
         tracker.track(start_image, 0.0)
     with pytest.raises(EstimatorError, match="start"):
@@ -160,7 +158,7 @@ def test_same_input_same_bytes_and_arguments_untouched(start_image: Image) -> No
     for _ in range(2):
         images = [start_image.copy(), *(picture(pose) for pose in way(3))]
         before = [image.copy() for image in images]
-        tracker = BearingTracker(CAMERA, SETTINGS)
+        tracker = BearingTracker(CAMERA)
         pixels, ids = grid(tracker), np.arange(len(grid(tracker)))
         kept = pixels.copy(), ids.copy()
         tracker.start(images[0], 0.0, ids, pixels)

@@ -7,8 +7,7 @@ from scipy import ndimage
 
 from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.arrays import Image
-from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
-from fgslam.frontend.homing.video_tracking import ReplenishedTracker
+from fgslam.frontend.homing.bearing_tracking import ReplenishedTracker
 
 WIDTH, HEIGHT = 361, 121
 CAMERA = Equirectangular(WIDTH, HEIGHT, np.pi / 3, -np.pi / 3)
@@ -29,7 +28,7 @@ def turned(image: Image, columns: int) -> Image:
 
 
 def tracker() -> ReplenishedTracker:
-    return ReplenishedTracker(CAMERA, OmniTrackingSettings(), least=40, most=60)
+    return ReplenishedTracker(CAMERA, least=40, most=60)
 
 
 def test_points_follow_a_turn_and_keep_their_names() -> None:

@@ -17,11 +17,9 @@ from fgslam.core.planar import wrap
 from fgslam.frontend.features.colour_sift import empty_features
 from fgslam.frontend.features.column_segments import empty_segments
 from fgslam.frontend.homing.trackable_points import DISTINCT_PX, move_to_trackable
-from fgslam.frontend.homing.tracking_settings import OmniTrackingSettings
 from tests.homing import make_matches
 from tests.textured_room import CAMERA, angles, hits, picture
 
-SETTINGS = OmniTrackingSettings()
 START = np.array([-1.2, 0.4, 0.3])
 TARGET = np.array([0.3, 0.1, -0.5])
 
@@ -70,7 +68,7 @@ def two_views(points: FloatArray) -> tuple[BearingMatches, tuple[OmniFeatures, O
 def test_points_of_planar_patches_are_mapped_within_half_a_degree() -> None:
     """On walls: against where the very point that was chosen is seen from the target."""
     matches, features = two_views(wall_points(400, 1))
-    rows, pixels, moved = move_to_trackable(view_of(START), CAMERA, matches, features, SETTINGS)
+    rows, pixels, moved = move_to_trackable(view_of(START), CAMERA, matches, features)
     assert len(rows) > 150
     truth = angles(TARGET, hits(START, CAMERA.rays(pixels)))
     off = wrap(np.column_stack([moved.bearing_b, moved.elevation_b]) - truth)
@@ -88,7 +86,7 @@ def test_points_of_planar_patches_are_mapped_within_half_a_degree() -> None:
 
 def test_the_start_sees_the_point_at_its_pixel() -> None:
     matches, features = two_views(wall_points(60, 2))
-    rows, pixels, moved = move_to_trackable(view_of(START), CAMERA, matches, features, SETTINGS)
+    rows, pixels, moved = move_to_trackable(view_of(START), CAMERA, matches, features)
     rays = CAMERA.rays(pixels)
     np.testing.assert_allclose(
         wrap(moved.bearing_a - np.arctan2(rays[:, 1], rays[:, 0])), 0.0, atol=1e-9
@@ -110,7 +108,7 @@ def test_a_window_tells_corners_from_edges() -> None:
     for seen, found in ((corner, 1), (edge, 0)):
         matches = make_matches(np.hstack([seen, seen]), 1e-4)
         features = features_at(seen, np.array([0.02]))
-        rows, pixels, _ = move_to_trackable(grey, CAMERA, matches, (features,) * 2, SETTINGS)
+        rows, pixels, _ = move_to_trackable(grey, CAMERA, matches, (features,) * 2)
         assert len(rows) == found
         assert np.all(np.abs(pixels - [300, 90]) <= 4.0)
 
@@ -128,7 +126,7 @@ def test_points_near_the_seam() -> None:
     seen = place(CAMERA.width - 2, 90)
     features = features_at(seen, np.array([np.deg2rad(4.0)]))
     matches = make_matches(np.hstack([seen, seen]), 1e-4)
-    rows, pixels, moved = move_to_trackable(grey, CAMERA, matches, (features,) * 2, SETTINGS)
+    rows, pixels, moved = move_to_trackable(grey, CAMERA, matches, (features,) * 2)
     assert rows.tolist() == [0]
     assert 0 <= pixels[0, 0] <= 8
     assert abs(wrap(moved.bearing_b - seen[0, 0])[0]) < np.deg2rad(6.0)
@@ -137,7 +135,7 @@ def test_points_near_the_seam() -> None:
 def test_features_with_the_same_point_give_it_once() -> None:
     points = wall_points(40, 3)
     matches, features = two_views(np.repeat(points, 2, axis=0))
-    rows, pixels, _ = move_to_trackable(view_of(START), CAMERA, matches, features, SETTINGS)
+    rows, pixels, _ = move_to_trackable(view_of(START), CAMERA, matches, features)
     apart = np.hypot(*(pixels[:, None] - pixels[None]).transpose(2, 0, 1))
     apart[np.diag_indices(len(apart))] = np.inf
     assert apart.min() >= DISTINCT_PX
@@ -147,10 +145,10 @@ def test_features_with_the_same_point_give_it_once() -> None:
 def test_nothing_to_track() -> None:
     grey = np.full((CAMERA.height, CAMERA.width - 1), 90, np.uint8)
     matches, features = two_views(wall_points(30, 4))
-    rows, pixels, moved = move_to_trackable(grey, CAMERA, matches, features, SETTINGS)
+    rows, pixels, moved = move_to_trackable(grey, CAMERA, matches, features)
     assert len(rows) == len(pixels) == len(moved) == 0
     none = matches.select(np.empty(0, dtype=np.int64))
-    rows, pixels, moved = move_to_trackable(grey, CAMERA, none, features, SETTINGS)
+    rows, pixels, moved = move_to_trackable(grey, CAMERA, none, features)
     assert rows.shape == (0,)
     assert pixels.shape == (0, 2)
     assert len(moved) == 0
@@ -175,9 +173,7 @@ def test_column_segments_scale_by_their_length() -> None:
     plain = make_matches(np.hstack([seen, seen]), 1e-4)
     columns = np.full(n, int(FeatureKind.COLUMN), dtype=np.int64)
     matches = BearingMatches(columns, *(getattr(plain, f) for f in _FIELDS))
-    rows, _, moved = move_to_trackable(
-        view_of(START), CAMERA, matches, (segments[0], segments[1]), SETTINGS
-    )
+    rows, _, moved = move_to_trackable(view_of(START), CAMERA, matches, (segments[0], segments[1]))
     assert len(rows) > 10
     np.testing.assert_allclose(
         wrap(moved.bearing_b - matches.bearing_b[rows]),

@@ -7,7 +7,11 @@ import pytest
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import unit, wrap
-from fgslam.frontend.homing.two_point import TwoPointSamples, TwoPointSolutions, solve_two_point
+from fgslam.frontend.homing.two_view_geometry import (
+    TwoPointSamples,
+    TwoPointSolutions,
+    solve_two_point,
+)
 
 poselib = pytest.importorskip("poselib", reason="the test oracle PoseLib is not installed")
 

@@ -1,30 +1,29 @@
-"""The homing vector from wide-baseline matches: RANSAC over pairs, refinement, honest refusal.
+"""The homing vector from wide-baseline matches: RANSAC over pairs, refinement, refusal.
 
-Section III-B of Goedemé et al. (2005). Samples of two matches give one or two hypotheses each
-(:mod:`two_point`); each is supported by the matches that keep the epipolar constraint with positive
-distances; the best is refined on its inliers. An answer is given only if its support cannot be
+Section III-B of Goedemé et al. (2005). Samples of two matches give one or two hypotheses each; each
+is supported by the matches that keep the epipolar constraint with positive distances; the best is
+refined on its inliers. An answer is given only if its support cannot be
 chance and no different solution comes near it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.homing import BearingMatches, Refusal, RefusalReason, TwoViewVector
+from fgslam.core.homing import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import unit, wrap
-from fgslam.frontend.homing.epipolar import EpipolarTest
-from fgslam.frontend.homing.match_probability import (
+from fgslam.frontend.features.omni_settings import OmniMatchingSettings
+from fgslam.frontend.homing.matching import (
     COMMON_CHANCE,
     gain,
     log_likelihood_ratio,
+    match_features,
     right_probability,
 )
 from fgslam.frontend.homing.refinement import HomingRefinement, Refined, RefinementPrior
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.frontend.homing.two_point import TwoPointSamples, solve_two_point
+from fgslam.frontend.homing.two_view_geometry import EpipolarTest, TwoPointSamples, solve_two_point
 
 _LEAST_PARALLAX_DEG = 3.0  # of two rays; below, the signs of the distances are noise
 
@@ -58,7 +57,7 @@ def estimate_homing_vector(
         )
     search = _Search(matches, settings, rng)
     candidates = search.candidates()
-    if not candidates:
+    if not len(candidates):
         return Refusal(
             RefusalReason.TOO_FEW_INLIERS, "no pair of matches agrees on any homing vector"
         )
@@ -76,12 +75,6 @@ def estimate_homing_vector(
     support = max((search.independent_inliers(r.inliers) for r in competitors), default=0)
     floor = np.deg2rad([settings.direction_floor_deg, settings.rotation_floor_deg])
     return TwoViewVector(theta, psi, covariance + np.diag(floor**2), best.inliers, support)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Candidate:
-    direction: float
-    rotation: float
 
 
 class _Search:
@@ -109,11 +102,11 @@ class _Search:
     # ----------------------------------------------------------------------------------------
     # Sampling
 
-    def candidates(self) -> list[_Candidate]:
-        """The best supported hypotheses that differ from each other, best first."""
+    def candidates(self) -> FloatArray:
+        """(c, 2) direction and rotation of the best supported, different hypotheses, best first."""
         log_ratio, sigma_log, eligible = _log_ratios(self._matches, self._tilt)
         if len(eligible) < 2:
-            return []
+            return np.empty((0, 2))
         found: list[FloatArray] = []
         drawn, best = 0, 0.0
         while drawn < self._settings.samples and drawn < self._needed(best):
@@ -124,7 +117,7 @@ class _Search:
             if solutions.shape[1]:
                 found.append(solutions)
                 best = max(best, float(np.max(solutions[2])))
-        return self._different(np.hstack(found)) if found else []
+        return self._different(np.hstack(found)) if found else np.empty((0, 2))
 
     def _needed(self, share: float) -> float:
         """Samples until one of two inliers was drawn with the wanted confidence.
@@ -165,24 +158,23 @@ class _Search:
         odds = (self._right / (1.0 - self._right))[:, None]
         return np.asarray(np.sum(np.where(inliers, np.log1p(odds * gains), 0.0), axis=0))
 
-    def _different(self, hypotheses: FloatArray) -> list[_Candidate]:
-        """The best of each group of like hypotheses."""
+    def _different(self, hypotheses: FloatArray) -> FloatArray:
+        """(c, 2) the best of each group of like hypotheses (4, m)."""
         ordered = hypotheses[:, np.argsort(-hypotheses[3], kind="stable")]
-        chosen: list[_Candidate] = []
+        chosen: list[int] = []
         open_ = np.ones(ordered.shape[1], dtype=np.bool_)
         while len(chosen) < _REFINED and np.any(open_):
             k = int(np.argmax(open_))
-            chosen.append(_Candidate(float(ordered[0, k]), float(ordered[1, k])))
+            chosen.append(k)
             open_ &= _angle_apart(ordered[:2], ordered[:2, k : k + 1]) > _ALIKE
-        return chosen
+        return ordered[:2, chosen].T
 
     # ----------------------------------------------------------------------------------------
     # Refining and judging
 
-    def refined(self, candidates: list[_Candidate]) -> list[Refined]:
-        """The candidates after least squares, the best score first, each solution once."""
-        starts = np.array([(c.direction, c.rotation) for c in candidates])
-        found = self._refinement.refine(starts[:, 0], starts[:, 1])
+    def refined(self, candidates: FloatArray) -> list[Refined]:
+        """The candidates (c, 2) after least squares, the best score first, each solution once."""
+        found = self._refinement.refine(candidates[:, 0], candidates[:, 1])
         found.sort(key=lambda r: -self._score_of(r))
         out: list[Refined] = []
         for solution in found:
@@ -372,3 +364,32 @@ def paired_anew(matches: BearingMatches, first: IntArray, second: IntArray) -> B
         a.kind, a.index_a, b.index_b, a.bearing_a, a.elevation_a, b.bearing_b, b.elevation_b,
         np.column_stack([a.sigma[:, :2], b.sigma[:, 2:]]), a.quality,
     )  # fmt: skip
+
+
+# --------------------------------------------------------------------------------------------
+# From the features of two images
+
+
+def vector_between(
+    present: OmniFeatures,
+    target: OmniFeatures,
+    matching: OmniMatchingSettings,
+    settings: HomingVectorSettings,
+    rng: np.random.Generator,
+) -> tuple[TwoViewVector | Refusal, BearingMatches]:
+    """The homing vector from one image's place to another's, and the tentative matches.
+
+    Args:
+        present: features of the image where the robot is.
+        target: of the one where it is to go.
+        matching: of features.
+        settings: of the search, and when it refuses.
+        rng: chooses RANSAC's samples.
+    """
+    matches = match_features(present, target, matching)
+    return estimate_homing_vector(matches, settings, rng), matches
+
+
+def pair_generator(seed: int, a: int, b: int) -> np.random.Generator:
+    """What RANSAC draws from for the pair of images (a, b), whichever process and order."""
+    return np.random.default_rng((seed, a, b))
