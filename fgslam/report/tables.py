@@ -112,7 +112,7 @@ TIME_COLUMNS: tuple[tuple[str, str], ...] = (
 
 def write_comparison_csv(
     path: Path,
-    runs: Sequence[tuple[str, Mapping[str, EstimatorMetrics]]],
+    runs: Sequence[tuple[str, Mapping[str, Mapping[str, Any]]]],
     columns: Sequence[tuple[str, str]] = RESULT_COLUMNS + TIME_COLUMNS,
     key: str = "run",
 ) -> None:
@@ -120,7 +120,7 @@ def write_comparison_csv(
 
     Args:
         path: the file.
-        runs: name of each run and its estimators' metrics by title.
+        runs: name of each run and its estimators' numbers of metrics.json by title.
         columns: which, see above.
         key: heading of the runs' names.
 
@@ -131,8 +131,7 @@ def write_comparison_csv(
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow([key, "estimator", *(name for name, _ in columns)])
     for run, estimators in runs:
-        for title, metrics in estimators.items():
-            values = metrics.as_json()
+        for title, values in estimators.items():
             cells = [_cell(value_at(values, where)) for _, where in columns]
             writer.writerow([run, title, *cells])
     write_text(path, buffer.getvalue())

@@ -1,51 +1,30 @@
-"""`fgslam compare`: the logs of runs through other estimators, set side by side."""
+"""`fgslam compare`: the logs of runs through other estimators, set side by side.
+
+What a replay is, how it is judged and which tables come of it, is the matter of
+:mod:`fgslam.runs.slam_comparison` and :mod:`fgslam.runs.homing_comparison`.
+"""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.errors import ConfigError, DatasetError, OutputError
-from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
 from fgslam.report.content import TextTable
-from fgslam.report.tables import read_metrics, write_comparison_csv, write_metrics
+from fgslam.report.tables import write_comparison_csv
 from fgslam.runs.choosing import EVERY, Choice, choose
-from fgslam.runs.comparison import (
-    Compared,
-    load_run,
-    load_truth,
-    remark_of,
-    replay_apart,
-    tasks_of,
-)
-from fgslam.runs.comparison_tables import ate_table, comparison_particulars, comparison_tables
-from fgslam.runs.config import is_homing, load_homing
+from fgslam.runs.config import is_homing, load_config, load_homing
 from fgslam.runs.config_models import Experiment, ExperimentConfig, HomingExperiment
-from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, run_task
-from fgslam.runs.folder import (
-    COMPARISON_FILE,
-    METRICS_FILE,
-    RUN_MARKER,
-    ExistingFolder,
-    is_run_folder,
-)
-from fgslam.runs.homing_compare import open_homing_comparison
-from fgslam.runs.homing_replay import load_bearing_logs
-from fgslam.runs.report import report_from_folder
+from fgslam.runs.engine import RunResult, Task, is_finished, run_task
+from fgslam.runs.folder import COMPARISON_FILE, RUN_MARKER, ExistingFolder, is_run_folder
+from fgslam.runs.homing_comparison import open_homing_comparison
+from fgslam.runs.metric_tables import ate_table
+from fgslam.runs.slam_comparison import open_slam_comparison
 from fgslam.runs.units import Progress, Stopped
 
 DEFAULT_FOLDER = "compare"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ComparedResult(RunResult):
-    """How a comparison of SLAM ended; ``compared`` are its estimators."""
-
-    compared: Compared = field(kw_only=True)
 
 
 def compare_runs(
@@ -60,11 +39,13 @@ def compare_runs(
     """Replays the logs of runs through estimators: measurements of SLAM, or bearings of homing.
 
     Args:
-        runs: run folders, of SLAM or of homing.
+        runs: run folders, all of SLAM or all of homing.
         choice: which estimators.
         out: folder of the results; of several runs each gets one below it, by its folder's name.
             None: `compare` inside each run.
-        existing: what to do where results are already.
+        existing: what to do where results are already. `resume` goes on with what an interrupted
+            comparison left: of several runs those that had finished are left as they are, and
+            those that were not begun are.
         jobs: processes at a time; more than one disturbs the times.
         progress: called after each estimator that is done.
         stopped: True ends the replays; what was finished is kept.
@@ -72,19 +53,25 @@ def compare_runs(
     Raises:
         FgslamError: a run cannot be read, a name is unknown, or the results cannot be written.
     """
-    opener: Callable[[Path, Choice], tuple[Experiment, Task[RunResult]]]
-    opener = _open_homing if _all_homing(runs) else _open_slam
+    configs = [load_run(run) for run in runs]
+    _require_one_kind(runs, configs)
     folders = _folders(runs, out)
-    opened = [opener(run, choice) for run in runs]
+    opened = [_open(*run, choice) for run in zip(runs, configs, strict=True)]
     for run, folder in zip(runs, folders, strict=True):
-        _require_apart(run, folder, existing)
+        require_room(folder, run, existing)
     results = []
     for (config, task), folder in zip(opened, folders, strict=True):
-        opener_now = functools.partial(_opened, task)
-        results.append(run_task(opener_now, config, folder, existing, progress, stopped, jobs))
-    compared = [one.compared for one in results if isinstance(one, ComparedResult)]
-    if out is not None and len(compared) > 1:
-        write_comparison_csv(out / COMPARISON_FILE, [(c.name, c.metrics) for c in compared])
+        begun = existing
+        if existing == "resume" and len(runs) > 1:
+            if is_finished(folder):
+                results.append(RunResult(config, folder, "finished", (f"{folder}: had finished",)))
+                continue
+            begun = "resume" if is_run_folder(folder) else "refuse"
+        results.append(
+            run_task(partial(_opened, task), config, folder, begun, progress, stopped, jobs)
+        )
+    if out is not None and len(_of_slam(results)) > 1:
+        write_comparison_csv(out / COMPARISON_FILE, _of_slam(results))
     return results
 
 
@@ -95,120 +82,66 @@ def metrics_of(results: Sequence[RunResult]) -> dict[str, dict[str, Any]]:
 
 def ate_tables(results: Sequence[RunResult]) -> tuple[TextTable, ...]:
     """Final ATE of each estimator on each run, where there are several runs of SLAM."""
-    compared = [one.compared for one in results if isinstance(one, ComparedResult)]
-    return (ate_table(compared),) if len(compared) > 1 else ()
+    found = _of_slam(results)
+    return (ate_table(found),) if len(found) > 1 else ()
 
 
-def _opened(task: Task[RunResult], config: Experiment, opening: Opening) -> Task[RunResult]:
+def load_run(run: Path) -> ExperimentConfig | HomingExperiment:
+    """Configuration of a run folder.
+
+    Raises:
+        DatasetError: it is none.
+        ConfigError: its configuration cannot be read, or it is of a task without estimators.
+    """
+    if not is_run_folder(run):
+        what = f"not a run folder (no {RUN_MARKER}); give what fgslam run wrote"
+        if run.is_file():
+            what = "not a run folder; give it to fgslam run first, or add --trials N"
+        raise DatasetError(f"{run}: {what}")
+    path = run / RUN_MARKER
+    return load_homing(path) if is_homing(path) else load_config(path)
+
+
+def require_room(folder: Path, run: Path, existing: ExistingFolder) -> None:
+    """Raises where results would replace earlier ones unasked, or the run they are made from."""
+    if folder.resolve() in (run.resolve(), *run.resolve().parents):
+        raise ConfigError(f"--out {folder}: holds the run itself; choose another folder")
+    if existing == "refuse" and is_run_folder(folder):
+        raise OutputError(
+            f"{folder} holds results already; choose another --out, or add --overwrite or --resume"
+        )
+
+
+def _open(
+    run: Path, config: ExperimentConfig | HomingExperiment, choice: Choice
+) -> tuple[Experiment, Task[RunResult]]:
+    """The comparison of a run; one that cannot be judged is refused before anything is written."""
+    estimators = choose(config, choice)
+    if isinstance(config, ExperimentConfig):
+        now = config.model_copy(update={"compare": estimators})
+        return now, open_slam_comparison(config, run, estimators)
+    first, *others = estimators
+    chosen = config.model_copy(update={"estimator": first, "compare": tuple(others)})
+    return chosen, open_homing_comparison(config, run, estimators)
+
+
+def _opened(task: Task[RunResult], *_: object) -> Task[RunResult]:
     """A task whose run was read already."""
     return task
 
 
-def write_comparison(
-    out: Path,
-    config: ExperimentConfig,
-    frames: int,
-    metrics: dict[str, EstimatorMetrics],
-    about: dict[str, JsonValue],
-    run: Path,
-) -> None:
-    """metrics.json, comparison.csv and report.html of results that are in ``out``."""
-    write_metrics(out / METRICS_FILE, frames, metrics, about)
-    write_comparison_csv(out / COMPARISON_FILE, [(config.name, metrics)])
-    if config.output.report:
-        report_from_folder(out, run)
+def _of_slam(results: Sequence[RunResult]) -> list[tuple[str, dict[str, Any]]]:
+    """Name and numbers of each run, where they are of SLAM."""
+    slam = [one for one in results if isinstance(one.config, ExperimentConfig)]
+    return [(one.config.name, one.metrics["estimators"]) for one in slam]
 
 
-# --------------------------------------------------------------------------------------------
-# One run
-
-
-def _open_slam(run: Path, choice: Choice) -> tuple[ExperimentConfig, Task[RunResult]]:
-    """The comparison of a run; one that cannot be judged is refused before anything is written."""
-    config, log = load_run(run)
-    load_truth(run, log)
-    estimators = choose(config, choice)
-    provenance = {"dataset": (config.provenance or {}).get("dataset"), "run": str(run)}
-    now = config.model_copy(update={"compare": estimators})
-
-    def compared(context: Context) -> ComparedResult:
-        return _compare(run, config, len(log), estimators, context)
-
-    return now, Task(provenance, compared)
-
-
-def _open_homing(run: Path, choice: Choice) -> tuple[HomingExperiment, Task[RunResult]]:
-    config, logs = load_homing(run / RUN_MARKER), load_bearing_logs(run)
-    first, *others = estimators = choose(config, choice)
-    now = config.model_copy(update={"estimator": first, "compare": tuple(others)})
-    return now, open_homing_comparison(config, logs, estimators, run)
-
-
-def _compare(
-    run: Path,
-    config: ExperimentConfig,
-    frames: int,
-    estimators: Sequence[EstimatorSettings],
-    context: Context,
-) -> ComparedResult:
-    """One run's log through the estimators."""
-    out = context.folder
-    metrics = replay_apart(tasks_of(config, run, out, estimators), context)
-    status: Status = "interrupted" if context.stopped() else "finished"
-    about: dict[str, JsonValue] = {
-        "name": config.name,
-        "status": status,
-        "run": str(run),
-        "odometry": config.odometry.kind,
-        "remark": remark_of(config) or None,
-        "notes": _notes(run),
-    }
-    write_comparison(out, config, frames, metrics, about, run)
-    compared = Compared(config.name, run, out, frames, metrics)
-    return ComparedResult(
-        config,
-        out,
-        status,
-        tables=comparison_tables(compared),
-        particulars=comparison_particulars(compared),
-        failed=len(compared.failures) == len(metrics),
-        compared=compared,
-    )
-
-
-def _notes(run: Path) -> list[str]:
-    """What was tolerated in the recording, as the run wrote it down."""
-    path = run / METRICS_FILE
-    notes = read_metrics(path).get("notes") if path.is_file() else None
-    return [str(note) for note in notes or ()]
-
-
-# --------------------------------------------------------------------------------------------
-# Folders
-
-
-def _all_homing(runs: Sequence[Path]) -> bool:
-    """Whether all runs are of homing; False where none is.
-
-    Raises:
-        FgslamError: some are and some are not, or one is no run folder.
-    """
-    kinds = [is_run_folder(run) and is_homing(run / RUN_MARKER) for run in runs]
-    if any(kinds) and not all(kinds):
-        other = runs[kinds.index(False)]
+def _require_one_kind(runs: Sequence[Path], configs: Sequence[Experiment]) -> None:
+    homing = [isinstance(config, HomingExperiment) for config in configs]
+    if any(homing) and not all(homing):
         raise DatasetError(
-            f"{other}: is no homing run, others are; compare homing runs by themselves"
-        )
-    return all(kinds)
-
-
-def _require_apart(run: Path, folder: Path, existing: ExistingFolder) -> None:
-    """A comparison may replace an earlier one, never the run that it is made from."""
-    if folder.resolve() == run.resolve() or folder.resolve() in run.resolve().parents:
-        raise ConfigError(f"--out {folder}: holds the run itself; choose another folder")
-    if existing == "refuse" and is_run_folder(folder):
-        raise OutputError(
-            f"{folder} holds results already; choose another --out, or add --overwrite"
+            f"{runs[homing.index(False)]}: is no homing run, others are; compare homing runs by "
+            "themselves"
         )
 
 

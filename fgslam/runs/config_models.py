@@ -62,6 +62,9 @@ ViewName: TypeAlias = Annotated[
 ]
 
 
+SYNTHETIC_REMARK = "odometry: SYNTHETIC (ground truth plus stated noise, see config.yaml)"
+
+
 class Experiment(BaseModel):
     """What the experiments of all tasks have."""
 
@@ -141,6 +144,11 @@ class ExperimentConfig(Experiment):
     def on_measurements(self) -> bool:
         """Whether the data set holds measurements instead of images."""
         return isinstance(self.dataset, MeasurementDatasetSettings)
+
+    @property
+    def remark(self) -> str:
+        """Marks results whose odometry was made from ground truth; empty otherwise."""
+        return SYNTHETIC_REMARK if self.odometry.kind == "synthetic" else ""
 
     def problem(self) -> str:
         """Also contradictions about the map."""

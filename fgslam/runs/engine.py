@@ -41,6 +41,9 @@ from fgslam.runs.units import (
     perform,
 )
 
+_GROUND = ("log", "trials", "first_seed")
+"""What a resumed run must find as it was, of its provenance, beside the data set's identity."""
+
 Status: TypeAlias = Literal["finished", "interrupted"]
 R_co = TypeVar("R_co", bound="RunResult", covariant=True)
 
@@ -181,11 +184,16 @@ def run_task(
     return result
 
 
-def require_unfinished(folder: Path) -> None:
-    """Raises OutputError where there is nothing left to do."""
+def is_finished(folder: Path) -> bool:
+    """Whether a run folder has nothing left to do."""
     path = folder / METRICS_FILE
     begun = (folder / UNITS_FOLDER).is_dir() or (folder / STATE_FILE).is_file()
-    if not begun and path.is_file() and read_document(path).get("status") == "finished":
+    return not begun and path.is_file() and read_document(path).get("status") != "interrupted"
+
+
+def require_unfinished(folder: Path) -> None:
+    """Raises OutputError where there is nothing left to do."""
+    if is_finished(folder):
         raise OutputError(
             f"{folder}: nothing to resume (no unfinished units): the run has finished; use "
             "--overwrite to run again"
@@ -195,10 +203,13 @@ def require_unfinished(folder: Path) -> None:
 def require_same(config: Experiment, folder: Path) -> None:
     """A run resumes only with the configuration that it was started with."""
     path = folder / RUN_MARKER
-    if load_experiment(path).as_values() != config.as_values():
+    before = load_experiment(path)
+    if before.as_values() != config.as_values():
+        compared = set(before.provenance or {}) & {"run", "trials"}  # not begun by `fgslam run`
+        command = "" if compared else f" ({resume_command(folder)})"
         raise ConfigError(
-            f"{path}: differs from the configuration given; resume with the same one "
-            f"({resume_command(folder)}) or start again with --overwrite"
+            f"{path}: differs from the configuration given; resume with the same one{command} or "
+            "start again with --overwrite"
         )
 
 
@@ -212,6 +223,12 @@ def require_same_ground(now: Mapping[str, Any], folder: Path) -> None:
             f"{dataset.get('name')}: the recording has changed since {path} was written; restore "
             "it, or start again with --overwrite"
         )
+    for name in _GROUND:
+        if then.get(name) != now.get(name):
+            raise ConfigError(
+                f"{path}: was begun with {name} {then.get(name)}, and now it is {now.get(name)}; "
+                "resume with the same, or start again with --overwrite"
+            )
     before, own = then.get("versions") or {}, versions()
     differing = [name for name in own if name in before and before[name] != own[name]]
     changed = [f"{name} {before[name]} -> {own[name]}" for name in differing]

@@ -5,8 +5,10 @@ Its files are written whole or not at all: :mod:`fgslam.core.files`.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import platform
+from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -33,6 +35,8 @@ REPORT_FILE = "report.html"
 LOG_FILE = "measurements.npz"
 STATE_FILE = "checkpoint.npz"
 COMPARISON_FILE = "comparison.csv"
+TRIALS_FILE = "trials.csv"
+TIMING_FILE = "trials_timing.csv"
 
 _ESTIMATOR_FILES = ("online.tum", "final.tum", "covariance.csv", "map.ply", "frames.csv")
 _RESULT_FILES = (
@@ -44,8 +48,8 @@ _RESULT_FILES = (
     METRICS_FILE,
     "timing.csv",
     COMPARISON_FILE,
-    "trials.csv",
-    "trials_timing.csv",
+    TRIALS_FILE,
+    TIMING_FILE,
     REPORT_FILE,
     "view.rrd",
     "map.fgmap",
@@ -164,6 +168,14 @@ def versions() -> dict[str, str | None]:
     """Versions of this program, of Python and of the packages that shape the numbers."""
     own = {"fgslam": __version__, "python": platform.python_version()}
     return own | {name: _version(name) for name in _VERSIONS_OF}
+
+
+def digest_of(files: Iterable[Path]) -> str:
+    """SHA-256 of the files' names and contents, in their order."""
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
 
 
 def read_document(path: Path) -> dict[str, Any]:

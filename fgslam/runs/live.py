@@ -13,7 +13,6 @@ import yaml
 from fgslam.core import __version__
 from fgslam.core.errors import ConfigError
 from fgslam.core.sensors import CameraRig
-from fgslam.runs.comparison import remark_of
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.maps import Map, map_points
 from fgslam.runs.named_experiments import find_experiment
@@ -101,7 +100,7 @@ class Slam(Session):
             seed=settings.seed,
         )
         slam.numbering = (settings.dataset.start, settings.dataset.stride)
-        slam._remark = remark_of(settings)
+        slam._remark = settings.remark
         return slam
 
     def result(self) -> Result:

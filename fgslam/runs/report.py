@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
+import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from fgslam.core.errors import DatasetError, FgslamError
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.trajectories import read_covariances, read_tum
+from fgslam.report.content import Picture
 from fgslam.report.point_cloud import MapPoints, read_ply
 from fgslam.report.run_results import (
     EstimatorReport,
@@ -27,7 +30,7 @@ from fgslam.report.run_results import (
 from fgslam.report.slam_page import write_report
 from fgslam.report.tables import read_metrics
 from fgslam.runs.folder import LOG_FILE, REPORT_FILE, RUN_MARKER
-from fgslam.runs.report_parts import comparison_table, sample_pictures
+from fgslam.runs.metric_tables import page_table
 from fgslam.runs.tasks.slam_places import LOOPS_FILE, read_closures
 
 _UP = np.array([0.0, -1.0, 0.0])
@@ -75,7 +78,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
     pictures = next((p for p in folders if (p / "pictures").is_dir()), folder) / "pictures"
     loops = _find(folders, LOOPS_FILE)
     places, closures = (None, []) if loops is None else read_closures(loops)
-    comparison = comparison_table(metrics["estimators"])
+    comparison = page_table(metrics["estimators"])
     return ReportData(
         title=str(metrics.get("name") or config.get("name") or folder.name),
         subtitle=_subtitle(metrics, config),
@@ -84,7 +87,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
         notes=_notes(metrics),
         tables=(comparison, *([places] if places and places.rows else [])),
         closures=tuple(closures),
-        pictures=tuple(sample_pictures(pictures)),
+        pictures=tuple(_pictures(pictures)),
         config_yaml=config_text,
         versions=_versions(config),
         up=_up(_find(folders, LOG_FILE)),
@@ -247,3 +250,42 @@ def _number_pairs(path: Path, rows: Any, name: str) -> list[tuple[float, float]]
         raise DatasetError(
             f"{path}: not a table of timestamp and {name} ({error}); run the experiment again"
         ) from error
+
+
+# --------------------------------------------------------------------------------------------
+# Pictures
+
+_FIGURES_OF_A_FRAME = {
+    "flow": "Matches of two frames: dot where a landmark was, cross where it is, line its motion",
+    "disparities": "Stereo matches: a line as long as the disparity from each feature",
+    "features": "SIFT features: a square for each, its side the scale, the stroke its orientation",
+}
+_FIGURES_OF_A_RUN = {
+    "matches": "Landmarks matched and used in each frame, and landmarks in the map",
+}
+_FIGURES_OF_THE_PAGE = frozenset({"map_from_above", "map_views", "position_error"})
+"""The page shows these as figures, drawn from the same values."""
+
+
+def _pictures(folder: Path) -> Iterator[Picture]:
+    """The pictures of a run's folder with captions, matches first; nothing where it is absent."""
+    drawn = (path for path in folder.glob("*.png") if path.stem not in _FIGURES_OF_THE_PAGE)
+    for path in sorted(drawn, key=_order):
+        try:
+            yield Picture(_caption(path.stem), path.read_bytes())
+        except OSError as error:
+            raise DatasetError(f"cannot read {path}: {error.strerror}; check the path") from error
+
+
+def _order(path: Path) -> tuple[int, str]:
+    """Matches of frames, then of the run, then the rest; each by name."""
+    kinds = ["flow", *_FIGURES_OF_A_RUN, "disparities", "features"]
+    kind = re.sub(r"_\d+$", "", path.stem)
+    return (kinds.index(kind) if kind in kinds else len(kinds), path.stem)
+
+
+def _caption(stem: str) -> str:
+    found = re.fullmatch(r"([a-z_]+)_(\d+)", stem)
+    if found and found[1] in _FIGURES_OF_A_FRAME:
+        return f"{_FIGURES_OF_A_FRAME[found[1]]} (frame number {int(found[2])} of the run)"
+    return _FIGURES_OF_A_RUN.get(stem, stem.replace("_", " "))

@@ -72,6 +72,46 @@ class Done(Generic[Result]):
     results: dict[int, Result]
     ended: list[tuple[tuple[int, ...], str]] = field(default_factory=list)
 
+    def all(self, ended: Callable[[int, str], Result]) -> list[Result]:
+        """Results of all units; ``ended`` makes those of a block that gave none, and why."""
+        lost = {k: ended(k, why) for block, why in self.ended for k in block}
+        found = self.results | lost
+        return [found[k] for k in sorted(found)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Each(Generic[Argument, Result]):
+    """Calls a function on each argument of a block; handed over to the process that does so."""
+
+    function: Callable[[Argument], Result]
+
+    def __call__(self, arguments: Sequence[Argument]) -> list[Result]:
+        return [self.function(argument) for argument in arguments]
+
+
+def each_apart(
+    names: tuple[str, str],
+    function: Callable[[Argument], Result],
+    arguments: Sequence[Argument],
+    kind: Any,
+    block: int = 1,
+) -> Stage[list[Argument], Result]:
+    """A stage with a unit for each argument.
+
+    Args:
+        names: of the stage, and of its progress.
+        function: of a module's top level; makes the result of one unit.
+        arguments: one a unit.
+        kind: type of one unit's result.
+        block: units that share a process: starting one takes as long as some units.
+    """
+
+    def those(units: tuple[int, ...]) -> list[Argument]:
+        return [arguments[k] for k in units]
+
+    name, label = names
+    return Stage(name, label, len(arguments), _Each(function), those, kind, in_blocks(block))
+
 
 class UnitStore:
     """Finished units in a run folder; without a folder nothing is kept."""
@@ -144,11 +184,6 @@ def perform(
         lost = sum(len(block) for block, _ in ended)
         progress(stage.label, len(found) + lost, stage.count)
     return Done({k: found[k] for k in sorted(found)}, sorted(ended))
-
-
-def one_by_one(units: Sequence[int]) -> list[Sequence[int]]:
-    """Each unit in a process of its own."""
-    return in_blocks(1)(units)
 
 
 def in_blocks(size: int) -> Callable[[Sequence[int]], list[Sequence[int]]]:

@@ -17,7 +17,7 @@ from fgslam.homing.drive_record import DriveRecord, HomingLog, cross_track, pass
 from fgslam.homing.path_memory import PathMemory
 from fgslam.report.figures.plan import Drive
 from fgslam.report.tables import Cell, write_csv
-from fgslam.runs.homing_replay import save_bearing_logs
+from fgslam.runs.homing_comparison import save_bearing_logs
 from fgslam.runs.tasks.homing_drive_pictures import LegView
 
 LEGS_FILE = "legs.csv"

@@ -30,7 +30,7 @@ from fgslam.report.figures.traces import Figure
 from fgslam.runs.config_models import DrivingConfig
 from fgslam.runs.documents import write_document, write_page
 from fgslam.runs.engine import RunResult, Status
-from fgslam.runs.homing_replay import replay_homing
+from fgslam.runs.homing_comparison import replay_homing
 from fgslam.runs.tasks.homing_drive_files import (
     DrivenSeed,
     bearing_log,

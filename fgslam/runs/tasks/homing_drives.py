@@ -23,7 +23,7 @@ from fgslam.runs.engine import Context, Opening, RunResult, Status, Task
 from fgslam.runs.tasks.homing_drive_files import DrivenSeed
 from fgslam.runs.tasks.homing_drive_pictures import DriveWatcher, Unwrapping
 from fgslam.runs.tasks.homing_drive_results import finish_drives
-from fgslam.runs.units import Stage, one_by_one
+from fgslam.runs.units import each_apart
 
 _TRIES = 50  # places drawn for a start that is free
 
@@ -89,26 +89,14 @@ def open_house_drive(config: DrivingConfig, seed: int) -> Opened:
 
 def _run(config: DrivingConfig, opener: Opener, context: Context) -> RunResult:
     """Stopped early, the drives that are done count."""
-    stage = Stage(
-        name="drives",
-        label="drives",
-        count=config.trials,
-        work=_perform,
-        argument=lambda units: [DriveTask(config, config.seed + k, opener) for k in units],
-        kind=DrivenSeed,
-        blocks=one_by_one,
-    )
-    done = context.perform(stage)
+    tasks = [DriveTask(config, config.seed + k, opener) for k in range(config.trials)]
+    done = context.perform(each_apart(("drives", "drives"), perform_drive, tasks, DrivenSeed))
     driven = list(done.results.values())
     failures = sorted(f"seed {config.seed + k}: {why}" for (k,), why in done.ended)
     if not driven and not context.stopped():
         raise OutputError(f"no drive was finished; {failures[0]}")
     status: Status = "finished" if len(driven) == config.trials else "interrupted"
     return finish_drives(config, context.folder, status, driven, failures)
-
-
-def _perform(tasks: Sequence[DriveTask]) -> list[DrivenSeed]:
-    return [perform_drive(task) for task in tasks]
 
 
 def perform_drive(task: DriveTask) -> DrivenSeed:

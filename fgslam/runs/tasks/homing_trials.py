@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
@@ -12,20 +14,74 @@ from fgslam.core.arrays import IntArray
 from fgslam.core.bearing_log import BearingLog
 from fgslam.core.homing import BearingMatches, HomingStart, Refusal
 from fgslam.datasets.simulated_homing import open_simulated_homing
-from fgslam.evaluation.homing import homing_errors
+from fgslam.evaluation.consistency import Nees
+from fgslam.evaluation.homing import HomingErrors
+from fgslam.evaluation.metrics import JsonValue, UpdateTime
 from fgslam.frontend.homing.homing_vector import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view_geometry import make_local_map
+from fgslam.report.content import TextTable
+from fgslam.report.figures.homing import sorted_errors
+from fgslam.report.figures.traces import Figure
+from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.config_models import HomingTrialsConfig
+from fgslam.runs.documents import write_document, write_page
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task
-from fgslam.runs.homing_replay import replay_homing, save_bearing_logs
-from fgslam.runs.tasks.homing_trial_results import HomingTrial, TriedEstimator, finish_trials
-from fgslam.runs.units import Stage, in_blocks
+from fgslam.runs.folder import TIMING_FILE, TRIALS_FILE
+from fgslam.runs.homing_comparison import (
+    ESTIMATOR_COLUMNS,
+    NEES_NAMES,
+    JudgedHoming,
+    finished_errors,
+    replay_homing,
+    save_bearing_logs,
+    summary_numbers,
+    summary_of,
+    table_row,
+    update_time_of,
+)
+from fgslam.runs.units import each_apart
 
-Unit: TypeAlias = tuple[int, int]
-"""Number of the share of outliers, and of the trial."""
+Unit: TypeAlias = tuple[HomingTrialsConfig, int, int]
+"""Configuration, number of the share of outliers, and of the trial."""
 
 _BLOCK = 20  # trials a process: starting one takes as long as some trials
+_COLUMNS = (
+    "outliers",
+    "trial",
+    "estimator",
+    "refused",
+    "failure",
+    "inliers",
+    "wrong_inliers",
+    "images",
+    "direction_error_deg",
+    "rotation_error_deg",
+    "distance_error_legs",
+    *(f"{what}_{name}" for name in NEES_NAMES for what in ("nees", "dof")),
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HomingTrial:
+    """One simulated homing.
+
+    Attributes:
+        share: part of outliers.
+        trial: its number.
+        refused: why there was no homing vector; empty where there was one.
+        inliers, wrong_inliers: matches that support the vector; wrong ones among them.
+        tried: by title of the estimator.
+        log: of the bearings, where it is to be kept.
+    """
+
+    share: float
+    trial: int
+    refused: str
+    inliers: int
+    wrong_inliers: int
+    tried: dict[str, JudgedHoming]
+    log: BearingLog | None = None
 
 
 def open_trials(config: HomingTrialsConfig, opening: Opening) -> Task[RunResult]:
@@ -37,16 +93,9 @@ def open_trials(config: HomingTrialsConfig, opening: Opening) -> Task[RunResult]
 def _run(config: HomingTrialsConfig, context: Context) -> RunResult:
     """Runs all trials; stopped early, those finished count."""
     units = _units(config)
-    stage = Stage(
-        name="trials",
-        label="trials",
-        count=len(units),
-        work=perform_block,
-        argument=lambda block: (config, [units[k] for k in block]),
-        kind=HomingTrial,
-        blocks=in_blocks(_BLOCK),
+    done = context.perform(
+        each_apart(("trials", "trials"), perform_trial, units, HomingTrial, _BLOCK)
     )
-    done = context.perform(stage)
     trials = sorted(done.results.values(), key=lambda trial: (trial.share, trial.trial))
     failures = sorted(_failure([units[k] for k in block], why) for block, why in done.ended)
     logs = {trial_name(trial): trial.log for trial in trials if trial.log is not None}
@@ -56,7 +105,7 @@ def _run(config: HomingTrialsConfig, context: Context) -> RunResult:
 
 
 def _failure(units: Sequence[Unit], why: str) -> str:
-    share, first = units[0]
+    _, share, first = units[0]
     return f"{len(units)} trials, from trial {first} of share {share} on: {why}"
 
 
@@ -65,14 +114,9 @@ def trial_name(trial: HomingTrial) -> str:
     return f"outliers_{100.0 * trial.share:02.0f}_trial_{trial.trial:04d}"
 
 
-def perform_block(block: tuple[HomingTrialsConfig, Sequence[Unit]]) -> list[HomingTrial]:
-    """Some trials, one after the other."""
-    config, units = block
-    return [perform_trial(config, share, trial) for share, trial in units]
-
-
-def perform_trial(config: HomingTrialsConfig, share: int, trial: int) -> HomingTrial:
+def perform_trial(unit: Unit) -> HomingTrial:
     """One trial; its noise depends on the seed, the share's number and its own number alone."""
+    config, share, trial = unit
     rng = np.random.default_rng((config.seed, share, trial))
     part = config.outliers[share]
     simulated = open_simulated_homing(config.dataset, part, rng)
@@ -81,14 +125,10 @@ def perform_trial(config: HomingTrialsConfig, share: int, trial: int) -> HomingT
         return HomingTrial(part, trial, begun.reason.value, 0, 0, {})
     start, rows = begun
     tracks, truth = simulated.followed(rows)
-    tried = {}
-    for settings in config.estimators:
-        replayed = replay_homing(start, tracks, settings)
-        errors = None
-        if replayed.estimates:
-            seen = dataclasses.replace(truth, robots=truth.robots[: len(replayed.estimates)])
-            errors = homing_errors(replayed.estimates, seen)
-        tried[settings.title] = TriedEstimator(errors, replayed.update_ms, replayed.failure)
+    tried = {
+        settings.title: replay_homing(start, tracks, settings).judged(truth)
+        for settings in config.estimators
+    }
     wrong = int(np.count_nonzero(~simulated.correct[rows]))
     log = BearingLog(start, list(tracks), truth) if trial < config.output.logs else None
     return HomingTrial(part, trial, "", len(rows), wrong, tried, log)
@@ -97,7 +137,7 @@ def perform_trial(config: HomingTrialsConfig, share: int, trial: int) -> HomingT
 def _units(config: HomingTrialsConfig) -> list[Unit]:
     """All trials; those of one block are of one share, and the shares take turns."""
     return [
-        (share, trial)
+        (config, share, trial)
         for first in range(0, config.trials, _BLOCK)
         for share in range(len(config.outliers))
         for trial in range(first, min(first + _BLOCK, config.trials))
@@ -123,3 +163,133 @@ def start_from_matches(
     kept = matches.select(rows)
     of_kept = dataclasses.replace(vector, inliers=np.ones(len(rows), np.bool_))
     return HomingStart(time, of_kept, make_local_map(of_kept, kept), kept), rows
+
+
+# --------------------------------------------------------------------------------------------
+# Files
+
+
+def finish_trials(
+    config: HomingTrialsConfig,
+    folder: Path,
+    status: Status,
+    trials: Sequence[HomingTrial],
+    failures: Sequence[str],
+) -> RunResult:
+    """trials.csv, metrics.json and the page. Raises OutputError."""
+    titles = [settings.title for settings in config.estimators]
+    write_csv(folder / TRIALS_FILE, _COLUMNS, _rows(trials, titles))
+    timing = ("outliers", "trial", "estimator", "median_ms", "p95_ms", "max_ms")
+    write_csv(folder / TIMING_FILE, timing, _times(trials, titles))
+    groups = {share: [t for t in trials if t.share == share] for share in config.outliers}
+    found = {title: _of_estimator(groups, title) for title in titles}
+    tables = tuple(_table(share, group, titles) for share, group in groups.items() if group)
+    result = RunResult(config, folder, status, _best(groups, titles), tables, tuple(failures))
+    refused = {f"{share:g}": sum(bool(t.refused) for t in group) for share, group in groups.items()}
+    numbers: dict[str, JsonValue] = {
+        "trials": config.trials,
+        "outliers": list(config.outliers),
+        "trials_done": {f"{share:g}": len(group) for share, group in groups.items()},
+        "refused": refused,
+    }
+    kinds = {settings.title: settings.kind for settings in config.estimators}
+    estimators = {title: {"kind": kinds[title], **values} for title, values in found.items()}
+    write_document(result, numbers, estimators)
+    subtitle = f"{len(trials)} simulated homings of bearings alone, seed {config.seed}"
+    write_page(result, subtitle, figures=tuple(_figures(groups, titles)), series=tuple(titles))
+    return result
+
+
+# --------------------------------------------------------------------------------------------
+# Numbers, tables, figures
+
+
+def _of(trials: Sequence[HomingTrial], title: str) -> list[JudgedHoming]:
+    """What one estimator made of the trials that had a homing vector."""
+    return [t.tried[title] for t in trials if title in t.tried]
+
+
+def _of_estimator(groups: dict[float, list[HomingTrial]], title: str) -> dict[str, JsonValue]:
+    every = [trial for group in groups.values() for trial in group]
+    failures = [
+        f"outliers {t.share:g}, trial {t.trial}: {t.tried[title].failure}"
+        for t in every
+        if title in t.tried and t.tried[title].failure
+    ]
+    shares: dict[str, JsonValue] = {
+        f"{share:g}": summary_numbers(_of(group, title)) for share, group in groups.items()
+    }
+    return {
+        "outliers": shares,
+        "update_ms": asdict(update_time_of(_of(every, title))),
+        "failures": list(failures),
+    }
+
+
+def _rows(trials: Sequence[HomingTrial], titles: Sequence[str]) -> Iterator[list[Cell]]:
+    for trial in trials:
+        start: list[Cell] = [trial.share, trial.trial]
+        if trial.refused:
+            yield [*start, "", trial.refused, *[None] * (len(_COLUMNS) - 4)]
+        for title in titles if trial.tried else ():
+            tried = trial.tried[title]
+            about: list[Cell] = [title, "", tried.failure, trial.inliers, trial.wrong_inliers]
+            yield [*start, *about, len(tried.update_ms), *_last(tried.errors)]
+
+
+def _last(errors: HomingErrors | None) -> list[Cell]:
+    if errors is None:
+        return [None] * (3 + 2 * len(NEES_NAMES))
+    last = errors.last()
+    degrees = np.rad2deg([last.direction[0], last.rotation[0]]).tolist()
+    judged: list[Nees] = [getattr(last, name) for name in NEES_NAMES]
+    cells = [value for one in judged for value in (_value(one), int(one.dof[0]))]
+    return [*degrees, float(last.distance[0]), *cells]
+
+
+def _value(one: Nees) -> float | None:
+    return float(one.values[0]) if one.dof[0] else None
+
+
+def _times(trials: Sequence[HomingTrial], titles: Sequence[str]) -> Iterator[list[Cell]]:
+    for trial in trials:
+        for title in titles if trial.tried else ():
+            time = UpdateTime.of(trial.tried[title].update_ms)
+            yield [trial.share, trial.trial, title, time.median, time.p95, time.max]
+
+
+def _table(share: float, group: Sequence[HomingTrial], titles: Sequence[str]) -> TextTable:
+    refused = sum(bool(t.refused) for t in group)
+    rows = tuple((title, table_row(_of(group, title))) for title in titles)
+    heading = f"{100.0 * share:.0f} % outliers, {len(group)} trials"
+    heading += f", {refused} of them refused" if refused else ""
+    return TextTable(f"share-{100.0 * share:.0f}", heading, "estimator", ESTIMATOR_COLUMNS, rows)
+
+
+def _best(groups: dict[float, list[HomingTrial]], titles: Sequence[str]) -> tuple[str, ...]:
+    lines = []
+    for share, group in groups.items():
+        summaries = [(summary_of(_of(group, title)), title) for title in titles]
+        ranked = sorted((s.direction_median_deg, title) for s, title in summaries if s is not None)
+        if ranked:
+            error, title = ranked[0]
+            lines.append(
+                f"At {100.0 * share:.0f} % outliers {title} has the smallest median error of the "
+                f"home direction: {error:.2f} degrees."
+            )
+    return tuple(lines) or ("No trial gave a result.",)
+
+
+def _figures(groups: dict[float, list[HomingTrial]], titles: Sequence[str]) -> Iterator[Figure]:
+    for share, group in groups.items():
+        errors = {title: _directions(group, title) for title in titles}
+        if any(map(len, errors.values())):
+            heading = f"Error of the home direction at {100.0 * share:.0f} % outliers"
+            figure = sorted_errors(errors, "degrees", (f"direction-{100.0 * share:.0f}", heading))
+            figure.layout["xaxis"]["type"] = "log"
+            yield figure
+
+
+def _directions(group: Sequence[HomingTrial], title: str) -> np.ndarray:
+    last = [errors.last().direction for errors in finished_errors(_of(group, title))]
+    return np.rad2deg(np.concatenate(last)) if last else np.empty(0)

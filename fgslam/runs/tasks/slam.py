@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,12 +16,12 @@ from fgslam.core.features import StereoFeatures
 from fgslam.core.recordings import Sequence
 from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.report.tables import write_comparison_csv
-from fgslam.runs.comparison import Compared, replay_apart, tasks_of
-from fgslam.runs.comparison_tables import comparison_particulars, comparison_tables
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, run_task
 from fgslam.runs.folder import COMPARISON_FILE, ExistingFolder, is_run_folder
+from fgslam.runs.metric_tables import comparison_particulars, comparison_tables
 from fgslam.runs.report import report_from_folder
+from fgslam.runs.slam_comparison import replay_apart
 from fgslam.runs.tasks import slam_checkpoint as checkpoint
 from fgslam.runs.tasks import slam_map_entry as map_entry
 from fgslam.runs.tasks import slam_mapping as mapping
@@ -47,13 +48,11 @@ class SlamResult(RunResult):
         outputs: all that was computed.
         live: numbers of the estimator that steered; after an interruption, of the frames so far.
         pictures: drawn, if any.
-        compared: the estimators that replayed the run's log, beside the live one.
     """
 
     outputs: RunOutputs = field(kw_only=True)
     live: EstimatorMetrics = field(kw_only=True)
     pictures: tuple[Path, ...] = ()
-    compared: Compared | None = None
 
 
 def open_slam(config: ExperimentConfig, opening: Opening) -> Task[SlamResult]:
@@ -166,7 +165,7 @@ def _finish(begun: BegunRun, context: Context) -> SlamResult:
     if outputs.config.output.report:
         report_from_folder(outputs.folder)
     status: Status = "finished"
-    if compared is not None and context.stopped():
+    if compared and context.stopped():
         status = "interrupted"  # the replays that are missing are for the next session
     else:
         # The checkpoint goes last: while anything is left, a run goes on from its last frames.
@@ -175,18 +174,20 @@ def _finish(begun: BegunRun, context: Context) -> SlamResult:
     return _result(outputs, status, live, pictures, compared, about_map)
 
 
-def _compare(outputs: RunOutputs, live: EstimatorMetrics, context: Context) -> Compared | None:
-    """Replays the run's log through the other estimators that the configuration names."""
+def _compare(outputs: RunOutputs, live: EstimatorMetrics, context: Context) -> dict[str, Any]:
+    """Metrics of the estimators that the configuration compares; empty where there is only one.
+
+    Those beside the live one replay the run's log.
+    """
     config, folder = outputs.config, outputs.folder
     others = config.estimators[1:]
     if not others:
-        return None
-    metrics = {outputs.title: live} | replay_apart(
-        tasks_of(config, folder, folder, others), context
-    )
+        return {}
+    metrics = {outputs.title: live} | replay_apart(config, folder, others, context)
     outputs.write_metrics(metrics, "interrupted" if context.stopped() else "finished")
-    write_comparison_csv(folder / COMPARISON_FILE, [(config.name, metrics)])
-    return Compared(config.name, folder, folder, len(outputs.recorder), metrics)
+    values = {title: one.as_json() for title, one in metrics.items()}
+    write_comparison_csv(folder / COMPARISON_FILE, [(config.name, values)])
+    return values
 
 
 def _result(
@@ -194,7 +195,7 @@ def _result(
     status: Status,
     live: EstimatorMetrics,
     pictures: tuple[Path, ...] = (),
-    compared: Compared | None = None,
+    compared: Mapping[str, Any] | None = None,
     about_map: str = "",
 ) -> SlamResult:
     """What is said of the run."""
@@ -202,20 +203,18 @@ def _result(
     files = [("trajectory", str(own / "final.tum")), ("map", str(own / "map.ply"))]
     files += [("saved map", about_map)] if about_map else []
     files += [("pictures", f"{pictures[0].parent}/")] if pictures else []
-    others = () if compared is None else comparison_tables(compared)
-    more = () if compared is None else comparison_particulars(compared)
+    tables = comparison_tables(outputs.config.name, len(outputs.recorder), compared or {})
     return SlamResult(
         config=outputs.config,
         folder=outputs.folder,
         status=status,
-        tables=(summary_table(outputs, live), *others),
+        tables=(summary_table(outputs, live), *tables),
         notes=run_notes(outputs, live),
-        particulars=(*files, *more),
+        particulars=(*files, *comparison_particulars(compared or {}, outputs.folder)),
         reached=f"after {len(outputs.recorder)} frames",
         outputs=outputs,
         live=live,
         pictures=pictures,
-        compared=compared,
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,19 +17,11 @@ from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.point_cloud import read_ply
 from fgslam.report.tables import LANDMARK_TRUTH_FILE, StageTime, write_landmark_truth, write_timing
-from fgslam.runs.compare import write_comparison
-from fgslam.runs.comparison import (
-    GROUND_TRUTH_FILE,
-    Compared,
-    remark_of,
-    replay_apart,
-    tasks_of,
-)
-from fgslam.runs.comparison_tables import comparison_particulars, comparison_tables
 from fgslam.runs.config import ExperimentConfig
-from fgslam.runs.engine import Context, Opening, RunResult, Status, Task
+from fgslam.runs.engine import Context, Opening, RunResult, Task
 from fgslam.runs.estimator_files import FRAMES_FILE, read_frames
 from fgslam.runs.folder import write_config
+from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, replay_apart, write_comparison
 from fgslam.runs.tasks.slam_checkpoint import save_log
 from fgslam.runs.tasks.slam_pictures import RunFigures, draw_run
 from fgslam.runs.tasks.slam_summary import spread
@@ -49,46 +40,23 @@ def open_measured(config: ExperimentConfig, seed: int | None = None) -> Measurem
     return open_measurements(config.dataset, seed, config.odometry)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasuredResult(RunResult):
-    """How a run on measurements ended; ``compared`` are its estimators."""
-
-    compared: Compared = field(kw_only=True)
-
-
-def open_measurements_task(config: ExperimentConfig, opening: Opening) -> Task[MeasuredResult]:
+def open_measurements_task(config: ExperimentConfig, opening: Opening) -> Task[RunResult]:
     """Opens or simulates the recording. Raises FgslamError."""
     recording = open_measured(config)
     return Task(_provenance(recording), lambda context: _run(config, recording, context))
 
 
-def _run(
-    config: ExperimentConfig, recording: MeasurementRecording, context: Context
-) -> MeasuredResult:
+def _run(config: ExperimentConfig, recording: MeasurementRecording, context: Context) -> RunResult:
     """Replays the recording through the configuration's estimators."""
     folder = context.folder
     write_log_and_truth(folder, recording)
-    metrics = replay_apart(tasks_of(config, folder, folder, config.estimators), context)
-    status: Status = "interrupted" if context.stopped() else "finished"
+    metrics = replay_apart(config, folder, config.estimators, context)
     rows = _live_rows(folder, config)
     _write_times(folder, recording, rows)
-    pictures: tuple[Path, ...] = ()
     if config.output.pictures and rows:
-        pictures = tuple(draw_run(folder, _figures(folder, config, recording, rows)))
-    about = _about(config, recording, rows, status)
-    write_comparison(folder, config, len(recording.log), metrics, about, folder)
-    compared = Compared(
-        config.name, folder, folder, len(recording.log), metrics, recording.notes, pictures
-    )
-    return MeasuredResult(
-        config,
-        folder,
-        status,
-        tables=comparison_tables(compared),
-        particulars=comparison_particulars(compared),
-        failed=len(compared.failures) == len(metrics),
-        compared=compared,
-    )
+        draw_run(folder, _figures(folder, config, recording, rows))
+    about = _about(config, recording, rows)
+    return write_comparison(context, config, len(recording.log), metrics, about, folder)
 
 
 def _provenance(recording: MeasurementRecording) -> dict[str, Any]:
@@ -130,14 +98,14 @@ def _write_times(folder: Path, recording: MeasurementRecording, rows: list[Repla
 
 
 def _about(
-    config: ExperimentConfig, recording: MeasurementRecording, rows: list[ReplayRow], status: str
+    config: ExperimentConfig, recording: MeasurementRecording, rows: list[ReplayRow]
 ) -> dict[str, JsonValue]:
     return {
         "name": config.name,
-        "status": status,
+        "status": None,
         "frames_in_recording": len(recording.log),
         "odometry": config.odometry.kind,
-        "remark": remark_of(config) or None,
+        "remark": config.remark or None,
         "notes": list(recording.notes),
         "status_counts": dict(sorted(Counter(row.status for row in rows).items())),
         "landmark_matches": spread(np.array([row.inliers for row in rows[1:]], np.int64)),

@@ -24,10 +24,10 @@ from fgslam.report.tables import (
     write_metrics,
     write_timing,
 )
-from fgslam.runs.comparison import GROUND_TRUTH_FILE, load_truth, remark_of
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.estimator_files import write_estimate
 from fgslam.runs.maps import map_points
+from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, load_truth
 from fgslam.runs.tasks.rendered_truth import rendered_landmark_truth
 from fgslam.runs.tasks.slam_checkpoint import save_log
 from fgslam.runs.tasks.slam_places import closures_of, place_numbers, write_closures
@@ -71,7 +71,7 @@ class RunOutputs:
     @property
     def remark(self) -> str:
         """Marks results whose odometry was made from ground truth; empty otherwise."""
-        return remark_of(self.config)
+        return self.config.remark
 
     def write_results(self, status: str) -> EstimatorMetrics:
         """Log, trajectories, covariances, map, metrics and timing of the frames so far."""

@@ -21,6 +21,7 @@ from fgslam.core.recordings import LandmarkTruth
 from fgslam.evaluation.consistency import Nees
 from fgslam.evaluation.judging import seen_often
 from fgslam.evaluation.metrics import EstimatorMetrics, UpdateTime, value_at
+from fgslam.report.content import TextTable
 from fgslam.report.point_cloud import MapPoints
 from fgslam.report.tables import (
     RESULT_COLUMNS,
@@ -31,12 +32,11 @@ from fgslam.report.tables import (
 )
 from fgslam.runs.baseline import check_baseline, read_baseline, write_baseline
 from fgslam.runs.choosing import Choice, all_kinds, choose
-from fgslam.runs.comparison import Compared
-from fgslam.runs.comparison_tables import comparison_particulars, comparison_tables
 from fgslam.runs.config import ExperimentConfig, parse_config
 from fgslam.runs.estimator_files import points_from_log
+from fgslam.runs.metric_tables import comparison_particulars, comparison_tables
 from fgslam.runs.tasks.rendered_truth import points_under
-from fgslam.runs.trial_results import summarise, together
+from fgslam.runs.trials import Trial, summarise, together
 
 LAB: dict[str, Any] = {"name": "x", "dataset": {"kind": "rendered_lab"}}
 
@@ -128,7 +128,8 @@ METRICS = EstimatorMetrics(
 
 def test_the_table_has_a_row_for_every_estimator_and_run(tmp_path: Path) -> None:
     path = tmp_path / "comparison.csv"
-    write_comparison_csv(path, [("a", {"x": METRICS, "y": EstimatorMetrics()}), ("b", {})])
+    rows = {"x": METRICS.as_json(), "y": EstimatorMetrics().as_json()}
+    write_comparison_csv(path, [("a", rows), ("b", {})])
     rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
     assert [(row["run"], row["estimator"]) for row in rows] == [("a", "x"), ("a", "y")]
     first = rows[0]
@@ -140,8 +141,13 @@ def test_the_table_has_a_row_for_every_estimator_and_run(tmp_path: Path) -> None
     assert value_at(METRICS.as_json(), "online.ate_rmse_m.more") is None
 
 
-def compared(metrics: dict[str, EstimatorMetrics]) -> Compared:
-    return Compared("drive", Path("drive"), Path("drive/compare"), 9, metrics)
+def tables(metrics: dict[str, EstimatorMetrics]) -> tuple[TextTable, ...]:
+    return comparison_tables("drive", 9, {title: one.as_json() for title, one in metrics.items()})
+
+
+def particulars(metrics: dict[str, EstimatorMetrics]) -> tuple[tuple[str, str], ...]:
+    values = {title: one.as_json() for title, one in metrics.items()}
+    return comparison_particulars(values, Path("drive/compare"))
 
 
 def consistent(lower: float, upper: float) -> EstimatorMetrics:
@@ -151,28 +157,28 @@ def consistent(lower: float, upper: float) -> EstimatorMetrics:
 
 def test_consistency_table_says_which_estimator_each_band_is_of() -> None:
     three, six = consistent(0.07, 3.12), consistent(0.21, 2.41)
-    (table, *_) = comparison_tables(compared({"ekf": three, "isam2": six, "batch": six}))
+    (table, *_) = tables({"ekf": three, "isam2": six, "batch": six})
     bands = "95 % bands of the pose NEES: 0.07-3.12 of ekf; 0.21-2.41 of isam2, batch"
     assert table.heading == f"drive: consistency (1 is right; {bands})"
-    (table, *_) = comparison_tables(compared({"isam2": six, "batch": six}))
+    (table, *_) = tables({"isam2": six, "batch": six})
     assert table.heading.endswith("(1 is right; 95 % band of the pose NEES 0.21-2.41)")
 
 
 def test_columns_that_no_estimator_fills_are_left_out_with_the_reason() -> None:
-    untrue = compared({"isam2": EstimatorMetrics(update_ms=UpdateTime(1.0, 2.0, 3.0))})
-    (table,) = comparison_tables(untrue)  # accuracy and consistency would be empty
+    untrue = {"isam2": EstimatorMetrics(update_ms=UpdateTime(1.0, 2.0, 3.0))}
+    (table,) = tables(untrue)  # accuracy and consistency would be empty
     assert [column.name.split("\n")[0] for column in table.columns] == ["update ms"]
     assert table.rows == (("isam2", ("1.00 2.00 3.0",)),)
-    reasons = [text for label, text in comparison_particulars(untrue) if label == "left out"]
+    reasons = [text for label, text in particulars(untrue) if label == "left out"]
     assert any(r.startswith("ATE final cm, ") and "no ground truth" in r for r in reasons)
 
 
 def test_a_column_that_one_estimator_fills_stays() -> None:
-    some = compared({"a": EstimatorMetrics(ate_rmse_m=0.01), "b": EstimatorMetrics()})
-    (table,) = comparison_tables(some)
+    some = {"a": EstimatorMetrics(ate_rmse_m=0.01), "b": EstimatorMetrics()}
+    (table,) = tables(some)
     assert table.rows == (("a", ("1.00",)), ("b", ("-",)))
     assert ("-", "ATE final cm: no ground truth, or fewer than three poses matched") in (
-        comparison_particulars(some)
+        particulars(some)
     )
 
 
@@ -278,7 +284,7 @@ def test_at_an_edge_or_without_depth_the_point_is_not_known() -> None:
 # Trials
 
 
-def trial(seed: int, filter_ate: float, smoother_ate: float, failure: str = "") -> Any:
+def trial(seed: int, filter_ate: float, smoother_ate: float, failure: str = "") -> Trial:
     more: dict[str, Any] = {"kind": "x", "failure": failure or None}
     metrics = {
         "kalman": EstimatorMetrics(ate_rmse_m=filter_ate, more={"kind": "landmark_kalman"}),
@@ -286,11 +292,8 @@ def trial(seed: int, filter_ate: float, smoother_ate: float, failure: str = "") 
         "smooth": EstimatorMetrics(ate_rmse_m=smoother_ate, more=more),
     }
     nees = Nees(np.array([6.0, 12.0]), np.array([3, 3]))
-    return (
-        seed,
-        metrics,
-        {t: dict.fromkeys(("pose", "online_pose", "landmark"), nees) for t in metrics},
-    )
+    errors = {t: dict.fromkeys(("pose", "online_pose", "landmark"), nees) for t in metrics}
+    return Trial(seed, metrics, errors)
 
 
 KINDS = {"kalman": "landmark_kalman", "worse": "ekf", "smooth": "isam2"}

@@ -1,0 +1,201 @@
+"""A run of SLAM through other estimators: its log replayed, each in a process of its own, judged.
+
+The run itself compares the estimators of its configuration so, and `fgslam compare` any.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.backend.settings import EstimatorSettings
+from fgslam.core.errors import DatasetError
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.trajectories import read_tum
+from fgslam.evaluation.judging import Truth, judge_replay, seen_often
+from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
+from fgslam.frontend.tracking.settings import EgoMotionSettings
+from fgslam.report.point_cloud import MapPoints, read_ply
+from fgslam.report.tables import (
+    LANDMARK_TRUTH_FILE,
+    read_landmark_truth,
+    read_metrics,
+    write_comparison_csv,
+    write_metrics,
+)
+from fgslam.runs.config import ExperimentConfig, load_config
+from fgslam.runs.engine import Context, RunResult, Status, Task
+from fgslam.runs.estimator_files import write_replay
+from fgslam.runs.folder import COMPARISON_FILE, LOG_FILE, METRICS_FILE, RUN_MARKER, digest_of
+from fgslam.runs.metric_tables import comparison_particulars, comparison_tables
+from fgslam.runs.report import report_from_folder
+from fgslam.runs.tasks.slam_map_entry import arrival_of
+from fgslam.runs.units import each_apart
+from fgslam.slam.replay import replay
+
+GROUND_TRUTH_FILE = "ground_truth.tum"
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayTask:
+    """What one process is to do: replay the log of ``run``, write into ``out/<title>/``."""
+
+    run: Path
+    out: Path
+    settings: EstimatorSettings
+    ego_motion: EgoMotionSettings
+    remark: str = ""
+
+
+def open_slam_comparison(
+    config: ExperimentConfig, run: Path, estimators: Sequence[EstimatorSettings]
+) -> Task[RunResult]:
+    """The log of a run, through estimators; one that cannot be judged is refused now.
+
+    Raises:
+        FgslamError: log or truth of the run cannot be read.
+    """
+    log = load_log(run)
+    load_truth(run, log)
+    provenance = {
+        "dataset": (config.provenance or {}).get("dataset"),
+        "run": str(run),
+        "log": digest_of([run / LOG_FILE]),
+    }
+    return Task(provenance, lambda context: _compare(run, config, len(log), estimators, context))
+
+
+def replay_apart(
+    config: ExperimentConfig,
+    run: Path,
+    estimators: Sequence[EstimatorSettings],
+    context: Context,
+) -> dict[str, EstimatorMetrics]:
+    """Metrics of estimators by title, each replayed in its own process into the context's folder.
+
+    With one job the times do not disturb each other.
+    """
+    ego_motion, remark = config.frontend.ego_motion, config.remark
+    tasks = [ReplayTask(run, context.folder, s, ego_motion, remark) for s in estimators]
+    stage = each_apart(("replays", "replaying"), perform, tasks, EstimatorMetrics)
+    found = context.perform(stage, single_threaded=False).all(
+        lambda k, why: EstimatorMetrics(more={"kind": estimators[k].kind, "failure": why})
+    )
+    return {settings.title: one for settings, one in zip(estimators, found, strict=True)}
+
+
+def perform(task: ReplayTask) -> EstimatorMetrics:
+    """One estimator, start to end: replay, files, judgement.
+
+    Raises:
+        FgslamError: the log or the truth cannot be read, or a file cannot be written.
+    """
+    log = MeasurementLog.load(task.run / LOG_FILE)
+    result = replay(log, task.settings, task.ego_motion, arrival=arrival_of(task.run))
+    write_replay(task.out, result, log, task.remark, _look(task.run))
+    return judge_replay(result, load_truth(task.run, log)).metrics
+
+
+def write_comparison(
+    context: Context,
+    config: ExperimentConfig,
+    frames: int,
+    metrics: Mapping[str, EstimatorMetrics],
+    about: Mapping[str, JsonValue],
+    run: Path,
+) -> RunResult:
+    """metrics.json, comparison.csv and report.html of estimators, and what is said of them.
+
+    Args:
+        context: its folder holds the estimators' own files.
+        config: of the run.
+        frames: in its log.
+        metrics: by title.
+        about: what metrics.json says beside them; its `status` is set here.
+        run: folder of the run.
+    """
+    out = context.folder
+    status: Status = "interrupted" if context.stopped() else "finished"
+    values = {title: one.as_json() for title, one in metrics.items()}
+    write_metrics(out / METRICS_FILE, frames, metrics, {**about, "status": status})
+    write_comparison_csv(out / COMPARISON_FILE, [(config.name, values)])
+    if config.output.report:
+        report_from_folder(out, run)
+    return RunResult(
+        config,
+        out,
+        status,
+        tables=comparison_tables(config.name, frames, values),
+        particulars=comparison_particulars(values, out),
+        failed=all(one.more.get("failure") for one in metrics.values()),
+    )
+
+
+def _compare(
+    run: Path,
+    config: ExperimentConfig,
+    frames: int,
+    estimators: Sequence[EstimatorSettings],
+    context: Context,
+) -> RunResult:
+    """One run's log through the estimators."""
+    metrics = replay_apart(config, run, estimators, context)
+    about: dict[str, JsonValue] = {
+        "name": config.name,
+        "status": None,
+        "run": str(run),
+        "odometry": config.odometry.kind,
+        "remark": config.remark or None,
+        "notes": _notes(run),
+    }
+    return write_comparison(context, config, frames, metrics, about, run)
+
+
+def _notes(run: Path) -> list[str]:
+    """What was tolerated in the recording, as the run wrote it down."""
+    path = run / METRICS_FILE
+    notes = read_metrics(path).get("notes") if path.is_file() else None
+    return [str(note) for note in notes or ()]
+
+
+# --------------------------------------------------------------------------------------------
+# What a run folder knows
+
+
+def load_truth(run: Path, log: MeasurementLog) -> Truth:
+    """What the run folder knows to be true, the landmarks being those seen often enough.
+
+    Raises:
+        DatasetError: a file of it is damaged.
+    """
+    path, landmark_path = run / GROUND_TRUTH_FILE, run / LANDMARK_TRUTH_FILE
+    trajectory = read_tum(path) if path.is_file() else None
+    if not landmark_path.is_file():
+        return Truth(trajectory)
+    landmarks, sigma = read_landmark_truth(landmark_path)
+    judged = seen_often(log, landmarks)
+    own = sigma[np.isin(landmarks.ids, judged.ids)]
+    return Truth(trajectory, judged, float(np.median(own)) if len(own) else None)
+
+
+def load_log(run: Path) -> MeasurementLog:
+    """The measurements of a run folder.
+
+    Raises:
+        DatasetError: it holds no frame.
+        MeasurementLogError: it cannot be read.
+    """
+    log = MeasurementLog.load(run / LOG_FILE)
+    if not len(log):
+        raise DatasetError(f"{run / LOG_FILE}: holds no frame; resume the run first")
+    return log
+
+
+def _look(run: Path) -> MapPoints | None:
+    """The colours that the live front-end saw; None where the run had no images."""
+    config = load_config(run / RUN_MARKER)
+    path = run / config.estimator.title / "map.ply"
+    return read_ply(path) if path.is_file() else None
