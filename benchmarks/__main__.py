@@ -16,15 +16,12 @@ from typing import Any
 
 from benchmarks.evidence import (
     chess,
+    drives,
     lasting,
     noise,
-    paper_loop,
     paper_views,
     person,
-    real,
-    recognised,
-    seeds,
-    unmapped,
+    relocalising,
     variants,
     visits,
 )
@@ -36,18 +33,18 @@ from benchmarks.tables import Table
 from fgslam.core.errors import ConfigError, FgslamError
 
 EVIDENCE: dict[str, Callable[[Path], Iterable[Table]]] = {
-    "paper_tables": lambda data: [*paper_views.tables(), *paper_loop.tables()],
-    "seeds": lambda data: [seeds.table()],
+    "paper_tables": lambda data: [*paper_views.tables(), *drives.paper_tables()],
+    "seeds": lambda data: [drives.seeds_table()],
     "person": lambda data: person.tables(),
     "chess": chess.tables,
     "variants": lambda data: [variants.table(data)],
     "paired": lambda data: [variants.paired_table()],
-    "real": lambda data: [real.table(data)],
+    "real": lambda data: [drives.real_table(data)],
     "noise": lambda data: noise.tables(),
     "lasting": lambda data: lasting.tables(),
     "visits": lambda data: visits.tables(),
-    "unmapped": lambda data: unmapped.tables(),
-    "recognised": recognised.tables,
+    "unmapped": lambda data: relocalising.unmapped_tables(),
+    "recognised": relocalising.recognised_tables,
 }
 """Sets of tables by name; each is called with the folder of the real recordings."""
 

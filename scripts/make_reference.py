@@ -6,15 +6,36 @@ stale.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-from scripts.reference_commands import commands_page
-from scripts.reference_settings import settings_page
-from scripts.tutorials import EXAMPLES, tutorial_page
+import typer
+from typer.core import TyperArgument, TyperOption
+
+from fgslam.cli.main import app
+from scripts.reference_settings import item, paragraph, settings_page
 
 DOCS = Path(__file__).parents[1] / "docs"
+EXAMPLES = Path(__file__).parents[1] / "examples"
+_CELL = re.compile(r"^# %%(?P<kind> \[markdown\])?.*\n", re.MULTILINE)
+_NOTE = "<!-- Made by `python -m scripts.make_reference` from examples/{}: edit that. -->"
+_END = """Run it: `python examples/{}`. It opens as a notebook in VS Code and (jupytext) in Jupyter.
+"""
+
+_INTRODUCTION = """# Command line
+
+<!-- Made by `python -m scripts.make_reference` from the program's help: edit that. -->
+"""
+_STATUS = """
+## Exit status
+
+- 0: done; of a comparison: at least one estimator finished.
+- 1: no estimator of a comparison finished, a trial failed, or a baseline got worse.
+- 2: a mistake in what was given: one line on standard error says what, where, and how to fix it.
+- 130: interrupted; the run folder holds everything computed so far.
+"""
 
 
 def pages() -> dict[str, Callable[[], str]]:
@@ -32,6 +53,63 @@ def main() -> None:
     """Writes every page."""
     for path, page in pages().items():
         (DOCS / path).write_text(page(), encoding="utf-8")
+
+
+def commands_page() -> str:
+    """The whole page, in Markdown: each command with its arguments and options."""
+    group = typer.main.get_command(app)
+    if not isinstance(group, typer.core.TyperGroup):
+        raise TypeError("fgslam is a group of commands")
+    lines = [_INTRODUCTION, *paragraph(group.help or ""), "", "```sh", "fgslam COMMAND --help"]
+    lines += ["fgslam --version", "fgslam --install-completion", "```"]
+    for name, command in group.commands.items():
+        if not isinstance(command, typer.core.TyperCommand):
+            raise TypeError(f"{name} is no command")
+        lines += ["", f"## `fgslam {name}`", "", *_described(command)]
+    return "\n".join(lines) + "\n" + _STATUS
+
+
+def _described(command: typer.core.TyperCommand) -> Iterator[str]:
+    for text in (command.help or "").split("\n\n"):
+        yield from (*paragraph(text), "")
+    for parameter in command.params:
+        if isinstance(parameter, TyperArgument | TyperOption) and parameter.name != "help":
+            yield from item(_parameter(parameter))
+
+
+def _parameter(parameter: TyperArgument | TyperOption) -> str:
+    names = ", ".join(parameter.opts)
+    if isinstance(parameter, TyperArgument):
+        return f"`{parameter.metavar or names.upper()}`: {parameter.help or ''}"
+    value = f" {parameter.metavar}" if parameter.metavar else ""
+    return f"`{names}{value}`: {parameter.help or ''}"
+
+
+def tutorial_page(name: str) -> str:
+    """The example ``name`` as Markdown: its text, and its code in fenced blocks.
+
+    Raises:
+        ValueError: the example does not begin with a text cell and a title.
+    """
+    source = (EXAMPLES / f"{name}.py").read_text(encoding="utf-8")
+    marks = list(_CELL.finditer(source))
+    if not marks or marks[0].start() != 0 or not marks[0]["kind"]:
+        raise ValueError(f"examples/{name}.py: begin with `# %% [markdown]` and a title")
+    ends = [*(mark.start() for mark in marks[1:]), len(source)]
+    parts = [
+        _cell(source[mark.end() : end].strip(), text=mark["kind"] is not None)
+        for mark, end in zip(marks, ends, strict=True)
+    ]
+    title, _, rest = parts[0].partition("\n")
+    head = [title, _NOTE.format(f"{name}.py"), rest.strip()]
+    return "\n\n".join([*head, *parts[1:], _END.format(f"{name}.py")])
+
+
+def _cell(body: str, text: bool) -> str:
+    if not text:
+        shown = "\n".join(line.replace("  # fmt: skip", "") for line in body.splitlines())
+        return f"```python\n{shown}\n```"
+    return "\n".join(re.sub(r"^# ?", "", line) for line in body.splitlines())
 
 
 if __name__ == "__main__":

@@ -1,16 +1,24 @@
-"""The page of settings, made from the schema: every key, its default, range and meaning."""
+"""The page of settings, made from the schema: one line a key, with default, range and meaning.
+
+What several groups have alike, as `start` and `stop` of every recording, is described once.
+"""
 
 from __future__ import annotations
 
 import json
+import re
+import textwrap
 from collections.abc import Iterator
 from typing import Any, TypeAlias
 
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.config_models import HOMING_TASKS, TASKS, LocalisationConfig
-from scripts.markdown import item, paragraph
+
+WIDTH = 118
 
 Node: TypeAlias = dict[str, Any]
+Known: TypeAlias = set[str | tuple[str, str]]
+"""Lines of keys, and titles of groups with their classes, that stand on the page already."""
 
 _UNWRITTEN = ("kind", "task", "provenance")
 _DESCRIBED_ELSEWHERE = ("map.made_from.dataset", "map.made_from.odometry")
@@ -43,9 +51,11 @@ one. Unknown keys, keys given twice, NaN and infinity are refused. A run writes 
 configuration, every default filled in, to `RUN/config.yaml`; that file is itself a configuration
 and repeats the run.
 
-Keys without a default must be given. Units are metres, seconds and pixels, angles in degrees,
-unless the key's name or meaning says otherwise. Experiments of homing have a key `task`: see
-[homing experiments](#homing-experiments).
+Units are metres, seconds and pixels, angles in degrees, unless the key's name or meaning says
+otherwise. A line gives the key, its default, its choices or range, and the gist of its meaning; all
+of it is in the class that the group's heading names. Keys that stand on the page already are named
+as *alike*. `null` is off, `{}` switches a group on with its defaults. Experiments of homing have a
+key `task`: see [homing experiments](#homing-experiments).
 """
 
 _LOCALISATION = """## Task `localisation`
@@ -64,75 +74,99 @@ them.
 
 def settings_page() -> str:
     """The whole page, in Markdown."""
-    schema = ExperimentConfig.model_json_schema()
+    schema, known = ExperimentConfig.model_json_schema(), set[str | tuple[str, str]]()
     first = [line for key, described in FIRST.items() for line in item(f"`{key}`: {described}")]
     sections = [_INTRODUCTION, "## The ten that matter first\n\n" + "\n".join(first)]
-    sections += ["## The experiment\n\n" + "\n".join(_keys(schema, schema))]
+    sections += ["## The experiment\n\n" + "\n".join(_keys(schema, schema, known))]
     for name, node in schema["properties"].items():
         if name not in _UNWRITTEN:
-            sections += _sections(schema, node, name, 2)
-    sections += _localisation()
-    sections += _homing()
+            sections += _sections(schema, node, name, 2, known)
+    sections += _localisation(known)
+    sections += _homing(known)
     return "\n".join(section.rstrip() + "\n" for section in sections)
 
 
-def _localisation() -> Iterator[str]:
+def _localisation(known: Known) -> Iterator[str]:
     """The keys that only this task has; the others are those of the experiments above."""
     schema = LocalisationConfig.model_json_schema()
     described = " ".join(schema.get("description", "").split())
     yield (
         _LOCALISATION.format(described="\n".join(paragraph(described)))
         + "\n"
-        + "\n".join(_keys(schema, schema))
+        + "\n".join(_keys(schema, schema, known))
     )
     for name in ("map", "localisation"):
-        for section in _sections(schema, schema["properties"][name], name, 3):
+        for section in _sections(schema, schema["properties"][name], name, 3, known):
             yield section.replace("`map`", "`map` of the task `localisation`", 1)
 
 
-def _homing() -> Iterator[str]:
+def _homing(known: Known) -> Iterator[str]:
     """The keys of each task, then the groups of all of them, each once."""
     yield _HOMING
-    groups: dict[str, None] = {}
+    groups: list[str] = []
     for task in HOMING_TASKS:
         schema = TASKS[task].model_json_schema()
         described = " ".join(schema.get("description", "").split())
-        yield "\n".join(
-            [f"### Task `{task}`", "", *paragraph(described), "", *_keys(schema, schema)]
-        )
+        keys = _keys(schema, schema, known)
+        yield "\n".join([f"### Task `{task}`", "", *paragraph(described), "", *keys])
         for name, node in schema["properties"].items():
             if name not in _UNWRITTEN:
-                groups |= dict.fromkeys(_sections(schema, node, name, 3))
-    yield from groups
+                groups += _sections(schema, node, name, 3, known)
+    yield from dict.fromkeys(groups)
 
 
-def _sections(schema: Node, node: Node, dotted: str, level: int) -> Iterator[str]:
+def _sections(schema: Node, node: Node, dotted: str, level: int, known: Known) -> Iterator[str]:
     """One section for each group of keys below a node, one for each kind of a union."""
-    groups = [_resolve(schema, part) for part in _alternatives(node)]
-    for group in (g for g in groups if "properties" in g):
+    for group in (_resolve(schema, part) for part in _alternatives(node)):
+        if "properties" not in group:
+            continue
         kind = group["properties"].get("kind", {}).get("const")
+        lines = _keys(schema, group, known)
+        inner = [
+            section
+            for name, below in group["properties"].items()
+            if name not in _UNWRITTEN and f"{dotted}.{name}" not in _DESCRIBED_ELSEWHERE
+            for section in _sections(schema, below, f"{dotted}.{name}", min(level + 1, 4), known)
+        ]
         title = f"`{dotted}`" + (f", kind `{kind}`" if kind else "")
-        described = " ".join(group.get("description", "").split())
-        lines = [f"{'#' * level} {title}", "", *([*paragraph(described), ""] if described else [])]
-        keys = _keys(schema, group)
-        yield "\n".join([*lines, *(keys or ["Groups of keys:"])])
-        for name, inner in group["properties"].items():
-            below = f"{dotted}.{name}"
-            if name not in _UNWRITTEN and below not in _DESCRIBED_ELSEWHERE:
-                yield from _sections(schema, inner, below, min(level + 1, 4))
+        if (title, group["title"]) not in known:
+            known.add((title, group["title"]))
+            said = " ".join(group.get("description", "").split())
+            about = paragraph(f"`{group['title']}`: {said}")
+            yield "\n".join([f"{'#' * level} {title}", "", *about, "", *lines]).rstrip()
+        yield from inner
 
 
-def _keys(schema: Node, group: Node) -> list[str]:
-    """Items of the keys that hold a value or may be switched on; nothing where there are none."""
+def _keys(schema: Node, group: Node, known: Known) -> list[str]:
+    """Items of the keys that hold a value or may be switched on; those on the page by name."""
     lines: list[str] = []
+    alike: list[str] = []
     for name, node in group["properties"].items():
         if name in _UNWRITTEN or _is_plain_group(schema, node):
             continue
-        required = name in group.get("required", ())
-        default = "must be given" if required else f"default `{_default(node)}`"
-        kind, meaning = _kind(schema, node), _meaning(schema, node)
-        lines += item(f"`{name}` ({kind}; {default}): {meaning}")
-    return lines
+        line = _line(schema, name, node, required=name in group.get("required", ()))
+        if line in known:
+            alike.append(f"`{name}`")
+        else:
+            known.add(line)
+            lines += item(line)
+    return [*lines, *(item(f"alike: {', '.join(alike)}") if alike else ())]
+
+
+def _line(schema: Node, name: str, node: Node, required: bool) -> str:
+    """Key, default, range and meaning; of a long meaning as many clauses as fit on the line."""
+    default = "must be given" if required else f"`{_default(node)}`"
+    choices = [f"`{json.dumps(value)}`" for value in _choices(schema, node)]
+    others = [choice for choice in choices if choice != default]
+    facts = ", ".join(filter(None, (" or ".join([default, *others]), _range(schema, node))))
+    head, meaning = f"`{name}` ({facts}): ", _meaning(schema, node)
+    clauses = re.split(r"(?<=[;.]) ", meaning)
+    fitting = [
+        found
+        for k in range(len(clauses), 0, -1)
+        if len(head + (found := " ".join(clauses[:k]).rstrip(";."))) <= WIDTH - 2
+    ]
+    return head + (fitting[0] if fitting else clauses[0].rstrip(";."))
 
 
 def _alternatives(node: Node) -> list[Node]:
@@ -162,7 +196,7 @@ def _meaning(schema: Node, node: Node) -> str:
     ]
     if kinds:
         return f"`kind`: {', '.join(f'`{kind}`' for kind in kinds)}; its keys are below"
-    return "null is off; a group, `{}` for its defaults, switches it on"
+    return "a group; its keys are below"
 
 
 def _default(node: Node) -> str:
@@ -172,36 +206,50 @@ def _default(node: Node) -> str:
     return json.dumps(value)
 
 
-def _kind(schema: Node, node: Node) -> str:
-    """Type and range of a value, in words."""
+def _choices(schema: Node, node: Node) -> list[Any]:
+    """Values of which one is given; none where any of a type may be."""
     parts = [_resolve(schema, part) for part in _alternatives(node)]
-    return " or ".join(dict.fromkeys(_type(part) for part in parts))
+    chosen = [value for part in parts for value in part.get("enum", ())]
+    null = any(part.get("type") == "null" for part in parts)
+    return [*chosen, None] if null else chosen
 
 
-def _type(node: Node) -> str:
-    if "enum" in node:
-        return " or ".join(f"`{value}`" for value in node["enum"])
-    if "const" in node:
-        return f"`{node['const']}`"
-    if "properties" in node:
-        return "group"
+def _range(schema: Node, node: Node) -> str:
+    """Limits of a number or of those in a list."""
+    parts = [_resolve(schema, part) for part in _alternatives(node)]
+    return " or ".join(dict.fromkeys(filter(None, map(_limits, parts))))
+
+
+def _limits(node: Node) -> str:
     if node.get("type") == "array":
-        items = node.get("prefixItems")
-        if items:
-            return f"{len(items)} of: {_type(items[0])}"
-        return f"list of: {_type(node.get('items', {}))}"
-    name = {"integer": "whole number", "number": "number", "boolean": "true or false"}
-    limits = [
-        f"{sign} {node[key]:g}"
-        for key, sign in (
-            ("minimum", ">="),
-            ("exclusiveMinimum", ">"),
-            ("maximum", "<="),
-            ("exclusiveMaximum", "<"),
-        )
-        if key in node
-    ]
-    kind = str(node.get("type", "value"))
-    return " ".join(
-        [name.get(kind, "text" if kind == "string" else kind), ", ".join(limits)]
-    ).strip()
+        items = node.get("prefixItems", [node.get("items", {})])
+        inner = _limits(items[0])
+        count = f"{len(items)} of" if "prefixItems" in node else "list of"
+        return f"{count} {inner}" if inner else ""
+    signs = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
+    found = [f"{sign} {node[key]:g}" for key, sign in signs.items() if key in node]
+    return " ".join([*(["integer"] if node.get("type") == "integer" else []), *found])
+
+
+def paragraph(text: str) -> list[str]:
+    """Lines of a paragraph; code in backticks stays on one line."""
+    return _wrapped(text, "", "")
+
+
+def item(text: str) -> list[str]:
+    """Lines of a list item."""
+    return _wrapped(text, "- ", "  ")
+
+
+def _wrapped(text: str, first: str, rest: str) -> list[str]:
+    words = " ".join(text.split())
+    whole = re.sub(r"(`+).+?\1", lambda code: code.group().replace(" ", "\0"), words)
+    lines = textwrap.wrap(
+        whole,
+        WIDTH,
+        initial_indent=first,
+        subsequent_indent=rest,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return [line.replace("\0", " ") for line in lines]

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.evidence import epi
 from benchmarks.runs import DATA, experiment, find_features, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.recordings import Sequence
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.datasets.settings import LightFieldSettings
 from fgslam.frontend.features.settings import Appearance
@@ -90,7 +90,7 @@ def judge_chess(
     settings, truth = config.dataset, sequence.ground_truth
     if not isinstance(settings, LightFieldSettings) or truth is None:
         raise ValueError("chess_trinocular is a light field")
-    row, spacing = epi.open_row(settings), settings.spacing
+    row, spacing = open_row(settings), settings.spacing
     matcher = _matcher(sequence, config, mode)
     per_metre = settings.shift_px_per_step * spacing / sequence.rig.baseline
     parts = []
@@ -119,7 +119,7 @@ def _pairs(matcher: StereoMatcher, frame: FeatureFrame) -> tuple[IntArray, IntAr
 
 
 def _judged(
-    row: epi.Row,
+    row: Row,
     views: tuple[int, int],
     raw: FloatArray,
     disparity: FloatArray,
@@ -128,7 +128,7 @@ def _judged(
     reference, left = views
     baseline = row.places[reference, 0] - row.places[left, 0]
     slopes = np.arange(-3.0, 16.01, 0.25) / baseline
-    found = epi.judge(row, reference, np.array([left]), raw, slopes)
+    found = judge(row, reference, np.array([left]), raw, slopes)
     error = np.abs(found.slope * baseline - disparity)
     return Judged(error <= CORRECT_PX, found.decided, confirmed)
 
@@ -191,3 +191,100 @@ def _precision_table(title: str, judged: Mapping[Appearance, Judged]) -> Table:
         )
     note = f"correct: disparity within {CORRECT_PX:g} px of the judge's"
     return Table(title, columns, rows, (note,))
+
+
+HALF_PATCH = 3
+_KEEP = 0.6  # share of the views that must see the point: the best ones count
+_PENALTY = 30.0  # grey levels at which a difference counts as an occlusion
+_AMBIGUOUS = 1.25  # a second minimum this near to the first leaves the judge undecided
+_DISTINCT_PX = 0.75  # apart from the first by more than this, at the matches' baseline
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """Unshifted views of one grid row.
+
+    Attributes:
+        images: (n, height, width) grey levels.
+        places: (n, 2) true (x, y) in metres, x with the image's columns, y down.
+    """
+
+    images: FloatArray
+    places: FloatArray
+
+
+def open_row(settings: LightFieldSettings) -> Row:
+    """All views of ``settings.row`` but the first, which has no left neighbour."""
+    single = replace(settings, spacing=1, use_top=False, shift_px_per_step=0.0, start=0, stop=None)
+    recording = open_recording(single)
+    truth = recording.ground_truth
+    if truth is None:
+        raise ValueError("a light field has ground truth")
+    images = [recording.frame(i).images[0] for i in range(len(recording))]
+    return Row(np.array(images, np.float64), truth.poses[:, :2, 3])
+
+
+@dataclass(frozen=True, eq=False)
+class SlopeFound:
+    """What the judge says of points.
+
+    Attributes:
+        slope: (n,) of the best line, pixels a metre.
+        decided: (n,) whether no other line is nearly as good.
+    """
+
+    slope: FloatArray
+    decided: BoolArray
+
+
+def judge(
+    row: Row, reference: int, hidden: IntArray, xy: FloatArray, slopes: FloatArray
+) -> SlopeFound:
+    """Finds the slope of points by the views that the matches did not use.
+
+    Args:
+        row: the views.
+        reference: index of the view in which the points were found.
+        hidden: indices of the views that the judge must not see.
+        xy: (n, 2) points in the unshifted reference view.
+        slopes: (m,) to try, pixels a metre, ascending and evenly spaced.
+    """
+    seen = np.setdiff1d(np.arange(len(row.images)), np.append(hidden, reference))
+    patch = _sample(row.images[reference], xy)
+    cost = np.empty((len(slopes), len(xy)))
+    for k, slope in enumerate(slopes):
+        difference = np.array(
+            [
+                np.abs(_sample(row.images[v], xy - slope * _step(row, reference, v)) - patch)
+                for v in seen
+            ]
+        )
+        each = np.minimum(difference, _PENALTY).mean(axis=2)
+        keep = int(np.ceil(_KEEP * len(seen)))
+        cost[k] = np.partition(each, keep - 1, axis=0)[:keep].mean(axis=0)
+    best = cost.argmin(axis=0)
+    step = row.places[reference, 0] - row.places[hidden[0], 0] if len(hidden) else 1.0
+    apart = np.abs(slopes[:, None] - slopes[best]) * abs(step) > _DISTINCT_PX
+    second = np.where(apart, cost, np.inf).min(axis=0)
+    return SlopeFound(slopes[best], second > _AMBIGUOUS * cost.min(axis=0))
+
+
+def _step(row: Row, reference: int, view: int) -> FloatArray:
+    """(2,) camera motion in metres from the reference to a view."""
+    return np.asarray(row.places[view] - row.places[reference])
+
+
+def _sample(image: FloatArray, centres: FloatArray) -> FloatArray:
+    """Patches (n, k) around sub-pixel centres (n, 2), bilinear, clipped at the border."""
+    offset = np.arange(-HALF_PATCH, HALF_PATCH + 1)
+    columns = centres[:, 0, None, None] + offset[None, None, :]
+    rows = centres[:, 1, None, None] + offset[None, :, None]
+    columns, rows = np.broadcast_arrays(columns, rows)
+    height, width = image.shape
+    columns = np.clip(columns, 0.0, width - 1.001)
+    rows = np.clip(rows, 0.0, height - 1.001)
+    c, r = columns.astype(np.int64), rows.astype(np.int64)
+    fc, fr = columns - c, rows - r
+    upper = image[r, c] * (1.0 - fc) + image[r, c + 1] * fc
+    lower = image[r + 1, c] * (1.0 - fc) + image[r + 1, c + 1] * fc
+    return np.asarray((upper * (1.0 - fr) + lower * fr).reshape(len(centres), -1))

@@ -15,7 +15,7 @@ from fgslam.runs.tasks.localisation_results import Scored, scored
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from benchmarks.evidence import recognised
+from benchmarks.evidence import relocalising
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 QUIET = ("output.pictures=false", "output.report=false", "output.checkpoint_seconds=3600")
@@ -68,7 +68,7 @@ def test_odd_frames_of_euroc_are_found_in_the_map_of_the_even_ones(
 @pytest.mark.data
 def test_links_between_single_frames_of_euroc(shared_data: Path) -> None:
     """A twelfth of all pairs. One frame is a poor map: the loop detector needs more than this."""
-    links = recognised.link_frames(shared_data, every=12).surer(0.05, 1.0)
+    links = relocalising.link_frames(shared_data, every=12).surer(0.05, 1.0)
     assert links.linked.sum() > 15
     assert links.precision > 0.8
     assert links.recall > 0.4

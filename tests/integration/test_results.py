@@ -10,7 +10,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from benchmarks.evidence import chess, epi, noise, paper_views, person, real, variants
+from benchmarks.evidence import chess, drives, noise, paper_views, person, variants
 from benchmarks.runs import (
     Run,
     experiment,
@@ -67,7 +67,7 @@ def test_every_variant_is_a_valid_experiment(name: str, course: variants.Course)
 
 def textured_row(
     rng: np.random.Generator, slope: float, views: int, period: int | None = None
-) -> epi.Row:
+) -> chess.Row:
     """A wall square to the cameras, which moves by ``slope`` pixels a metre; 0.01 m a view."""
     places = np.column_stack([0.01 * np.arange(views), np.zeros(views)])
     wall = rng.uniform(0.0, 255.0, (40, 400))
@@ -80,7 +80,7 @@ def textured_row(
         np.array([np.interp(columns + 100.0 + slope * x, np.arange(400), line) for line in wall])
         for x in places[:, 0]
     ]
-    return epi.Row(np.array(images), places)
+    return chess.Row(np.array(images), places)
 
 
 @pytest.mark.parametrize("slope", [-50.0, 0.0, 130.0, 250.0])
@@ -88,7 +88,7 @@ def test_judge_finds_the_true_slope(slope: float) -> None:
     rng = np.random.default_rng(0)
     row = textured_row(rng, slope, views=13)
     points = np.column_stack([rng.uniform(60.0, 140.0, 30), rng.uniform(8.0, 32.0, 30)])
-    found = epi.judge(row, 6, np.array([2]), points, np.arange(-100.0, 400.1, 10.0))
+    found = chess.judge(row, 6, np.array([2]), points, np.arange(-100.0, 400.1, 10.0))
     assert found.decided.all()
     np.testing.assert_allclose(found.slope, slope, atol=1e-9)
 
@@ -97,7 +97,7 @@ def test_judge_is_undecided_where_texture_repeats() -> None:
     rng = np.random.default_rng(1)
     row = textured_row(rng, 100.0, views=13, period=2)  # columns alternate: all even shifts agree
     points = np.column_stack([rng.uniform(60.0, 140.0, 30), rng.uniform(8.0, 32.0, 30)])
-    found = epi.judge(row, 6, np.array([2]), points, np.arange(-100.0, 400.1, 10.0))
+    found = chess.judge(row, 6, np.array([2]), points, np.arange(-100.0, 400.1, 10.0))
     assert not found.decided.any()
 
 
@@ -211,10 +211,10 @@ def test_the_top_image_raises_the_precision_in_the_lab(mode: chess.Appearance) -
 @pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize(
-    "goal", real.GOALS, ids=lambda goal: "-".join((goal.experiment, *goal.overrides))
+    "goal", drives.GOALS, ids=lambda goal: "-".join((goal.experiment, *goal.overrides))
 )
-def test_a_real_recording_reaches_its_goal(goal: real.Goal, shared_data: Path) -> None:
-    run = real.reach(goal, shared_data)
+def test_a_real_recording_reaches_its_goal(goal: drives.Goal, shared_data: Path) -> None:
+    run = drives.reach(goal, shared_data)
     assert run.tracked == run.metrics["frames_in_recording"]
     assert run.estimator["ate_rmse_m"] <= goal.ate_m
     if goal.drift_percent is not None:

@@ -11,11 +11,8 @@ from fgslam.cli.main import app
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.config_models import HOMING_TASKS, TASKS, LocalisationConfig
 from scripts import reference_settings
-from scripts.make_reference import DOCS, pages
-from scripts.markdown import WIDTH, item
-from scripts.reference_commands import commands_page
-from scripts.reference_settings import settings_page
-from scripts.tutorials import EXAMPLES, tutorial_page
+from scripts.make_reference import DOCS, EXAMPLES, commands_page, pages, tutorial_page
+from scripts.reference_settings import WIDTH, item, settings_page
 
 PAGES = pages()
 
@@ -81,9 +78,21 @@ def test_every_key_of_localisation_is_on_the_page(page: str) -> None:
 
 
 def test_item_holds_range_default_and_meaning(page: str) -> None:
-    assert "- `seed` (whole number >= 0; default `0`): of everything random in the run" in page
-    assert "- `path` (text; must be given): folder of the recording" in page
-    assert '- `mode` (`descriptor` or `paper`; default `"descriptor"`):' in page
+    assert "- `seed` (`0`, integer >= 0): of everything random in the run" in page
+    assert "- `path` (must be given): folder of the recording" in page
+    assert '- `mode` (`"descriptor"` or `"paper"`):' in page
+
+
+def test_nearly_every_setting_stands_on_one_line(page: str) -> None:
+    lines = page.splitlines()
+    items = [line for line in lines if line.startswith("- ")]
+    assert sum(line.startswith("  ") for line in lines) < 0.15 * len(items)
+
+
+def test_keys_that_groups_have_alike_are_described_once_and_named_again(page: str) -> None:
+    assert page.count("- `stride` (") == 1
+    euroc = page.split("## `dataset`, kind `euroc`", 1)[1].split("\n## ", 1)[0]
+    assert re.search(r"- alike: .*`stride`", euroc)
 
 
 def test_keys_that_matter_first_exist(page: str) -> None:

@@ -1,12 +1,100 @@
-"""The paper's drive: tables of Section 5 beside ours."""
+"""Whole drives: the paper's loop, ten other seeds of it, and the real recordings."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
 
-from benchmarks.runs import Run, experiment, run_whole
+from benchmarks.runs import DATA, Run, experiment, run_whole
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import IntArray
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A run on a real recording and what it must reach."""
+
+    experiment: str
+    overrides: tuple[str, ...]
+    ate_m: float
+    drift_percent: float | None
+
+
+GOALS = (
+    Goal("euroc_v101", (), 0.10, None),
+    Goal("kitti_raw_0926", (), 0.40, None),
+    Goal("kitti_raw_0926", ("odometry.kind=constant_velocity",), 0.50, 1.1),
+    Goal("kitti06", (), 0.15, None),
+)
+
+
+def reach(goal: Goal, data: Path = DATA) -> Run:
+    """Runs one of the goals."""
+    return run_whole(experiment(goal.experiment, goal.overrides, data))
+
+
+def real_table(data: Path = DATA) -> Table:
+    """Accuracy on each of the recordings."""
+    columns = (
+        "experiment", "odometry", "tracked", "ATE m", "drift %", "RPE m", "RPE deg", "NEES per dof",
+    )  # fmt: skip
+    return Table("Real recordings", columns, [_row(goal, reach(goal, data)) for goal in GOALS])
+
+
+def _row(goal: Goal, run: Run) -> tuple[Cell, ...]:
+    numbers = run.estimator
+    return (
+        goal.experiment,
+        run.metrics["odometry"],
+        run.tracked,
+        numbers["ate_rmse_m"],
+        numbers["drift_percent"],
+        numbers["rpe_trans_m"],
+        numbers["rpe_rot_deg"],
+        numbers["nees_pose_per_dof"],
+    )
+
+
+COLUMNS = (
+    "seed", "ATE cm", "end cm", "yaw deg", "pitch deg", "roll deg",
+    "matched, 5 %", "landmarks", "precision", "NEES per dof",
+)  # fmt: skip
+_LESS_IS_BETTER = ("ATE cm", "end cm", "yaw deg", "pitch deg", "roll deg", "NEES per dof")
+
+
+def seeds_table(seeds: Iterable[int] = range(1, 11)) -> Table:
+    """One row a seed, and the worst of each column."""
+    rows = [row(run_whole(experiment("lab_loop", [f"seed={seed}"]))) for seed in seeds]
+    return Table("Ten other seeds", COLUMNS, [*rows, _worst(rows)])
+
+
+def row(run: Run) -> tuple[Cell, ...]:
+    """The numbers that are bounded, of one run of the lab loop."""
+    end = run.estimator["end_against_start"]
+    return (
+        run.result.outputs.config.seed,
+        100.0 * run.estimator["ate_rmse_m"],
+        end["distance_cm"],
+        end["yaw_deg"],
+        end["pitch_deg"],
+        end["roll_deg"],
+        run.metrics["landmark_matches"]["p05"],
+        run.estimator["landmarks"],
+        run.metrics["stereo_precision"],
+        run.estimator["nees_pose_per_dof"],
+    )
+
+
+def _worst(rows: list[tuple[Cell, ...]]) -> tuple[Cell, ...]:
+    out: list[Cell] = ["**worst**"]
+    for name, values in zip(COLUMNS[1:], list(zip(*rows, strict=True))[1:], strict=True):
+        numbers = [abs(float(v)) for v in values if v is not None]
+        out.append(max(numbers) if name in _LESS_IS_BETTER else min(numbers))
+    return tuple(out)
+
 
 # Frames that Figure 4 of the paper shows, and the last one.
 _SHOWN = (1, 60, 120, 180, 249)
@@ -19,7 +107,7 @@ _VARIANTS: tuple[tuple[str, tuple[str, ...]], ...] = (
 )
 
 
-def tables() -> list[Table]:
+def paper_tables() -> list[Table]:
     """End pose and accuracy; landmarks and matches. One row a variant, the paper's first."""
     runs = [(name, run_whole(experiment("lab_loop", options))) for name, options in _VARIANTS]
     return [_end_poses(runs), _maps(runs), _growth(runs)]
