@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import yaml
 
 from fgslam.core.arrays import FloatArray
+from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, is_rigid, pose, so3_exp
 from fgslam.core.sensors import CameraRig
@@ -70,7 +70,7 @@ def number(path: Path, values: Mapping[str, Any], key: str) -> float:
     if key not in values:
         raise CalibrationError(f"{path} has no {key!r}; {_remedy(values, key)}")
     value = values[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if not is_finite_number(value):
         raise CalibrationError(f"{path}: {key} is {value!r}, not a finite number; correct it")
     return float(value)
 
@@ -155,14 +155,9 @@ def read_calibration_yaml(path: Path) -> Mapping[str, Any]:
 def numbers(path: Path, values: Mapping[str, Any], key: str, count: int) -> FloatArray:
     """A list of ``count`` finite numbers of the file. Raises CalibrationError otherwise."""
     given = values.get(key)
-    good = isinstance(given, list) and len(given) == count and all(map(_is_finite, given))
+    good = isinstance(given, list) and len(given) == count and all(map(is_finite_number, given))
     if not good:
         raise CalibrationError(
             f"{path}: {key} is {given!r}, expected {count} finite numbers; correct the file"
         )
     return np.array(given, np.float64)
-
-
-def _is_finite(value: object) -> bool:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number and math.isfinite(float(value))  # type: ignore[arg-type]

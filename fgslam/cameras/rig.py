@@ -20,6 +20,7 @@ from fgslam.cameras.calibration_formats import (
 )
 from fgslam.cameras.rectification import Rectifier, rectifier, right_and_left
 from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
 from fgslam.core.files import read_lines
 from fgslam.core.geometry import is_rigid
@@ -113,7 +114,7 @@ def require_rig(rig: CameraRig) -> None:
     for name, extent in (("cx", rig.width), ("cy", rig.height)):
         value = getattr(rig, name)
         # Cropped images may have it outside, but hardly by more than their own size.
-        if not _is_finite(value) or not -extent <= value <= 2 * extent:
+        if not is_finite_number(value) or not -extent <= value <= 2 * extent:
             raise CalibrationError(
                 f"rig: {name} is {value!r}, far from the image of {rig.width}x{rig.height} pixels; "
                 "give the principal point (column, row) in pixels of these images"
@@ -129,7 +130,7 @@ def _require_length(rig: CameraRig, name: str) -> None:
     value = getattr(rig, name)
     if name == "vertical_baseline" and value is None:
         return
-    if not _is_finite(value) or value <= 0.0:
+    if not is_finite_number(value) or value <= 0.0:
         what = (
             "the distance between the cameras in metres; one camera alone cannot measure depth, "
             "and a negative one means that left and right are swapped"
@@ -137,11 +138,6 @@ def _require_length(rig: CameraRig, name: str) -> None:
             else "the focal length in pixels"
         )
         raise CalibrationError(f"rig: {name} is {value!r}, not a positive number; give {what}")
-
-
-def _is_finite(value: object) -> bool:
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    return number and math.isfinite(float(value))  # type: ignore[arg-type]
 
 
 # --------------------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from difflib import get_close_matches
-from numbers import Integral
 from typing import Annotated, Any, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
@@ -45,12 +44,6 @@ def make_settings(kind: type[S], values: Mapping[str, Any], where: str) -> S:
         raise ConfigError(
             f"{where}: {key} is {first['input']!r}, but it {message}; correct it"
         ) from None
-
-
-def require_seed(seed: object, where: str) -> None:
-    """Raises ConfigError where a random generator cannot begin with it."""
-    if not isinstance(seed, Integral) or isinstance(seed, bool) or seed < 0:
-        raise ConfigError(f"{where}: seed is {seed!r}; give a whole number, 0 or larger")
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -5,20 +5,19 @@ The tasks ``homing_pairs`` and ``path_following`` run the same parts; nothing is
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from types import TracebackType
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from fgslam.backend.homing.factory import homing_settings_of, make_homing_estimator
 from fgslam.backend.homing.settings import HomingEstimatorKind
 from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.core.checks import is_finite_number, later_time, require_seed
 from fgslam.core.errors import CalibrationError, EstimatorError, SessionError, StoredMapError
 from fgslam.core.homing import Refusal, TwoViewVector
-from fgslam.core.settings import make_settings, require_seed
+from fgslam.core.settings import make_settings
 from fgslam.frontend.features.colour_image import colour_image
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.omni_settings import OmniFeatureSettings
@@ -209,7 +208,7 @@ class PathFollower:
             EstimatorError: a number is not finite, or the time is negative.
         """
         self._require_open()
-        if not all(map(_is_finite, (v, omega, seconds))) or seconds < 0.0:
+        if not all(map(is_finite_number, (v, omega, seconds))) or seconds < 0.0:
             raise EstimatorError(
                 f"PathFollower: driven({v!r}, {omega!r}, {seconds!r}); give finite numbers, and a "
                 "time that is not negative"
@@ -250,21 +249,10 @@ class PathFollower:
 
     def _elapsed(self, time: float) -> float:
         """Seconds since the last image, as far as steering may rely on the next one being near."""
-        if not _is_finite(time):
-            raise EstimatorError(f"PathFollower: the time is {time!r}; give finite seconds")
+        seconds = later_time(time, self._time, "PathFollower", EstimatorError)
         if self._time is None:
             return self._longest_step
-        if time <= self._time:
-            raise EstimatorError(
-                f"PathFollower: an image at {time:.9f} s does not come after {self._time:.9f} s; "
-                "give images in the order of their times"
-            )
-        return min(time - self._time, self._longest_step)
-
-
-def _is_finite(value: object) -> bool:
-    number = isinstance(value, int | float | np.integer | np.floating)
-    return number and math.isfinite(float(value))  # type: ignore[arg-type]  # a number
+        return min(seconds - self._time, self._longest_step)
 
 
 def _require_camera(camera: OmniCamera, who: str) -> OmniCamera:

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from fgslam.core.arrays import ByteArray
+from fgslam.core.checks import later_time
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
@@ -88,7 +89,7 @@ class HomingController:
         Raises:
             EstimatorError: time does not increase; nothing has changed then.
         """
-        self._take_time(time)
+        self._time = later_time(time, self._time, "homing", EstimatorError)
         if self._ended is not None:
             return replace(self._ended, time=time)
         if self.active is None:
@@ -99,16 +100,6 @@ class HomingController:
         """Obstacles, not homing, decided on the last ``seconds``: that is no lack of progress."""
         self._progress.excuse(min(seconds, self._patience))
         self._patience = max(self._patience - seconds, 0.0)
-
-    def _take_time(self, time: float) -> None:
-        last = self._time
-        if not np.isfinite(time) or (last is not None and time <= last):
-            raise EstimatorError(
-                f"homing: image at {time:.9f} s does not come after "
-                f"{'the start' if last is None else f'{last:.9f} s'}; give images in the order of "
-                "their times"
-            )
-        self._time = time
 
     # ----------------------------------------------------------------------------------------
     # Under way

@@ -12,13 +12,13 @@ import numpy.typing as npt
 
 from fgslam.cameras.rig import require_rig
 from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.checks import require_seed
 from fgslam.core.errors import MapError, OutputError
 from fgslam.core.estimates import LandmarkMap, Relocalisation, Trajectory
 from fgslam.core.geometry import so3_log
 from fgslam.core.saved_map import SavedMap, load_map, save_map
 from fgslam.core.saved_map import require_rig as require_rig_of_map
 from fgslam.core.sensors import CameraRig
-from fgslam.core.settings import require_seed
 from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.report.point_cloud import MapPoints, write_map

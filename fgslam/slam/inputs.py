@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TypeAlias
 
@@ -24,22 +23,6 @@ Images: TypeAlias = Sequence[npt.ArrayLike]
 
 _NAMES = ("left", "right", "top")
 _SYMMETRY = 1e-6  # relative: covariances that were added up in another order
-
-
-def checked_time(t: float, last: float | None) -> float:
-    """The time stamp in seconds. Raises FrameError where it is none, or not after ``last``."""
-    try:
-        timestamp = float(t)
-    except (TypeError, ValueError, OverflowError):
-        raise FrameError(f"time stamp {t!r} is not a number; give seconds") from None
-    if not math.isfinite(timestamp):
-        raise FrameError(f"time stamp {timestamp} is not finite; give seconds")
-    if last is not None and not timestamp > last:
-        raise FrameError(
-            f"time stamp {timestamp:.9f} s does not come after {last:.9f} s; give the frames in "
-            "the order of their times, each once"
-        )
-    return timestamp
 
 
 def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:

@@ -12,12 +12,12 @@ from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.cameras.rig import require_rig
 from fgslam.core.arrays import FloatArray
-from fgslam.core.errors import SessionError
+from fgslam.core.checks import later_time, require_seed
+from fgslam.core.errors import FrameError, SessionError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
-from fgslam.core.settings import require_seed
 from fgslam.core.threads import one_blas_thread
 from fgslam.datasets.settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.slam.arrival import Arrival
@@ -25,7 +25,7 @@ from fgslam.slam.choosing import chosen_estimator, chosen_frontend
 from fgslam.slam.factory import make_extractor, make_pipeline
 from fgslam.slam.feature_stream import FeatureExtractor, FeatureFrame, FrameDescriber
 from fgslam.slam.frontend_settings import FrontendSettings
-from fgslam.slam.inputs import Images, checked_images, checked_odometry, checked_time
+from fgslam.slam.inputs import Images, checked_images, checked_odometry
 from fgslam.slam.pipeline import FrameReport
 from fgslam.slam.recorder import RunRecorder
 from fgslam.slam.results import SessionResult, Step, result_of
@@ -131,7 +131,7 @@ class Session:
         """
         self._require_open()
         i = len(self.recorder)
-        timestamp = checked_time(t, self._last_time())
+        timestamp = later_time(t, self._last_time(), "session", FrameError)
         body = checked_odometry(odometry, self._odometry) if i else None
         checked = None if images is None else checked_images(images, self.rig)
         frame = None if checked is None else Frame(i, timestamp, checked)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, IntArray
+from fgslam.core.checks import later_time
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import HomingStart, TrackedBearings, among
 
@@ -37,12 +38,7 @@ class TrackedFeatures:
             EstimatorError: time does not increase, an identity the map never had, or a value
                 that is no number. Nothing is noted then.
         """
-        step = tracked.time - self.time
-        if not step > 0.0:
-            raise EstimatorError(
-                f"image at {tracked.time:.9f} s does not come after {self.time:.9f} s; give images "
-                "in the order of their times"
-            )
+        step = later_time(tracked.time, self.time, "homing", EstimatorError) - self.time
         self._require_sound(tracked)
         self.time = tracked.time
         self.alive = self.alive[among(self.alive, tracked.ids)]

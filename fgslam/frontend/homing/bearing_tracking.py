@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
+from fgslam.core.checks import later_time
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import TrackedBearings
 from fgslam.frontend.homing.reference_patches import ReferencePatches, align, anchor
@@ -119,10 +120,7 @@ class BearingTracker:
         """
         if self._last is None or self._patches is None:
             raise EstimatorError("no image was tracked yet: start before tracking")
-        if not time > self._time:
-            raise EstimatorError(
-                f"an image at {time:.9f} s follows one at {self._time:.9f} s; give images in order"
-            )
+        later_time(time, self._time, "tracking", EstimatorError)
         turn = _MAX_TURN * self.stabilised.period / (2.0 * np.pi)
         now = self.stabilised.make(image, self._last, turn)
         if len(self._ids):

@@ -1,0 +1,40 @@
+"""Checks of values that callers of the library give: numbers, times, seeds."""
+
+from __future__ import annotations
+
+import math
+from numbers import Integral
+
+import numpy as np
+
+from fgslam.core.errors import ConfigError, FgslamError
+
+
+def is_finite_number(value: object) -> bool:
+    """Whether a value is a finite real number; truth values are none."""
+    number = isinstance(value, int | float | np.integer | np.floating)
+    return number and not isinstance(value, bool) and math.isfinite(float(value))  # type: ignore[arg-type]
+
+
+def later_time(time: object, last: float | None, who: str, error: type[FgslamError]) -> float:
+    """The time in seconds; raises ``error`` where it is none, or not after ``last`` (None: any)."""
+    try:
+        if isinstance(time, str):
+            raise TypeError("text")
+        seconds = float(time)  # type: ignore[arg-type]  # what is no number raises
+    except (TypeError, ValueError, OverflowError):
+        raise error(f"{who}: the time stamp {time!r} is not a number; give seconds") from None
+    if not math.isfinite(seconds):
+        raise error(f"{who}: the time stamp {seconds} is not finite; give seconds")
+    if last is not None and not seconds > last:
+        raise error(
+            f"{who}: the time stamp {seconds:.9f} s does not come after {last:.9f} s; give images "
+            "in the order of their times, each once"
+        )
+    return seconds
+
+
+def require_seed(seed: object, where: str) -> None:
+    """Raises ConfigError where a random generator cannot begin with it."""
+    if not isinstance(seed, Integral) or isinstance(seed, bool) or seed < 0:
+        raise ConfigError(f"{where}: seed is {seed!r}; give a whole number, 0 or larger")
