@@ -144,7 +144,7 @@ def test_bad_input(start_image: Image) -> None:
     tracker = started(start_image)
     tracker.track(start_image, 1.0)
     for time in (1.0, 0.5, np.nan):
-        with pytest.raises(EstimatorError, match="order|not finite"):
+        with pytest.raises(EstimatorError, match=r"order|not finite"):
             tracker.track(start_image, time)
     with pytest.raises(FrameError, match="calibration"):
         tracker.track(start_image[:, :-1], 2.0)
