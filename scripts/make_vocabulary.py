@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
+from fgslam.frontend.features.descriptor_index import VOCABULARY_FILE
 from fgslam.frontend.features.sift import SiftExtractor
-from fgslam.frontend.features.vocabulary import VOCABULARY_FILE
 from fgslam.runs.config import load_config
 from fgslam.runs.opening import open_sequence
 

@@ -15,14 +15,12 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.features import Features
 from fgslam.core.measurements import Increment, Odometry
 from fgslam.core.recordings import Frame
-from fgslam.frontend.places.loops.confirmation import difference
-from fgslam.frontend.places.settings import LoopSettings, LostSettings
-from fgslam.frontend.stereo.matching import StereoMatcher
-from fgslam.frontend.tracking.settings import EgoMotionSettings
+from fgslam.frontend.places.closures import difference
+from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings, LoopSettings, LostSettings
+from fgslam.frontend.stereo import StereoMatcher
 from fgslam.slam.arrival import Arrival, take_over
 from fgslam.slam.factory import make_estimator, make_places, make_tracker
 from fgslam.slam.feature_stream import FeatureFrame
-from fgslam.slam.frontend_settings import FrontendSettings
 from fgslam.slam.motion import OdometryMotion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 

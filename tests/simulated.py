@@ -20,8 +20,8 @@ from fgslam.core.features import Features
 from fgslam.core.measurements import Increment, Observations, Odometry
 from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.datasets.settings import ConstantVelocitySettings
+from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
-from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import replay_step
 from fgslam.worlds.simulated.landmarks import IdentityBook

@@ -16,7 +16,7 @@ from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.estimates import Estimate, Prediction, UpdateStats
 from fgslam.core.measurements import Increment
 from fgslam.evaluation.consistency import Nees, landmark_nees, pose_nees
-from fgslam.frontend.tracking.settings import EgoMotionSettings
+from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.slam.factory import make_estimator
 
 FREE = EgoMotionSettings(dof=6)

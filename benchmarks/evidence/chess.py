@@ -16,7 +16,7 @@ from fgslam.datasets.opening import open_recording
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.datasets.settings import LightFieldSettings
 from fgslam.frontend.features.settings import Appearance
-from fgslam.frontend.stereo.matching import StereoMatcher
+from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.config import ExperimentConfig
 from fgslam.slam.feature_stream import FeatureFrame
 

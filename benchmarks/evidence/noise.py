@@ -14,7 +14,7 @@ from fgslam.core.measurements import Observations
 from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.rendered_lab import RenderedLabSequence
-from fgslam.frontend.stereo.matching import StereoMatcher
+from fgslam.frontend.stereo import StereoMatcher
 
 APART = (1, 2, 5, 10, 20, 40)
 """Frames between two sightings of a landmark."""

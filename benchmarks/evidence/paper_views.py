@@ -13,8 +13,8 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotion, Trajectory
 from fgslam.evaluation.trajectory import end_pose
 from fgslam.frontend.features.settings import AppearanceSettings
-from fgslam.frontend.stereo.matching import StereoMatcher
-from fgslam.frontend.stereo.settings import StereoSettings
+from fgslam.frontend.settings import StereoSettings
+from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.config import ExperimentConfig
 from fgslam.slam.factory import make_pipeline
 from fgslam.slam.feature_stream import FeatureFrame

@@ -19,7 +19,7 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CameraRig
 from fgslam.evaluation.trajectory import rotation_angles
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
-from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
+from fgslam.frontend.settings import RelocalisationSettings
 from fgslam.runs.config import load_experiment
 from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.engine import run_task

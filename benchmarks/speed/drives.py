@@ -18,8 +18,8 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Odometry
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import MeasurementDatasetSettings
+from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.runs.config import load_config
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.pipeline import replay_frame

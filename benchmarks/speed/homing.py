@@ -26,7 +26,7 @@ from fgslam.core.arrays import Image
 from fgslam.core.homing import OmniFeatures, TrackedBearings
 from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
-from fgslam.frontend.features.omni_settings import OmniFeatureSettings
+from fgslam.frontend.features.settings import OmniFeatureSettings
 from fgslam.homing.controller import HomingController
 from fgslam.homing.front_end import HomingFrontEnd, ImageFrontEnd
 from fgslam.homing.settings import FrontEndSettings, HomingControlSettings

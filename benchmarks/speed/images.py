@@ -36,7 +36,7 @@ from fgslam.slam.factory import make_pipeline, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import SlamPipeline
-from fgslam.slam.recorder import RunRecorder
+from fgslam.slam.results import RunRecorder
 
 BLOCK = 40
 LEAST = 3 * BLOCK + 1

@@ -21,15 +21,15 @@ from fgslam.core.measurements import Observations
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
-from fgslam.frontend.tracking.database import LandmarkDatabase
-from fgslam.frontend.tracking.settings import (
+from fgslam.frontend.settings import (
     DatabaseSettings,
+    FrontendSettings,
     PermanenceSettings,
     ViewpointSettings,
 )
+from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.slam.factory import make_tracker
-from fgslam.slam.frontend_settings import FrontendSettings
 
 SIZES = (1_000, 10_000, 100_000)
 FRAMES = 30

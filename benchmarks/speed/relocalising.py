@@ -28,14 +28,13 @@ from fgslam.core.saved_map import SavedMap
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.features.sift import SiftExtractor
-from fgslam.frontend.places.loops.recognition import PlaceRecognition
-from fgslam.frontend.places.settings import LostSettings
+from fgslam.frontend.places.recognition import PlaceRecognition
+from fgslam.frontend.settings import FrontendSettings, LostSettings
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.runs.config import load_config
 from fgslam.runs.opening import open_sequence
 from fgslam.slam.factory import make_pipeline, make_places, make_stereo_matcher, make_tracker
 from fgslam.slam.feature_stream import FeatureFrame
-from fgslam.slam.frontend_settings import FrontendSettings
 from fgslam.slam.motion import body_motion
 
 SIZES = (1_000, 3_000, 10_000, 30_000, 100_000)

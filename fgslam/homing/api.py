@@ -18,9 +18,9 @@ from fgslam.core.checks import is_finite_number, later_time, require_seed
 from fgslam.core.errors import CalibrationError, EstimatorError, SessionError, StoredMapError
 from fgslam.core.homing import Refusal, TwoViewVector
 from fgslam.core.settings import make_settings
-from fgslam.frontend.features.colour_image import colour_image
+from fgslam.frontend.features.images import colour_image
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
-from fgslam.frontend.features.omni_settings import OmniFeatureSettings
+from fgslam.frontend.features.settings import OmniFeatureSettings
 from fgslam.frontend.homing.homing_vector import pair_generator, vector_between
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.homing.command import Drive, DriveCommand

@@ -25,8 +25,9 @@ from fgslam.datasets.settings import (
     OdometrySettings,
     RecordedOdometrySettings,
 )
-from fgslam.frontend.features.omni_settings import OmniFeatureSettings
+from fgslam.frontend.features.settings import OmniFeatureSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.settings import FrontendSettings
 from fgslam.homing.settings import (
     HomingBehaviourSettings,
     LocalisationSettings,
@@ -39,7 +40,6 @@ from fgslam.runs.settings import (
     OutputSettings,
     QuerySettings,
 )
-from fgslam.slam.frontend_settings import FrontendSettings
 from fgslam.slam.map_settings import MapSettings
 
 LiveEstimator: TypeAlias = Annotated[

@@ -30,11 +30,10 @@ from fgslam.datasets.checks.matches import (
     check_stereo_counts,
     fit_turn,
 )
-from fgslam.frontend.features.descriptor_matching import mutual_nearest
+from fgslam.frontend.features.matching import mutual_nearest
 from fgslam.frontend.features.sift import SiftExtractor
-from fgslam.frontend.stereo.matching import StereoMatcher
-from fgslam.frontend.stereo.settings import StereoSettings
-from fgslam.slam.frontend_settings import FrontendSettings
+from fgslam.frontend.settings import FrontendSettings, StereoSettings
+from fgslam.frontend.stereo import StereoMatcher
 
 _FEWEST_FOR_MEDIAN = 10
 _NEAR_LINE_PX = 2.0

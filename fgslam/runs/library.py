@@ -17,7 +17,7 @@ from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.layouts import recognise_layout
-from fgslam.frontend.tracking.settings import EgoMotionSettings
+from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.runs.config import ExperimentConfig, load_experiment, make_config
 from fgslam.runs.engine import RunResult
 from fgslam.runs.folder import ExistingFolder
@@ -25,7 +25,7 @@ from fgslam.runs.live import Overrides, override_texts, slam_config
 from fgslam.runs.named_experiments import find_experiment, suggestion
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.run import run_experiment
-from fgslam.slam.choosing import chosen_estimator, is_settings
+from fgslam.slam.factory import chosen_estimator, is_settings
 from fgslam.slam.replay import Replay
 from fgslam.slam.replay import replay as replay_log
 

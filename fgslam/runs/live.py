@@ -17,8 +17,8 @@ from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.maps import Map, map_points
 from fgslam.runs.named_experiments import find_experiment
 from fgslam.runs.opening import open_sequence
+from fgslam.slam.arrival import saved_map
 from fgslam.slam.feature_stream import FeatureExtractor
-from fgslam.slam.maps import saved_map
 from fgslam.slam.results import SessionResult
 from fgslam.slam.session import Session
 

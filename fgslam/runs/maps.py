@@ -20,10 +20,10 @@ from fgslam.core.saved_map import SavedMap, load_map, save_map
 from fgslam.core.saved_map import require_rig as require_rig_of_map
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
+from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.report.point_cloud import MapPoints, write_map
 from fgslam.slam.factory import make_extractor, make_relocaliser, make_stereo_matcher
-from fgslam.slam.frontend_settings import FrontendSettings
 from fgslam.slam.inputs import checked_images
 
 _VALID_HITS = 3  # where the map does not say how many its run asked for (Se et al. 6.1)

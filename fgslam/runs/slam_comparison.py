@@ -17,7 +17,7 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.trajectories import read_tum
 from fgslam.evaluation.judging import Truth, judge_replay, seen_often
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
-from fgslam.frontend.tracking.settings import EgoMotionSettings
+from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.report.point_cloud import MapPoints, read_ply
 from fgslam.report.tables import (
     LANDMARK_TRUTH_FILE,

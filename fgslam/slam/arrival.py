@@ -1,13 +1,17 @@
-"""Where a run begins in a saved map, and what its estimator takes over."""
+"""Saved maps of sessions: where one begins, what its estimator takes over, and what is saved."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from fgslam.backend.protocol import Estimator, MapUser
+from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import ConfigError
-from fgslam.core.estimates import Prediction
+from fgslam.core.estimates import Estimate, Prediction
 from fgslam.core.saved_map import SavedMap
+from fgslam.core.sensors import CameraRig
+from fgslam.slam.pipeline import SlamPipeline
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,3 +60,38 @@ def require_map_user(estimator: Estimator, extends: bool) -> MapUser:
             "ekf, or map.extend true"
         )
     return estimator
+
+
+def saved_map(
+    pipeline: SlamPipeline,
+    rig: CameraRig,
+    estimate: Estimate,
+    about: dict[str, Any],
+    session: StateArrays | None = None,
+) -> SavedMap:
+    """The estimator's geometry joined with the database's appearances and counts.
+
+    Args:
+        pipeline: the parts as they are now.
+        rig: the cameras that saw the map.
+        estimate: the estimator's.
+        about: where the map comes from; plain JSON values.
+        session: what its run needs to go on; None for nothing.
+    """
+    database, places = pipeline.tracker.database, pipeline.places
+    landmarks = estimate.landmarks
+    if places is not None:  # no later frame of this run ends them
+        landmarks = landmarks.without(places.ending)
+    rows = database.rows(landmarks.ids)
+    return SavedMap(
+        rig=rig,
+        landmarks=landmarks,
+        appearances=database.appearances(landmarks.ids),
+        hits=database.hits[rows],
+        misses=database.misses[rows],
+        permanent=database.lasting[rows],
+        colour=database.colour[rows],
+        trajectory=estimate.trajectory,
+        about=about,
+        session=session or {},
+    )

@@ -1,4 +1,4 @@
-"""Builds the parts of a session from settings; the only place that distinguishes kinds.
+"""Builds the parts of a session from what a user names; the only place that distinguishes kinds.
 
 An estimator is imported when its kind is made: a filter needs no solver of graphs.
 """
@@ -6,9 +6,12 @@ An estimator is imported when its kind is made: a filter needs no solver of grap
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, cast
+import difflib
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, TypeGuard, cast, get_args
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from fgslam.backend.common_settings import FloorSettings
 from fgslam.backend.filters.settings import (
@@ -32,21 +35,19 @@ from fgslam.datasets.settings import (
     RecordedOdometrySettings,
 )
 from fgslam.frontend.features.sift import SiftExtractor
-from fgslam.frontend.stereo.matching import StereoMatcher
+from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
+from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.map_matching import MapMatcher
-from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.slam.arrival import Arrival, take_over
-from fgslam.slam.choosing import is_settings
 from fgslam.slam.feature_stream import FeatureExtractor, FeatureStream
-from fgslam.slam.frontend_settings import FrontendSettings
 from fgslam.slam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
 from fgslam.slam.pipeline import SlamPipeline
 
 if TYPE_CHECKING:
-    from fgslam.frontend.places.loops.recognition import PlaceRecognition
+    from fgslam.frontend.places.recognition import PlaceRecognition
     from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 
 
@@ -202,7 +203,7 @@ def make_places(
     """Place recognition: loop closures and relocalisation; None where neither is wanted."""
     if settings.loops is None and settings.lost is None:
         return None
-    from fgslam.frontend.places.loops.recognition import PlaceRecognition, RecognitionParts
+    from fgslam.frontend.places.recognition import PlaceRecognition, RecognitionParts
 
     parts = RecognitionParts(
         loops=settings.loops,
@@ -235,3 +236,96 @@ def require_support(estimator: Estimator, measured_odometry: bool, loops: bool =
             f"estimator.kind {estimator.kind} cannot use {' and '.join(lacking)} measurements; "
             "choose another estimator"
         )
+
+
+_ESSENTIAL = ("kind", "supports", "predict", "landmarks", "update", "estimate")
+"""What the loop needs of an estimator; the protocol's other members serve resuming and tests."""
+
+
+def estimator_kinds() -> tuple[str, ...]:
+    """Names of the estimators, the simplest first."""
+    return tuple(str(settings.kind) for settings in _classes())
+
+
+def is_settings(value: object) -> TypeGuard[EstimatorSettings]:
+    """True if the value is the settings of an estimator of this package."""
+    return isinstance(value, _classes())
+
+
+def _classes() -> tuple[type[Any], ...]:
+    union, _ = get_args(EstimatorSettings)
+    return get_args(union)
+
+
+def chosen_estimator(
+    estimator: str | EstimatorSettings | Estimator,
+) -> EstimatorSettings | Estimator:
+    """Settings of the estimator that is named, or what was given.
+
+    Raises:
+        ConfigError: there is no such kind, or the object lacks members of an estimator.
+    """
+    if isinstance(estimator, str):
+        return _named(estimator)
+    if is_settings(estimator):
+        return estimator
+    if isinstance(estimator, type):
+        raise ConfigError(
+            f"estimator: {estimator.__name__} is a class; give an object of it, made for this rig"
+        )
+    lacking = [name for name in _ESSENTIAL if not hasattr(estimator, name)]
+    if lacking:
+        raise ConfigError(
+            f"estimator: {type(estimator).__name__} lacks {', '.join(lacking)}; give a kind "
+            f"({', '.join(estimator_kinds())}), its settings, or an object with the members of "
+            "fgslam.Estimator"
+        )
+    _require_supports(estimator)
+    return cast("Estimator", estimator)
+
+
+def chosen_frontend(given: FrontendSettings | Mapping[str, Any] | None) -> FrontendSettings:
+    """Settings of the front-end as given; None: the defaults; a mapping: what differs from these.
+
+    Raises:
+        ConfigError: a key of the mapping is not known, or its value is not usable.
+    """
+    if isinstance(given, FrontendSettings):
+        return given
+    adapter: TypeAdapter[FrontendSettings] = TypeAdapter(FrontendSettings)
+    try:
+        return adapter.validate_python(dict(given or {}))
+    except (ValidationError, TypeError, ValueError) as error:
+        first = error.errors()[0] if isinstance(error, ValidationError) else None
+        what = "not a mapping" if first is None else f"{_dotted(first['loc'])}: {first['msg']}"
+        raise ConfigError(
+            f"frontend: {what}; give settings by group, e.g. "
+            '{"stereo": {"max_disparity_px": 80}}, as in the settings reference'
+        ) from None
+
+
+def _dotted(location: tuple[int | str, ...]) -> str:
+    return ".".join(map(str, location))
+
+
+def _require_supports(estimator: object) -> None:
+    supports = getattr(estimator, "supports", None)
+    known = isinstance(supports, set | frozenset) and all(
+        isinstance(one, MeasurementType) for one in supports
+    )
+    if not known:
+        raise ConfigError(
+            f"estimator: supports of {type(estimator).__name__} is {supports!r}; give a frozenset "
+            "of fgslam.core.measurements.MeasurementType"
+        )
+
+
+def _named(kind: str) -> EstimatorSettings:
+    known = estimator_kinds()
+    if kind not in known:
+        close = difflib.get_close_matches(kind, known, n=1, cutoff=0.4)
+        hint = f"did you mean {close[0]}? " if close else ""
+        raise ConfigError(f"estimator: no kind {kind!r}; {hint}known: {', '.join(known)}")
+    adapter: TypeAdapter[Any] = TypeAdapter(EstimatorSettings)
+    settings: EstimatorSettings = adapter.validate_python({"kind": kind})
+    return settings

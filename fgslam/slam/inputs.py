@@ -16,7 +16,7 @@ from fgslam.core.measurements import Odometry
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.odometry import pose_noise
 from fgslam.datasets.settings import OdometrySettings, RecordedOdometrySettings
-from fgslam.frontend.features.grey import grey_image
+from fgslam.frontend.features.images import grey_image
 
 Images: TypeAlias = Sequence[npt.ArrayLike]
 """Images (left, right[, top]) of one instant."""

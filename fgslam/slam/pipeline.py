@@ -19,7 +19,7 @@ from fgslam.core.arrays import IntArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.features import StereoFeatures
 from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
-from fgslam.frontend.stereo.matching import StereoMatcher
+from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
 from fgslam.frontend.tracking.resection import Resection
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
@@ -27,7 +27,7 @@ from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import MotionModel
 
 if TYPE_CHECKING:
-    from fgslam.frontend.places.loops.recognition import PlaceRecognition
+    from fgslam.frontend.places.recognition import PlaceRecognition
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,8 +24,8 @@ from fgslam.core.measurements import Increment, MeasurementType
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.datasets.settings import ConstantVelocitySettings
+from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.slam.arrival import Arrival, take_over
 from fgslam.slam.factory import made_or_given
 from fgslam.slam.motion import ConstantVelocityMotion

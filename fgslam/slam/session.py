@@ -20,15 +20,13 @@ from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.datasets.settings import OdometrySettings, RecordedOdometrySettings
+from fgslam.frontend.settings import FrontendSettings
 from fgslam.slam.arrival import Arrival
-from fgslam.slam.choosing import chosen_estimator, chosen_frontend
-from fgslam.slam.factory import make_extractor, make_pipeline
+from fgslam.slam.factory import chosen_estimator, chosen_frontend, make_extractor, make_pipeline
 from fgslam.slam.feature_stream import FeatureExtractor, FeatureFrame, FrameDescriber
-from fgslam.slam.frontend_settings import FrontendSettings
 from fgslam.slam.inputs import Images, checked_images, checked_odometry
 from fgslam.slam.pipeline import FrameReport
-from fgslam.slam.recorder import RunRecorder
-from fgslam.slam.results import SessionResult, Step, result_of
+from fgslam.slam.results import RunRecorder, SessionResult, Step, result_of
 
 
 class Session:

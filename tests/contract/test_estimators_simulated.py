@@ -31,12 +31,11 @@ from fgslam.core.estimates import Prediction
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.datasets.settings import ConstantVelocitySettings
-from fgslam.frontend.stereo.matching import StereoMatcher
+from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
+from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.slam.factory import make_estimator, make_tracker
 from fgslam.slam.feature_stream import FeatureFrame
-from fgslam.slam.frontend_settings import FrontendSettings
 from fgslam.slam.motion import ConstantVelocityMotion, OdometryMotion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline, replay_step
 

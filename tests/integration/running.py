@@ -23,7 +23,7 @@ from fgslam.runs.config import parse_config
 from fgslam.runs.engine import run_task
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.tasks.slam import SlamResult, open_slam
-from fgslam.slam.recorder import STAGES
+from fgslam.slam.results import STAGES
 
 KIND = "landmark_kalman"
 SAME_BYTES = (

@@ -9,7 +9,7 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.homing import BearingMatches
 from fgslam.core.planar import wrap
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
-from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
+from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.frontend.homing.bearing_tracking import BearingTracker
 from fgslam.frontend.homing.matching import match_features
 from fgslam.frontend.homing.trackable_points import move_to_trackable

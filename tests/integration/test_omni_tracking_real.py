@@ -15,7 +15,7 @@ from fgslam.datasets.images import read_colour_image
 from fgslam.datasets.omni_settings import OmniVideoSettings
 from fgslam.datasets.opening import open_omni
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
-from fgslam.frontend.features.omni_settings import OmniFeatureSettings, OmniMatchingSettings
+from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.frontend.homing.bearing_tracking import ReplenishedTracker
 from fgslam.frontend.homing.homing_vector import estimate_homing_vector
 from fgslam.frontend.homing.matching import match_features

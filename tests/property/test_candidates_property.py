@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from fgslam.frontend.features.candidates import (
+from fgslam.frontend.features.matching import (
     alike,
     choose,
     descriptor_distance,

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from simulated import RIG
 
 from fgslam.core.features import StereoFeatures
+from fgslam.frontend.settings import DatabaseSettings, PermanenceSettings
 from fgslam.frontend.tracking.database import LandmarkDatabase
-from fgslam.frontend.tracking.settings import DatabaseSettings, PermanenceSettings
 
 TYPES = st.sampled_from(["I", "II", "III"])
 FRAMES = st.lists(

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
-from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
+from fgslam.frontend.settings import RelocalisationSettings
 from tests.known_places import RIG, error, floor, planar, room, seen
 
 SETTINGS = RelocalisationSettings(map_sigma_m=0.001, view_sigma_px=0.0)

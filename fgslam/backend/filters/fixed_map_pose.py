@@ -29,8 +29,8 @@ from fgslam.core.sensors import CameraRig
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.noise import Whitening
 from fgslam.factors.stereo import FROM_MEASUREMENT, StereoFactors
+from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import MAX_ITERATIONS
-from fgslam.frontend.tracking.settings import EgoMotionSettings
 
 _POSE = pose_key(0)
 _CONVERGED = 1e-9  # radians and metres; as the front-end's, which does not take that step either

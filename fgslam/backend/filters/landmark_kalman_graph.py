@@ -27,7 +27,7 @@ from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.noise import Whitening
 from fgslam.factors.stereo import StereoFactors
-from fgslam.frontend.tracking.settings import EgoMotionSettings
+from fgslam.frontend.settings import EgoMotionSettings
 
 _POSE, _LANDMARK = pose_key(0), landmark_key(0)
 

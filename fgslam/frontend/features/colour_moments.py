@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.core.arrays import FloatArray, Image, IntArray
-from fgslam.frontend.features.omni_settings import ColourMomentSettings
+from fgslam.frontend.features.settings import ColourMomentSettings
 
 _MEAN_FLOOR = 8.0
 """Grey values; means (and deviations) below it count as it, so that the noise of dark patches is no

@@ -19,7 +19,7 @@ from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray
 from fgslam.core.homing import UprightFeatures
 from fgslam.core.planar import wrap
 from fgslam.frontend.features.colour_moments import PatchColours
-from fgslam.frontend.features.omni_settings import ColourMomentSettings, UprightSiftSettings
+from fgslam.frontend.features.settings import ColourMomentSettings, UprightSiftSettings
 
 _SIGMA_SCALES = 0.27  # scales of a feature, added in quadrature to its position's sigma
 _BASE_SIGMA_PX = 1.6  # Gaussian of the first level, doubled image

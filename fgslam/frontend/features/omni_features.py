@@ -17,7 +17,7 @@ from fgslam.frontend.features.colour_sift import (
     wrapping_period,
 )
 from fgslam.frontend.features.column_segments import ColumnSegmentFinder, empty_segments
-from fgslam.frontend.features.omni_settings import OmniFeatureSettings
+from fgslam.frontend.features.settings import OmniFeatureSettings
 
 _MAX_VIEW_WIDTH = 2048  # of the unwrapped view, pixels
 _MAX_TANGENT = 1.0  # of the elevation, up and down, that the cylinder has

@@ -1,4 +1,4 @@
-"""Settings of SIFT and of how descriptors are compared."""
+"""Settings of features: SIFT, how descriptors are compared, omnidirectional features."""
 
 from __future__ import annotations
 
@@ -58,3 +58,102 @@ class AppearanceSettings:
         float,
         Field(gt=0.0, le=1.0, description="best distance at most this fraction of second best"),
     ] = 0.85
+
+
+@dataclass(frozen=True, config=STRICT)
+class ColourMomentSettings:
+    """Colour of a patch or segment: eq. 1 with centred bands."""
+
+    form: Annotated[
+        Literal["ratio", "correlation"],
+        Field(
+            description="`ratio`: mean(PQ) / (mean P mean Q), blind to the gain of each band; "
+            "`correlation`: Pearson's, blind to gain and offset"
+        ),
+    ] = "ratio"
+
+
+@dataclass(frozen=True, config=STRICT)
+class UprightSiftSettings:
+    """Rotation-reduced SIFT (III-A1)."""
+
+    contrast_threshold: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="OpenCV's contrast threshold (its default is 0.04); low, as dim rooms "
+            "and wide baselines need many weak features",
+        ),
+    ] = 0.015
+    max_features: Annotated[
+        int, Field(ge=0, le=1_000_000, description="keep the strongest so many; 0 keeps all")
+    ] = 3000
+    min_elevation_deg: Annotated[
+        float, Field(ge=-90.0, lt=90.0, description="below it: the floor at our feet, the tripod")
+    ] = -60.0
+    max_elevation_deg: Annotated[
+        float, Field(gt=-90.0, le=90.0, description="above it: the ceiling overhead")
+    ] = 60.0
+    view: Annotated[
+        Literal["unwrapped", "raw"],
+        Field(
+            description="of a mirror's or fisheye's image: `raw` describes features along the "
+            "radius where they are, `unwrapped` works on the panorama; panoramas are as they are"
+        ),
+    ] = "unwrapped"
+    sigma_px: Annotated[
+        float, Field(gt=0.0, description="position of a feature: this, in pixels of its view")
+    ] = 1.2
+
+
+@dataclass(frozen=True, config=STRICT)
+class ColumnSegmentSettings:
+    """Invariant column segments (III-A2)."""
+
+    sigma_px: Annotated[
+        float, Field(gt=0.0, description="position of an end, and of a run of one column")
+    ] = 1.8
+
+
+@dataclass(frozen=True, config=STRICT)
+class OmniMatchingSettings:
+    """Matching of two views' features (III-A)."""
+
+    ratio: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            le=1.0,
+            description="SIFT: nearest over second nearest distance below this; high, as the "
+            "colour filter and the planar gates take the wrong ones",
+        ),
+    ] = 0.8
+    root: Annotated[
+        bool,
+        Field(description="compare square roots of descriptors (Arandjelovic, Zisserman 2012)"),
+    ] = True
+    max_colour_distance: Annotated[
+        float,
+        Field(gt=0.0, description="Euclidean, of (C_RB, C_RG, C_GB); larger ones are discarded"),
+    ] = 0.2
+    planar_gates: Annotated[
+        bool,
+        Field(
+            description="among candidates, leave out those no planar motion explains: elevations "
+            "of opposite sign, apparent sizes against elevations"
+        ),
+    ] = True
+
+
+@dataclass(frozen=True, config=STRICT)
+class OmniFeatureSettings:
+    """All of the omnidirectional features."""
+
+    sift: UprightSiftSettings = UprightSiftSettings()
+    colour: ColourMomentSettings = ColourMomentSettings()
+    columns: ColumnSegmentSettings = ColumnSegmentSettings()
+    matching: OmniMatchingSettings = OmniMatchingSettings()
+    kinds: Annotated[
+        Literal["both", "sift", "columns"],
+        Field(description="which features are sought; the paper uses both kinds together"),
+    ] = "both"

@@ -13,7 +13,7 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.homing import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import unit, wrap
-from fgslam.frontend.features.omni_settings import OmniMatchingSettings
+from fgslam.frontend.features.settings import OmniMatchingSettings
 from fgslam.frontend.homing.matching import (
     COMMON_CHANCE,
     gain,

@@ -25,8 +25,8 @@ from fgslam.core.homing import (
     UprightFeatures,
 )
 from fgslam.frontend.features.colour_sift import up_in_image
-from fgslam.frontend.features.column_whitening import whitened
-from fgslam.frontend.features.omni_settings import OmniMatchingSettings
+from fgslam.frontend.features.column_segments import whitened
+from fgslam.frontend.features.settings import OmniMatchingSettings
 
 _MAX_COLUMN_DISTANCE = 4.4  # Mahalanobis, of 11 elements; 4.4 is exceeded by 5 % if normal
 _COLUMN_RATIO = 0.7  # column segments: nearest over second nearest distance below this

@@ -23,8 +23,8 @@ from fgslam.core.geometry import (
     transform_to_world,
 )
 from fgslam.core.saved_map import SavedMap
-from fgslam.frontend.places.relocalisation.alignment import align_in_space
-from fgslam.frontend.places.relocalisation.appearance_index import AppearanceIndex
+from fgslam.frontend.features.descriptor_index import AppearanceIndex
+from fgslam.frontend.tracking.resection import align_in_space
 
 _NEIGHBOURS = 6  # views asked for: enough to pass over a place's own and reach the next
 _HYPOTHESES = 400  # rigid triples that are scored

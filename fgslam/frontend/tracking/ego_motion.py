@@ -35,7 +35,7 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.measurements import Observations
 from fgslam.core.sensors import CameraRig, Sensor
-from fgslam.frontend.tracking.settings import EgoMotionSettings
+from fgslam.frontend.settings import EgoMotionSettings
 
 _STEP_TOLERANCE = 1e-9  # radians and metres; far below anything measurable
 _ROBUST_TOLERANCE = 1e-5  # the robust minimum only chooses the inliers for the exact one

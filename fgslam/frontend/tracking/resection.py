@@ -1,7 +1,8 @@
 """Pose of a frame from landmarks whose identity is known, without any prior.
 
 Three matches (two on a floor) place the camera: the triangulated points are laid onto the
-landmarks. The pose that most matches agree with starts the least squares.
+landmarks. The pose that most matches agree with starts the least squares. The closed forms serve
+relocalisation and the alignment of maps, too.
 """
 
 from __future__ import annotations
@@ -10,10 +11,10 @@ import dataclasses
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction
+from fgslam.core.floor import Floor
 from fgslam.core.geometry import triangulate
-from fgslam.frontend.places.relocalisation.alignment import align, sample_size
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
 
 _SAMPLES = 200  # at half the matches wrong, no good triple among them once in 10^11
@@ -64,3 +65,118 @@ class Resection:
     def _agreeing(self, wTc: FloatArray, problem: PoseProblem) -> int:
         residuals = self._solver.image_residuals(wTc, problem)
         return int((residuals <= _NEAR * self._solver.farthest).sum())
+
+
+_RIGID_SIGMAS = 3.0
+_LEAST_SPREAD_M = 0.15  # shorter samples turn the pose by more than any measurement corrects
+
+
+def sample_size(floor: Floor) -> int:
+    """Matches that fix a pose: 2 on a level floor, otherwise 3."""
+    return 2 if floor.rigid_dof == 3 else 3
+
+
+def rigid(here: FloatArray, there: FloatArray, covariances: FloatArray, floor: Floor) -> BoolArray:
+    """Which samples keep their lengths between camera and map, and are long enough.
+
+    Args:
+        here: (h, m, 3) sampled features in the camera's frame.
+        there: (h, m, 3) their landmarks in the world.
+        covariances: (h, m, 3, 3) of feature and landmark together, isotropic enough for a test.
+        floor: on a level one lengths are horizontal (A^2 + B^2 = C^2 + D^2).
+    """
+    keep = np.ones(len(here), np.bool_)
+    sizes = []
+    for a, b in ((0, 1), (1, 2), (2, 0))[: 1 if here.shape[1] == 2 else 3]:
+        first, second = here[:, b] - here[:, a], there[:, b] - there[:, a]
+        if here.shape[1] == 2:
+            first, second = first @ floor.horizontal, second @ floor.horizontal
+        own, other = np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1)
+        along = first / np.maximum(own, 1e-9)[:, None]
+        if here.shape[1] == 2:
+            along = along @ floor.horizontal.T
+        noise = covariances[:, a] + covariances[:, b]
+        variance = np.einsum("hi,hij,hj->h", along, noise, along)
+        keep &= np.abs(own - other) <= _RIGID_SIGMAS * np.sqrt(variance)
+        sizes.append(other)
+    return np.asarray(keep & (_spread(np.array(sizes)) >= _LEAST_SPREAD_M))
+
+
+def _spread(lengths: FloatArray) -> FloatArray:
+    """Of pairs (1, h) their length, of triangles (3, h) the smallest altitude (Heron)."""
+    if len(lengths) == 1:
+        return np.asarray(lengths[0])
+    half = 0.5 * lengths.sum(axis=0)
+    squared = half * np.prod(half - lengths, axis=0)
+    return np.asarray(
+        2.0 * np.sqrt(np.maximum(squared, 0.0)) / np.maximum(lengths.max(axis=0), 1e-9)
+    )
+
+
+def align(here: FloatArray, there: FloatArray, floor: Floor) -> FloatArray:
+    """Poses ``wTc`` (h, 4, 4) that bring the samples (h, m, 3) from camera to world best."""
+    if floor.rigid_dof == 3:
+        return align_planar(here, there, floor)
+    poses = align_in_space(here, there)
+    if floor.rigid_dof == 5:
+        poses[:, :3, 3] -= (poses[:, :3, 3] @ floor.down)[:, None] * floor.down
+    return poses
+
+
+def floor_axes(floor: Floor) -> FloatArray:
+    """(3, 2) two horizontal directions; a turn about the vertical takes the first to the second."""
+    first = floor.horizontal[:, 0]
+    return np.column_stack([first, np.cross(floor.down, first)])
+
+
+def align_planar(here: FloatArray, there: FloatArray, floor: Floor) -> FloatArray:
+    """The two-match alignment on a level floor, for any number of points: turn, then shift.
+
+    With the differences (A, B) of the camera's and (C, D) of the map's horizontal coordinates the
+    turn about the vertical is ``atan2(sum A D - B C, sum A C + B D)``.
+    """
+    axes = floor_axes(floor)
+    a, b = here @ axes, there @ axes
+    a_mean, b_mean = a.mean(axis=1), b.mean(axis=1)
+    a, b = a - a_mean[:, None], b - b_mean[:, None]
+    sine = (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]).sum(axis=1)
+    cosine = (a * b).sum(axis=(1, 2))
+    length = np.maximum(np.hypot(sine, cosine), 1e-300)
+    sine, cosine = sine / length, cosine / length
+    return _planar_poses(cosine, sine, a_mean, b_mean, axes, floor.down)
+
+
+def _planar_poses(
+    cosine: FloatArray,
+    sine: FloatArray,
+    here: FloatArray,
+    there: FloatArray,
+    axes: FloatArray,
+    down: FloatArray,
+) -> FloatArray:
+    """Poses turned about the vertical that bring (h, 2) ``here`` onto ``there``."""
+    shift_x = there[:, 0] - cosine * here[:, 0] + sine * here[:, 1]
+    shift_y = there[:, 1] - sine * here[:, 0] - cosine * here[:, 1]
+    e, f = axes[:, 0], axes[:, 1]
+    out = np.zeros((len(cosine), 4, 4))
+    out[:, 3, 3] = 1.0
+    out[:, :3, :3] = np.outer(down, down)
+    out[:, :3, :3] += cosine[:, None, None] * (np.outer(e, e) + np.outer(f, f))
+    out[:, :3, :3] += sine[:, None, None] * (np.outer(f, e) - np.outer(e, f))
+    out[:, :3, 3] = shift_x[:, None] * e + shift_y[:, None] * f
+    return out
+
+
+def align_in_space(here: FloatArray, there: FloatArray) -> FloatArray:
+    """Least squares in three dimensions (Kabsch 1976), three points or more."""
+    a_mean, b_mean = here.mean(axis=1), there.mean(axis=1)
+    correlation = np.swapaxes(there - b_mean[:, None], 1, 2) @ (here - a_mean[:, None])
+    u, _, vt = np.linalg.svd(correlation)
+    flip = np.ones((len(here), 3))
+    flip[:, 2] = np.sign(np.linalg.det(u @ vt))
+    rotation = (u * flip[:, None, :]) @ vt
+    out = np.zeros((len(here), 4, 4))
+    out[:, 3, 3] = 1.0
+    out[:, :3, :3] = rotation
+    out[:, :3, 3] = b_mean - np.einsum("hij,hj->hi", rotation, a_mean)
+    return out

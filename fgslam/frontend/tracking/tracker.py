@@ -13,13 +13,14 @@ from fgslam.core.measurements import Observations
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
-from fgslam.frontend.tracking.map_matching import MapMatcher, MapMatches
-from fgslam.frontend.tracking.resection import Resection
-from fgslam.frontend.tracking.visibility import (
+from fgslam.frontend.tracking.map_matching import (
     ExpectedLandmarks,
+    MapMatcher,
+    MapMatches,
     directions_to,
     predicted_covariance,
 )
+from fgslam.frontend.tracking.resection import Resection
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
 from fgslam.core.features import StereoFeatures, Words
-from fgslam.frontend.features.vocabulary import words_of
+from fgslam.frontend.features.descriptor_index import words_of
 
 Places = npt.NDArray[np.int32]
 """(n, max_views) places in the pool; -1 where there is no view."""

@@ -19,7 +19,7 @@ from fgslam.core.homing import (
     Refusal,
     TwoViewVector,
 )
-from fgslam.frontend.features.omni_settings import OmniMatchingSettings
+from fgslam.frontend.features.settings import OmniMatchingSettings
 from fgslam.frontend.homing.homing_vector import pair_generator, vector_between
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.report.content import Picture

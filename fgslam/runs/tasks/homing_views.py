@@ -17,7 +17,7 @@ from fgslam.datasets.omni_settings import OmniDatasetSettings
 from fgslam.datasets.opening import open_omni
 from fgslam.frontend.features.column_segments import empty_segments
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
-from fgslam.frontend.features.omni_settings import OmniFeatureSettings
+from fgslam.frontend.features.settings import OmniFeatureSettings
 from fgslam.frontend.homing.matching import plain_sift
 from fgslam.runs.engine import Context
 from fgslam.runs.units import Stage, in_blocks

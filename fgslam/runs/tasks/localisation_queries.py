@@ -17,7 +17,7 @@ from fgslam.core.floor import Floor
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import require_rig
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
-from fgslam.frontend.stereo.matching import StereoMatcher
+from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.engine import Context
 from fgslam.runs.tasks.localisation_submap import Window, submap_features

@@ -23,9 +23,9 @@ from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame, Sequence
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.settings import OdometrySettings
+from fgslam.frontend.settings import FrontendSettings
 from fgslam.slam.factory import make_pipeline
 from fgslam.slam.feature_stream import FeatureFrame
-from fgslam.slam.frontend_settings import FrontendSettings
 from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import SlamPipeline
 

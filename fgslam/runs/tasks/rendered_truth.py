@@ -14,8 +14,8 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LandmarkTruth, Sequence
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.sensors import CameraRig
+from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.tracking.database import LandmarkDatabase
-from fgslam.slam.frontend_settings import FrontendSettings
 
 _LEAST_SIGHTINGS = 3
 _SAME_SURFACE = 0.03

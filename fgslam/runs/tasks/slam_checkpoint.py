@@ -11,7 +11,7 @@ from fgslam.core.errors import OutputError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.runs.folder import LOG_FILE, STATE_FILE
 from fgslam.slam.pipeline import SlamPipeline
-from fgslam.slam.recorder import RunRecorder
+from fgslam.slam.results import RunRecorder
 
 
 def save(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:

@@ -20,10 +20,10 @@ from fgslam.runs.config import ExperimentConfig, parse_config
 from fgslam.runs.tasks import slam_checkpoint as checkpoint
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, entry_of
 from fgslam.runs.tasks.slam_outputs import RunOutputs
+from fgslam.slam.arrival import saved_map
 from fgslam.slam.map_settings import MapSettings
-from fgslam.slam.maps import saved_map
 from fgslam.slam.pipeline import SlamPipeline
-from fgslam.slam.recorder import RunRecorder
+from fgslam.slam.results import RunRecorder
 
 _LOG = "log/"
 _TIMES = "recorder/stage_ms"

@@ -33,7 +33,7 @@ from fgslam.runs.tasks.slam_checkpoint import save_log
 from fgslam.runs.tasks.slam_places import closures_of, place_numbers, write_closures
 from fgslam.runs.tasks.slam_summary import estimator_metrics, frame_problems, run_numbers
 from fgslam.slam.pipeline import SlamPipeline
-from fgslam.slam.recorder import STAGES, RunRecorder
+from fgslam.slam.results import STAGES, RunRecorder
 from fgslam.slam.session import Session
 
 

@@ -16,7 +16,7 @@ from fgslam.evaluation.closures import JudgedClosure, judge_closures
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.content import Column, TextTable
 from fgslam.report.tables import Cell, write_csv
-from fgslam.slam.recorder import RunRecorder
+from fgslam.slam.results import RunRecorder
 
 LOOPS_FILE = "loops.csv"
 _NAMES = ("frame", "returned_to", *(f.name for f in fields(JudgedClosure)), "false")

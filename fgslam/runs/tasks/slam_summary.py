@@ -11,8 +11,8 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import EgoMotionStatus, Estimate, Trajectory, correlation
 from fgslam.evaluation.judging import Answer, Truth, judge_answer
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, UpdateTime
-from fgslam.slam.recorder import STAGES, RunRecorder
 from fgslam.slam.replay import peak_memory_mb
+from fgslam.slam.results import STAGES, RunRecorder
 
 _ESTIMATOR_STAGES = ("predict", "update")
 _LOOP_STAGES = ("predict", "stereo", "track", "places", "update")

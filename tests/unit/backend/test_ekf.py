@@ -25,7 +25,7 @@ from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior
 from fgslam.factors.noise import Whitening
 from fgslam.factors.stereo import StereoFactors
-from fgslam.frontend.tracking.settings import EgoMotionSettings
+from fgslam.frontend.settings import EgoMotionSettings
 
 FREE = Floor.under(RIG, 6)
 PRIOR = np.diag([1e-3, 2e-3, 1e-3, 3e-3, 2e-3, 4e-3]) ** 2

@@ -33,8 +33,8 @@ from fgslam.factors.keys import landmark_key, pose_key
 from fgslam.factors.motion import pose_prior
 from fgslam.factors.noise import Whitening
 from fgslam.factors.stereo import StereoFactors
+from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
-from fgslam.frontend.tracking.settings import EgoMotionSettings
 
 SIGMA = np.array([0.3, 0.4, 0.2])
 NO_IDS = np.empty(0, np.int64)

@@ -29,7 +29,7 @@ from fgslam.core import geometry as g
 from fgslam.core.estimates import EgoMotionStatus, Prediction
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.saved_map import SavedMap
-from fgslam.frontend.places.loops.confirmation import difference
+from fgslam.frontend.places.closures import difference
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.arrival import Arrival, take_over
 from fgslam.slam.factory import make_estimator

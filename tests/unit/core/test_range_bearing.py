@@ -14,8 +14,8 @@ from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.core.measurements import Increment, Observations
 from fgslam.core.planar import wrap
 from fgslam.core.sensors import RangeBearingSensor
+from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
-from fgslam.frontend.tracking.settings import EgoMotionSettings
 
 SENSOR = RangeBearingSensor(8.0, g.BODY_FORWARD_LEFT_UP_FROM_CAMERA)
 SIGMA = np.array([0.02, 0.02, 0.03])

@@ -28,7 +28,7 @@ from fgslam.datasets.checks.matches import (
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.layouts import kitti_drives, recognise_layout
 from fgslam.datasets.settings import ImageFolderSettings, RecordedOdometrySettings
-from fgslam.frontend.features.descriptor_matching import mutual_nearest
+from fgslam.frontend.features.matching import mutual_nearest
 from fgslam.runs.inspection import inspect_recording, render_report
 
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -22,8 +22,8 @@ from fgslam.core.sensors import CameraRig
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import ConstantVelocitySettings, StereoTracksSettings
 from fgslam.evaluation.trajectory import evaluate_trajectory
+from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import replay_step
 

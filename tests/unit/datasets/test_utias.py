@@ -25,8 +25,8 @@ from fgslam.datasets.settings import (
     UtiasStereoSettings,
 )
 from fgslam.evaluation.trajectory import evaluate_trajectory
+from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import replay_step
 

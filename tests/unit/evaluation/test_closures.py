@@ -24,7 +24,7 @@ from fgslam.runs.tasks.slam_places import (
     read_closures,
     write_closures,
 )
-from fgslam.slam.recorder import RunRecorder
+from fgslam.slam.results import RunRecorder
 
 COUNT = 12
 

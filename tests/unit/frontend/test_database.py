@@ -14,9 +14,9 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.features import StereoFeatures
 from fgslam.core.sensors import CameraRig
+from fgslam.frontend.settings import DatabaseSettings
 from fgslam.frontend.tracking.database import LandmarkDatabase
-from fgslam.frontend.tracking.settings import DatabaseSettings
-from fgslam.frontend.tracking.visibility import predicted_covariance
+from fgslam.frontend.tracking.map_matching import predicted_covariance
 
 NO_BORDER = DatabaseSettings(border_px=0.0)
 BORDER = DatabaseSettings(border_px=8.0)

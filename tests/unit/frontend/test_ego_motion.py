@@ -16,8 +16,8 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.core.measurements import Observations
 from fgslam.core.sensors import CameraRig
+from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
-from fgslam.frontend.tracking.settings import EgoMotionSettings
 
 SIGMA = np.array([0.3, 0.3, 0.2])
 PRIOR_SIGMA = np.array([0.01, 0.01, 0.01, 0.03, 0.03, 0.03])

@@ -14,12 +14,12 @@ from fgslam.core.errors import MapError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.features import LandmarkAppearances
 from fgslam.core.saved_map import SavedMap
-from fgslam.frontend.tracking.database import LandmarkDatabase
-from fgslam.frontend.tracking.settings import (
+from fgslam.frontend.settings import (
     DatabaseSettings,
     PermanenceSettings,
     ViewpointSettings,
 )
+from fgslam.frontend.tracking.database import LandmarkDatabase
 
 PLACES = at_pixels([(80, 60, 8), (100, 110, 12), (120, 90, 10), (150, 100, 9)])
 LASTING = DatabaseSettings(

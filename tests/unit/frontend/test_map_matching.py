@@ -10,9 +10,8 @@ import pytest
 from fgslam.core.arrays import FloatArray
 from fgslam.core.features import StereoFeatures
 from fgslam.frontend.features.settings import AppearanceSettings
-from fgslam.frontend.tracking.map_matching import MapMatcher, MapMatches
-from fgslam.frontend.tracking.settings import MapMatchingSettings
-from fgslam.frontend.tracking.visibility import ExpectedLandmarks
+from fgslam.frontend.settings import MapMatchingSettings
+from fgslam.frontend.tracking.map_matching import ExpectedLandmarks, MapMatcher, MapMatches
 
 PAPER = AppearanceSettings(mode="paper")
 DESCRIPTOR = AppearanceSettings(mode="descriptor", max_distance=250.0, ratio=0.85)

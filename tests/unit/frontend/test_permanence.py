@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.frontend.tracking.permanence import is_blind, reliable, seen_past
-from fgslam.frontend.tracking.settings import PermanenceSettings
-from fgslam.frontend.tracking.visibility import ExpectedLandmarks
+from fgslam.frontend.settings import PermanenceSettings
+from fgslam.frontend.tracking.database import is_blind, reliable, seen_past
+from fgslam.frontend.tracking.map_matching import ExpectedLandmarks
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ SEEN = {
 
 @pytest.mark.parametrize("what", SEEN)
 def test_what_contradicts_a_missed_landmark(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fgslam.frontend.tracking.permanence._NEAR_PX", 20.0)
+    monkeypatch.setattr("fgslam.frontend.tracking.database._NEAR_PX", 20.0)
     shown, past = SEEN[what]
     found = seen_past(np.array([PLACE]), np.array(shown, np.float64).reshape(-1, 3))
     assert found.tolist() == [past]

@@ -13,8 +13,8 @@ from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.planar import wrap
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.features.settings import AppearanceSettings
-from fgslam.frontend.stereo.matching import StereoMatcher, measurement_map
-from fgslam.frontend.stereo.settings import StereoSettings
+from fgslam.frontend.settings import StereoSettings
+from fgslam.frontend.stereo import StereoMatcher, measurement_map
 
 PAPER = AppearanceSettings(mode="paper")
 DESCRIPTOR = AppearanceSettings(mode="descriptor")

@@ -13,16 +13,16 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.frontend.features.settings import AppearanceSettings
-from fgslam.frontend.stereo.matching import StereoMatcher
-from fgslam.frontend.stereo.settings import StereoSettings
-from fgslam.frontend.tracking.settings import (
+from fgslam.frontend.settings import (
     DatabaseSettings,
     EgoMotionSettings,
+    FrontendSettings,
     MapMatchingSettings,
+    StereoSettings,
 )
+from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
 from fgslam.slam.factory import make_tracker
-from fgslam.slam.frontend_settings import FrontendSettings
 
 COUNT = 60
 IMAGE = np.tile(np.arange(240, dtype=np.uint8)[:, None], (1, 320))  # grey value is the row

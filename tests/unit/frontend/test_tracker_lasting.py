@@ -12,16 +12,16 @@ from test_tracker import CERTAIN, IMAGE, SETTINGS
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
-from fgslam.frontend.stereo.matching import StereoMatcher
-from fgslam.frontend.tracking.database import LandmarkDatabase
-from fgslam.frontend.tracking.settings import (
+from fgslam.frontend.settings import (
     DatabaseSettings,
+    FrontendSettings,
     PermanenceSettings,
     ViewpointSettings,
 )
+from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.tracker import Association
 from fgslam.slam.factory import make_tracker
-from fgslam.slam.frontend_settings import FrontendSettings
 
 DISTANCE = 3.0  # metres, from the camera to the middle of the things
 HERE = 0.0

@@ -12,8 +12,8 @@ from test_database import database_of, landmark_map
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.sensors import CameraRig
-from fgslam.frontend.tracking.settings import DatabaseSettings
-from fgslam.frontend.tracking.visibility import _CONE_DEG, FieldOfView, directions_to
+from fgslam.frontend.settings import DatabaseSettings
+from fgslam.frontend.tracking.map_matching import _CONE_DEG, FieldOfView, directions_to
 
 MAX_DISPARITY = 40.0
 TWO_CAMERAS = dataclasses.replace(RIG, vertical_baseline=None)

@@ -10,7 +10,7 @@ import yaml
 
 from fgslam.core.errors import ConfigError
 from fgslam.datasets.settings import ConstantVelocitySettings, ImageFolderSettings
-from fgslam.frontend.places.settings import LoopSettings
+from fgslam.frontend.settings import LoopSettings
 from fgslam.runs.config import ExperimentConfig, load_config, parse_config
 from fgslam.runs.config_models import TASKS
 from fgslam.runs.config_reading import accepted_at, read_mapping, typed_value

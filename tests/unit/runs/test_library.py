@@ -108,8 +108,7 @@ def test_live_and_replayed_results_stand_in_one_table(
 def test_an_estimator_brought_along_is_replayed_and_named(
     driven: tuple[fg.Slam, fg.Result],
 ) -> None:
-    from fgslam.slam.choosing import chosen_estimator
-    from fgslam.slam.factory import made_or_given
+    from fgslam.slam.factory import chosen_estimator, made_or_given
 
     log = driven[0].log
     own = made_or_given(log.rig, chosen_estimator("ekf"))

@@ -27,7 +27,7 @@ from fgslam.evaluation.judging import Truth
 from fgslam.runs.tasks.slam_summary import estimator_metrics, frame_problems, run_numbers
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.pipeline import FrameReport
-from fgslam.slam.recorder import STAGES, FrameRow, RunRecorder
+from fgslam.slam.results import STAGES, FrameRow, RunRecorder
 
 RIG = CameraRig(32, 24, 30.0, 30.0, 15.5, 11.5, 0.1, None, np.eye(4))
 NO_IDS = np.empty(0, np.int64)

@@ -8,9 +8,9 @@ import pytest
 
 from fgslam.core.errors import CalibrationError, ConfigError, MeasurementLogError
 from fgslam.core.measurements import MeasurementType
+from fgslam.frontend.settings import FrontendSettings
 from fgslam.runs.library import replay
-from fgslam.slam.choosing import chosen_estimator, chosen_frontend
-from fgslam.slam.frontend_settings import FrontendSettings
+from fgslam.slam.factory import chosen_estimator, chosen_frontend
 from fgslam.slam.session import Session
 
 

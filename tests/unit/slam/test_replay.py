@@ -19,7 +19,7 @@ from fgslam.core.estimates import Estimate, Trajectory, UpdateStats
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.evaluation.judging import Truth, judge_replay
-from fgslam.frontend.tracking.settings import EgoMotionSettings
+from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.slam import factory
 from fgslam.slam import replay as module
 from fgslam.slam.replay import Replay, memory_mb, peak_memory_mb, replay, replay_motion

@@ -21,8 +21,8 @@ from fgslam.core.sensors import CameraRig
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import ConstantVelocitySettings, SyntheticOdometrySettings
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
+from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.frontend.tracking.settings import EgoMotionSettings
 from fgslam.runs.config import ExperimentConfig, load_experiment, make_config
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import replay_step

@@ -1,4 +1,4 @@
-"""The map as relocalisation knows it: landmarks, their views, and the index over them."""
+"""The map as relocalisation knows it, and the tentative matches of a frame with it."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap
-from fgslam.core.features import LandmarkAppearances
+from fgslam.core.features import LandmarkAppearances, StereoFeatures
+from fgslam.core.floor import Floor
 from fgslam.core.geometry import project, transform_to_camera
+from fgslam.core.planar import wrap
 from fgslam.core.sensors import CameraRig
-from fgslam.frontend.places.relocalisation.appearance_index import AppearanceIndex
+from fgslam.frontend.features.descriptor_index import AppearanceIndex, Neighbours
+from fgslam.frontend.features.matching import pairs_within
 
 _NEAREST_DEPTH_M = 0.3
 _ROUNDING_M = 1e-6  # of depths computed in two ways, with thousands of kilometres to spare
@@ -150,3 +153,180 @@ def _owners(ids: IntArray, viewed: IntArray) -> tuple[IntArray, IntArray]:
     known = row < len(ids)
     known[known] = ids[row[known]] == viewed[known]
     return np.where(known, row, -1), np.bincount(row[known], minlength=len(ids))
+
+
+MAX_DISTANCE = 400.0  # of descriptors, whose norm is 512
+_RATIO = 0.85  # a gap: the next place is farther than its predecessor by this ratio
+_MOST_PLACES = 3  # that may share a feature before it says nothing
+_SAME_PLACE_M = 0.3  # landmarks this near to one another are one place
+_SIZE_RATIO = 1.6  # of a feature's physical size to a landmark's, at most
+_ORIENTATION_DEG = 30.0  # on a level floor, largest difference
+_HEIGHT_M = 0.05  # on a level floor, largest difference beyond what the covariances allow
+_GATE_SIGMAS = 3.0  # of sizes and heights; what their covariances allow
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tentative:
+    """Matches by appearance, in the order of features, then of distance.
+
+    Attributes:
+        features: (k,) indices of features, ascending; a feature may have several candidates.
+        landmarks: (k,) rows of the map.
+        distances: (k,) of descriptors.
+        places: (k,) number of different places among the feature's candidates.
+    """
+
+    features: IntArray
+    landmarks: IntArray
+    distances: FloatArray
+    places: IntArray
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+
+def gated(
+    features: StereoFeatures,
+    pairs: tuple[IntArray, IntArray],
+    landmarks: LandmarkMap,
+    looks: tuple[LandmarkAppearances, IntArray],
+    floor: Floor,
+) -> BoolArray:
+    """Which pairs (feature, view) agree in size and, on a level floor, in height and orientation.
+
+    Args:
+        features: of the frame.
+        pairs: (k,) indices of features and (k,) rows of stored views.
+        landmarks: the map.
+        looks: stored views and the map's row of each view's landmark.
+        floor: decides whether the camera is upright and at one height.
+    """
+    (i, v), (views, owners) = pairs, looks
+    depth = np.abs(features.position[i, 2])
+    sigma = np.sqrt(features.position_covariance[i, 2, 2]) / np.maximum(depth, 1e-6)
+    ratio = np.abs(np.log(features.scale[i] * depth / np.maximum(views.size[v], 1e-9)))
+    keep = ratio <= np.log(_SIZE_RATIO) + _GATE_SIGMAS * sigma
+    if floor.rigid_dof != 3:
+        return np.asarray(keep)
+    turn = np.abs(wrap(features.orientation[i] - views.orientation[v]))
+    keep &= turn <= np.deg2rad(_ORIENTATION_DEG)
+    return np.asarray(keep & _heights_agree(features, i, landmarks, owners[v], floor))
+
+
+def _heights_agree(
+    features: StereoFeatures,
+    i: IntArray,
+    landmarks: LandmarkMap,
+    rows: IntArray,
+    floor: Floor,
+) -> BoolArray:
+    """Motion on a level floor leaves heights as they are."""
+    down = floor.down
+    difference = np.abs(features.position[i] @ down - landmarks.positions[rows] @ down)
+    variance = np.einsum("i,kij,j->k", down, features.position_covariance[i], down)
+    variance += np.einsum("i,kij,j->k", down, landmarks.covariances[rows], down)
+    return np.asarray(difference <= _HEIGHT_M + _GATE_SIGMAS * np.sqrt(variance))
+
+
+def specific(
+    neighbours: Neighbours,
+    keep: BoolArray,
+    owners: IntArray,
+    landmarks: LandmarkMap,
+) -> Tentative:
+    """Candidates of each feature, up to the first clear gap of distances between places.
+
+    A feature that looks like a few places keeps them all, as repeated texture must; one that looks
+    like many (no gap within three places) keeps none.
+
+    Args:
+        neighbours: (q, k) nearest views of each feature.
+        keep: (q, k) of which passed the gates.
+        owners: the map's row of each view's landmark.
+        landmarks: the map.
+    """
+    features, rows, distances, places = [], [], [], []
+    limits = np.where(keep, neighbours.distances, np.inf)
+    for i in np.flatnonzero((limits <= MAX_DISTANCE).any(axis=1)):
+        order = np.flatnonzero(keep[i])
+        own, far = owners[neighbours.rows[i, order]], limits[i, order]
+        place = _places(landmarks.positions[own], _SAME_PLACE_M)
+        end, count = _gap(place, far)
+        first = _first_views(own[:end], far[:end], MAX_DISTANCE)
+        features.append(np.full(len(first), i))
+        rows.append(own[first])
+        distances.append(far[first])
+        places.append(np.full(len(first), count))
+    return _joined(features, rows, distances, places)
+
+
+def unspecific(
+    features: StereoFeatures,
+    landmarks: LandmarkMap,
+    looks: tuple[LandmarkAppearances, IntArray],
+    floor: Floor,
+) -> Tentative:
+    """Every landmark that agrees in size (on a level floor in height and orientation, too).
+
+    What features without descriptors can say; each is shared by all that it may be.
+    """
+    views, owners = looks
+    depth = np.maximum(np.abs(features.position[:, 2]), 1e-6)
+    sigma = np.sqrt(features.position_covariance[:, 2, 2]) / depth
+    size = np.log(np.maximum(features.scale * depth, 1e-9))
+    reach = np.log(_SIZE_RATIO) + _GATE_SIGMAS * sigma
+    i, v = pairs_within(size, reach, np.log(np.maximum(views.size, 1e-9)))
+    keep = gated(features, (i, v), landmarks, looks, floor)
+    pairs = np.unique(np.column_stack([i[keep], owners[v[keep]]]), axis=0)
+    counts = np.bincount(pairs[:, 0], minlength=len(features))
+    return Tentative(pairs[:, 0], pairs[:, 1], np.zeros(len(pairs)), counts[pairs[:, 0]])
+
+
+def _places(positions: FloatArray, radius: float) -> IntArray:
+    """Each position's place: the index of the first one within ``radius`` of it."""
+    apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
+    return np.asarray(np.argmax(apart <= radius, axis=1))
+
+
+def _first_views(own: IntArray, far: FloatArray, limit: float) -> IntArray:
+    """The first view of each landmark within ``limit``, the nearest ones first."""
+    first: dict[int, int] = {}
+    for k in np.flatnonzero(far <= limit).tolist():
+        first.setdefault(int(own[k]), k)
+    return np.array(sorted(first.values(), key=lambda k: (far[k], own[k])), np.int64)
+
+
+def _gap(place: IntArray, far: FloatArray) -> tuple[int, int]:
+    """Number of leading candidates before the first gap, and of their places; 0 without a gap."""
+    seen: list[int] = []
+    for k, p in enumerate(place):
+        if p in seen:
+            continue
+        if seen and _last(far, place, seen, k) <= _RATIO * far[k]:
+            return k, len(seen)
+        if len(seen) == _MOST_PLACES:
+            return 0, 0
+        seen.append(int(p))
+    return len(place), len(seen)
+
+
+def _last(far: FloatArray, place: IntArray, seen: list[int], k: int) -> float:
+    """Distance of the last of the places before ``k``: the first view of each counts."""
+    return float(max(far[:k][place[:k] == p][0] for p in seen))
+
+
+def _joined(
+    features: list[IntArray],
+    rows: list[IntArray],
+    distances: list[FloatArray],
+    places: list[IntArray],
+) -> Tentative:
+    if not features:
+        none = np.empty(0, np.int64)
+        return Tentative(none, none, np.empty(0), none)
+    return Tentative(
+        np.concatenate(features),
+        np.concatenate(rows),
+        np.concatenate(distances),
+        np.concatenate(places),
+    )

@@ -1,4 +1,10 @@
-"""Poses proposed with what speaks for them, and the choice of the best that lie apart."""
+"""Poses proposed from tentative matches: by random samples, or by votes on a level floor.
+
+Samples: RANSAC (Fischler and Bolles 1981). Votes: the Hough transform over X, Z and heading. A
+match fixes two of the three numbers: for each heading there is one position from which the feature
+would be the landmark. So it votes along a one-parameter family of poses; where many families cross
+is the robot.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +12,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, Rows
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
+from fgslam.core.floor import Floor
 from fgslam.core.sensors import CameraRig
-from fgslam.frontend.places.relocalisation.residuals import Pairs, log_likelihoods, residuals
-from fgslam.frontend.places.relocalisation.tentative import Tentative
+from fgslam.frontend.places.relocalisation.known_map import Tentative
+from fgslam.frontend.places.relocalisation.residuals import (
+    Pairs,
+    log_likelihoods,
+    refine,
+    residuals,
+)
+from fgslam.frontend.settings import RelocalisationSettings
+from fgslam.frontend.tracking.resection import align, align_planar, floor_axes, rigid, sample_size
 
 _AT_ONCE = 40_000  # residuals computed together; a few megabytes
 
@@ -94,3 +108,191 @@ def distinct(found: Proposals, count: int, metres: float, radians: float) -> Pro
         free &= apart(found.poses, found.poses[best], metres, radians)
         free[best] = False
     return found.select(np.array(chosen, np.int64))
+
+
+_HYPOTHESES = 64  # poses scored at a time, from the rigid samples
+_ROUNDS = 6  # times that samples are drawn at most
+_CONFIDENCE = 0.999  # that one sample was free of mistakes, at which the search ends
+_SAMPLED_STEPS = 3  # Newton steps of a sample: from the closed form to the image's metric
+
+
+def propose_by_samples(
+    evidence: Evidence, floor: Floor, settings: RelocalisationSettings, rng: np.random.Generator
+) -> Proposals:
+    """Poses, best first; none where too few matches make a sample.
+
+    Rounds of samples are drawn until one of them was free of mistakes with the wanted confidence,
+    judged by the matches that agree with the best pose so far.
+    """
+    size, found, drawn = sample_size(floor), Proposals.none(), 0
+    if len(np.unique(evidence.tentative.features)) < size:
+        return found
+    odds = _odds(evidence)
+    for _ in range(_ROUNDS):
+        samples = _draw(evidence, odds, size, settings.samples, rng)
+        rigid_ones = samples[_rigid(evidence, samples, floor)]
+        used = rigid_ones[:_HYPOTHESES]
+        share = 1.0 if len(rigid_ones) <= len(used) else len(used) / len(rigid_ones)
+        drawn += int(len(samples) * share)
+        if len(used):
+            found = found.join(_poses(evidence, used, floor))
+        if len(found) and drawn >= _needed(evidence, found, odds, size, _CONFIDENCE):
+            break
+    return found
+
+
+def _odds(evidence: Evidence) -> FloatArray:
+    """Probability of drawing each match: a feature's say is shared by its places."""
+    weight = 1.0 / evidence.tentative.places
+    return np.asarray(weight / weight.sum())
+
+
+def _draw(
+    evidence: Evidence, odds: FloatArray, size: int, count: int, rng: np.random.Generator
+) -> IntArray:
+    """Samples (c, size) of matches without a feature or landmark twice."""
+    edges = np.cumsum(odds)
+    drawn = np.searchsorted(edges, rng.random((count, size)) * edges[-1], side="right")
+    drawn = np.minimum(drawn, len(odds) - 1)
+    keep = np.ones(count, np.bool_)
+    for a in range(size):
+        for b in range(a):
+            for column in (evidence.tentative.features, evidence.tentative.landmarks):
+                keep &= column[drawn[:, a]] != column[drawn[:, b]]
+    return np.asarray(drawn[keep])
+
+
+def _rigid(evidence: Evidence, samples: IntArray, floor: Floor) -> BoolArray:
+    pairs = evidence.pairs
+    here, there = pairs.seen.position[samples], pairs.points[samples]
+    # The map's ellipsoids are rounded to balls: their axes in the camera's frame are not known yet.
+    balls = np.trace(pairs.point_covariances, axis1=1, axis2=2) / 3.0
+    noise = pairs.seen.position_covariance + balls[:, None, None] * np.eye(3)
+    return np.asarray(rigid(here, there, noise[samples], floor))
+
+
+def _poses(evidence: Evidence, samples: IntArray, floor: Floor) -> Proposals:
+    pairs = evidence.pairs
+    poses = align(pairs.seen.position[samples], pairs.points[samples], floor)
+    rows = np.repeat(np.arange(len(samples)), samples.shape[1])
+    sampled: Pairs = pairs.select(samples.ravel())
+    poses, covariances = refine(evidence.rig, floor, poses, sampled, rows, _SAMPLED_STEPS)
+    good = np.isfinite(covariances).all(axis=(1, 2)) & np.isfinite(poses).all(axis=(1, 2))
+    poses, covariances = poses[good], covariances[good]
+    scores = evidence.scores(poses, covariances)
+    order = np.argsort(-scores, kind="stable")
+    return Proposals(poses[order], covariances[order], scores[order])
+
+
+def _needed(
+    evidence: Evidence, found: Proposals, odds: FloatArray, size: int, confidence: float
+) -> float:
+    """Samples after which one was clean, if the best pose's matches are all that are right."""
+    agreeing = evidence.agreeing(found.poses[0], found.covariances[0])
+    chance = float(odds[agreeing].sum()) ** size
+    if chance <= 0.0:
+        return np.inf
+    if chance >= 1.0:
+        return 1.0
+    return float(np.log(1.0 - confidence) / np.log1p(-chance))
+
+
+_BIN_M = 0.3  # side of a bin
+_BIN_DEG = 5.0  # width of a bin of heading
+_BINS = 16  # fullest ones whose matches are solved for a pose
+_VOTED_STEPS = 6  # Newton steps from a bin's mean to the least squares of its matches
+_VOTED_KERNEL_WIDTH = 3.0
+_MOST_BINS = 16_000_000  # the accumulator's; larger maps get wider bins
+
+
+def propose_by_votes(evidence: Evidence, floor: Floor) -> Proposals:
+    """Poses of the fullest bins after least squares over their matches, best first."""
+    if len(evidence.pairs) < 2:
+        return Proposals.none()
+    grid = _Grid(evidence, floor)
+    peaks = grid.peaks(_BINS)
+    members = [grid.members(peak) for peak in peaks]
+    members = [group for group in members if len(group) >= 2]
+    if not members:
+        return Proposals.none()
+    starts = np.concatenate([_aligned(evidence, group, floor) for group in members])
+    rows = np.repeat(np.arange(len(members)), [len(group) for group in members])
+    pairs = evidence.pairs.select(np.concatenate(members))
+    poses, covariances = refine(
+        evidence.rig, floor, starts, pairs, rows, _VOTED_STEPS, _VOTED_KERNEL_WIDTH
+    )
+    good = np.isfinite(covariances).all(axis=(1, 2)) & np.isfinite(poses).all(axis=(1, 2))
+    poses, covariances = poses[good], covariances[good]
+    scores = evidence.scores(poses, covariances)
+    order = np.argsort(-scores, kind="stable")
+    return Proposals(poses[order], covariances[order], scores[order])
+
+
+def _aligned(evidence: Evidence, group: IntArray, floor: Floor) -> FloatArray:
+    """(1, 4, 4) closed-form pose of a bin's matches."""
+    pairs = evidence.pairs
+    return align_planar(pairs.seen.position[group][None], pairs.points[group][None], floor)
+
+
+class _Grid:
+    """The accumulator: every feature has one vote a bin, however many landmarks it resembles."""
+
+    def __init__(self, evidence: Evidence, floor: Floor) -> None:
+        axes = floor_axes(floor)
+        self._features = evidence.tentative.features
+        self._headings = max(4, round(360.0 / _BIN_DEG))
+        angles = np.arange(self._headings) * (2.0 * np.pi / self._headings)
+        here, there = evidence.pairs.seen.position @ axes, evidence.pairs.points @ axes
+        turn = np.stack([np.cos(angles), np.sin(angles)])
+        turned = np.stack(
+            [
+                here[:, :1] * turn[0] - here[:, 1:] * turn[1],
+                here[:, :1] * turn[1] + here[:, 1:] * turn[0],
+            ],
+            axis=2,
+        )
+        positions = there[:, None, :] - turned  # (k, headings, 2)
+        low = positions.min(axis=(0, 1))
+        extent = positions.max(axis=(0, 1)) - low
+        area = float(np.prod(extent + 4.0 * _BIN_M))
+        self._side = max(_BIN_M, float(np.sqrt(area * self._headings / _MOST_BINS)))
+        # Each vote goes to the two nearest bins of either coordinate (Lowe 1999).
+        self._corner = np.floor((positions - low) / self._side - 0.5).astype(np.int64) + 1
+        self._shape = (*(np.floor(extent / self._side).astype(np.int64) + 4), self._headings)
+        self._counts = self._vote()
+
+    def _vote(self) -> IntArray:
+        counts = np.zeros(int(np.prod(self._shape)), np.int64)
+        bounds = np.flatnonzero(np.diff(self._features, prepend=-1))
+        for group in np.split(np.arange(len(self._features)), bounds[1:]):
+            counts[np.unique(self._bins(group))] += 1
+        return counts
+
+    def _bins(self, rows: IntArray) -> IntArray:
+        """Flat bins of matches (m,), four a heading: (m, headings, 4)."""
+        corner = self._corner[rows]
+        steps = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+        at = corner[:, :, None, :] + steps
+        heading = np.arange(self._headings)[None, :, None]
+        return np.asarray((at[..., 0] * self._shape[1] + at[..., 1]) * self._headings + heading)
+
+    def peaks(self, count: int) -> IntArray:
+        """The fullest bins, one of each neighbourhood (3 x 3 bins, three headings)."""
+        fullest = np.argsort(-self._counts, kind="stable")[: 40 * count]
+        fullest = fullest[self._counts[fullest] >= 2]
+        at = np.stack(np.unravel_index(fullest, self._shape), axis=1)
+        chosen: list[int] = []
+        for k in range(len(fullest)):
+            gap = np.abs(at[chosen] - at[k])
+            gap[:, 2] = np.minimum(gap[:, 2], self._headings - gap[:, 2])
+            if not (gap <= 1).all(axis=1).any():
+                chosen.append(k)
+            if len(chosen) == count:
+                break
+        return np.asarray(fullest[np.array(chosen, np.int64)])
+
+    def members(self, peak: int) -> IntArray:
+        """Matches that voted for a bin."""
+        x, z, heading = np.unravel_index(peak, self._shape)
+        gap = np.array([x, z]) - self._corner[:, heading]
+        return np.flatnonzero(((gap == 0) | (gap == 1)).all(axis=1))

@@ -10,17 +10,16 @@ from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
 from fgslam.core.features import StereoFeatures
 from fgslam.core.floor import Floor
 from fgslam.core.sensors import CameraRig
-from fgslam.frontend.places.relocalisation.known_map import KnownMap
-from fgslam.frontend.places.relocalisation.least_squares import refine
+from fgslam.frontend.places.relocalisation.known_map import MAX_DISTANCE, KnownMap, gated
 from fgslam.frontend.places.relocalisation.proposals import Evidence, Proposals
 from fgslam.frontend.places.relocalisation.residuals import (
     Pairs,
     SeenPoints,
+    refine,
     residuals,
     squared_distances,
 )
-from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
-from fgslam.frontend.places.relocalisation.tentative import MAX_DISTANCE, gated
+from fgslam.frontend.settings import RelocalisationSettings
 
 PIECE_M = 0.5  # landmarks in a cube of this side drift together and may be one object, moved as one
 _GATE_SIGMAS = 4.0  # largest normalised residual (three numbers) of an inlier

@@ -7,7 +7,7 @@ import pytest
 
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.frontend.features.colour_moments import PAIRS, PatchColours, colour_from_means
-from fgslam.frontend.features.omni_settings import ColourMomentSettings
+from fgslam.frontend.features.settings import ColourMomentSettings
 
 
 def patch(seed: int = 1) -> Image:

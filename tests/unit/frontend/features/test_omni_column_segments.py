@@ -9,9 +9,13 @@ from fgslam.cameras.omni.panoramas import Cylinder
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.homing import ColumnSegments
 from fgslam.core.planar import wrap
-from fgslam.frontend.features.column_segments import ColumnSegmentFinder, dct_rows
-from fgslam.frontend.features.column_whitening import COVARIANCE, whitened
-from fgslam.frontend.features.omni_settings import (
+from fgslam.frontend.features.column_segments import (
+    COVARIANCE,
+    ColumnSegmentFinder,
+    dct_rows,
+    whitened,
+)
+from fgslam.frontend.features.settings import (
     ColourMomentSettings,
     ColumnSegmentSettings,
     OmniMatchingSettings,

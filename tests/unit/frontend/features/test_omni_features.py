@@ -17,7 +17,7 @@ from fgslam.core.homing import FeatureKind, OmniFeatures, UprightFeatures
 from fgslam.core.planar import wrap
 from fgslam.frontend.features.colour_sift import _SIGMA_SCALES, up_in_image, wrapping_period
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor, _View
-from fgslam.frontend.features.omni_settings import (
+from fgslam.frontend.features.settings import (
     OmniFeatureSettings,
     OmniMatchingSettings,
     UprightSiftSettings,

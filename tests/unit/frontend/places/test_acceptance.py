@@ -9,14 +9,14 @@ import pytest
 
 from fgslam.core.arrays import IntArray
 from fgslam.core.estimates import LandmarkMap, RelocalisationStatus
-from fgslam.frontend.places.relocalisation.acceptance import (
+from fgslam.frontend.places.relocalisation.known_map import Tentative
+from fgslam.frontend.places.relocalisation.refinement import Refined
+from fgslam.frontend.places.relocalisation.relocaliser import (
     ENOUGH_INLIERS,
     MAX_MISFIT,
     accept,
 )
-from fgslam.frontend.places.relocalisation.refinement import Refined
-from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
-from fgslam.frontend.places.relocalisation.tentative import Tentative
+from fgslam.frontend.settings import RelocalisationSettings
 
 SETTINGS = RelocalisationSettings()
 # A metre apart: each is an independent inlier. The first hundred stand at one place, and so on.

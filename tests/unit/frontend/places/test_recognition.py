@@ -27,9 +27,9 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotionStatus
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.datasets.settings import ConstantVelocitySettings
-from fgslam.frontend.places.loops.confirmation import difference
-from fgslam.frontend.places.loops.recognition import PlaceRecognition
-from fgslam.frontend.places.settings import LostSettings
+from fgslam.frontend.places.closures import difference
+from fgslam.frontend.places.recognition import PlaceRecognition
+from fgslam.frontend.settings import LostSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.motion import ConstantVelocityMotion

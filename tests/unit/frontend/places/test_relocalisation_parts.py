@@ -8,10 +8,8 @@ import pytest
 from fgslam.core import geometry
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import StereoFeatures
-from fgslam.frontend.places.relocalisation.alignment import align, align_in_space, rigid
-from fgslam.frontend.places.relocalisation.appearance_index import Neighbours
-from fgslam.frontend.places.relocalisation.known_map import KnownMap
-from fgslam.frontend.places.relocalisation.least_squares import refine
+from fgslam.frontend.features.descriptor_index import Neighbours
+from fgslam.frontend.places.relocalisation.known_map import KnownMap, specific
 from fgslam.frontend.places.relocalisation.proposals import Evidence, Proposals, distinct
 from fgslam.frontend.places.relocalisation.refinement import (
     Refiner,
@@ -24,10 +22,11 @@ from fgslam.frontend.places.relocalisation.residuals import (
     Pairs,
     SeenPoints,
     log_uniform,
+    refine,
     residuals,
 )
-from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
-from fgslam.frontend.places.relocalisation.tentative import specific
+from fgslam.frontend.settings import RelocalisationSettings
+from fgslam.frontend.tracking.resection import align, align_in_space, rigid
 from tests.known_places import RIG, Place, error, floor, planar, room, seen
 
 

@@ -13,7 +13,7 @@ from fgslam.core.estimates import Relocalisation, RelocalisationStatus
 from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import pose, so3_exp
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
-from fgslam.frontend.places.relocalisation.settings import RelocalisationSettings
+from fgslam.frontend.settings import RelocalisationSettings
 from tests.known_places import RIG, Place, error, floor, planar, room, seen, things
 
 DEFAULTS = RelocalisationSettings(map_sigma_m=0.001, view_sigma_px=0.0)

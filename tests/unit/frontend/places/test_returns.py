@@ -15,14 +15,17 @@ from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, LoopClosure, Observations
 from fgslam.frontend.features.settings import AppearanceSettings
-from fgslam.frontend.places.loops.closure import close_loop
-from fgslam.frontend.places.loops.confirmation import Confirmation, difference, drift_allows
-from fgslam.frontend.places.loops.fusion import duplicates
-from fgslam.frontend.places.loops.memory import SightingMemory
-from fgslam.frontend.places.settings import LoopSettings
+from fgslam.frontend.places.closures import (
+    Confirmation,
+    close_loop,
+    difference,
+    drift_allows,
+    duplicates,
+)
+from fgslam.frontend.places.sightings import SightingMemory
+from fgslam.frontend.settings import EgoMotionSettings, LoopSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.resection import Resection
-from fgslam.frontend.tracking.settings import EgoMotionSettings
 
 LOOPS = LoopSettings()
 DOWN = np.array([0.0, 1.0, 0.0])

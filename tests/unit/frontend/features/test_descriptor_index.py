@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import ByteArray
-from fgslam.frontend.features import vocabulary
-from fgslam.frontend.places.relocalisation import appearance_index
-from fgslam.frontend.places.relocalisation.appearance_index import AppearanceIndex, Neighbours
+from fgslam.frontend.features import descriptor_index
+from fgslam.frontend.features.descriptor_index import AppearanceIndex, Neighbours
+from fgslam.frontend.tracking import views as views_module
+from fgslam.frontend.tracking.views import ViewPool, Views
 from tests.known_places import blurred, looks
 
 
@@ -33,7 +34,7 @@ def test_small_contents_are_answered_exactly(rng: np.random.Generator) -> None:
 def test_large_contents_are_answered_nearly(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(appearance_index, "_EXACT", 100)
+    monkeypatch.setattr(descriptor_index, "_EXACT", 100)
     held = looks(rng, 4000)
     asked = blurred(held[:200], rng)
     found = AppearanceIndex(held).query(asked, 3)
@@ -49,11 +50,11 @@ def test_every_cell_searched_finds_what_a_full_search_does(
 ) -> None:
     held, asked = looks(rng, 900), looks(rng, 40)
     held[450:600] = held[300:450]  # ties, at the last of the asked neighbours as well
-    monkeypatch.setattr(appearance_index, "_CHUNK", chunk)
+    monkeypatch.setattr(descriptor_index, "_CHUNK", chunk)
     in_full = AppearanceIndex(held).query(asked, 7)
-    monkeypatch.setattr(appearance_index, "_EXACT", 0)
-    monkeypatch.setattr(appearance_index, "_PROBES", 256)
-    monkeypatch.setattr(appearance_index, "_LEADING", chunk)
+    monkeypatch.setattr(descriptor_index, "_EXACT", 0)
+    monkeypatch.setattr(descriptor_index, "_PROBES", 256)
+    monkeypatch.setattr(descriptor_index, "_LEADING", chunk)
     probed = AppearanceIndex(held).query(asked, 7)
     _assert_equal(in_full, probed)
 
@@ -62,10 +63,10 @@ def test_every_cell_searched_finds_what_a_full_search_does(
 def test_words_at_hand_change_nothing(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
 ) -> None:
-    monkeypatch.setattr(appearance_index, "_EXACT", exact)
+    monkeypatch.setattr(descriptor_index, "_EXACT", exact)
     held, asked = looks(rng, 500), looks(rng, 30)
     found = AppearanceIndex(held).query(asked, 8)
-    given = AppearanceIndex(held, vocabulary.words_of(held)).query(asked, 8)
+    given = AppearanceIndex(held, descriptor_index.words_of(held)).query(asked, 8)
     _assert_equal(found, given)
 
 
@@ -73,10 +74,10 @@ def test_words_at_hand_change_nothing(
 def test_queries_are_answered_one_by_one(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
 ) -> None:
-    monkeypatch.setattr(appearance_index, "_EXACT", exact)
+    monkeypatch.setattr(descriptor_index, "_EXACT", exact)
     held, asked = looks(rng, 500), looks(rng, 30)
     together = AppearanceIndex(held).query(asked, 4)
-    monkeypatch.setattr(appearance_index, "_AT_ONCE", 7)
+    monkeypatch.setattr(descriptor_index, "_AT_ONCE", 7)
     apart = AppearanceIndex(held).query(asked, 4)
     _assert_equal(together, apart)
 
@@ -85,7 +86,7 @@ def test_queries_are_answered_one_by_one(
 def test_ties_come_in_the_order_of_their_rows_and_none_too_many(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
 ) -> None:
-    monkeypatch.setattr(appearance_index, "_EXACT", exact)
+    monkeypatch.setattr(descriptor_index, "_EXACT", exact)
     look = looks(rng, 1)
     held = np.concatenate([looks(rng, 5), np.repeat(look, 6, axis=0)])
     found = AppearanceIndex(held).query(look, 3)
@@ -97,7 +98,7 @@ def test_ties_come_in_the_order_of_their_rows_and_none_too_many(
 def test_what_is_not_held_is_marked(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
 ) -> None:
-    monkeypatch.setattr(appearance_index, "_EXACT", exact)
+    monkeypatch.setattr(descriptor_index, "_EXACT", exact)
     made = AppearanceIndex(looks(rng, 2))
     found = made.query(looks(rng, 4), 6)
     missing = found.rows == -1
@@ -107,3 +108,52 @@ def test_what_is_not_held_is_marked(
     nothing = AppearanceIndex(looks(rng, 0))
     assert len(nothing) == 0
     assert (nothing.query(looks(rng, 4), 2).rows == -1).all()
+
+
+def _views(descriptors: ByteArray) -> Views:
+    n = len(descriptors)
+    return Views(
+        np.ones(n), np.zeros(n), descriptors, np.zeros((n, 3), np.float32), np.zeros(n, np.int64)
+    )
+
+
+def test_words_are_the_nearest_centres(rng: np.random.Generator) -> None:
+    descriptors = looks(rng, 5000)  # more than are compared at once
+    extreme = np.array([[255] * 128, [0] * 128], np.uint8)
+    descriptors = np.concatenate([descriptors, extreme, descriptor_index.vocabulary()])
+    centres = descriptor_index.vocabulary().astype(np.int64)
+    own = descriptors.astype(np.int64)
+    squared = (own**2).sum(axis=1)[:, None] + (centres**2).sum(axis=1) - 2 * own @ centres.T
+    order = np.argsort(squared, axis=1, kind="stable")
+    assert np.array_equal(descriptor_index.words_of(descriptors), order[:, 0])
+    assert np.array_equal(descriptor_index.nearest_words(descriptors[:50], 12), order[:50, :12])
+
+
+def test_a_word_is_found_once_in_a_views_life(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+
+    def counted(descriptors: ByteArray) -> np.ndarray:
+        asked.append(len(descriptors))
+        return descriptor_index.words_of(descriptors)
+
+    monkeypatch.setattr(views_module, "words_of", counted)
+    pool = ViewPool(max_views=1, angle=0.0)
+    first, later = looks(rng, 100), looks(rng, 3)
+    places = pool.start(_views(first))
+    assert np.array_equal(pool.words(places[:40, 0]), descriptor_index.words_of(first[:40]))
+    assert np.array_equal(pool.words(places[:, 0]), descriptor_index.words_of(first))
+    pool.refresh(places[10:13], _views(later))
+    pool.release(places[50:52])
+    anew = pool.start(_views(later[:2]))  # in the places just released
+    first[10:13] = later
+    assert np.array_equal(pool.words(places[:50, 0]), descriptor_index.words_of(first[:50]))
+    assert np.array_equal(pool.words(anew[:, 0]), descriptor_index.words_of(later[:2]))
+    more = pool.start(_views(first))  # the pool grows; what is known stays known
+    assert np.array_equal(pool.words(places[:50, 0]), descriptor_index.words_of(first[:50]))
+    assert asked == [40, 60, 3, 2, 0]
+    pool.find_words()
+    pool.find_words()
+    assert np.array_equal(pool.words(more[:, 0]), descriptor_index.words_of(first))
+    assert asked[5:] == [100, 0, 0]

@@ -12,9 +12,9 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.sensors import CameraRig, measurement_map, vertical_to_horizontal
-from fgslam.frontend.features.candidates import alike, choose, pairs_within
+from fgslam.frontend.features.matching import alike, choose, pairs_within
 from fgslam.frontend.features.settings import AppearanceSettings
-from fgslam.frontend.stereo.settings import StereoSettings
+from fgslam.frontend.settings import StereoSettings
 
 
 class StereoMatcher:

@@ -14,11 +14,16 @@ from fgslam.core.geometry import inverse
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, LoopClosure
 from fgslam.frontend.features.settings import AppearanceSettings
-from fgslam.frontend.places.loops.closure import close_loop, is_sharp
-from fgslam.frontend.places.loops.confirmation import Confirmation, difference, drift_allows
-from fgslam.frontend.places.loops.fusion import duplicates
-from fgslam.frontend.places.loops.memory import SightingMemory
-from fgslam.frontend.places.settings import LoopSettings, LostSettings
+from fgslam.frontend.places.closures import (
+    Confirmation,
+    close_loop,
+    difference,
+    drift_allows,
+    duplicates,
+    is_sharp,
+)
+from fgslam.frontend.places.sightings import SightingMemory
+from fgslam.frontend.settings import LoopSettings, LostSettings
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
 
 _STREAM = 11  # of random numbers, beside those of the recording

@@ -1,4 +1,4 @@
-"""Settings of map matching, the landmark database and the ego-motion."""
+"""Settings of the SLAM front-end: stereo, landmark database, map matching, ego-motion, places."""
 
 from __future__ import annotations
 
@@ -8,6 +8,43 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT
+from fgslam.frontend.features.settings import AppearanceSettings, SiftSettings
+
+
+@dataclass(frozen=True, config=STRICT)
+class StereoSettings:
+    """Matching over the rig (Se et al. 2.2); gates from the authors' later paper (IJRR 2002)."""
+
+    epipolar_px: Annotated[
+        float, Field(gt=0.0, description="largest distance from the epipolar line")
+    ] = 1.0
+    min_disparity_px: Annotated[
+        float, Field(gt=0.0, description="smallest disparity; below it depth is meaningless")
+    ] = 1.0
+    max_disparity_px: Annotated[
+        float, Field(gt=0.0, description="largest disparity; 20 in IJRR 2002 (1.4 m at 320x240)")
+    ] = 40.0
+    scale_ratio: Annotated[
+        float, Field(gt=1.0, description="largest ratio of scales; one level is 1.5 in IJRR 2002")
+    ] = 1.5
+    orientation_deg: Annotated[
+        float, Field(gt=0.0, le=180.0, description="largest difference of orientations")
+    ] = 20.0
+    disparity_agreement_px: Annotated[
+        float,
+        Field(gt=0.0, description="largest difference of horizontal and vertical disparity"),
+    ] = 1.0
+    measurement: Annotated[
+        Literal["fused", "paper"],
+        Field(
+            description="`paper`: reference (row, column) and the mean of both disparities; "
+            "`fused`: least squares over all coordinates of the two or three images"
+        ),
+    ] = "fused"
+    pixel_sigma: Annotated[
+        float,
+        Field(gt=0.0, description="standard deviation of a SIFT coordinate, pixels"),
+    ] = 0.3
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -209,3 +246,159 @@ class EgoMotionSettings:
     max_correction_deg: Annotated[
         float, Field(gt=0.0, description="cap on the correction of the odometry (5)")
     ] = 6.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class RelocalisationSettings:
+    """Global localisation from one frame, or from a short submap of frames."""
+
+    method: Annotated[
+        Literal["ransac", "hough"],
+        Field(description="how poses are proposed: from minimal samples of matches, or by votes"),
+    ] = "ransac"
+    descriptors: Annotated[
+        bool,
+        Field(
+            description="propose matches by SIFT descriptor; false: by size, height and "
+            "orientation alone, as features without descriptors would"
+        ),
+    ] = True
+    samples: Annotated[
+        int,
+        Field(ge=16, description="minimal samples drawn at a time; most fail the rigidity test"),
+    ] = 4096
+    view_sigma_px: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="added to a feature's noise: from elsewhere it is found elsewhere, pixels",
+        ),
+    ] = 0.3
+    map_sigma_m: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="added to a landmark's: what the map's drift hides from its covariances",
+        ),
+    ] = 0.01
+    min_inliers: Annotated[
+        int,
+        Field(
+            ge=3,
+            description="fewer independent inliers are no pose; at most four count of one piece "
+            "of the map, which may be one object",
+        ),
+    ] = 8
+    max_sigma_m: Annotated[
+        float, Field(gt=0.0, description="largest standard deviation of an accepted position")
+    ] = 0.05
+    max_sigma_deg: Annotated[
+        float, Field(gt=0.0, description="largest standard deviation of an accepted heading")
+    ] = 1.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class LostSettings:
+    """When a robot counts as lost, and what it then does."""
+
+    after: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="frames in a row that the landmarks did not locate, until the whole map is "
+            "searched",
+        ),
+    ] = 2
+    give_up_after: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="frames lost until mapping goes on from the odometry; until then nothing "
+            "new enters the map, which would be misplaced if the robot was carried off",
+        ),
+    ] = 10
+
+
+@dataclass(frozen=True, config=STRICT)
+class LoopSettings:
+    """When a return is looked for, and what it takes to be believed."""
+
+    every: Annotated[
+        int,
+        Field(ge=1, description="frames between looks; after a place was recognised, every frame"),
+    ] = 4
+    forgotten_after: Annotated[
+        int,
+        Field(
+            ge=2,
+            description="frames unseen until seeing a landmark again is a return; more recent ones "
+            "are the tracker's business",
+        ),
+    ] = 60
+    confirm: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="frames in a row that must find the same offset between map and estimate",
+        ),
+    ] = 3
+    max_drift_m: Annotated[
+        float, Field(gt=0.0, description="drift that needs no way to have come about, metres")
+    ] = 0.5
+    max_drift_share: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="drift of position that is believed, as a share of the way since; poor "
+            "wheels with a gyro-less heading reach 0.05",
+        ),
+    ] = 0.08
+    max_drift_deg: Annotated[
+        float, Field(gt=0.0, description="drift of heading that needs no way, degrees")
+    ] = 10.0
+    max_drift_deg_m: Annotated[
+        float, Field(ge=0.0, description="drift of heading that is believed, degrees a metre")
+    ] = 0.25
+    min_matches: Annotated[
+        int, Field(ge=3, description="old landmarks that must agree on the closure in the end")
+    ] = 12
+    max_sigma_m: Annotated[
+        float,
+        Field(gt=0.0, description="largest standard deviation of a closure's position, metres"),
+    ] = 0.10
+    max_sigma_deg: Annotated[
+        float,
+        Field(gt=0.0, description="largest standard deviation of a closure's heading, degrees"),
+    ] = 1.0
+    rest: Annotated[
+        int, Field(ge=0, description="frames after a closure in which no other is looked for")
+    ] = 15
+    fuse_m: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="after a closure, landmarks that look alike and lie this near to each "
+            "other become one; 0 leaves them",
+        ),
+    ] = 0.10
+
+
+@dataclass(frozen=True, config=STRICT)
+class FrontendSettings:
+    """All of the front-end."""
+
+    sift: SiftSettings = SiftSettings()
+    stereo: StereoSettings = StereoSettings()
+    appearance: AppearanceSettings = AppearanceSettings()
+    matching: MapMatchingSettings = MapMatchingSettings()
+    database: DatabaseSettings = DatabaseSettings()
+    ego_motion: EgoMotionSettings = EgoMotionSettings()
+    relocalisation: RelocalisationSettings = RelocalisationSettings()
+    loops: Annotated[
+        LoopSettings | None,
+        Field(description="look for returns to mapped places and close the loop; null does not"),
+    ] = None
+    lost: Annotated[
+        LostSettings | None,
+        Field(description="search the whole map when lost; null goes on by odometry alone"),
+    ] = None

@@ -1,1 +1,0 @@
-"""Stereo matching over two and three cameras."""
