@@ -62,16 +62,13 @@ def run(
 
     Ctrl-C ends it early with all files valid; --resume goes on from there.
     """
-    from fgslam.core.errors import ConfigError
     from fgslam.runs.config import load_experiment
 
-    if overwrite and resume:
-        raise ConfigError("--overwrite and --resume exclude each other; give one of them")
+    existing = _existing(overwrite, resume)
     maps = {"load": map_in, "save": map_out}
     given = [f"map.{key}={json.dumps(str(path))}" for key, path in maps.items() if path]
     settings = load_experiment(config, [*(overrides or ()), *given])
     folder = out or Path("runs") / settings.name
-    existing: ExistingFolder = "resume" if resume else "overwrite" if overwrite else "refuse"
 
     # Not before: a wrong key is answered before any library of numbers is loaded.
     from fgslam.runs.engine import resume_command
@@ -127,6 +124,7 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     overrides: options.EstimatorOverrides = None,
     out: options.Out = None,
     overwrite: options.OverwriteResults = False,
+    resume: options.ResumeResults = False,
     jobs: options.Jobs = 1,
     trials: options.TrialCount = None,
     seed: options.FirstSeed = None,
@@ -138,6 +136,8 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     Every estimator gets exactly the measurements that the run has logged. An estimator that fails
     says where and why; the others go on. With --trials the experiment is repeated with new noise,
     and paired tests say whether the smoothers beat the filters.
+
+    Ctrl-C ends it early; the same command with --resume does what is left.
     """
     from fgslam.cli.console import show_parts
     from fgslam.core.errors import ConfigError
@@ -147,7 +147,7 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     from fgslam.runs.trials import Seeds, run_trials
 
     names = None if estimators is None else tuple(estimators.split(","))
-    choice, existing = Choice(names, tuple(overrides or ())), _existing(overwrite)
+    choice, existing = Choice(names, tuple(overrides or ())), _existing(overwrite, resume)
     expected = None if check_baseline is None else read_baseline(check_baseline)
     if trials is None and seed is not None:
         raise ConfigError("--seed means nothing without --trials; give both or none")
@@ -160,7 +160,7 @@ def compare(  # noqa: PLR0913 - each option is a parameter
             seeds = Seeds(trials, seed)
             tried = run_trials(runs[0], seeds, choice, out, existing, jobs, progress, stopped)
             results = [tried]
-    _show(results)
+    _show(results, shlex.join(["fgslam", *sys.argv[1:], *([] if resume else ["--resume"])]))
     show_parts((), ate_tables(results))
     regression = _baselines(metrics_of(results), write_baseline, expected)
     _exit_as(results)
@@ -183,8 +183,13 @@ def _baselines(results: Results, written: Path | None, expected: dict[str, Any] 
     return any(deviation.regression for deviation in deviations)
 
 
-def _existing(overwrite: bool) -> ExistingFolder:
-    return "overwrite" if overwrite else "refuse"
+def _existing(overwrite: bool, resume: bool = False) -> ExistingFolder:
+    """What to do with results that are there. Raises ConfigError where both were asked for."""
+    from fgslam.core.errors import ConfigError
+
+    if overwrite and resume:
+        raise ConfigError("--overwrite and --resume exclude each other; give one of them")
+    return "resume" if resume else "overwrite" if overwrite else "refuse"
 
 
 @app.command()

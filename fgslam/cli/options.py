@@ -193,6 +193,9 @@ Out = Annotated[
 OverwriteResults = Annotated[
     bool, typer.Option("--overwrite", help="replace an earlier comparison")
 ]
+ResumeResults = Annotated[
+    bool, typer.Option("--resume", help="go on with an interrupted one, to the same bytes")
+]
 Jobs = Annotated[
     int, typer.Option(min=1, help="processes at a time; more than 1 disturbs the times")
 ]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -18,7 +19,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pytest
@@ -27,10 +28,15 @@ from PIL import Image as PictureFile
 from recordings import experiment
 
 from fgslam.core import files
+from fgslam.core.errors import ConfigError, OutputError
+from fgslam.report.tables import write_comparison_csv
+from fgslam.runs.choosing import Choice
+from fgslam.runs.compare import compare_runs
 from fgslam.runs.config import parse_experiment
 from fgslam.runs.engine import RunResult
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.run import run_experiment
+from fgslam.runs.trials import Seeds, run_trials
 
 QUIET = {"pictures": False, "report": False, "checkpoint_seconds": 0.0}
 SILENT = {"pictures": 1, "report": False}
@@ -46,6 +52,9 @@ TASKS = (
     "homing_trials",
     "homing",
     "path_following",
+    "compare",
+    "compare_homing",
+    "trials",
 )
 HOUSE: dict[str, Any] = {
     "name": "short",
@@ -64,6 +73,9 @@ main()
 """
 _TIMED_FILES = ("timing.csv", "trials_timing.csv", "report.html")
 _TIMED_VALUES = ("ms", "mb", "seconds", "second", "growth", "memory")
+
+
+Doing: TypeAlias = Callable[[Path, ExistingFolder], RunResult]
 
 
 class Killed(BaseException):
@@ -130,6 +142,36 @@ def values_of(recording: Path, views: Path) -> Callable[[str], dict[str, Any]]:
     return known.__getitem__
 
 
+@pytest.fixture(scope="module")
+def doing(
+    values_of: Callable[[str], dict[str, Any]], tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], Doing]:
+    """What does the work of a task into a folder; comparisons are of runs that are made once."""
+    base = tmp_path_factory.mktemp("compared")
+    estimators = Choice(("odometry", "landmark_kalman", "ekf"))
+
+    def compared(task: str, choice: Choice) -> Doing:
+        logged = base / task
+        if not logged.is_dir():
+            run(values_of(task), logged)
+        return lambda folder, existing: compare_runs([logged], choice, folder, existing)[0]
+
+    def found(task: str) -> Doing:
+        if task == "compare":
+            return compared("measurements", estimators)
+        if task == "compare_homing":
+            return compared("homing_trials", Choice(("homing_ekf", "alv")))
+        if task == "trials":
+            path = base / "trials.yaml"
+            path.write_text(yaml.safe_dump(values_of("measurements")))
+            return lambda folder, existing: run_trials(
+                path, Seeds(2, 5), Choice(), folder, existing
+            )
+        return lambda folder, existing: run(values_of(task), folder, existing)
+
+    return found
+
+
 @pytest.fixture(autouse=True)
 def here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Units in this process, few in a block, and every state saved."""
@@ -182,7 +224,7 @@ def renames(monkeypatch: pytest.MonkeyPatch, most: float, *, after: bool) -> lis
 def untimed(value: Any) -> Any:
     """A document without what was measured by a clock."""
     if isinstance(value, dict):
-        kept = {k: v for k, v in value.items() if not set(k.split("_")) & set(_TIMED_VALUES)}
+        kept = {k: v for k, v in value.items() if not set(re.split("[_ ]", k)) & set(_TIMED_VALUES)}
         return {k: untimed(v) for k, v in kept.items()}
     return [untimed(item) for item in value] if isinstance(value, list) else value
 
@@ -209,13 +251,14 @@ def content_of(folder: Path) -> dict[str, object]:
 class Straight:
     """Uninterrupted runs, each made once."""
 
-    def __init__(self, folder: Path, values_of: Callable[[str], dict[str, Any]]) -> None:
-        self._folder, self._values_of = folder, values_of
+    def __init__(self, doing: Callable[[str], Doing]) -> None:
+        self._doing = doing
         self._made: dict[str, tuple[dict[str, object], int]] = {}
 
     def of(self, task: str, folder: Path) -> tuple[dict[str, object], int]:
         """What a run into ``folder`` leaves there, and how many files it renames."""
         if task not in self._made:
+            self._doing(task)  # a run that is compared is made before files are counted
             with pytest.MonkeyPatch.context() as patch:
                 count = len(self._count(task, folder, patch))
             self._made[task] = content_of(folder), count
@@ -224,15 +267,13 @@ class Straight:
 
     def _count(self, task: str, folder: Path, patch: pytest.MonkeyPatch) -> list[Path]:
         seen = renames(patch, float("inf"), after=False)
-        assert run(self._values_of(task), folder).status == "finished"
+        assert self._doing(task)(folder, "refuse").status == "finished"
         return seen
 
 
 @pytest.fixture(scope="module")
-def straight(
-    values_of: Callable[[str], dict[str, Any]], tmp_path_factory: pytest.TempPathFactory
-) -> Straight:
-    return Straight(tmp_path_factory.mktemp("straight"), values_of)
+def straight(doing: Callable[[str], Doing]) -> Straight:
+    return Straight(doing)
 
 
 def moments(task: str, files: int, count: int) -> list[tuple[int, bool]]:
@@ -246,21 +287,21 @@ def killed_and_resumed(
     task: str,
     count: int,
     straight: Straight,
-    values_of: Callable[[str], dict[str, Any]],
+    doing: Callable[[str], Doing],
     tmp_path: Path,
 ) -> None:
-    values = values_of(task)
+    do = doing(task)
     expected, files = straight.of(task, tmp_path / "run")
     for most, after in moments(task, files, count):
         folder = tmp_path / "run"
         with pytest.MonkeyPatch.context() as patch:
             renames(patch, most, after=after)
             with pytest.raises(Killed):
-                run(values, folder)
+                do(folder, "refuse")
         if not unfinished(folder):
             shutil.rmtree(folder)
             continue  # killed after its last file
-        assert run(values, folder, "resume").status == "finished"
+        assert do(folder, "resume").status == "finished"
         found = content_of(folder)
         assert found.keys() == expected.keys(), (most, after)
         assert [n for n in found if found[n] != expected[n]] == [], (most, after)
@@ -271,17 +312,17 @@ def unfinished(folder: Path) -> bool:
     """Whether there is anything left to do."""
     metrics = folder / "metrics.json"
     begun = (folder / "units").is_dir() or (folder / "checkpoint.npz").is_file()
-    return begun or not metrics.is_file() or '"finished"' not in metrics.read_text()
+    return begun or not metrics.is_file() or '"interrupted"' in metrics.read_text()
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_killed_once_a_run_resumes_to_the_same_bytes(
     task: str,
     straight: Straight,
-    values_of: Callable[[str], dict[str, Any]],
+    doing: Callable[[str], Doing],
     tmp_path: Path,
 ) -> None:
-    killed_and_resumed(task, 1, straight, values_of, tmp_path)
+    killed_and_resumed(task, 1, straight, doing, tmp_path)
 
 
 @pytest.mark.slow
@@ -289,10 +330,10 @@ def test_killed_once_a_run_resumes_to_the_same_bytes(
 def test_killed_at_ten_moments_a_run_resumes_to_the_same_bytes(
     task: str,
     straight: Straight,
-    values_of: Callable[[str], dict[str, Any]],
+    doing: Callable[[str], Doing],
     tmp_path: Path,
 ) -> None:
-    killed_and_resumed(task, 10, straight, values_of, tmp_path)
+    killed_and_resumed(task, 10, straight, doing, tmp_path)
 
 
 @pytest.mark.parametrize("task", ["slam_compared", "localisation"])
@@ -371,3 +412,59 @@ def test_a_command_killed_by_a_signal_resumes_to_the_same_bytes(
     found = content_of(folder)
     assert found.keys() == expected.keys()
     assert [name for name in found if found[name] != expected[name]] == []
+
+
+def killed(do: Callable[[], object], most: int) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        renames(patch, most, after=True)
+        with pytest.raises(Killed):
+            do()
+
+
+def test_trials_and_comparisons_are_resumed_only_on_what_they_were_begun_with(
+    values_of: Callable[[str], dict[str, Any]], tmp_path: Path
+) -> None:
+    """Another first seed or another log would make a mixture of two results."""
+    source, logged, out = tmp_path / "trials.yaml", tmp_path / "run", tmp_path / "out"
+    values = values_of("measurements")
+    source.write_text(yaml.safe_dump(values))
+    killed(lambda: run_trials(source, Seeds(2, 5), Choice(), out), 8)
+    with pytest.raises(ConfigError, match="begun with first_seed 5, and now it is 6"):
+        run_trials(source, Seeds(2, 6), Choice(), out, "resume")
+    with pytest.raises(ConfigError, match="begun with trials 2, and now it is 3"):
+        run_trials(source, Seeds(3, 5), Choice(), out, "resume")
+    run(values, logged)
+    killed(lambda: compare_runs([logged]), 4)
+    other = tmp_path / "other"
+    run(values | {"seed": 1}, other)
+    shutil.copy(other / "measurements.npz", logged)
+    with pytest.raises(ConfigError, match="begun with log "):
+        compare_runs([logged], existing="resume")
+
+
+def test_of_several_comparisons_those_that_had_finished_stay_as_they_are(
+    values_of: Callable[[str], dict[str, Any]], tmp_path: Path
+) -> None:
+    values = values_of("measurements") | {"compare": ["odometry"]}
+    runs, out = [tmp_path / name for name in ("a", "b", "c")], tmp_path / "out"
+    for folder in runs:
+        run(values, folder)
+
+    def write(path: Path, *more: Any) -> None:
+        if path.parent == out / "b":
+            raise Killed
+        write_comparison_csv(path, *more)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fgslam.runs.slam_comparison.write_comparison_csv", write)
+        with pytest.raises(Killed):
+            compare_runs(runs, out=out)
+    first = (out / "a" / "metrics.json").read_bytes()
+    assert not (out / "c").exists()
+    results = compare_runs(runs, out=out, existing="resume")
+    assert [one.status for one in results] == ["finished"] * 3
+    assert (out / "a" / "metrics.json").read_bytes() == first
+    rows = list(csv.DictReader((out / "comparison.csv").read_text().splitlines()))
+    assert len(rows) == 6
+    with pytest.raises(OutputError, match="nothing to resume"):
+        compare_runs(runs[:1], out=out / "a", existing="resume")
