@@ -86,12 +86,15 @@ def camera_path(frames: int) -> FloatArray:
 
 
 def experiment(root: Path, **changes: object) -> dict[str, object]:
-    """Values of a configuration that runs the recording; whole groups may be replaced."""
+    """Values of a configuration that runs the recording; whole groups may be replaced.
+
+    Without pictures and page, which take longer than the run.
+    """
     return {
         "name": "boards",
         "dataset": {"kind": "image_folder", "path": str(root)},
         "frontend": {"matching": {"widen_sigmas": 3.0}},
-        "output": {"pictures": False, "checkpoint_seconds": 1000.0},
+        "output": {"pictures": False, "report": False, "checkpoint_seconds": 1000.0},
     } | changes
 
 

@@ -3,11 +3,27 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from recordings import experiment, write_recording
-from running import Finished, run_values
+from running import Finished, run_values, units_in_this_process
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _coarse_pictures() -> Iterator[None]:
+    """What pictures look like is tested elsewhere; here coarse ones, which are drawn faster."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fgslam.report.pictures.style.DPI", 50)
+        yield
+
+
+@pytest.fixture
+def in_this_process() -> Iterator[None]:
+    """Replays, pairs and drives in this process: one of its own imports everything for seconds."""
+    with units_in_this_process():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -6,7 +6,8 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -66,6 +67,21 @@ def stop_after(frames: int) -> Callable[[], bool]:
         return asked >= frames
 
     return stopped
+
+
+@contextmanager
+def units_in_this_process() -> Iterator[None]:
+    """The units of a run are done in this process, one after the other."""
+
+    def here(
+        function: Callable[[Any], Any], arguments: Sequence[Any], *_: object
+    ) -> Iterator[tuple[int, Any]]:
+        for k, argument in enumerate(arguments):
+            yield k, function(argument)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fgslam.runs.units.run_apart", here)
+        yield
 
 
 def bytes_of(folder: Path, names: tuple[str, ...] = SAME_BYTES) -> dict[str, bytes]:

@@ -377,7 +377,8 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 def test_a_disk_that_fills_up(recording: Path, small_disk: Path) -> None:
     """One clear error; what was written before stays whole, and goes on once there is room."""
-    values = experiment(recording, output={"pictures": False, "checkpoint_seconds": 0.0})
+    output = {"pictures": False, "report": False, "checkpoint_seconds": 0.0}
+    values = experiment(recording, output=output)
     folder = small_disk / "run"
     with pytest.raises(OutputError, match="the disk is full; free some space") as caught:
         run_values(values, folder)

@@ -49,7 +49,7 @@ def test_pictures(recording: Path, tmp_path: Path) -> None:
     values = experiment(
         recording,
         dataset={"kind": "image_folder", "path": str(recording), "stop": 2},
-        output={"pictures": True, "checkpoint_seconds": 0.0},
+        output={"pictures": True, "report": False, "checkpoint_seconds": 0.0},
     )
     straight = run_values(values, tmp_path / "straight")
     run_values(values, tmp_path / "resumed", stopped=stop_after(1))

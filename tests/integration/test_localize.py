@@ -27,7 +27,6 @@ def map_file(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("maps")
     dataset = {"kind": "image_folder", "path": str(recording), "stride": 2}
     values = experiment(recording, dataset=dataset, map={"save": str(folder / "boards.fgmap")})
-    values["output"] = {"pictures": False, "report": False, "checkpoint_seconds": 1000.0}
     run_values(values, folder / "run")
     return folder / "boards.fgmap"
 

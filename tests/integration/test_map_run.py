@@ -39,10 +39,7 @@ def mapped(recording: Path, first: int = 0, stop: int | None = None, **changes: 
     """Values of a run with a map; ``kind`` chooses the estimator, the rest goes to `map`."""
     kind = changes.pop("kind", KIND)
     dataset = {"kind": "image_folder", "path": str(recording), "start": first, "stop": stop}
-    quiet = {"pictures": False, "report": False, "checkpoint_seconds": 1000.0}
-    return experiment(
-        recording, dataset=dataset, estimator={"kind": kind}, map=changes, output=quiet
-    )
+    return experiment(recording, dataset=dataset, estimator={"kind": kind}, map=changes)
 
 
 @pytest.fixture(scope="module")

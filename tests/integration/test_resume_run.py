@@ -225,7 +225,7 @@ def long_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def long_values(long_recording: Path) -> dict[str, Any]:
-    output = {"pictures": False, "checkpoint_seconds": 0.0}
+    output = {"pictures": False, "report": False, "checkpoint_seconds": 0.0}
     return experiment(long_recording, output=output)
 
 

@@ -17,7 +17,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -173,16 +173,8 @@ def doing(
 
 
 @pytest.fixture(autouse=True)
-def here(monkeypatch: pytest.MonkeyPatch) -> None:
+def _small_steps(in_this_process: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Units in this process, few in a block, and every state saved."""
-
-    def apart(
-        function: Callable[[Any], Any], arguments: Sequence[Any], *_: object
-    ) -> Iterator[tuple[int, Any]]:
-        for k, argument in enumerate(arguments):
-            yield k, function(argument)
-
-    monkeypatch.setattr("fgslam.runs.units.run_apart", apart)
     monkeypatch.setattr("fgslam.runs.tasks.homing_views._VIEWS_A_BLOCK", 2)
     monkeypatch.setattr("fgslam.runs.tasks.homing_trials._BLOCK", 1)
     monkeypatch.setattr("fgslam.runs.tasks.homing_video._SAVE_EVERY_S", 0.0)
