@@ -1,6 +1,7 @@
 # Every target works from a fresh clone: what it needs is set up first, once.
 
-PYTEST = .venv/bin/python -m pytest -n 2
+# A module's tests on one worker, which shares what they make; the long ones, first by name, first.
+PYTEST = .venv/bin/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder
 DEMO_OUT ?= runs/demo
 
 .DEFAULT_GOAL := help

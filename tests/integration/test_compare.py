@@ -12,7 +12,14 @@ import numpy as np
 import pytest
 import yaml
 from recordings import experiment
-from running import KIND, main, metrics_of, run_values, write_config
+from running import (
+    KIND,
+    main,
+    metrics_of,
+    run_values,
+    units_in_this_process,
+    write_config,
+)
 
 from fgslam.backend.filters.settings import DeadReckoningSettings
 from fgslam.backend.smoothers.settings import Isam2Settings
@@ -116,6 +123,7 @@ def test_a_finished_run_on_measurements_is_neither_resumed_nor_replaced(
     assert "holds a run already" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_run_replays_its_own_log_to_the_bit(recording: Path, tmp_path: Path) -> None:
     values = experiment(recording) | {
         "estimator": {"kind": KIND, "label": "live"},
@@ -162,12 +170,14 @@ def test_compare_gives_the_runs_own_bytes_and_a_table(
     assert main(monkeypatch, "compare", measured, "--out", out) == 2
     assert "holds results already" in capsys.readouterr().err
     check = ("--overwrite", "--check-baseline", baseline)
-    assert main(monkeypatch, "compare", measured, "--out", out, *check) == 1
+    with units_in_this_process():
+        assert main(monkeypatch, "compare", measured, "--out", out, *check) == 1
     shown = capsys.readouterr().out
     assert "short_drive, world: ate_final_m: " in shown
     assert f"short_drive, {KIND}: " not in shown
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_one_estimator_may_fail(
     plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
@@ -188,6 +198,7 @@ def test_one_estimator_may_fail(
     assert main(monkeypatch, "compare", plain, "--out", out, *again) == 1
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_two_runs_are_compared_side_by_side(
     plain: Path, finished: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
@@ -263,7 +274,8 @@ def test_trials_repeat_to_the_byte_and_need_noise_to_vary(
     outs = [tmp_path / "a", tmp_path / "b"]
     assert main(monkeypatch, "compare", config, *common, "--out", outs[0], "--jobs", 2) == 0
     assert "2 trials, mean [95 % interval]" in capsys.readouterr().out
-    assert main(monkeypatch, "compare", plain, *common, "--out", outs[1]) == 0
+    with units_in_this_process():
+        assert main(monkeypatch, "compare", plain, *common, "--out", outs[1]) == 0
     first, second = ((out / "trials.csv").read_bytes() for out in outs)
     assert first == second
     rows = rows_of(outs[0] / "trials.csv")
@@ -283,6 +295,7 @@ def test_trials_repeat_to_the_byte_and_need_noise_to_vary(
     assert "one world of noise" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_trials_take_overrides_of_the_experiment_and_of_estimators(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

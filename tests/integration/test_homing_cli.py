@@ -106,6 +106,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_one_does_not(
     assert (again / name).read_bytes() == (trials / name).read_bytes()
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_logs_are_compared(
     trials: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:
@@ -141,6 +142,7 @@ def test_mistakes_in_comparing(
     assert words in mistake(capfd, monkeypatch, "compare", trials, *given)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_trials_repeat_simulated_homings_with_other_noise(
     trials: Path, tmp_path: Path, monkeypatch: Patch
 ) -> None:
@@ -152,6 +154,7 @@ def test_trials_repeat_simulated_homings_with_other_noise(
     assert load_homing(out / RUN_MARKER).seed == 7
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_baseline_of_homing_runs_is_checked(
     trials: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:

@@ -21,6 +21,8 @@ from fgslam.worlds.house_settings import HousePanoramaSettings, HousePathSetting
 STEPS, DT, SEED = 10, 0.1, 0
 QUIET = {"pictures": 0, "report": False}
 HOUSE = OmniHouseSettings(path=HousePathSettings(legs=1, spacing_m=2.0))
+# The house is built once for all tests, not in each process.
+pytestmark = pytest.mark.usefixtures("in_this_process")
 
 
 def run(folder: Path, values: dict[str, Any]) -> Path:
@@ -58,6 +60,7 @@ def test_between_gives_the_numbers_of_the_task_homing_pairs(tmp_path: Path) -> N
         "jobs": 1,
         "dataset": dataset,
         "reference": False,
+        "output": QUIET,
     }
     (row,) = rows(run(tmp_path, values | {"homing_vector": {"samples": 500}}) / "pairs.csv")
     answer = fg.HomingVector(world.camera, samples=500).between(*images)

@@ -3,8 +3,8 @@
 The commands run in a copy of the checkout whose `.venv` is the environment that runs the tests. Two
 are replaced: `make test` is shown but not run, since it would run this test again; `pip install .`
 would change that environment, so that it installs into a folder of its own, without dependencies
-and without downloading the build system. The fast test shortens the demo to its first frames, the
-slow one drives it whole.
+and without downloading the build system. The fast test shortens the demo to its first frames and
+draws no pictures, the slow one drives it whole.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-DEMO_SHORT = "fgslam run lab_loop --set dataset.stop=12 --set compare=[] --out runs/demo"
+DEMO_SHORT = (
+    "fgslam run lab_loop --set dataset.stop=6 --set compare=[] --set output.pictures=false"
+    " --out runs/demo"
+)
 
 
 def blocks(language: str) -> list[str]:
