@@ -58,107 +58,53 @@ class Trajectory(Brief):
         Raises:
             OutputError: the suffix is another one, a pose is not finite, or writing failed.
         """
-        write_trajectory(Path(path), self, remark)
+        path = Path(path)
+        texts = {".tum": _tum_text, ".kitti": _kitti_text}
+        if path.suffix.lower() not in texts:
+            raise OutputError(
+                f"cannot write {path}: unknown trajectory format '{path.suffix}'; use .tum or "
+                ".kitti"
+            )
+        _require_finite(path, self)
+        write_text(path, texts[path.suffix.lower()](self, remark))
 
     @staticmethod
     def load(path: str | Path) -> Trajectory:
-        """Reads a TUM file; `timestamp tx ty tz qx qy qz qw` a line, seconds and metres.
+        """Reads a TUM file: `timestamp tx ty tz qx qy qz qw` a line, seconds and metres.
 
         Raises:
-            DatasetError: the file is missing, a line is malformed, or the times do not increase.
+            DatasetError: the file is missing, a line is malformed, a quaternion is zero, or the
+                time stamps do not increase. The message names the line.
         """
-        return read_tum(Path(path))
+        path = Path(path)
+        expected = "timestamp tx ty tz qx qy qz qw on each line"
+        values, lines = _parse_rows(path, _read_text(path, expected), _TUM_COLUMNS, expected)
+        _refuse(path, lines, np.asarray(~np.isfinite(values).all(axis=1)), _NOT_FINITE)
+        norms = np.linalg.norm(values[:, 4:], axis=1)
+        _refuse(path, lines, norms < 0.5, "the quaternion has no length; repair or remove the line")
+        backwards = np.concatenate([[False], np.diff(values[:, 0]) <= 0.0])
+        _refuse(path, lines, backwards, "the time stamp does not increase; sort or repair the file")
+        poses = np.empty((len(values), 4, 4))
+        for out, row in zip(poses, values, strict=True):
+            out[:] = pose(rotation_from_quaternion(row[4:]), row[1:4])
+        return Trajectory(values[:, 0].copy(), poses)
 
 
-def write_trajectory(path: Path, trajectory: Trajectory, remark: str = "") -> None:
-    """Write a trajectory in the format that the suffix names: `.tum` or `.kitti`.
-
-    Args:
-        path: the file to write, atomically.
-        trajectory: poses ``wTc``.
-        remark: put into a comment line of `.tum`; `.kitti` knows no comments.
-
-    Raises:
-        OutputError: the suffix is another one, a pose is not finite, or writing failed.
-    """
-    suffix = path.suffix.lower()
-    if suffix == ".tum":
-        write_tum(path, trajectory, remark)
-    elif suffix == ".kitti":
-        write_kitti(path, trajectory)
-    else:
-        raise OutputError(
-            f"cannot write {path}: unknown trajectory format '{path.suffix}'; use .tum or .kitti"
-        )
-
-
-# --------------------------------------------------------------------------------------------
-# TUM
-
-
-def write_tum(path: Path, trajectory: Trajectory, remark: str = "") -> None:
-    """Write lines of `timestamp tx ty tz qx qy qz qw` (seconds, metres), as evo reads them.
-
-    Args:
-        path: the file to write, atomically.
-        trajectory: poses ``wTc``.
-        remark: put into a comment line in front.
-
-    Raises:
-        OutputError: a pose is not finite, or the file cannot be written.
-    """
-    _require_finite(path, trajectory)
+def _tum_text(trajectory: Trajectory, remark: str) -> str:
+    """Lines of `timestamp tx ty tz qx qy qz qw` (seconds, metres), as evo reads them."""
     rows = np.empty((len(trajectory), _TUM_COLUMNS))
     rows[:, 0] = trajectory.timestamps
     rows[:, 1:4] = trajectory.poses[:, :3, 3]
     for row, wTc in zip(rows, trajectory.poses, strict=True):
         row[4:] = _canonical(quaternion_from_rotation(wTc[:3, :3]))
     rows[:, 1:] = _without_negative_zeros(rows[:, 1:], decimals=12)
-    write_text(path, _comment(remark) + _format_rows(rows, _TUM_FORMAT))
+    return _comment(remark) + _format_rows(rows, _TUM_FORMAT)
 
 
-def read_tum(path: Path) -> Trajectory:
-    """Read a TUM trajectory: `timestamp tx ty tz qx qy qz qw`; `#` starts a comment.
-
-    Raises:
-        DatasetError: the file is missing, a line is malformed, a quaternion is zero, or the time
-            stamps do not increase. The message names the line.
-    """
-    expected = "timestamp tx ty tz qx qy qz qw on each line"
-    values, lines = _parse_rows(path, _read_text(path, expected), _TUM_COLUMNS, expected)
-    _refuse(path, lines, np.asarray(~np.isfinite(values).all(axis=1)), _NOT_FINITE)
-    norms = np.linalg.norm(values[:, 4:], axis=1)
-    _refuse(path, lines, norms < 0.5, "the quaternion has no length; repair or remove the line")
-    backwards = np.concatenate([[False], np.diff(values[:, 0]) <= 0.0])
-    _refuse(path, lines, backwards, "the time stamp does not increase; sort or repair the file")
-    poses = np.empty((len(values), 4, 4))
-    for out, row in zip(poses, values, strict=True):
-        out[:] = pose(rotation_from_quaternion(row[4:]), row[1:4])
-    return Trajectory(values[:, 0].copy(), poses)
-
-
-# --------------------------------------------------------------------------------------------
-# KITTI
-
-
-def write_kitti(path: Path, trajectory: Trajectory) -> None:
-    """Write one row-major 3x4 ``wTc`` a line (metres), as KITTI odometry and evo read.
-
-    The format has no time stamps. Raises OutputError as :func:`write_tum`.
-    """
-    _require_finite(path, trajectory)
+def _kitti_text(trajectory: Trajectory, _: str) -> str:
+    """One row-major 3x4 ``wTc`` a line (metres), as KITTI odometry and evo read; no time stamps."""
     rows = trajectory.poses[:, :3, :].reshape(len(trajectory), _KITTI_COLUMNS)
-    write_text(path, _format_rows(rows + 0.0, _KITTI_FORMAT))
-
-
-def read_kitti(path: Path) -> FloatArray:
-    """Poses (n, 4, 4) of a KITTI trajectory. Raises DatasetError naming the line at fault."""
-    expected = "the 12 numbers of a 3x4 matrix on each line"
-    values, lines = _parse_rows(path, _read_text(path, expected), _KITTI_COLUMNS, expected)
-    _refuse(path, lines, np.asarray(~np.isfinite(values).all(axis=1)), _NOT_FINITE)
-    poses = np.tile(np.eye(4), (len(values), 1, 1))
-    poses[:, :3, :] = values.reshape(-1, 3, 4)
-    return poses
+    return _format_rows(rows + 0.0, _KITTI_FORMAT)
 
 
 # --------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.files import make_subfolder, write_text
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.trajectories import write_covariances, write_tum
+from fgslam.core.trajectories import write_covariances
 from fgslam.report.point_cloud import MapPoints, write_ply
 from fgslam.slam.replay import Replay, ReplayRow
 
@@ -32,8 +32,8 @@ def write_estimate(
     folder: Path, online: Trajectory, estimate: Estimate, points: MapPoints, remark: str
 ) -> None:
     """Trajectories, covariances and map into an estimator's folder. Raises OutputError."""
-    write_tum(folder / "online.tum", online, remark)
-    write_tum(folder / "final.tum", estimate.trajectory, remark)
+    online.save(folder / "online.tum", remark)
+    estimate.trajectory.save(folder / "final.tum", remark)
     stamps = estimate.trajectory.timestamps
     write_covariances(folder / "covariance.csv", stamps, estimate.covariances, remark)
     write_ply(folder / "map.ply", points, remark)

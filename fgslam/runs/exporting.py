@@ -14,7 +14,6 @@ from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment
 from fgslam.core.saved_map import SavedMap, load_map
-from fgslam.core.trajectories import read_tum, write_trajectory
 from fgslam.report.graph_file import PoseLandmarkGraph, require_graph_suffix, write_g2o
 from fgslam.report.point_cloud import read_ply, write_map
 from fgslam.report.tables import read_metrics
@@ -62,8 +61,8 @@ def export_run(
         write_map(map_file, points, remark)
         lines.append(f"{map_file}: {len(points)} landmarks")
     if trajectory_file is not None:
-        trajectory = read_tum(folder / "final.tum")
-        write_trajectory(trajectory_file, trajectory, remark)
+        trajectory = Trajectory.load(folder / "final.tum")
+        trajectory.save(trajectory_file, remark)
         lines.append(f"{trajectory_file}: {len(trajectory)} poses")
     if graph_file is not None:
         lines.append(export_graph(graph_file, _log_of(run), folder, remark))
@@ -135,7 +134,7 @@ def export_map(
         write_map(map_file, points, remark)
         lines.append(f"{map_file}: {len(points)} landmarks")
     if trajectory_file is not None:
-        write_trajectory(trajectory_file, saved.trajectory, remark)
+        saved.trajectory.save(trajectory_file, remark)
         lines.append(f"{trajectory_file}: {len(saved.trajectory)} poses")
     return lines
 
@@ -199,7 +198,7 @@ def export_graph(path: Path, log_file: Path, folder: Path, remark: str = "") -> 
     """
     require_graph_suffix(path)  # now, not after seconds of reading
     log = MeasurementLog.load(log_file)
-    trajectory = read_tum(folder / "final.tum")
+    trajectory = Trajectory.load(folder / "final.tum")
     points = read_ply(folder / "map.ply")
     graph = build_graph(log, trajectory, points.ids, points.positions)
     write_g2o(path, graph, [*([remark] if remark else []), *_HEADER])

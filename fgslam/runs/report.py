@@ -17,7 +17,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError, FgslamError
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.trajectories import read_covariances, read_tum
+from fgslam.core.trajectories import read_covariances
 from fgslam.report.content import Picture
 from fgslam.report.point_cloud import MapPoints, read_ply
 from fgslam.report.run_results import (
@@ -68,7 +68,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
             "report.html, or give it to `fgslam compare`"
         )
     truth_file = _find(folders, "ground_truth.tum")
-    truth = None if truth_file is None else read_tum(truth_file)
+    truth = None if truth_file is None else Trajectory.load(truth_file)
     live = _live_title(config)
     timing = _live_times(_find(folders, "timing.csv")) if folder == folders[-1] else {}
     estimators = tuple(
@@ -185,7 +185,7 @@ def _estimator(
     failure = str(values.get("failure") or "")
     if not (folder / "final.tum").is_file():
         return EstimatorReport.failed(title, kind, failure or "it left no trajectory")
-    final = read_tum(folder / "final.tum")
+    final = Trajectory.load(folder / "final.tum")
     estimate = Estimate(
         trajectory=final,
         covariances=_covariances(folder / "covariance.csv", final),
@@ -210,7 +210,7 @@ def _covariances(path: Path, final: Trajectory) -> FloatArray:
 
 
 def _online(path: Path) -> Trajectory | None:
-    return read_tum(path) if path.is_file() else None
+    return Trajectory.load(path) if path.is_file() else None
 
 
 def _landmarks(path: Path) -> LandmarkMap:

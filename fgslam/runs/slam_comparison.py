@@ -14,7 +14,7 @@ import numpy as np
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.errors import DatasetError
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.trajectories import read_tum
+from fgslam.core.trajectories import Trajectory
 from fgslam.evaluation.judging import Truth, judge_replay, seen_often
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
 from fgslam.frontend.settings import EgoMotionSettings
@@ -172,7 +172,7 @@ def load_truth(run: Path, log: MeasurementLog) -> Truth:
         DatasetError: a file of it is damaged.
     """
     path, landmark_path = run / GROUND_TRUTH_FILE, run / LANDMARK_TRUTH_FILE
-    trajectory = read_tum(path) if path.is_file() else None
+    trajectory = Trajectory.load(path) if path.is_file() else None
     if not landmark_path.is_file():
         return Truth(trajectory)
     landmarks, sigma = read_landmark_truth(landmark_path)

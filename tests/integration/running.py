@@ -18,7 +18,7 @@ import yaml
 
 from fgslam.cli import main as cli
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.trajectories import read_covariances, read_tum
+from fgslam.core.trajectories import Trajectory, read_covariances
 from fgslam.report.point_cloud import read_ply
 from fgslam.runs.config import parse_config
 from fgslam.runs.engine import run_task
@@ -104,8 +104,8 @@ def assert_valid_results(folder: Path, frames: int | None = None, split_saves: i
     assert frames in (None, count)
     allowed = range(count, count + 1 + split_saves)
     log = MeasurementLog.load(folder / "measurements.npz")
-    final = read_tum(folder / KIND / "final.tum")
-    online = read_tum(folder / KIND / "online.tum")
+    final = Trajectory.load(folder / KIND / "final.tum")
+    online = Trajectory.load(folder / KIND / "online.tum")
     stamps, covariances = read_covariances(folder / KIND / "covariance.csv")
     points = read_ply(folder / KIND / "map.ply")
     rows = (folder / "timing.csv").read_text(encoding="utf-8").splitlines()

@@ -24,7 +24,7 @@ from running import (
 )
 
 from fgslam.core.errors import OutputError
-from fgslam.core.trajectories import read_tum
+from fgslam.core.trajectories import Trajectory
 
 Refusal = Callable[..., str]
 
@@ -146,8 +146,8 @@ def test_nothing_but_black_frames_leaves_the_odometry(own_recording: Path, tmp_p
         assert cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH), np.uint8))
     run = run_values(experiment(own_recording), tmp_path / "run")
     assert run.result.live.landmarks == 0
-    truth = read_tum(run.folder / "ground_truth.tum")
-    final = read_tum(run.folder / KIND / "final.tum")
+    truth = Trajectory.load(run.folder / "ground_truth.tum")
+    final = Trajectory.load(run.folder / KIND / "final.tum")
     assert np.abs(final.poses[-1] - truth.poses[-1]).max() < 0.05
 
 
@@ -385,7 +385,7 @@ def test_a_disk_that_fills_up(recording: Path, small_disk: Path) -> None:
     assert str(folder) in str(caught.value)
     assert "\n" not in str(caught.value)
     assert not list(folder.rglob("*partial*"))
-    done = len(read_tum(folder / KIND / "final.tum"))
+    done = len(Trajectory.load(folder / KIND / "final.tum"))
     assert 0 < done < 12
     moved = Path(shutil.copytree(folder, small_disk.parent / "moved"))
     run_values(values, moved, "resume")

@@ -24,7 +24,7 @@ from running import (
 from fgslam.backend.filters.settings import DeadReckoningSettings
 from fgslam.backend.smoothers.settings import Isam2Settings
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.trajectories import read_covariances, read_tum
+from fgslam.core.trajectories import Trajectory, read_covariances
 from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.report.point_cloud import read_ply
 from fgslam.runs.config import load_config, parse_config
@@ -74,7 +74,7 @@ def test_a_run_on_measurements_fills_its_folder(measured: Path) -> None:
     for title in (KIND, "world"):
         folder = measured / title
         assert {file.name for file in folder.iterdir()} == ESTIMATOR_FILES
-        assert len(read_tum(folder / "final.tum")) == FRAMES
+        assert len(Trajectory.load(folder / "final.tum")) == FRAMES
         assert len(read_covariances(folder / "covariance.csv")[0]) == FRAMES
         points = read_ply(folder / "map.ply")
         assert (points.colours == 128).all()
@@ -188,9 +188,11 @@ def test_one_estimator_may_fail(
     found = metrics_of(out)["estimators"]
     assert found["ekf"]["failure"].startswith("frame ")
     assert found[KIND]["failure"] is None
-    done = len(read_tum(out / "ekf/final.tum"))
+    done = len(Trajectory.load(out / "ekf/final.tum"))
     assert 0 < done < FRAMES
-    assert len(read_tum(out / "ekf/online.tum")) == len(rows_of(out / "ekf/frames.csv")) == done
+    assert (
+        len(Trajectory.load(out / "ekf/online.tum")) == len(rows_of(out / "ekf/frames.csv")) == done
+    )
     assert found["ekf"]["frames"] == done
     assert f"failed      ekf: {found['ekf']['failure']}" in capsys.readouterr().out
     # Alone, its failure is that of the command.
@@ -316,5 +318,5 @@ def test_export_takes_the_estimator_that_steered(
     exported = tmp_path / "path.tum"
     assert len(list(plain.glob("*/final.tum"))) > 1
     assert main(monkeypatch, "export", plain, "--trajectory", exported) == 0
-    steered = read_tum(plain / KIND / "final.tum")
-    np.testing.assert_array_equal(read_tum(exported).poses, steered.poses)
+    steered = Trajectory.load(plain / KIND / "final.tum")
+    np.testing.assert_array_equal(Trajectory.load(exported).poses, steered.poses)

@@ -9,7 +9,6 @@ import pytest
 
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import se3_exp
-from fgslam.core.trajectories import read_tum, write_tum
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory, path_length
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
@@ -20,7 +19,7 @@ def truth_of(name: str) -> Trajectory:
     path = DATA / name / "gt_left_cam.txt"
     if not path.exists():
         pytest.skip(f"the recording {name} is not there ({path})")
-    return read_tum(path)
+    return Trajectory.load(path)
 
 
 @pytest.mark.parametrize(
@@ -31,8 +30,8 @@ def test_truth_of_real_recordings(name: str, frames: int, metres: float, tmp_pat
     truth = truth_of(name)
     assert len(truth) == frames
     assert path_length(truth.poses) == pytest.approx(metres, rel=0.03)
-    write_tum(tmp_path / "a.tum", truth)
-    again = read_tum(tmp_path / "a.tum")
+    truth.save(tmp_path / "a.tum")
+    again = Trajectory.load(tmp_path / "a.tum")
     np.testing.assert_array_equal(again.timestamps, truth.timestamps)
     np.testing.assert_allclose(again.poses, truth.poses, atol=2e-12)
 
@@ -51,8 +50,8 @@ def test_drifting_estimate_of_a_real_drive_agrees_with_evo(tmp_path: Path) -> No
     # Every third frame was lost: association has something to do.
     kept = np.flatnonzero(np.arange(len(truth)) % 3)
     estimate = Trajectory(truth.timestamps[kept] + 0.002, np.array(poses)[kept])
-    write_tum(tmp_path / "truth.tum", truth)
-    write_tum(tmp_path / "estimate.tum", estimate)
+    truth.save(tmp_path / "truth.tum")
+    estimate.save(tmp_path / "estimate.tum")
 
     true, estimated = sync.associate_trajectories(
         file_interface.read_tum_trajectory_file(str(tmp_path / "truth.tum")),

@@ -24,7 +24,7 @@ from running import (
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, EstimatorError, FgslamError, MapError, OutputError
 from fgslam.core.saved_map import load_map, save_map
-from fgslam.core.trajectories import read_tum
+from fgslam.core.trajectories import Trajectory
 from fgslam.report.point_cloud import read_ply
 from fgslam.runs.tasks.slam_map_entry import arrival_of
 
@@ -71,7 +71,10 @@ def landmarks_of(path: Path) -> Mapping[str, Any]:
 
 def unaligned_errors(run: Path, kind: str = KIND) -> FloatArray:
     """Distances (n,) of the run's positions from the true ones, in the world of the map."""
-    truth, found = read_tum(run / "ground_truth.tum"), read_tum(run / kind / "final.tum")
+    truth, found = (
+        Trajectory.load(run / "ground_truth.tum"),
+        Trajectory.load(run / kind / "final.tum"),
+    )
     rows = np.searchsorted(truth.timestamps, found.timestamps - 1e-6)
     apart = truth.poses[rows, :3, 3] - found.poses[:, :3, 3]
     return np.asarray(np.linalg.norm(apart, axis=1))

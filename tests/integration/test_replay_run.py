@@ -12,7 +12,6 @@ from running import KIND, run_values
 
 from fgslam.core.estimates import Estimate
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.trajectories import write_tum
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.runs.config import ExperimentConfig, parse_config
 from fgslam.slam import factory
@@ -52,7 +51,7 @@ def test_replay_to_the_bit(
     np.testing.assert_array_equal(replayed.landmarks.ids, live.landmarks.ids)
     np.testing.assert_array_equal(replayed.landmarks.positions, live.landmarks.positions)
     np.testing.assert_array_equal(replayed.landmarks.covariances, live.landmarks.covariances)
-    write_tum(tmp_path / "replayed.tum", replayed.trajectory, run.result.outputs.remark)
+    replayed.trajectory.save(tmp_path / "replayed.tum", run.result.outputs.remark)
     assert (tmp_path / "replayed.tum").read_bytes() == (
         run.folder / KIND / "final.tum"
     ).read_bytes()

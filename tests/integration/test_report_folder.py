@@ -16,7 +16,7 @@ from running import KIND, Finished, main
 from fgslam.core.errors import DatasetError, FgslamError, MissingDependencyError, OutputError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import rotation_from_quaternion
-from fgslam.core.trajectories import read_covariances, read_tum, write_tum
+from fgslam.core.trajectories import read_covariances
 from fgslam.evaluation.trajectory import to_estimate_world
 from fgslam.report.run_results import EstimatorReport
 from fgslam.runs.report import load_report, report_from_folder
@@ -45,7 +45,7 @@ def test_page_shows_what_the_files_hold(finished: Finished) -> None:
     data = load_report(finished.folder)
     (estimator,) = data.estimators
     metrics = metrics_of(finished.folder)["estimators"][KIND]  # type: ignore[index]
-    final = read_tum(finished.folder / KIND / "final.tum")
+    final = Trajectory.load(finished.folder / KIND / "final.tum")
     np.testing.assert_array_equal(estimator.final_poses, final.poses)
     np.testing.assert_array_equal(
         estimator.covariances, read_covariances(finished.folder / KIND / "covariance.csv")[1]
@@ -66,8 +66,8 @@ def test_page_shows_what_the_files_hold(finished: Finished) -> None:
 def test_the_truth_is_in_the_estimate_s_world(finished: Finished) -> None:
     data = load_report(finished.folder)
     assert data.truth is not None
-    final = read_tum(finished.folder / KIND / "final.tum")
-    truth = read_tum(finished.folder / "ground_truth.tum")
+    final = Trajectory.load(finished.folder / KIND / "final.tum")
+    truth = Trajectory.load(finished.folder / "ground_truth.tum")
     found = to_estimate_world(final, truth)
     assert found is not None
     np.testing.assert_array_equal(data.truth.poses, found[1])
@@ -84,11 +84,11 @@ def test_the_page_is_written_into_the_folder(run: Path) -> None:
 
 def test_errors_over_time_are_those_of_displaced_poses(run: Path) -> None:
     """The second half moved up by 0.3 m: the error says so, and the NEES explodes."""
-    truth = read_tum(run / "ground_truth.tum")
+    truth = Trajectory.load(run / "ground_truth.tum")
     poses = truth.poses.copy()
     poses[6:, 1, 3] += 0.3
-    write_tum(run / KIND / "final.tum", Trajectory(truth.timestamps, poses))
-    write_tum(run / KIND / "online.tum", truth)
+    Trajectory(truth.timestamps, poses).save(run / KIND / "final.tum")
+    truth.save(run / KIND / "online.tum")
     estimator = only(run)
     np.testing.assert_allclose(estimator.final_error_m, [0.0] * 6 + [0.3] * 6, atol=1e-9)
     np.testing.assert_allclose(estimator.online_error_m, 0.0, atol=1e-9)
@@ -121,7 +121,7 @@ def test_a_run_that_lacks_a_file_has_a_page(run: Path, absent: str) -> None:
 
 
 def test_times_of_a_replay_come_from_its_own_file(run: Path) -> None:
-    stamps = read_tum(run / KIND / "final.tum").timestamps.tolist()
+    stamps = Trajectory.load(run / KIND / "final.tum").timestamps.tolist()
     rows = [f"{t:.9f},{k}.5,ok" for k, t in enumerate(stamps)]
     rows[3] = f"{stamps[3]:.9f},,ok"
     text = "\n".join(["timestamp,update_ms,status", *rows]) + "\n"

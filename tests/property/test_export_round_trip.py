@@ -12,7 +12,6 @@ from hypothesis.extra import numpy as nps
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import pose, so3_exp
-from fgslam.core.trajectories import read_tum, write_tum
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory, umeyama
 
 UNIT = st.floats(-1.0, 1.0, allow_subnormal=False)
@@ -35,8 +34,8 @@ def poses(draw: st.DrawFn, reach: float = 1e4) -> FloatArray:
 def test_tum_file_keeps_every_pose(tmp_path_factory, many: list[FloatArray], start: float) -> None:
     path: Path = tmp_path_factory.getbasetemp() / "law.tum"
     written = Trajectory(start + 0.1 * np.arange(len(many)), np.array(many).reshape(-1, 4, 4))
-    write_tum(path, written)
-    read = read_tum(path)
+    written.save(path)
+    read = Trajectory.load(path)
     np.testing.assert_allclose(read.timestamps, written.timestamps, atol=5e-10)
     np.testing.assert_allclose(read.poses, written.poses, atol=5e-12)
 

@@ -11,7 +11,7 @@ import numpy as np
 from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Estimate, LandmarkMap
 from fgslam.core.recordings import MeasurementRecording
-from fgslam.core.trajectories import read_covariances, read_tum, write_tum
+from fgslam.core.trajectories import Trajectory, read_covariances
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.metrics import JsonValue
@@ -75,7 +75,7 @@ def write_log_and_truth(folder: Path, recording: MeasurementRecording) -> None:
     """The log, and what is known to be true. Raises OutputError."""
     save_log(folder, recording.log)
     if recording.ground_truth is not None:
-        write_tum(folder / GROUND_TRUTH_FILE, recording.ground_truth)
+        recording.ground_truth.save(folder / GROUND_TRUTH_FILE)
     if recording.landmark_truth is not None:
         exact = np.zeros(len(recording.landmark_truth))
         write_landmark_truth(folder / LANDMARK_TRUTH_FILE, recording.landmark_truth, exact)
@@ -127,7 +127,7 @@ def _figures(
     return RunFigures(
         name=config.name,
         synthetic=False,
-        estimate=Estimate(read_tum(own / "final.tum"), covariances, landmarks),
+        estimate=Estimate(Trajectory.load(own / "final.tum"), covariances, landmarks),
         truth=recording.ground_truth,
         valid=points.valid,
         frames=np.array([i.index for i in recording.log.increments[: len(rows)]], np.int64),

@@ -13,7 +13,6 @@ import numpy as np
 from fgslam.core.estimates import Estimate, Trajectory
 from fgslam.core.files import make_subfolder
 from fgslam.core.recordings import Sequence
-from fgslam.core.trajectories import write_tum
 from fgslam.evaluation.judging import Truth, closure_counts
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
 from fgslam.report.content import Column, TextTable
@@ -106,7 +105,7 @@ class RunOutputs:
         What is returned is read back: replays of the log are judged by the same digits.
         """
         if self.sequence.ground_truth is not None:
-            write_tum(self.folder / GROUND_TRUTH_FILE, self.sequence.ground_truth)
+            self.sequence.ground_truth.save(self.folder / GROUND_TRUTH_FILE)
         found = (
             rendered_landmark_truth(self.sequence, self.recorder.log) if with_landmarks else None
         )
