@@ -17,7 +17,7 @@ from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.runs.engine import run_task
 from fgslam.runs.tasks.slam import SlamResult, open_slam
 from fgslam.runs.tasks.slam_map_entry import MAP_FILE
-from fgslam.runs.tasks.slam_mapping import first_config
+from fgslam.runs.tasks.slam_state import first_config
 from fgslam.worlds.buildings.lab import build_lab
 from fgslam.worlds.rendering.patches import Thing
 

@@ -31,7 +31,7 @@ from fgslam.report.slam_page import write_report
 from fgslam.report.tables import read_metrics
 from fgslam.runs.folder import LOG_FILE, REPORT_FILE, RUN_MARKER
 from fgslam.runs.metric_tables import page_table
-from fgslam.runs.tasks.slam_places import LOOPS_FILE, read_closures
+from fgslam.runs.tasks.slam_metrics import LOOPS_FILE, read_closures
 
 _UP = np.array([0.0, -1.0, 0.0])
 _TIMED_STAGES = ("predict", "update")

@@ -21,9 +21,8 @@ from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.engine import Context
 from fgslam.runs.tasks.localisation_submap import Window, submap_features
-from fgslam.runs.tasks.localisation_truth import TruthInMap, truth_in_map
-from fgslam.runs.tasks.rendered_truth import Sighted, TrueSights
 from fgslam.runs.tasks.slam_map_entry import GivenMap, trusted
+from fgslam.runs.tasks.truth import Sighted, TrueSights, TruthInMap, truth_in_map
 from fgslam.slam.factory import make_relocaliser, make_stereo_matcher, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 

@@ -1,7 +1,12 @@
-"""Runs one experiment: images in, run folder out; interruptible and resumable."""
+"""Task of SLAM: images in, trajectory, covariances and map out; interruptible and resumable.
+
+Units: none but the replays of further estimators; the drive itself keeps a checkpoint.
+Files and numbers: :mod:`fgslam.runs.tasks.slam_outputs`, :mod:`fgslam.runs.tasks.slam_metrics`.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -9,35 +14,167 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from fgslam.core.errors import DatasetError
-from fgslam.core.features import StereoFeatures
 from fgslam.core.recordings import Sequence
 from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.report.tables import write_comparison_csv
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, run_task
-from fgslam.runs.folder import COMPARISON_FILE, ExistingFolder, is_run_folder
+from fgslam.runs.folder import COMPARISON_FILE, ExistingFolder, is_run_folder, write_config
 from fgslam.runs.metric_tables import comparison_particulars, comparison_tables
+from fgslam.runs.opening import open_sequence
 from fgslam.runs.report import report_from_folder
 from fgslam.runs.slam_comparison import replay_apart
-from fgslam.runs.tasks import slam_checkpoint as checkpoint
 from fgslam.runs.tasks import slam_map_entry as map_entry
-from fgslam.runs.tasks import slam_mapping as mapping
-from fgslam.runs.tasks.rendered_truth import TrueDepth
-from fgslam.runs.tasks.slam_beginning import BegunRun, OpenedRun, begin, open_run
-from fgslam.runs.tasks.slam_outputs import RunOutputs, run_notes, summary_table
-from fgslam.runs.tasks.slam_pictures import draw_frame, draw_run, figures_of, frames_to_show
+from fgslam.runs.tasks import slam_state as state
+from fgslam.runs.tasks.slam_map_entry import Entry, GivenMap
+from fgslam.runs.tasks.slam_outputs import (
+    RunOutputs,
+    draw_frame,
+    draw_run,
+    figures_of,
+    frames_to_show,
+    run_notes,
+    summary_table,
+)
+from fgslam.runs.tasks.truth import stereo_precision
 from fgslam.runs.units import Progress
-from fgslam.slam.factory import make_stream
+from fgslam.slam.arrival import require_map_user
+from fgslam.slam.factory import make_estimator, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import FrameReport
+from fgslam.slam.session import Session
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OpenedRun:
+    """A run whose recording is open.
+
+    Attributes:
+        config: as given; ``opened`` is what its recording was opened with.
+        given: the map to go on with; None without one, or while it is still to be made.
+        entry: how the run enters it; None where it does not, or that is not yet known.
+        resumed: the folder holds a state to go on from.
+    """
+
+    config: ExperimentConfig
+    opened: ExperimentConfig
+    folder: Path
+    sequence: Sequence
+    given: GivenMap | None
+    entry: Entry | None
+    resumed: bool
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What it takes to repeat the run, beside its configuration."""
+        out: dict[str, Any] = {
+            "dataset": {"name": self.sequence.name, "identity": self.sequence.identity}
+        }
+        if self.entry is not None:
+            out["map"] = self.entry.as_values()
+        elif self.given is not None and (entered := state.entered_by(self.given)):
+            out["map"] = entered
+        return out
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether the run is the continuation of the one that made its map."""
+        return self.given is not None and self.config.map.start == "continue"
+
+
+def open_run(config: ExperimentConfig, opening: Opening) -> OpenedRun:
+    """Opens the recording and the map; nothing is driven or written yet.
+
+    Raises:
+        FgslamError: of any kind, with a message for the user.
+    """
+    folder, progress = opening.folder, opening.progress
+    state.require_savable(config.map, folder)
+    given = None if config.map.load is None else map_entry.open_map(Path(config.map.load))
+    opened = config
+    if given is not None and config.map.start == "continue":
+        opened = state.window(config, given)
+    sequence = open_sequence(opened, lambda done, total: progress("rendering", done, total))
+    _require_odometry(config, sequence)
+    if config.map.given and config.map.start != "continue":
+        estimator = make_estimator(sequence.rig, config.estimator, config.frontend.ego_motion)
+        user = require_map_user(estimator, config.map.extend)
+        if given is not None:  # one that is too large is refused now, not in a folder begun
+            landmarks = given.saved.landmarks
+            user.begin_in(landmarks, given.saved.hits, fixed=not config.map.extend)
+    resumed = opening.resumed and state.has_checkpoint(folder)
+    run = OpenedRun(config, opened, folder, sequence, given, None, resumed)
+    return dataclasses.replace(run, entry=_entry(run, given))
+
+
+def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
+    """Finds the run's place in its map, builds the loop, and takes up what there is to go on from.
+
+    Raises:
+        FgslamError: of any kind, with a message for the user.
+    """
+    config = run.config
+    if config.map.made_from is not None:
+        made = map_entry.open_map(run.folder / map_entry.FIRST_FOLDER / map_entry.MAP_FILE)
+        run = dataclasses.replace(run, given=made, entry=_entry(run, made))
+        write_config(run.folder, config, run.provenance)
+    given, entry, sequence, opened = run.given, run.entry, run.sequence, run.opened
+    if entry is not None and entry.frames_before:
+        opened = _later(opened, entry.frames_before)
+        sequence = open_sequence(opened, lambda done, total: progress("rendering", done, total))
+    arrival, notes = None, tuple[str, ...]()
+    if entry is not None and given is not None:
+        arrival, notes = entry.arrival(given, config.map), entry.notes(given, config.map)
+    session = Session(
+        sequence.rig,
+        config.estimator,
+        frontend=config.frontend,
+        odometry=config.odometry,
+        seed=config.seed,
+        arrival=arrival,
+    )
+    first_frame = opened.dataset.start
+    outputs = RunOutputs(run.folder, config, sequence, session, first_frame, notes, given)
+    if run.resumed:
+        state.load_checkpoint(run.folder, session.pipeline, session.recorder)
+    elif given is not None and run.goes_on:
+        state.go_on(given, session.pipeline, session.recorder)
+    return outputs
+
+
+def _entry(run: OpenedRun, given: GivenMap | None) -> Entry | None:
+    """How the run enters the map; on resuming, how it did."""
+    if given is None:
+        return None
+    if run.goes_on:
+        state.require_continuable(given, run.sequence)
+        return None
+    known = map_entry.entry_of(run.folder) if run.resumed else None
+    if known is not None:
+        known.require_same(given)
+    return known or map_entry.enter(run.config, given, run.sequence)
+
+
+def _later(config: ExperimentConfig, frames: int) -> ExperimentConfig:
+    """The configuration without its first selected frames."""
+    start = config.dataset.start + frames * config.dataset.stride
+    return config.model_copy(update={"dataset": dataclasses.replace(config.dataset, start=start)})
+
+
+def _require_odometry(config: ExperimentConfig, sequence: Sequence) -> None:
+    """Says before the start, not at frame 1, that a recording lacks odometry."""
+    if config.odometry.kind != "recorded" or len(sequence) < 2:
+        return
+    if all(sequence.odometry(i) is None for i in range(1, len(sequence))):
+        raise DatasetError(
+            f"{sequence.name} has no odometry; set odometry.kind to constant_velocity, or to "
+            "synthetic where there is ground truth"
+        )
+
 
 _SAVING_SHARE = 10.0  # the loop runs at least this many times as long as it saves
-_PRECISION_EVERY = 10  # frames between checks of stereo matches against rendered depth
-_PRECISION_PX = 1.5  # disparity error of a correct match; a SIFT match's noise is a tenth of it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,11 +203,11 @@ def _run(opened: OpenedRun, context: Context) -> SlamResult:
     ended = drive_first(opened.config, context)
     if ended is not None and ended.status == "interrupted":
         return ended
-    begun = begin(opened, context.progress)
-    saved = _loop(begun.outputs, context.progress, context.stopped)
+    outputs = begin(opened, context.progress)
+    saved = _loop(outputs, context.progress, context.stopped)
     if saved is not None:
-        return _result(begun.outputs, "interrupted", saved)
-    return _finish(begun, context)
+        return _result(outputs, "interrupted", saved)
+    return _finish(outputs, context)
 
 
 def drive_first(config: ExperimentConfig, context: Context) -> SlamResult | None:
@@ -79,10 +216,10 @@ def drive_first(config: ExperimentConfig, context: Context) -> SlamResult | None
     None where no map is to be made, or it is there already.
     """
     folder = context.folder / map_entry.FIRST_FOLDER
-    first = mapping.first_config(config, folder)
+    first = state.first_config(config, folder)
     made = context.resumed and (folder / map_entry.MAP_FILE).is_file()
     # Killed after writing the map, the drive has yet to draw, to report and to tidy up.
-    if first is None or (made and not checkpoint.exists(folder)):
+    if first is None or (made and not state.has_checkpoint(folder)):
         return None
     existing: ExistingFolder = "overwrite"
     if context.resumed and is_run_folder(folder):
@@ -135,7 +272,7 @@ def _save_timed(outputs: RunOutputs) -> float:
 def save_progress(outputs: RunOutputs) -> EstimatorMetrics:
     """All results so far, in valid files, and the state to resume from."""
     metrics = outputs.write_results("interrupted")
-    checkpoint.save(outputs.folder, outputs.pipeline, outputs.recorder)
+    state.save_checkpoint(outputs.folder, outputs.pipeline, outputs.recorder)
     return metrics
 
 
@@ -150,15 +287,14 @@ def _advance(outputs: RunOutputs, found: FeatureFrame, wait_ms: float) -> FrameR
         body_motion(sequence, found.i, session.pipeline.motion),
         index,
         wait_ms,
-        lambda report: _stereo_precision(sequence, found.i, report.stereo),
+        lambda report: stereo_precision(sequence, found.i, report.stereo),
     )
 
 
-def _finish(begun: BegunRun, context: Context) -> SlamResult:
-    outputs = begun.outputs
+def _finish(outputs: RunOutputs, context: Context) -> SlamResult:
     pictures: tuple[Path, ...] = ()
     live = outputs.write_results("finished")
-    about_map = mapping.save(outputs, begun.given)
+    about_map = state.leave_map(outputs)
     if outputs.config.output.pictures:
         pictures = tuple(draw_run(outputs.folder, figures_of(outputs)))
     compared = _compare(outputs, live, context)
@@ -170,7 +306,7 @@ def _finish(begun: BegunRun, context: Context) -> SlamResult:
     else:
         # The checkpoint goes last: while anything is left, a run goes on from its last frames.
         context.store.remove()
-        checkpoint.remove(outputs.folder)
+        state.remove_checkpoint(outputs.folder)
     return _result(outputs, status, live, pictures, compared, about_map)
 
 
@@ -216,22 +352,3 @@ def _result(
         live=live,
         pictures=pictures,
     )
-
-
-def _stereo_precision(sequence: Sequence, i: int, stereo: StereoFeatures) -> float:
-    """Fraction of stereo matches whose disparity is the rendered one's, every tenth frame.
-
-    The nearest of the four pixels around a feature decides: at an edge of depth either side is
-    right.
-    """
-    if i % _PRECISION_EVERY or not isinstance(sequence, TrueDepth) or not len(stereo):
-        return float("nan")
-    depth = sequence.depth(i)
-    height, width = depth.shape
-    low = np.floor(stereo.measurement[:, :2]).astype(np.int64)
-    columns = np.clip(low[:, 0, None] + [0, 1, 0, 1], 0, width - 1)
-    rows = np.clip(low[:, 1, None] + [0, 0, 1, 1], 0, height - 1)
-    rig = sequence.rig
-    true = rig.fx * rig.baseline / depth[rows, columns]
-    error = np.abs(true - stereo.measurement[:, 2:]).min(axis=1)
-    return float(np.mean(error <= _PRECISION_PX))

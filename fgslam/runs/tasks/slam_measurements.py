@@ -20,11 +20,10 @@ from fgslam.report.tables import LANDMARK_TRUTH_FILE, StageTime, write_landmark_
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task
 from fgslam.runs.estimator_files import FRAMES_FILE, read_frames
-from fgslam.runs.folder import write_config
+from fgslam.runs.folder import LOG_FILE, write_config
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, replay_apart, write_comparison
-from fgslam.runs.tasks.slam_checkpoint import save_log
-from fgslam.runs.tasks.slam_pictures import RunFigures, draw_run
-from fgslam.runs.tasks.slam_summary import spread
+from fgslam.runs.tasks.slam_metrics import spread
+from fgslam.runs.tasks.slam_outputs import RunFigures, draw_run
 from fgslam.slam.replay import ReplayRow
 
 
@@ -73,7 +72,7 @@ def write_recording(
 
 def write_log_and_truth(folder: Path, recording: MeasurementRecording) -> None:
     """The log, and what is known to be true. Raises OutputError."""
-    save_log(folder, recording.log)
+    recording.log.save(folder / LOG_FILE)
     if recording.ground_truth is not None:
         recording.ground_truth.save(folder / GROUND_TRUTH_FILE)
     if recording.landmark_truth is not None:

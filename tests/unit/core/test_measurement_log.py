@@ -17,7 +17,6 @@ from fgslam.core.errors import MeasurementLogError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
 from fgslam.core.sensors import CameraRig, RangeBearingSensor
-from fgslam.runs.tasks.slam_checkpoint import save_log
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 
@@ -54,7 +53,7 @@ def log(rng: np.random.Generator) -> MeasurementLog:
 
 @pytest.fixture
 def file(log: MeasurementLog, tmp_path: Path) -> Path:
-    save_log(tmp_path, log)
+    log.save(tmp_path / "measurements.npz")
     return tmp_path / "measurements.npz"
 
 
@@ -86,13 +85,13 @@ def test_every_bit_survives(log: MeasurementLog, file: Path) -> None:
 def test_the_same_log_gives_the_same_bytes(file: Path, tmp_path: Path) -> None:
     again = tmp_path / "again"
     again.mkdir()
-    save_log(again, MeasurementLog.load(file))
+    MeasurementLog.load(file).save(again / "measurements.npz")
     assert (again / "measurements.npz").read_bytes() == file.read_bytes()
 
 
 def test_a_two_camera_rig_and_an_empty_log(tmp_path: Path) -> None:
     rig = CameraRig(64, 48, 50.0, 50.0, 31.5, 23.5, 0.2, None, np.eye(4))
-    save_log(tmp_path, MeasurementLog(rig, {}))
+    MeasurementLog(rig, {}).save(tmp_path / "measurements.npz")
     loaded = MeasurementLog.load(tmp_path / "measurements.npz")
     assert len(loaded) == 0
     assert loaded.rig.vertical_baseline is None
@@ -279,7 +278,7 @@ def looped(log: MeasurementLog, rng: np.random.Generator) -> MeasurementLog:
 
 
 def test_every_bit_of_loops_survives(looped: MeasurementLog, tmp_path: Path) -> None:
-    save_log(tmp_path, looped)
+    looped.save(tmp_path / "measurements.npz")
     loaded = MeasurementLog.load(tmp_path / "measurements.npz")
     assert [len(s.loops) for s in loaded] == [0, 0, 2, 0, 1, 0]
     assert [s.relocalised for s in loaded] == [False] * 4 + [True, False]
@@ -289,7 +288,7 @@ def test_every_bit_of_loops_survives(looped: MeasurementLog, tmp_path: Path) -> 
 
 def test_a_relocalised_frame_alone_makes_version_3(log: MeasurementLog, tmp_path: Path) -> None:
     log.increments[5] = replace(log.increments[5], relocalised=True)
-    save_log(tmp_path, log)
+    log.save(tmp_path / "measurements.npz")
     loaded = MeasurementLog.load(tmp_path / "measurements.npz")
     assert [s.relocalised for s in loaded] == [False] * 5 + [True]
 

@@ -17,7 +17,7 @@ from fgslam.core.estimates import Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, LoopClosure, Observations
 from fgslam.evaluation.closures import judge_closures
-from fgslam.runs.tasks.slam_places import (
+from fgslam.runs.tasks.slam_metrics import (
     LOOPS_FILE,
     closures_of,
     place_numbers,

@@ -35,7 +35,7 @@ from fgslam.runs.choosing import Choice, all_kinds, choose
 from fgslam.runs.config import ExperimentConfig, parse_config
 from fgslam.runs.estimator_files import points_from_log
 from fgslam.runs.metric_tables import comparison_particulars, comparison_tables
-from fgslam.runs.tasks.rendered_truth import points_under
+from fgslam.runs.tasks.truth import points_under
 from fgslam.runs.trials import Trial, summarise, together
 
 LAB: dict[str, Any] = {"name": "x", "dataset": {"kind": "rendered_lab"}}

@@ -24,7 +24,7 @@ from fgslam.core.measurements import Increment, Observations
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
 from fgslam.evaluation.judging import Truth
-from fgslam.runs.tasks.slam_summary import estimator_metrics, frame_problems, run_numbers
+from fgslam.runs.tasks.slam_metrics import estimator_metrics, frame_problems, run_numbers
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.pipeline import FrameReport
 from fgslam.slam.results import STAGES, FrameRow, RunRecorder

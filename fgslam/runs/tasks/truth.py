@@ -1,21 +1,29 @@
-"""Truth about landmarks from rendered depth: where they truly are, and which are in view."""
+"""Ground truth by rendered depth (landmarks, disparities, views), and true poses in a saved map."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.errors import FgslamError
 from fgslam.core.estimates import LandmarkMap
-from fgslam.core.geometry import transform_to_world
+from fgslam.core.features import StereoFeatures
+from fgslam.core.geometry import inverse, pose, transform_to_world
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LandmarkTruth, Sequence
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.sensors import CameraRig
+from fgslam.datasets.settings import RenderedLabSettings
+from fgslam.evaluation.trajectory import align, associate
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.runs.config import ExperimentConfig
+from fgslam.runs.config_reading import Reader
+from fgslam.runs.opening import open_sequence
 
 _LEAST_SIGHTINGS = 3
 _SAME_SURFACE = 0.03
@@ -110,6 +118,29 @@ def _standard_error(points: FloatArray, median: FloatArray) -> float:
     return float(_MEDIAN_TO_MEAN * np.linalg.norm(deviation) / np.sqrt(len(points)))
 
 
+_PRECISION_EVERY = 10  # frames between checks of stereo matches against rendered depth
+_PRECISION_PX = 1.5  # disparity error of a correct match; a SIFT match's noise is a tenth of it
+
+
+def stereo_precision(sequence: Sequence, i: int, stereo: StereoFeatures) -> float:
+    """Fraction of stereo matches with the rendered disparity; NaN but of every tenth frame.
+
+    The nearest of the four pixels around a feature decides: at an edge of depth either side is
+    right.
+    """
+    if i % _PRECISION_EVERY or not isinstance(sequence, TrueDepth) or not len(stereo):
+        return float("nan")
+    depth = sequence.depth(i)
+    height, width = depth.shape
+    low = np.floor(stereo.measurement[:, :2]).astype(np.int64)
+    columns = np.clip(low[:, 0, None] + [0, 1, 0, 1], 0, width - 1)
+    rows = np.clip(low[:, 1, None] + [0, 0, 1, 1], 0, height - 1)
+    rig = sequence.rig
+    true = rig.fx * rig.baseline / depth[rows, columns]
+    error = np.abs(true - stereo.measurement[:, 2:]).min(axis=1)
+    return float(np.mean(error <= _PRECISION_PX))
+
+
 _BEHIND = 1.05  # times the rendered depth, plus the next: what is farther off is hidden
 _BEHIND_M = 0.05
 
@@ -164,3 +195,116 @@ class TrueSights:
         shown = rig.fx * rig.baseline / disparity[inside] <= _BEHIND * near + _BEHIND_M
         familiar = shown & expected.certain[inside]
         return Sighted(int(shown.sum()), int(familiar.sum()))
+
+
+_SAME_TIME_S = 1e-3
+_MOST_SLACK_RAD = 0.5  # of positions whose errors are all made of it: at most, not likely
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthInMap:
+    """True poses of a recording's frames in the map's world.
+
+    Attributes:
+        poses: (n, 4, 4) of the selected frames; NaN where unknown.
+        alignment: how the two worlds were brought together, in words.
+    """
+
+    poses: FloatArray
+    alignment: str
+
+
+def truth_in_map(saved: SavedMap, sequence: Sequence, config: ExperimentConfig) -> TruthInMap:
+    """True poses in the map's world, as far as they can be known.
+
+    Of rendered places exactly, since the map's world is where its first drive began. Of recordings
+    on disk if the map's last drive was part of the same one: by the rigid motion (SE3, least
+    squares over positions) that brings the truth of that drive to the map's own trajectory.
+
+    Args:
+        saved: the map.
+        sequence: the recording.
+        config: what it was opened with.
+    """
+    unknown = np.full((len(sequence), 4, 4), np.nan)
+    if sequence.ground_truth is None:
+        return TruthInMap(unknown, "the recording has no ground truth")
+    drives = saved.about.get("drives") or [{}]
+    if isinstance(config.dataset, RenderedLabSettings):
+        return _of_rendered(_drive_config(drives[0]), sequence, config) or TruthInMap(
+            unknown, "the map is of another place, so errors are not known"
+        )
+    mapped = _drive_config(drives[-1])
+    aligned = None if mapped is None else _of_recorded(saved, mapped, sequence, config)
+    if aligned is None:
+        return TruthInMap(unknown, "the map is of another recording, so errors are not known")
+    mTw, matched, slack = aligned
+    if slack > _MOST_SLACK_RAD:
+        words = "the map's drive is too straight to lay the truth onto it, so errors are not known"
+        return TruthInMap(unknown, words)
+    times, true_rows = associate(
+        sequence.timestamps, sequence.ground_truth.timestamps, _SAME_TIME_S
+    )
+    unknown[times] = mTw @ sequence.ground_truth.poses[true_rows]
+    words = f"truth aligned to the map's trajectory, SE3 over {matched} poses"
+    return TruthInMap(unknown, words)
+
+
+def _drive_config(drive: object) -> ExperimentConfig | None:
+    """What a map's drive was opened with; None where this fgslam cannot tell."""
+    if not isinstance(drive, dict) or not isinstance(drive.get("settings"), dict):
+        return None
+    try:
+        values = {"name": "map", **drive["settings"]}
+        return Reader(ExperimentConfig, ()).parse(values, "map")
+    except FgslamError:
+        return None
+
+
+def _of_rendered(
+    mapped: ExperimentConfig | None, sequence: Sequence, config: ExperimentConfig
+) -> TruthInMap | None:
+    """Both worlds are camera poses in one room."""
+    from fgslam.datasets.rendered_lab import RenderedLabSequence, first_camera_pose  # scipy's, slow
+
+    now, then = config.dataset, None if mapped is None else mapped.dataset
+    if not isinstance(now, RenderedLabSettings) or not isinstance(then, RenderedLabSettings):
+        return None
+    if not isinstance(sequence, RenderedLabSequence) or now.place != then.place:
+        return None
+    own = sequence.room_from_world @ sequence.ground_truth.poses
+    words = "truth in the world of the map's first frame, exactly"
+    return TruthInMap(inverse(first_camera_pose(then)) @ own, words)
+
+
+def _of_recorded(
+    saved: SavedMap, mapped: ExperimentConfig, sequence: Sequence, config: ExperimentConfig
+) -> tuple[FloatArray, int, float] | None:
+    """(4, 4) from the truth's world to the map's, how many poses it was found from, its slack."""
+    now, then = (getattr(one.dataset, "path", None) for one in (config, mapped))
+    if now is None or then is None or Path(now).resolve() != Path(then).resolve():
+        return None
+    try:
+        truth = open_sequence(mapped).ground_truth
+    except FgslamError:
+        return None
+    if truth is None:
+        return None
+    rows, true_rows = associate(saved.trajectory.timestamps, truth.timestamps, _SAME_TIME_S)
+    true, own = truth.poses[true_rows], saved.trajectory.poses[rows]
+    found = align(true, own)
+    if found is None:
+        return None
+    mTw = pose(found.rotation, found.translation)
+    return mTw, len(rows), alignment_slack(transform_to_world(mTw, true[:, :3, 3]), own[:, :3, 3])
+
+
+def alignment_slack(aligned: FloatArray, own: FloatArray) -> float:
+    """By how much aligned positions (n, 3) may yet turn about the line that they lie along.
+
+    Radians: what is left between them and ``own`` (n, 3), over how far they stray from that line;
+    infinite where they do not. Of a straight drive's positions no alignment knows the roll.
+    """
+    spread = np.linalg.svd(own - own.mean(axis=0), compute_uv=False)[1]
+    left = np.linalg.norm(aligned - own)
+    return float(left / spread) if spread > 0.0 else np.inf

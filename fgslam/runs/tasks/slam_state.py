@@ -1,4 +1,4 @@
-"""Runs that go on where one stopped, or leave a map behind."""
+"""The state of a run: its checkpoint, to resume it, and the map that it leaves, to go on with."""
 
 from __future__ import annotations
 
@@ -8,22 +8,112 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.backend.protocol import Estimator, Resumable
 from fgslam.core import __version__
+from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.arrays import StateArrays
-from fgslam.core.errors import ConfigError, MapError, MeasurementLogError
+from fgslam.core.errors import ConfigError, MapError, MeasurementLogError, OutputError
 from fgslam.core.estimates import Estimate
 from fgslam.core.files import require_writable
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap, require_rig, save_map
 from fgslam.runs.config import ExperimentConfig, parse_config
-from fgslam.runs.tasks import slam_checkpoint as checkpoint
+from fgslam.runs.folder import LOG_FILE, STATE_FILE
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, entry_of
 from fgslam.runs.tasks.slam_outputs import RunOutputs
 from fgslam.slam.arrival import saved_map
 from fgslam.slam.map_settings import MapSettings
 from fgslam.slam.pipeline import SlamPipeline
 from fgslam.slam.results import RunRecorder
+
+
+def save_checkpoint(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
+    """Writes the state. The log must have been written before: it may not lack a frame of it."""
+    write_arrays(folder / STATE_FILE, state_of(pipeline, recorder))
+
+
+def state_of(pipeline: SlamPipeline, recorder: RunRecorder) -> StateArrays:
+    """All that changes during a run but its log, as arrays named ``part/name``."""
+    parts = {
+        "database": pipeline.tracker.database.state(),
+        "estimator": _resumable(pipeline.estimator).state(),
+        "motion": pipeline.motion.state(),
+        "recorder": recorder.state(),
+    }
+    if pipeline.places is not None:
+        parts["places"] = pipeline.places.state()
+    return {
+        f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()
+    }
+
+
+def restore(
+    state: StateArrays, log: MeasurementLog, pipeline: SlamPipeline, recorder: RunRecorder
+) -> None:
+    """Continues from :func:`state_of` and the log.
+
+    Raises:
+        KeyError, ValueError, IndexError: the state is another's.
+    """
+    pipeline.tracker.database.restore(_part(state, "database"))
+    _resumable(pipeline.estimator).restore(_part(state, "estimator"))
+    pipeline.motion.restore(_part(state, "motion"))
+    recorder.restore(_part(state, "recorder"), log)
+    if pipeline.places is not None:
+        pipeline.places.restore(_part(state, "places"), recorder.log)
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """Whether there is a state to continue from."""
+    return (folder / STATE_FILE).is_file()
+
+
+def load_checkpoint(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
+    """Continues from a checkpoint.
+
+    Raises:
+        OutputError: state and log do not belong to each other or to this fgslam.
+        MeasurementLogError: one of the two files cannot be read.
+    """
+    state = load_arrays(folder / STATE_FILE)
+    log = MeasurementLog.load(folder / LOG_FILE)
+    try:
+        restore(state, log, pipeline, recorder)
+    except (KeyError, ValueError, IndexError) as error:
+        raise OutputError(
+            f"{folder / STATE_FILE}: not a state that this fgslam wrote ({error}); start again "
+            "with --overwrite"
+        ) from None
+    if len(recorder.log) < len(recorder):
+        raise OutputError(
+            f"{folder / LOG_FILE}: holds {len(log)} frames, the checkpoint {len(recorder)}; "
+            "restore it, or start again with --overwrite"
+        )
+
+
+def _resumable(estimator: Estimator) -> Resumable:
+    """The estimator, if its state can be kept. Raises OutputError where it cannot."""
+    if not isinstance(estimator, Resumable):
+        raise OutputError(
+            f"estimator {estimator.kind} has no state() and restore(): its run keeps no "
+            "checkpoint; give it both, or set output.checkpoint_seconds beyond the run's length"
+        )
+    return estimator
+
+
+def _part(state: StateArrays, part: str) -> StateArrays:
+    return {
+        name.removeprefix(f"{part}/"): array
+        for name, array in state.items()
+        if name.startswith(f"{part}/")
+    }
+
+
+def remove_checkpoint(folder: Path) -> None:
+    """Drops the state once the run has finished."""
+    (folder / STATE_FILE).unlink(missing_ok=True)
+
 
 _LOG = "log/"
 _TIMES = "recorder/stage_ms"
@@ -66,7 +156,7 @@ def require_savable(settings: MapSettings, run: Path) -> None:
 
 
 # --------------------------------------------------------------------------------------------
-# Going on where it stopped
+# Going on where the run of a map stopped
 
 
 def window(config: ExperimentConfig, given: GivenMap) -> ExperimentConfig:
@@ -145,7 +235,7 @@ def go_on(given: GivenMap, pipeline: SlamPipeline, recorder: RunRecorder) -> Non
     logged = {n.removeprefix(_LOG): a for n, a in session.items() if n.startswith(_LOG)}
     try:
         log = MeasurementLog.from_arrays(logged, where)
-        checkpoint.restore(session, log, pipeline, recorder)
+        restore(session, log, pipeline, recorder)
     except (KeyError, ValueError, IndexError, MeasurementLogError) as error:
         raise MapError(
             f"{where}: its session is not one that this fgslam wrote ({error}); use map.start last"
@@ -173,11 +263,11 @@ def _last_drive(saved: SavedMap) -> dict[str, Any]:
 # The map that is left
 
 
-def save(outputs: RunOutputs, given: GivenMap | None) -> str:
+def leave_map(outputs: RunOutputs) -> str:
     """Writes the map where the configuration wants it; a line about it, empty without."""
     if outputs.config.map.save is None:
         return ""
-    path, saved = Path(outputs.config.map.save), _saved_map(outputs, given)
+    path, saved = Path(outputs.config.map.save), _saved_map(outputs)
     size = save_map(saved, path)
     return (
         f"{path}: {len(saved)} landmarks, {int(saved.permanent.sum())} of them permanent, "
@@ -185,18 +275,18 @@ def save(outputs: RunOutputs, given: GivenMap | None) -> str:
     )
 
 
-def _saved_map(outputs: RunOutputs, given: GivenMap | None) -> SavedMap:
+def _saved_map(outputs: RunOutputs) -> SavedMap:
     """The session's map with what is known of its drives."""
     estimate = outputs.pipeline.estimator.estimate()
-    about = {"drives": [*_drives_before(outputs, given), _drive(outputs, estimate)]}
+    about = {"drives": [*_drives_before(outputs), _drive(outputs, estimate)]}
     session = _session(outputs) if outputs.config.map.session else None
     return saved_map(outputs.pipeline, outputs.sequence.rig, estimate, about, session)
 
 
-def _drives_before(outputs: RunOutputs, given: GivenMap | None) -> list[Any]:
-    if given is None:
+def _drives_before(outputs: RunOutputs) -> list[Any]:
+    if outputs.given is None:
         return []
-    before = list(given.saved.about.get("drives", ()))
+    before = list(outputs.given.saved.about.get("drives", ()))
     return before[:-1] if outputs.config.map.start == "continue" else before
 
 
@@ -222,6 +312,6 @@ def _drive(outputs: RunOutputs, estimate: Estimate) -> dict[str, Any]:
 def _session(outputs: RunOutputs) -> StateArrays:
     """What the run needs to go on; its times are the clock's, and no part of it."""
     log = outputs.recorder.log.to_arrays()
-    state = checkpoint.state_of(outputs.pipeline, outputs.recorder)
+    state = state_of(outputs.pipeline, outputs.recorder)
     state[_TIMES] = np.full_like(state[_TIMES], np.nan)
     return state | {f"{_LOG}{name}": array for name, array in log.items()}
