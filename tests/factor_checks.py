@@ -1,4 +1,4 @@
-"""A GTSAM factor beside its specification in fgslam.factors.residuals: values, cost, Jacobian."""
+"""A GTSAM factor beside its specification in factor_specifications: values, cost, Jacobian."""
 
 from __future__ import annotations
 

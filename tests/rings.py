@@ -8,8 +8,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from simulated import RIG, FeatureWorld, assert_same_bits
 
-from fgslam.backend.filters.settings import LandmarkKalmanSettings
-from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.settings import EstimatorSettings, LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.features import Features

@@ -9,8 +9,12 @@ import numpy as np
 from simulated import RIG, Drive, Simulation, observations, play, simulate
 
 from fgslam.backend.protocol import Estimator
-from fgslam.backend.settings import EstimatorSettings
-from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
+from fgslam.backend.settings import (
+    BatchSettings,
+    EstimatorSettings,
+    FixedLagSettings,
+    Isam2Settings,
+)
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.estimates import Estimate, Prediction, UpdateStats

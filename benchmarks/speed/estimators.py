@@ -21,18 +21,22 @@ from benchmarks.speed.drives import (
     open_drive,
     play,
 )
-from fgslam.backend.common_settings import KernelSettings
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
-from fgslam.backend.filters.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
-from fgslam.backend.graphs import solver_parameters
+from fgslam.backend.settings import (
+    BatchSettings,
+    Isam2Settings,
+    KernelSettings,
+    LandmarkKalmanGraphSettings,
+    LandmarkKalmanSettings,
+)
 from fgslam.backend.smoothers.batch import BatchSolver
 from fgslam.backend.smoothers.marginals import marginals_of
-from fgslam.backend.smoothers.settings import BatchSettings, Isam2Settings
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.factors.graphs import solver_parameters
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.pipeline import replay_frame

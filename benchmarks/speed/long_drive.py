@@ -9,10 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.speed.drives import MeasuredDrive, Player, cpu_seconds, open_drive, play
-from fgslam.backend.common_settings import KernelSettings
-from fgslam.backend.filters.settings import LandmarkKalmanSettings
-from fgslam.backend.settings import EstimatorSettings
-from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
+from fgslam.backend.settings import (
+    BatchSettings,
+    EstimatorSettings,
+    FixedLagSettings,
+    Isam2Settings,
+    KernelSettings,
+    LandmarkKalmanSettings,
+)
 from fgslam.core.estimates import Estimate
 from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory

@@ -13,10 +13,9 @@ To add an estimator:
 2. Where it can do more, add the members of :class:`Resumable` (interrupted runs),
    :class:`JointCovariances` or :class:`MapUser` (beginning in a saved map). What asks for them
    refuses an estimator without, in one line.
-3. To choose it in configurations, too: a frozen dataclass of settings beside the class, derived
-   from :class:`~fgslam.backend.common_settings.NamedSettings`, with its own ``kind`` and, for the
-   paired tests of many trials, its ``family``; add it to the union in
-   :mod:`fgslam.backend.settings`, and one ``case`` to ``make_estimator`` in
+3. To choose it in configurations, too: a frozen dataclass in :mod:`fgslam.backend.settings`,
+   derived from ``NamedSettings``, with its own ``kind`` and, for the paired tests of many trials,
+   its ``family``; add it to the union there, and one ``case`` to ``make_estimator`` in
    :mod:`fgslam.slam.factory`.
 
 ``tests/contract/test_estimators.py`` then holds it to the protocol without further ado: predicting

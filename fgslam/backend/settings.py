@@ -1,19 +1,322 @@
-"""Settings of the estimators, as a tagged union over ``kind``."""
+"""Settings of the estimators: filters, smoothers, and their union over ``kind``."""
 
 from __future__ import annotations
 
-from typing import Annotated, TypeAlias, get_args
+from typing import Annotated, ClassVar, Literal, TypeAlias, get_args
 
 from pydantic import Field
+from pydantic.dataclasses import dataclass
 
-from fgslam.backend.common_settings import Family
-from fgslam.backend.filters.settings import (
-    DeadReckoningSettings,
-    EkfSettings,
-    LandmarkKalmanGraphSettings,
-    LandmarkKalmanSettings,
-)
-from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
+from fgslam.core.settings import STRICT
+
+Family: TypeAlias = Literal["filter", "smoother", "other"]
+"""Whether past poses are revised; paired tests compare smoothers with filters, and no others.
+
+An `other` corrects nothing by landmarks seen again: dead reckoning.
+"""
+
+
+@dataclass(frozen=True, config=STRICT)
+class FloorSettings:
+    """How an estimator uses the floor under the robot."""
+
+    mode: Annotated[
+        Literal["auto", "none", "soft", "hard"],
+        Field(
+            description="`auto` the degrees of freedom of frontend.ego_motion.dof, exactly; `none` "
+            "all six; `hard` and `soft` those of dof (height, pitch and roll where it is 6), "
+            "exactly or up to the deviations below"
+        ),
+    ] = "auto"
+    height_sigma_m: Annotated[
+        float, Field(gt=0.0, description="soft: deviation of the camera's height a frame, metres")
+    ] = 0.005
+    tilt_sigma_deg: Annotated[
+        float, Field(gt=0.0, description="soft: deviation of pitch and of roll a frame, degrees")
+    ] = 0.2
+
+
+@dataclass(frozen=True, config=STRICT)
+class KernelSettings:
+    """Robust loss over a whitened residual, so that single wrong matches lose their pull."""
+
+    name: Annotated[
+        Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"],
+        Field(description="the M-estimator; `none` is least squares"),
+    ] = "cauchy"
+    width: Annotated[
+        float,
+        Field(gt=0.0, description="its scale, in standard deviations of the whole measurement"),
+    ] = 3.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class NamedSettings:
+    """What every estimator has."""
+
+    family: ClassVar[Family] = "other"
+
+    label: Annotated[
+        str | None,
+        Field(
+            pattern=r"^[A-Za-z0-9][\w.+-]*$",
+            description="name of its folder and of its row in tables; null: its kind",
+        ),
+    ] = None
+
+    @property
+    def title(self) -> str:
+        """The label, or the kind where there is none."""
+        return self.label or str(getattr(self, "kind", ""))
+
+
+@dataclass(frozen=True, config=STRICT)
+class LoopCorrectionSettings:
+    """Which loop closures an estimator accepts (docs/derivations/submaps.md)."""
+
+    gate_sigmas: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="a loop closure is refused where it raises the cost by more than the "
+            "square of this (ekf: its innovation squared beyond what is expected); 0: none is",
+        ),
+    ] = 10.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class DeadReckoningSettings(NamedSettings):
+    """Odometry alone: poses are never corrected, landmarks stay where they were first seen."""
+
+    kind: Literal["odometry"] = "odometry"
+
+
+@dataclass(frozen=True, config=STRICT)
+class PerLandmarkSettings(NamedSettings):
+    """What the paper's filter and the same filter as factor graphs share."""
+
+    family: ClassVar[Family] = "filter"
+    pose_covariance: Annotated[
+        bool,
+        Field(
+            description="add the pose's covariance to the observation's (6.4 read with IJRR 2002)"
+        ),
+    ] = True
+    miss_growth_m: Annotated[
+        float,
+        Field(
+            ge=0.0, description="standard deviation in metres added to a landmark on a miss (6.4)"
+        ),
+    ] = 0.0001
+    loops: LoopCorrectionSettings = LoopCorrectionSettings()
+
+
+@dataclass(frozen=True, config=STRICT)
+class LandmarkKalmanSettings(PerLandmarkSettings):
+    """The paper's estimator: least-squares pose, one 3x3 filter per landmark (6.4)."""
+
+    kind: Literal["landmark_kalman"] = "landmark_kalman"
+    update: Annotated[
+        Literal["pixel", "world", "running_mean", "half"],
+        Field(
+            description="how a matched landmark moves: `pixel` Kalman update on (column, row, "
+            "disparity), the most accurate measured; `world` Kalman fusion of 3-D positions "
+            "(6.4); `running_mean` and `half` the plain averaging of 4.1 (with and without a count)"
+        ),
+    ] = "pixel"
+
+
+@dataclass(frozen=True, config=STRICT)
+class LandmarkKalmanGraphSettings(PerLandmarkSettings):
+    """The same estimator as factor graphs: equal to ``landmark_kalman`` up to rounding."""
+
+    kind: Literal["landmark_kalman_graph"] = "landmark_kalman_graph"
+    update: Annotated[
+        Literal["pixel", "world"],
+        Field(description="as landmark_kalman's; the averaging of 4.1 is no least-squares problem"),
+    ] = "pixel"
+
+
+@dataclass(frozen=True, config=STRICT)
+class EkfSettings(NamedSettings):
+    """Full stochastic mapping: one joint covariance of pose and landmarks, no relinearisation."""
+
+    family: ClassVar[Family] = "filter"
+    kind: Literal["ekf"] = "ekf"
+    floor: FloorSettings = FloorSettings()
+    gate_sigmas: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="a match is left out when its own innovation exceeds this many standard "
+            "deviations (Mahalanobis distance); 0: no gate",
+        ),
+    ] = 5.0
+    loops: LoopCorrectionSettings = LoopCorrectionSettings()
+    max_landmarks: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="refuse to hold more: the joint covariance takes 72 n^2 bytes, 1.2 GB for "
+            "4000 landmarks, and up to half as much again in reserve",
+        ),
+    ] = 4000
+
+
+@dataclass(frozen=True, config=STRICT)
+class GraphSettings(NamedSettings):
+    """What all smoothers share: how measurements become a graph that can be solved."""
+
+    family: ClassVar[Family] = "smoother"
+    floor: FloorSettings = FloorSettings()
+    kernel: KernelSettings = KernelSettings()
+    noise_factor: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="standard deviations of landmark measurements are multiplied by this when "
+            "they are weighed; kernel and trim judge by the stated ones. Above 1 where errors of a "
+            "landmark persist from frame to frame, which a graph of independent measurements "
+            "would average away",
+        ),
+    ] = 1.0
+    gate_px: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="matches that the frame's own least squares rejected are left out where "
+            "their image residual exceeds this; nearer ones may be right, and the map have "
+            "drifted: the kernel deals with them. A range sensor's are all left out. 0: none is",
+        ),
+    ] = 12.0
+    least_sightings: Annotated[
+        int,
+        Field(ge=1, description="frames in which a landmark is seen before it enters the graph"),
+    ] = 2
+    least_parallax: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="disparity over its standard deviation below which a landmark waits; of a "
+            "range sensor, range over its deviation",
+        ),
+    ] = 3.0
+    weak_parallax: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            description="below this a landmark in the graph gets a weak prior, so that a far point "
+            "cannot be thrown behind the camera",
+        ),
+    ] = 8.0
+    contradicted_after: Annotated[
+        int,
+        Field(
+            ge=0,
+            description="left out in so many frames in a row, which agree on another place, a "
+            "landmark counts as moved and starts anew; 0: never",
+        ),
+    ] = 3
+    loops: LoopCorrectionSettings = LoopCorrectionSettings()
+
+
+@dataclass(frozen=True, config=STRICT)
+class FixedLagSettings(GraphSettings):
+    """Incremental fixed-lag smoother: what is older than the lag is marginalised."""
+
+    kind: Literal["fixed_lag"] = "fixed_lag"
+    kernel: KernelSettings = KernelSettings("huber", 4.0)
+    lag_frames: Annotated[
+        int | None, Field(ge=1, description="lag in frames; null: the lag is given in seconds")
+    ] = 10
+    lag_s: Annotated[
+        float | None, Field(gt=0.0, description="lag in seconds; used where lag_frames is null")
+    ] = None
+    relinearize_threshold: Annotated[
+        float, Field(gt=0.0, description="change (radians, metres) that relinearises a variable")
+    ] = 0.01
+
+
+@dataclass(frozen=True, config=STRICT)
+class Isam2Settings(GraphSettings):
+    """iSAM2 over all poses and landmarks."""
+
+    kind: Literal["isam2"] = "isam2"
+    update_every: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="frames between updates of the graph; a tracker (the paper's filter, "
+            "on the smoothed map) answers in between",
+        ),
+    ] = 5
+    ordering_window: Annotated[
+        int,
+        Field(
+            ge=0,
+            description="so many last poses are kept at the root of the Bayes tree; 0: GTSAM's own "
+            "choice, all variables of the update",
+        ),
+    ] = 30
+    relinearize_threshold: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="change (radians, metres) that relinearises a variable; 0.1, GTSAM's own, "
+            "leaves a drive of 50 m twice as far off as 0.01",
+        ),
+    ] = 0.01
+    keyframe_every: Annotated[
+        int,
+        Field(
+            ge=1,
+            description="frames to a keyframe; what the frames between measured is summarised in "
+            "factors of the keyframe. 1: every frame is a variable",
+        ),
+    ] = 1
+    final_iterations: Annotated[
+        int,
+        Field(
+            ge=0,
+            description="further updates without measurements, relinearising everything that "
+            "moved, before the estimate is reported",
+        ),
+    ] = 5
+
+
+@dataclass(frozen=True, config=STRICT)
+class BatchSettings(GraphSettings):
+    """Everything at once, the reference of the comparison."""
+
+    kind: Literal["batch"] = "batch"
+    gate_px: Annotated[
+        float,
+        Field(ge=0.0, description="as isam2's; 0: the whole problem decides what fits"),
+    ] = 0.0
+    trim: Annotated[
+        bool,
+        Field(
+            description="after the minimum with the kernel, leave out observations beyond the "
+            "99.9 % quantile of chi-square and solve the rest without it: its covariances are "
+            "those of least squares"
+        ),
+    ] = True
+    method: Annotated[
+        Literal["levenberg_marquardt", "gnc"],
+        Field(
+            description="Levenberg-Marquardt with the kernel, or graduated non-convexity "
+            "(truncated least squares) without"
+        ),
+    ] = "levenberg_marquardt"
+    solve_every: Annotated[
+        int,
+        Field(
+            ge=0,
+            description="live: solve anew after so many frames and track against the result; 0: "
+            "the tracker alone steers, the solution comes with the estimate",
+        ),
+    ] = 0
+
 
 EstimatorSettings: TypeAlias = Annotated[
     DeadReckoningSettings

@@ -22,8 +22,7 @@ from fgslam.factors.bearing_residuals import (
     elevation_jacobians,
     elevation_pair,
 )
-from fgslam.factors.kernels import KernelName
-from fgslam.factors.noise import Whitening
+from fgslam.factors.noise import KernelName, Whitening
 
 STIFF = 1e-4
 """Deviation, legs and radians, of what defines the frame: the start's pose, and the leg's length.

@@ -1,4 +1,4 @@
-"""Bearings and elevations in the plane, as pure functions with their derivatives.
+"""Bearings, elevations and motion in the plane, as pure functions with their derivatives.
 
 The specification of the factors of homing and the measurement model of its filter: eqs 7 to 9 as
 corrected in sign and order. Residuals are *predicted minus measured*. Poses are (x, y, psi)
@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.planar import bearings, between, rotation, unit, wrap
+from fgslam.core.planar import bearings, between, unit, wrap
 
-_SMALL = 1e-5  # radians: below it the series of the logarithm is exact to rounding
+_SMALL = 1e-2  # radians: below it the series of the cotangent is exact to rounding
 
 
 def bearing(pose: FloatArray, points: FloatArray, measured: FloatArray) -> FloatArray:
@@ -117,6 +117,38 @@ def direction_and_turn(
 
 
 # --------------------------------------------------------------------------------------------
+# Many views of the same points
+
+
+def offsets(views: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(v, m) of points from views, along x and y."""
+    return points[:, 0] - views[:, :1], points[:, 1] - views[:, 1:2]
+
+
+def bearings_from_views(
+    dx: FloatArray, dy: FloatArray, squared: FloatArray, numbers: int
+) -> tuple[FloatArray, FloatArray]:
+    """(v, m, 3) and (v, m, 2 or 3) derivatives of bearings by poses and points."""
+    by_pose, by_point = np.empty((*dx.shape, 3)), np.zeros((*dx.shape, numbers))
+    by_point[..., 0], by_point[..., 1] = -dy / squared, dx / squared
+    by_pose[..., :2], by_pose[..., 2] = -by_point[..., :2], -1.0
+    return by_pose, by_point
+
+
+def elevations_from_views(
+    dx: FloatArray, dy: FloatArray, squared: FloatArray, heights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The same of elevations of points at heights (m,)."""
+    distance = np.sqrt(squared)
+    whole = squared + heights**2
+    by_pose, by_point = np.zeros((*dx.shape, 3)), np.empty((*dx.shape, 3))
+    down = heights / (whole * distance)
+    by_pose[..., 0], by_pose[..., 1] = down * dx, down * dy
+    by_point[..., :2], by_point[..., 2] = -by_pose[..., :2], distance / whole
+    return by_pose, by_point
+
+
+# --------------------------------------------------------------------------------------------
 # Triangulation from start and target (III-C)
 
 
@@ -146,56 +178,98 @@ def triangulated(
 
 
 # --------------------------------------------------------------------------------------------
-# Motion
+# Motion: constant velocity between many poses at once; GTSAM's factor is WnoaMotionFactorPose2
 
 
-def constant_velocity(
-    before: FloatArray, speed: FloatArray, after: FloatArray, next_speed: FloatArray, step: float
-) -> FloatArray:
-    """Residual (6,) of white noise on acceleration between two poses (Barfoot 2017, 11.1).
+def constant_velocities(
+    poses: FloatArray, speeds: FloatArray, steps: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Residuals and derivatives of a chain.
 
     Args:
-        before: (3,) pose.
-        speed: (3,) velocity there, in the robot's own axes: forward, left, turning.
-        after: (3,) pose.
-        next_speed: (3,) velocity there.
-        step: seconds between them.
+        poses: (n + 1, 3) in the order of time.
+        speeds: (n + 1, 3) velocities there, in the robot's own axes: forward, left, turning.
+        steps: (n,) seconds between them.
+
+    Returns:
+        (n, 6) residuals, and (n, 6, 6) derivatives by (pose, velocity) before and after.
     """
-    moved = se2_log(between(before, after))
-    carried = _log_derivative(moved) @ next_speed
-    return np.concatenate([moved - step * speed, carried - speed])
+    moved = between(poses[:-1], poses[1:])
+    flat, derivative, curve = _log_terms(moved[:, 2])
+    residual, by_moved, by_speed = _by_motion(moved, speeds[1:], (flat, derivative, curve))
+    residual[:, :3] -= steps[:, None] * speeds[:-1]
+    residual[:, 3:] -= speeds[:-1]
+    by_before, by_after = _by_poses(poses[:-1], moved)
+    before, after = np.zeros((2, len(steps), 6, 6))
+    before[:, :, :3], after[:, :, :3] = by_moved @ by_before, by_moved @ by_after
+    every = np.arange(3)
+    before[:, every, 3 + every] = -steps[:, None]
+    before[:, 3 + every, 3 + every] = -1.0
+    after[:, 3:, 3:] = by_speed
+    return residual, before, after
 
 
-def constant_velocity_covariance(density: FloatArray, step: float) -> FloatArray:
-    """(6, 6) covariance of it, of densities (3,) of accelerations forward, left and turning."""
-    powers = np.array([[step**3 / 3.0, step**2 / 2.0], [step**2 / 2.0, step]])
-    return np.kron(powers, np.diag(density))
+def motion_informations(steps: FloatArray, density: FloatArray) -> FloatArray:
+    """(n, 6, 6) inverse covariances, of steps (n,) and the accelerations' densities (3,)."""
+    place, cross, speed = 12.0 / steps**3, -6.0 / steps**2, 4.0 / steps
+    powers = np.stack([place, cross, cross, speed], axis=-1).reshape(-1, 2, 2)
+    return np.asarray(np.einsum("nab,ij->naibj", powers, np.diag(1.0 / density)).reshape(-1, 6, 6))
 
 
-def se2_log(motion: FloatArray) -> FloatArray:
-    """Tangent vector (3,), [translation, rotation], of a planar motion (x, y, psi)."""
-    half = 0.5 * motion[2]
-    cotangent = 1.0 - half**2 / 3.0 if abs(half) < _SMALL else half / np.tan(half)
-    straight = np.array([[cotangent, half], [-half, cotangent]])
-    return np.append(straight @ motion[:2], motion[2])
+def _by_motion(
+    moved: FloatArray, speed: FloatArray, terms: tuple[FloatArray, FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(Log m, J(m) v) with derivatives (n, 6, 3) by the motion m and J (n, 3, 3), that by v.
 
-
-def _log_derivative(tangent: FloatArray) -> FloatArray:
-    """(3, 3) derivative of the logarithm by a step on the right of the motion.
-
-    The logarithm is (M(w) t, w) of a motion (t, w); a step (a, b) makes it (t + R(w) a, w + b).
+    Log m = (M(w) t, w) of m = (t, w), and J = [M R(w), M' t; 0, 1].
     """
-    w = tangent[2]
+    straight, derivative, curve = terms
+    t, w = moved[:, :2, None], moved[:, 2]
+    c, s = np.cos(w), np.sin(w)
+    turn = np.stack([c, -s, s, c], axis=-1).reshape(-1, 2, 2)
+    ahead = turn @ speed[:, :2, None]
+    aside = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)  # of R' = R rotated by 90 degrees
+    rate = speed[:, 2, None, None]
+    bent = derivative @ t
+    residual, by_moved = np.empty((len(moved), 6)), np.zeros((len(moved), 6, 3))
+    residual[:, :2] = (straight @ t)[..., 0]
+    residual[:, 2], residual[:, 5] = w, speed[:, 2]
+    residual[:, 3:5] = (straight @ ahead + bent * rate)[..., 0]
+    by_moved[:, :2, :2], by_moved[:, :2, 2] = straight, bent[..., 0]
+    by_moved[:, 2, 2] = 1.0
+    by_moved[:, 3:5, :2] = derivative * rate
+    by_turn = derivative @ ahead + straight @ aside + curve * t * rate
+    by_moved[:, 3:5, 2] = by_turn[..., 0]
+    by_speed = np.zeros((len(moved), 3, 3))
+    by_speed[:, :2, :2], by_speed[:, :2, 2], by_speed[:, 2, 2] = straight @ turn, bent[..., 0], 1.0
+    return residual, by_moved, by_speed
+
+
+def _log_terms(w: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """M(w) = [k, w/2; -w/2, k], k = w/2 cot(w/2): (n, 2, 2); M'; and k'' (n, 1, 1)."""
     half = 0.5 * w
-    if abs(half) < _SMALL:
-        cotangent, slope = 1.0 - half**2 / 3.0, -w / 6.0
-    else:
-        cotangent = half / np.tan(half)
-        slope = 0.5 * (1.0 / np.tan(half) - half / np.sin(half) ** 2)
-    straight = np.array([[cotangent, half], [-half, cotangent]])
-    by_turn = np.array([[slope, 0.5], [-0.5, slope]])
-    moved = np.linalg.solve(straight, tangent[:2])
-    out = np.eye(3)
-    out[:2, :2] = straight @ rotation(w)
-    out[:2, 2] = by_turn @ moved
-    return out
+    small = np.abs(half) < _SMALL
+    safe = np.where(small, 1.0, half)
+    tangent, sine = np.tan(safe), np.sin(safe)
+    square = half**2
+    k = np.where(small, 1.0 - square / 3.0 - square**2 / 45.0, safe / tangent)
+    series = -half / 3.0 - 2.0 / 45.0 * half * square
+    slope = np.where(small, series, 0.5 * (1.0 / tangent - safe / sine**2))
+    curve = np.where(small, -1.0 / 6.0 - square / 15.0, 0.5 * (safe / tangent - 1.0) / sine**2)
+    fixed = np.full_like(w, 0.5)
+    straight = np.stack([k, half, -half, k], axis=-1).reshape(-1, 2, 2)
+    derivative = np.stack([slope, fixed, -fixed, slope], axis=-1).reshape(-1, 2, 2)
+    return straight, derivative, curve[:, None, None]
+
+
+def _by_poses(before: FloatArray, moved: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(n, 3, 3) derivatives of a motion by both its poses."""
+    c, s = np.cos(before[:, 2]), np.sin(before[:, 2])
+    by_before, by_after = np.zeros((2, len(before), 3, 3))
+    by_after[:, 0, 0], by_after[:, 0, 1] = c, s
+    by_after[:, 1, 0], by_after[:, 1, 1] = -s, c
+    by_after[:, 2, 2] = 1.0
+    by_before[:, :2, :2] = -by_after[:, :2, :2]
+    by_before[:, 0, 2], by_before[:, 1, 2] = moved[:, 1], -moved[:, 0]
+    by_before[:, 2, 2] = -1.0
+    return by_before, by_after

@@ -11,9 +11,8 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from fgslam.backend.filters.settings import LandmarkKalmanSettings
 from fgslam.backend.homing.settings import HomingEstimatorSettings, HomingGraphSettings
-from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.settings import EstimatorSettings, LandmarkKalmanSettings
 from fgslam.datasets.omni_settings import (
     OmniDatasetSettings,
     OmniHouseSettings,

@@ -13,16 +13,18 @@ from typing import TYPE_CHECKING, Any, TypeGuard, cast, get_args
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from fgslam.backend.common_settings import FloorSettings
-from fgslam.backend.filters.settings import (
+from fgslam.backend.protocol import Estimator, FullEstimator
+from fgslam.backend.settings import (
+    BatchSettings,
     DeadReckoningSettings,
     EkfSettings,
+    EstimatorSettings,
+    FixedLagSettings,
+    FloorSettings,
+    Isam2Settings,
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
 )
-from fgslam.backend.protocol import Estimator, FullEstimator
-from fgslam.backend.settings import EstimatorSettings
-from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Prediction
 from fgslam.core.floor import DegreesOfFreedom, Floor

@@ -14,13 +14,15 @@ import numpy as np
 import pytest
 from simulated import RIG
 
-from fgslam.backend.filters.settings import (
+from fgslam.backend.protocol import Estimator, Resumable
+from fgslam.backend.settings import (
+    BatchSettings,
+    EstimatorSettings,
+    Isam2Settings,
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
+    family_of,
 )
-from fgslam.backend.protocol import Estimator, Resumable
-from fgslam.backend.settings import EstimatorSettings, family_of
-from fgslam.backend.smoothers.settings import BatchSettings, Isam2Settings
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray

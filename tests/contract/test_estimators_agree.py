@@ -14,16 +14,18 @@ import pytest
 from simulated import RIG, play, tracked_at
 from smoothing import FREE, SMOOTHERS, answer, ate, blackout, build, drawn, run
 
-from fgslam.backend.common_settings import KernelSettings
-from fgslam.backend.filters.settings import (
+from fgslam.backend.protocol import Estimator
+from fgslam.backend.settings import (
+    BatchSettings,
     DeadReckoningSettings,
     EkfSettings,
+    EstimatorSettings,
+    FixedLagSettings,
+    Isam2Settings,
+    KernelSettings,
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
 )
-from fgslam.backend.protocol import Estimator
-from fgslam.backend.settings import EstimatorSettings
-from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Estimate, Prediction

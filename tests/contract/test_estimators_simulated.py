@@ -23,8 +23,7 @@ from simulated import (
 from test_estimators import CORRECTING, SETTINGS
 
 from fgslam.backend.protocol import Estimator
-from fgslam.backend.settings import EstimatorSettings
-from fgslam.backend.smoothers.settings import FixedLagSettings, Isam2Settings
+from fgslam.backend.settings import EstimatorSettings, FixedLagSettings, Isam2Settings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Prediction

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from homings import Trial, trial
 
+from fgslam.backend.homing.estimator import HomingEstimator
 from fgslam.backend.homing.factory import make_homing_estimator
-from fgslam.backend.homing.protocol import HomingEstimator
 from fgslam.backend.homing.settings import (
     PAPER,
     AverageLandmarkVectorSettings,

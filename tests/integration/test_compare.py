@@ -21,8 +21,7 @@ from running import (
     write_config,
 )
 
-from fgslam.backend.filters.settings import DeadReckoningSettings
-from fgslam.backend.smoothers.settings import Isam2Settings
+from fgslam.backend.settings import DeadReckoningSettings, Isam2Settings
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.trajectories import Trajectory, read_covariances
 from fgslam.evaluation.metrics import EstimatorMetrics

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import factor_specifications as residuals
 import gtsam
 import numpy as np
 from factor_checks import values_of
@@ -17,11 +18,9 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.floor import Floor
 from fgslam.core.measurements import Odometry
 from fgslam.core.sensors import RangeBearingSensor
-from fgslam.factors import residuals
+from fgslam.factors.landmark import RangeBearingFactors, StereoFactors
 from fgslam.factors.motion import floor_factors, odometry_factor
 from fgslam.factors.noise import Whitening, positive_definite
-from fgslam.factors.range_bearing import RangeBearingFactors
-from fgslam.factors.stereo import StereoFactors
 
 SENSOR = RangeBearingSensor(20.0, g.BODY_FORWARD_LEFT_UP_FROM_CAMERA)
 

@@ -52,7 +52,7 @@ def test_a_lawful_package_passes(tmp_path: Path) -> None:
         "worlds/open3d_library.py": "def load():\n    import open3d\n    return open3d\n",
         "datasets/lab.py": "import cv2\nfrom fgslam.worlds import open3d_library\n",
         "factors/stereo.py": "import gtsam\nfrom fgslam.core import arrays\n",
-        "backend/isam2.py": "import gtsam\nfrom fgslam.factors.stereo import f\n",
+        "backend/isam2.py": "import gtsam\nfrom fgslam.factors.landmark import f\n",
         "slam/pipeline.py": "from fgslam.backend import isam2\nfrom fgslam.datasets import lab\n",
         "cli/main.py": "def main():\n    from fgslam.slam import pipeline\n    return pipeline\n",
         "__main__.py": "from fgslam.cli.main import main\n",

@@ -22,7 +22,7 @@ from fgslam.backend.filters.ekf_update import (
 )
 from fgslam.backend.filters.filtered import FilteredTrajectory, FirstSights
 from fgslam.backend.filters.growing_covariance import BLOCK, FRONT, GrowingCovariance, rows_of
-from fgslam.backend.filters.settings import EkfSettings
+from fgslam.backend.settings import EkfSettings
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats

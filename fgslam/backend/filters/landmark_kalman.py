@@ -17,11 +17,16 @@ from typing import ClassVar
 import numpy as np
 
 from fgslam.backend.filters.filtered import FilteredTrajectory, moved
-from fgslam.backend.filters.landmark_rows import LandmarkRows
-from fgslam.backend.filters.loop_correction import DriveRecord
-from fgslam.backend.filters.settings import LandmarkKalmanSettings
-from fgslam.backend.filters.submaps import Chain, changes, home_changes, rotated, transported
-from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.backend.filters.loop_correction import (
+    Chain,
+    DriveRecord,
+    changes,
+    home_changes,
+    rotated,
+    transported,
+)
+from fgslam.backend.settings import LandmarkKalmanSettings
+from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray, StateArrays
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.geometry import (
     block_diagonal,
@@ -39,6 +44,92 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
 from fgslam.core.sensors import Sensor
+
+
+class LandmarkRows:
+    """Identities ascending, with position, covariance, number of sightings and home frame.
+
+    An update costs what it touches: new landmarks are appended in place, and those that go are
+    mostly young, so that only what lies behind the first of them moves.
+    The arrays are views of the room in use: writing to rows of them changes the landmarks.
+    """
+
+    def __init__(self) -> None:
+        """No landmark."""
+        number = np.empty(0, np.int64)
+        self._columns = GrowingColumns(
+            ids=number,
+            positions=np.empty((0, 3)),
+            covariances=np.empty((0, 3, 3)),
+            counts=number,
+            homes=number,
+        )
+
+    def __len__(self) -> int:
+        return len(self._columns)
+
+    @property
+    def ids(self) -> IntArray:
+        """(n,) ascending."""
+        return self._columns["ids"]
+
+    @property
+    def positions(self) -> FloatArray:
+        """(n, 3) world, metres."""
+        return self._columns["positions"]
+
+    @property
+    def covariances(self) -> FloatArray:
+        """(n, 3, 3) metres squared."""
+        return self._columns["covariances"]
+
+    @property
+    def counts(self) -> IntArray:
+        """(n,) frames in which each was seen."""
+        return self._columns["counts"]
+
+    @property
+    def homes(self) -> IntArray:
+        """(n,) frame with which each moves when a loop is closed; -1 for one that stays."""
+        return self._columns["homes"]
+
+    def map(self) -> LandmarkMap:
+        """As a map; only until the next landmark comes or goes."""
+        return LandmarkMap(self.ids, self.positions, self.covariances)
+
+    def rows(self, ids: IntArray) -> IntArray:
+        """Row of each id. Raises KeyError when one is absent."""
+        return self.map().rows(ids)
+
+    def add(self, ids: IntArray, positions: FloatArray, covariances: FloatArray, home: int) -> None:
+        """Adds landmarks (k,), seen once; they must be new."""
+        before = len(self)
+        ones = np.ones(len(ids), np.int64)
+        self._columns.append(
+            {
+                "ids": ids,
+                "positions": positions,
+                "covariances": covariances,
+                "counts": ones,
+                "homes": home * ones,
+            }
+        )
+        if not (np.diff(self.ids[max(before - 1, 0) :]) > 0).all():
+            self._columns.take(0, np.argsort(self.ids, kind="stable"))
+
+    def remove(self, ids: IntArray) -> None:
+        """Drops landmarks. Raises KeyError when one is absent."""
+        if not len(ids):
+            return
+        gone = np.zeros(len(self), np.bool_)
+        gone[self.rows(ids)] = True
+        self._columns.drop(gone)
+
+    def load(self, landmarks: LandmarkMap, counts: IntArray, homes: IntArray) -> None:
+        """Replaces everything; the arrays are copied."""
+        self._columns.take(0, np.empty(0, np.int64))
+        self.add(landmarks.ids, landmarks.positions, landmarks.covariances, 0)
+        self.counts[:], self.homes[:] = counts, homes
 
 
 class LandmarkKalman:

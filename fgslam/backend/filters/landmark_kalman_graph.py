@@ -9,27 +9,276 @@ docs/derivations/landmark_filter_as_graph.md.
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import gtsam
 import numpy as np
 
-from fgslam.backend.filters.fixed_map_pose import FixedMapPose
-from fgslam.backend.filters.landmark_elimination import Eliminated, LandmarkElimination, fused
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
-from fgslam.backend.filters.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
+from fgslam.backend.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction, UpdateStats
-from fgslam.core.geometry import transform_to_world, triangulate
+from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import (
+    congruence,
+    pose,
+    projection_jacobian,
+    reorthonormalise,
+    so3_exp,
+    transform_to_camera,
+    transform_to_world,
+    triangulate,
+)
 from fgslam.core.measurements import Increment, MeasurementType, Observations
 from fgslam.core.sensors import CameraRig, Sensor
-from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.factors.graphs import landmark_key, pose_key
+from fgslam.factors.landmark import FROM_MEASUREMENT, StereoFactors
 from fgslam.factors.noise import Whitening
-from fgslam.factors.stereo import StereoFactors
 from fgslam.frontend.settings import EgoMotionSettings
+from fgslam.frontend.tracking.ego_motion import MAX_ITERATIONS
 
 _POSE, _LANDMARK = pose_key(0), landmark_key(0)
+_CONVERGED = 1e-9  # radians and metres; as the front-end's, which does not take that step either
+_EXACT_SIGMA = 1e-6  # radians and metres: stands for zero where the prediction has no variance
+_UNIT, _ZERO = gtsam.noiseModel.Unit.Create(3), np.zeros(3)
+
+
+class FixedMapPose:
+    """Solves for one frame's pose: prior at the prediction, landmarks held fixed (3.3).
+
+    Each match is GTSAM's stereo factor whose landmark column is dropped; a landmark's uncertainty,
+    where it counts, is added to the measurement's noise, at the pose that the front-end's least
+    squares weighted at. So the minimum is the front-end's, found by other means.
+    """
+
+    def __init__(self, rig: CameraRig, settings: EgoMotionSettings) -> None:
+        """``settings`` are the front-end's, so that both minimise the same cost."""
+        self._rig = rig
+        self._settings = settings
+        self._floor = Floor.under(rig, settings.dof)
+        self._factors = StereoFactors(rig, Whitening())
+
+    def solve(
+        self,
+        prediction: Prediction,
+        weighted_at: FloatArray,
+        landmarks: LandmarkMap,
+        observed: Observations,
+    ) -> Prediction:
+        """Gauss-Newton on the floor, from ``weighted_at``; pose and covariance at the minimum."""
+        graph = self._graph(prediction, weighted_at, landmarks, observed)
+        values = gtsam.Values()
+        rows = landmarks.rows(observed.ids)
+        for i, position in enumerate(landmarks.positions[rows]):
+            values.insert(landmark_key(i), position)
+        values.insert(_POSE, gtsam.Pose3(weighted_at))
+        wTc = weighted_at
+        for _ in range(MAX_ITERATIONS):
+            basis = self._floor.basis(wTc)
+            step, covariance = _solved(_pose_columns(graph.linearize(values)), basis)
+            if np.abs(step).max() < _CONVERGED:
+                break
+            wTc = pose(wTc[:3, :3] @ so3_exp(step[:3]), wTc[:3, 3] + wTc[:3, :3] @ step[3:])
+            values.update(_POSE, gtsam.Pose3(wTc))
+        return Prediction(reorthonormalise(wTc), covariance)
+
+    def _graph(
+        self,
+        prediction: Prediction,
+        weighted_at: FloatArray,
+        landmarks: LandmarkMap,
+        observed: Observations,
+    ) -> Any:
+        graph = gtsam.NonlinearFactorGraph()
+        roots = self._roots(weighted_at, landmarks, observed)
+        for i, (measured, root) in enumerate(zip(observed.measurement, roots, strict=True)):
+            model = gtsam.noiseModel.Gaussian.SqrtInformation(root)
+            graph.add(self._factors.with_model(_POSE, landmark_key(i), measured, model))
+        if self._settings.prior:
+            wTp = Prediction(self._floor.constrain(prediction.wTc), prediction.covariance)
+            graph.add(_exact_prior(wTp))
+        return graph
+
+    def _roots(
+        self, weighted_at: FloatArray, landmarks: LandmarkMap, observed: Observations
+    ) -> FloatArray:
+        """Square roots (k, 3, 3) of the information of (u_left, u_right, v)."""
+        settings = self._settings
+        covariance = observed.covariance
+        if settings.weighting == "uniform":
+            covariance = np.tile(np.eye(3), (len(observed), 1, 1))
+        if settings.weighting == "landmark":
+            rows = landmarks.rows(observed.ids)
+            points = transform_to_camera(weighted_at, landmarks.positions[rows])
+            jacobian = projection_jacobian(self._rig, points) @ weighted_at[:3, :3].T
+            covariance = covariance + congruence(jacobian, landmarks.covariances[rows])
+        used = 3 if settings.residuals == "image_disparity" else 2
+        roots = np.zeros((len(observed), 3, 3))
+        roots[:, :used, :used] = np.linalg.inv(np.linalg.cholesky(covariance[:, :used, :used]))
+        return np.asarray(roots @ np.linalg.inv(FROM_MEASUREMENT))
+
+
+def _exact_prior(prediction: Prediction) -> Any:
+    """``Log(predicted^-1 wTc)`` with its whole Jacobian.
+
+    GTSAM's own prior leaves the logarithm's out, and so stops a little beside the minimum.
+    """
+    predicted = gtsam.Pose3(prediction.wTc).inverse()
+    covariance = 0.5 * (prediction.covariance + prediction.covariance.T)
+    try:
+        root = whitening(covariance)
+    except np.linalg.LinAlgError:
+        root = whitening(covariance + _EXACT_SIGMA**2 * np.eye(6))
+    model = gtsam.noiseModel.Gaussian.SqrtInformation(root)
+
+    def error(factor: Any, values: Any, jacobians: Any) -> FloatArray:
+        deviation = predicted.compose(values.atPose3(factor.keys()[0]))
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray(gtsam.Pose3.LogmapDerivative(deviation))
+        return np.asarray(gtsam.Pose3.Logmap(deviation))
+
+    return gtsam.CustomFactor(model, [_POSE], error)
+
+
+def _pose_columns(linear: Any) -> tuple[FloatArray, FloatArray]:
+    """Whitened Jacobian (m, 6) and right-hand side (m,); the landmarks' columns are dropped."""
+    parts = [linear.at(i).jacobian() for i in range(linear.size())]
+    return np.concatenate([a[:, :6] for a, _ in parts]), np.concatenate([b for _, b in parts])
+
+
+def _solved(
+    system: tuple[FloatArray, FloatArray], basis: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Step (6,) and covariance (6, 6) within the floor's directions; GTSAM eliminates by QR."""
+    matrix, rhs = system
+    unit = gtsam.noiseModel.Unit.Create(len(rhs))
+    order = gtsam.Ordering()
+    order.push_back(_POSE)
+    factor = gtsam.JacobianFactor(_POSE, matrix @ basis, rhs, unit)
+    conditional, _ = factor.eliminate(order)
+    root = basis @ np.linalg.inv(conditional.R())
+    return root @ conditional.d(), root @ root.T
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Eliminated:
+    """Landmarks after their graphs' elimination.
+
+    Attributes:
+        steps: (k, 3) their offsets from the points of linearisation, metres.
+        covariances: (k, 3, 3) metres squared.
+        misfit: what remains of the squared whitened residuals: the innovations squared, summed.
+    """
+
+    steps: FloatArray
+    covariances: FloatArray
+    misfit: float
+
+
+class LandmarkElimination:
+    """Eliminates landmarks of one frame, whose pose is held fixed up to its covariance.
+
+    Every landmark is given a copy of the frame's pose of its own, whose prior is the pose's
+    covariance. Eliminating the copy leaves ``R + J P J^T`` as the measurement's noise. That the
+    copies know nothing of each other, nor of next frame's, is all that distinguishes the paper's
+    filter from the full graph.
+    """
+
+    def __init__(self, pose_covariance: FloatArray | None) -> None:
+        """``pose_covariance`` (6, 6) may be singular; None takes the pose as exact."""
+        self._root = np.empty((6, 0)) if pose_covariance is None else _root(pose_covariance)
+        self._rank = self._root.shape[1]
+        self._order = gtsam.Ordering()
+        if self._rank:
+            self._order.push_back(_POSE)
+        self._order.push_back(_LANDMARK)
+        self._by_itself = np.eye(self._rank), np.zeros(self._rank)
+        self._unit_pose = gtsam.noiseModel.Unit.Create(self._rank)
+
+    def observed(self, linear: list[Any], priors: FloatArray | None) -> Eliminated:
+        """A factor of pose and landmark, and the landmark's prior, for each of them.
+
+        Args:
+            linear: GTSAM's factors between ``pose_key(0)`` and ``landmark_key(0)``, linearised
+                at the pose, and at the landmark where its prior is centred.
+            priors: (k, 3, 3) covariances of the landmarks; None for new ones.
+        """
+        systems = [factor.jacobian() for factor in linear]
+        matrices = np.array([a for a, _ in systems]).reshape(-1, 3, 9)
+        by_pose = matrices[:, :, :6] @ self._root
+        known = [None] * len(linear) if priors is None else whitening(priors)
+        given = zip(by_pose, matrices[:, :, 6:], (b for _, b in systems), known, strict=True)
+        return _eliminated([self._graph(*of_one) for of_one in given], self._order)
+
+    def _graph(
+        self,
+        by_pose: FloatArray,
+        by_landmark: FloatArray,
+        rhs: FloatArray,
+        known: FloatArray | None,
+    ) -> Any:
+        graph = gtsam.GaussianFactorGraph()
+        if self._rank:
+            matrix, zero = self._by_itself
+            graph.add(_POSE, matrix, zero, self._unit_pose)
+            graph.add(_POSE, by_pose, _LANDMARK, by_landmark, rhs, _UNIT)
+        else:
+            graph.add(_LANDMARK, by_landmark, rhs, _UNIT)
+        if known is not None:
+            graph.add(_LANDMARK, known, _ZERO, _UNIT)
+        return graph
+
+
+def fused(priors: FloatArray, offsets: FloatArray, noise: FloatArray) -> Eliminated:
+    """Landmarks' priors, and positions measured ``offsets`` (k, 3) from them with ``noise``."""
+    values = gtsam.Values()
+    values.insert(_LANDMARK, _ZERO)
+    order = gtsam.Ordering()
+    order.push_back(_LANDMARK)
+    model = gtsam.noiseModel.Gaussian.SqrtInformation
+    graphs = []
+    for known, offset, measured in zip(whitening(priors), offsets, whitening(noise), strict=True):
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(gtsam.PriorFactorPoint3(_LANDMARK, _ZERO, model(known)))
+        graph.add(gtsam.PriorFactorPoint3(_LANDMARK, offset, model(measured)))
+        graphs.append(graph.linearize(values))
+    return _eliminated(graphs, order)
+
+
+def whitening(covariance: FloatArray) -> FloatArray:
+    """Upper triangular W with ``W^T W`` the inverse of positive definite covariances (..., n, n).
+
+    Upper, because GTSAM's ``SqrtInformation`` takes a lower triangular matrix for its diagonal.
+    """
+    upper = np.linalg.cholesky(covariance[..., ::-1, ::-1])[..., ::-1, ::-1]
+    return np.asarray(np.linalg.inv(upper))
+
+
+def _eliminated(graphs: list[Any], order: Any) -> Eliminated:
+    """By QR, the landmark last, so that its rows stand on their own.
+
+    Cholesky would square the condition of a far landmark's long ellipsoid.
+    """
+    roots, kept, misfit = np.empty((len(graphs), 3, 3)), np.empty((len(graphs), 3)), 0.0
+    for i, graph in enumerate(graphs):
+        joint = gtsam.JacobianFactor(graph, order)
+        conditional, _ = joint.eliminate(order)
+        rhs, left = joint.getb(), conditional.d()
+        roots[i], kept[i] = conditional.R()[-3:, -3:], left[-3:]
+        # Q is orthogonal: what the right-hand side lost in length is the residual at the minimum.
+        misfit += max(float(rhs @ rhs - left @ left), 0.0)
+    inverse = np.linalg.inv(roots)
+    steps = (inverse @ kept[:, :, None])[:, :, 0]
+    return Eliminated(steps, np.asarray(inverse @ np.swapaxes(inverse, 1, 2)), misfit)
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """(6, r) with ``S S^T`` the covariance of rank r."""
+    variances, directions = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    kept = variances > 1e-15 * max(variances[-1], 1e-300)
+    return np.asarray(directions[:, kept] * np.sqrt(variances[kept]))
 
 
 class LandmarkKalmanGraph(LandmarkKalman):

@@ -1,31 +1,304 @@
-"""The chain of steps that a filter keeps of its drive, and the acceptance of loop closures by it.
+"""Backward correction by submaps (Se, Lowe and Little's later work), and which loops are accepted.
 
-The filter's own covariance of a pose says how well it is known relative to the map around it, and
-never grows: drift is not in it. What drifts is the chain of steps, each as uncertain as its frame
-was tracked; where no landmark was matched, as uncertain as the odometry; where the robot was
-carried off, unknown. Derivation: docs/derivations/submaps.md.
+A drive is a chain of steps, each as uncertain as it was tracked. Closing a loop asks for the least
+weighted changes to the chain under which it meets itself: the minimum of a pose graph. Its
+variables are the poses at which submaps begin; within a submap the change is spread over the
+frames as their steps' uncertainty has it, so that nothing tears. Derivation:
+docs/derivations/submaps.md.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from dataclasses import dataclass, field
+from typing import Any
 
+import gtsam
 import numpy as np
 
-from fgslam.backend.filters.settings import LoopCorrectionSettings
-from fgslam.backend.filters.submaps import CLOSURE_FACTOR, FREE, SUBMAP_FRAMES, Chain, Constraint
+from fgslam.backend.settings import LoopCorrectionSettings
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import EgoMotion
-from fgslam.core.geometry import inverse
+from fgslam.core.estimates import EgoMotion, Prediction
+from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise, se3_log, skew
 from fgslam.core.measurements import LoopClosure, Odometry
+from fgslam.factors.graphs import pose_key, poses_of_frame, solver_parameters
+from fgslam.factors.motion import odometry_factor, pose_prior
+from fgslam.factors.noise import robust
 
+_DOUBT_WIDTH = 3.0  # deviations of the whole closure; its squared residual is 6 on average
+SUBMAP_FRAMES = 10
+"""Frames to a submap: enough that the pose graph of a long drive stays small, few enough that what
+a submap's frames measured hardly bends within it."""
+CLOSURE_FACTOR = 3.0
+"""By which deviations of a loop closure are multiplied: its own covariance takes the map around
+both frames as rigid, whose landmarks are as uncertain as the poses that saw them."""
+_ITERATIONS = 100
+_TOLERANCE = 1e-12  # of the cost
+_EXACT_SIGMA = 1e-6  # radians and metres: a step's least deviation, for what a floor excludes
+_SMALL = 1e-3  # radians: below, the formula's differences lose their digits
+_STILL = 1e-12  # of a change's tangent vector: what is not to be spread
+FREE_RAD, FREE_M = 3.0, 30.0
+"""Deviations of a step that nobody measured, as of a robot that was carried off: it pulls nothing
+(a frame's own landmarks know the pose a thousand times better), yet the graph stays solvable."""
+FREE = np.diag([FREE_RAD**2] * 3 + [FREE_M**2] * 3)
+"""(6, 6) covariance of such a step."""
 _TIED_BY = 10  # landmarks of an old place that hold a frame there
 _OLD = 5  # submaps
 _TIE_FACTOR = 5.0
 """On the deviations of a pose tracked by old landmarks, which lie about their homes as the drift
 has bent them. Measured on four rounds of the lab: up to 20 the corrected drive is as accurate,
 below 5 true closures are taken for impossible (docs/results)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Constraint:
+    """A measured motion between two frames of the chain that are not neighbours.
+
+    Attributes:
+        before, after: frames.
+        motion: (4, 4) pose of ``after`` in ``before``.
+        covariance: (6, 6) in the tangent space at it.
+        doubted: it may be wrong: the farther off, the less it pulls (Cauchy's kernel).
+    """
+
+    before: int
+    after: int
+    motion: FloatArray
+    covariance: FloatArray
+    doubted: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corrected:
+    """The chain that meets all constraints as well as it can.
+
+    Attributes:
+        poses: (n, 4, 4).
+        cost: squared residuals, each in its own deviations, of all changes together.
+    """
+
+    poses: FloatArray
+    cost: float
+
+
+@dataclass(slots=True, eq=False)
+class Chain:
+    """A drive as it was tracked: never revised, so that corrections do not accumulate.
+
+    Attributes:
+        poses: one (4, 4) a frame, each the last one's moved on by the step as tracked.
+        steps: (6, 6) covariance of the step to each frame, in the tangent space at its pose.
+        constraints: what else is known, in the order in which it came.
+    """
+
+    poses: list[FloatArray] = field(default_factory=list)
+    steps: list[FloatArray] = field(default_factory=list)
+    constraints: list[Constraint] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def append(self, motion: FloatArray, covariance: FloatArray) -> None:
+        """Adds a frame: its pose in the last one (of the first frame: in the world)."""
+        self.poses.append(self.poses[-1] @ motion if self.poses else motion)
+        self.steps.append(covariance)
+
+    def cost(self, constraints: list[Constraint], every: int) -> float:
+        """What these constraints cost, without the poses."""
+        if not constraints:
+            return 0.0
+        poses = np.array(self.poses)
+        errors = _as_motions_of_the_world(poses, np.array(self.steps))
+        return _minimum(poses, errors, constraints, every)[1]
+
+    def solve(self, constraints: list[Constraint], every: int) -> Corrected:
+        """The chain under these constraints, with a submap every so many frames."""
+        return corrected(np.array(self.poses), np.array(self.steps), constraints, every)
+
+    def steps_between(self, frames: IntArray) -> FloatArray:
+        """(m, 6, 6) covariances of the steps to some frames, ascending, from the one before."""
+        poses = np.array(self.poses)
+        errors = _as_motions_of_the_world(poses, np.array(self.steps))
+        sums = [errors[a + 1 : b + 1].sum(axis=0) for a, b in itertools.pairwise([-1, *frames])]
+        return congruence(_adjoints(_inverses(poses[frames])), np.array(sums))
+
+    def state(self) -> StateArrays:
+        """All of it as plain arrays."""
+        n, known = len(self.poses), self.constraints
+        return {
+            "chain_poses": np.array(self.poses).reshape(n, 4, 4),
+            "chain_steps": np.array(self.steps).reshape(n, 6, 6),
+            "chain_between": np.array([(c.before, c.after) for c in known], np.int64).reshape(
+                -1, 2
+            ),
+            "chain_motions": np.array([c.motion for c in known]).reshape(-1, 4, 4),
+            "chain_doubted": np.array([c.doubted for c in known], np.bool_),
+            "chain_covariances": np.array([c.covariance for c in known]).reshape(-1, 6, 6),
+        }
+
+    @staticmethod
+    def restored(state: StateArrays) -> Chain:
+        """Back from :meth:`state`."""
+        known = zip(
+            state["chain_between"].tolist(),
+            state["chain_motions"],
+            state["chain_covariances"],
+            state["chain_doubted"].tolist(),
+            strict=True,
+        )
+        constraints = [Constraint(a, b, *rest) for (a, b), *rest in known]
+        return Chain(list(state["chain_poses"]), list(state["chain_steps"]), constraints)
+
+
+def corrected(
+    poses: FloatArray, steps: FloatArray, constraints: list[Constraint], every: int
+) -> Corrected:
+    """Least weighted changes to a chain under which it meets its constraints.
+
+    Args:
+        poses: (n, 4, 4) the chain; its first pose stays.
+        steps: (n, 6, 6) covariances of the steps to each pose, in the tangent space at it; the
+            first one is not used.
+        constraints: between frames of the chain.
+        every: frames to a submap; frames with a constraint begin one, too.
+    """
+    errors = _as_motions_of_the_world(poses, steps)
+    at, cost = _minimum(poses, errors, constraints, every)
+    out = poses.copy()
+    for a, b in itertools.pairwise(sorted(at)):
+        out[a : b + 1] = _between(poses[a : b + 1], errors[a : b + 1], at[a], at[b])
+    return Corrected(out, cost)
+
+
+def constraint_factor(known: Constraint) -> Any:
+    """The factor of a constraint between the poses of its frames."""
+    step = Odometry(known.motion, known.covariance)
+    factor = odometry_factor(pose_key(known.before), pose_key(known.after), step)
+    if not known.doubted:
+        return factor
+    return robust(factor, "cauchy", _DOUBT_WIDTH)
+
+
+def rotated(transforms: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Covariances (n, 3, 3) of points that rigid motions (n, 4, 4) take along."""
+    return congruence(transforms[:, :3, :3], covariances)
+
+
+def nearest_positive(covariance: FloatArray) -> FloatArray:
+    """A symmetric matrix (n, n) without its negative part, as of differences of covariances."""
+    variances, directions = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    return np.asarray((directions * np.maximum(variances, 0.0)) @ directions.T)
+
+
+def transported(transforms: FloatArray, points: FloatArray) -> FloatArray:
+    """Points (n, 3), each moved by its own rigid motion (n, 4, 4)."""
+    moved = np.einsum("nij,nj->ni", transforms[:, :3, :3], points)
+    return np.asarray(moved + transforms[:, :3, 3])
+
+
+def changes(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Motions (n, 4, 4) of the world that take poses (n, 4, 4) ``before`` to those ``after``."""
+    return np.asarray(after @ _inverses(before))
+
+
+# --------------------------------------------------------------------------------------------
+
+
+def _minimum(
+    poses: FloatArray, errors: FloatArray, constraints: list[Constraint], every: int
+) -> tuple[dict[int, FloatArray], float]:
+    """Poses (4, 4) at which submaps begin, by frame, at the least cost; and that cost."""
+    begins = _beginnings(len(poses), constraints, every)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(pose_prior(pose_key(0), Prediction(poses[0], np.zeros((6, 6)))))
+    for frame in begins:
+        values.insert(pose_key(frame), gtsam.Pose3(poses[frame]))
+    for a, b in itertools.pairwise(begins):
+        whole = errors[a + 1 : b + 1].sum(axis=0)
+        motion = inverse(poses[a]) @ poses[b]
+        step = Odometry(motion, congruence(adjoint(inverse(poses[b])), whole))
+        graph.add(odometry_factor(pose_key(a), pose_key(b), step))
+    for known in constraints:
+        graph.add(constraint_factor(known))
+    params = solver_parameters(_ITERATIONS, _TOLERANCE)
+    params.setLinearSolverType("MULTIFRONTAL_QR")  # a tight loop on a loose chain defeats Cholesky
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+    at = {frame: reorthonormalise(poses_of_frame(found, frame)) for frame in begins}
+    return at, 2.0 * float(graph.error(found))
+
+
+def _inverses(poses: FloatArray) -> FloatArray:
+    """Inverses (n, 4, 4) of rigid motions."""
+    out = np.zeros_like(poses)
+    out[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
+    out[:, :3, 3] = -np.einsum("nij,nj->ni", out[:, :3, :3], poses[:, :3, 3])
+    out[:, 3, 3] = 1.0
+    return out
+
+
+def _motions(twists: FloatArray) -> FloatArray:
+    """Rigid motions (n, 4, 4) of tangent vectors (n, 6), as ``se3_exp`` of each."""
+    angle = np.linalg.norm(twists[:, :3], axis=1)[:, None, None]
+    cross = skew(twists[:, :3])
+    square = cross @ cross
+    first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    small = angle < _SMALL
+    cubed = np.where(small, 1.0, angle) ** 3
+    third = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (angle - np.sin(angle)) / cubed)
+    out = np.tile(np.eye(4), (len(twists), 1, 1))
+    out[:, :3, :3] += first * cross + second * square
+    along = np.eye(3) + second * cross + third * square
+    out[:, :3, 3] = np.einsum("nij,nj->ni", along, twists[:, 3:])
+    return out
+
+
+def _beginnings(count: int, constraints: list[Constraint], every: int) -> list[int]:
+    ends = {frame for known in constraints for frame in (known.before, known.after)}
+    return sorted({*range(0, count, every), count - 1, *ends})
+
+
+def _as_motions_of_the_world(poses: FloatArray, steps: FloatArray) -> FloatArray:
+    """Covariances (n, 6, 6) of each step's error as a motion of the world.
+
+    The error ``xi`` of the step to pose T moves all that follows by ``Ad(T) xi``: to first order
+    these motions add up, and so do their covariances.
+    """
+    return congruence(_adjoints(poses), steps + _EXACT_SIGMA**2 * np.eye(6))
+
+
+def _adjoints(poses: FloatArray) -> FloatArray:
+    """Adjoints (n, 6, 6) of poses (n, 4, 4)."""
+    out = np.zeros((len(poses), 6, 6))
+    out[:, :3, :3] = out[:, 3:, 3:] = poses[:, :3, :3]
+    out[:, 3:, :3] = skew(poses[:, :3, 3]) @ poses[:, :3, :3]
+    return out
+
+
+def _between(
+    poses: FloatArray, errors: FloatArray, first: FloatArray, last: FloatArray
+) -> FloatArray:
+    """A submap's poses (m, 4, 4) when its ends have moved to ``first`` and ``last``.
+
+    Given the change of the whole, that of a part is the share of the part's covariance: the
+    conditional mean of a chain of independent steps.
+    """
+    begun = first @ inverse(poses[0])
+    change = se3_log(inverse(begun) @ last @ inverse(poses[-1]))
+    if np.abs(change).max() < _STILL:
+        out = begun @ poses
+    else:
+        spread = np.cumsum(errors[1:], axis=0)
+        shares = spread @ np.linalg.solve(spread[-1], change)
+        out = begun @ _motions(np.concatenate([np.zeros((1, 6)), shares])) @ poses
+    out[0], out[-1] = first, last
+    return np.asarray(out)
+
+
+def home_changes(homes: IntArray, moved: FloatArray) -> FloatArray:
+    """Motion (n, 4, 4) of each landmark: that of its home frame; none where that is -1."""
+    return np.asarray(np.concatenate([moved, np.eye(4)[None]])[homes])
 
 
 def refusal(what: str, squared: float, gate_sigmas: float) -> str:
@@ -43,7 +316,13 @@ def refusal(what: str, squared: float, gate_sigmas: float) -> str:
 
 
 class DriveRecord:
-    """The chain of steps of a drive, the constraints on it, and which loops were accepted."""
+    """The chain of steps of a filter's drive, the constraints on it, and which loops were accepted.
+
+    The filter's own covariance of a pose says how well it is known relative to the map around it,
+    and never grows: drift is not in it. What drifts is the chain of steps, each as uncertain as its
+    frame was tracked; where no landmark was matched, as uncertain as the odometry; where the robot
+    was carried off, unknown.
+    """
 
     def __init__(self, settings: LoopCorrectionSettings) -> None:
         """An empty drive."""

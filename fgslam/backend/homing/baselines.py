@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from fgslam.backend.homing.inputs import TrackedFeatures
+from fgslam.backend.homing.estimator import TrackedFeatures
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings
@@ -23,7 +23,7 @@ from fgslam.core.planar import unit, wrap
 class BearingAverage:
     """What both methods share.
 
-    On :class:`fgslam.backend.homing.protocol.HomingEstimator`; the frame of its estimates is not
+    On :class:`fgslam.backend.homing.estimator.HomingEstimator`; the frame of its estimates is not
     the start's but the present robot's own, at the origin, with the target at distance 1 in the
     home direction: where the robot is, neither method knows. Covariances are NaN.
     """

@@ -6,8 +6,8 @@ from difflib import get_close_matches
 
 from fgslam.backend.homing.baselines import AverageDisplacement, AverageLandmarkVector
 from fgslam.backend.homing.ekf import HomingEkf
+from fgslam.backend.homing.estimator import HomingEstimator
 from fgslam.backend.homing.graph import HomingGraph
-from fgslam.backend.homing.protocol import HomingEstimator
 from fgslam.backend.homing.settings import (
     AverageLandmarkVectorSettings,
     HomingEkfSettings,

@@ -1,23 +1,328 @@
-"""Homing as one bearing-only factor graph, solved with every image."""
+"""Homing as one bearing-only factor graph, solved with every image.
+
+Start, target and every image on the way are planar poses, landmarks points. The start's and the
+target's bearings enter once, with the landmark; scale is the leg from start to target. Here is what
+each image adds, with first guesses; :mod:`fgslam.backend.homing.schur_solver` and
+:mod:`fgslam.backend.homing.graph_gtsam` solve it. Derivation: docs/derivations/homing_graph.md.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
-from fgslam.backend.homing.graph_problem import HomingProblem, Motion
-from fgslam.backend.homing.graph_solvers import make_solver
-from fgslam.backend.homing.inputs import TrackedFeatures
-from fgslam.backend.homing.settings import HomingGraphSettings
-from fgslam.core.arrays import FloatArray
+from fgslam.backend.homing.estimator import TrackedFeatures
+from fgslam.backend.homing.graph_gtsam import BatchSolver, FixedLagSolver, Isam2Solver
+from fgslam.backend.homing.graph_parts import TARGET, Beginning, NewPart, Pair, Sight, Solver
+from fgslam.backend.homing.schur_solver import SchurSolver
+from fgslam.backend.homing.settings import GraphMotionSettings, HomingGraphSettings
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.gauss_newton import GaussNewton, Linearised
 from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings
+from fgslam.core.planar import compose, unit, wrap
+from fgslam.factors.bearing_residuals import bearing, bearing_jacobians, polar_points, triangulated
+
+_PRIOR_DISTANCES = 2.0  # deviation of the weak prior on a landmark's place, in initial distances
+_COLLAPSED = 0.1  # of the first distance from the start: gates let no error of ninety percent in
+_CONFIRMED, _SAME_SIGMAS = 3, 1.0  # agreements in a row before a waiting feature enters
+_JUMPED = 4  # misses in a row after which a track follows something else
+_WIDER = 10.0  # deviations of the initialisation's answer where its elevations enter themselves
+_SEEN_SIGMAS = 3.0  # of the target's bearing against the place where a feature is to enter
+_LEAST_SIGMA = 1e-3  # radians: of the initialisation's direction and rotation, stated smaller
+_WIDTH = 2.0  # of Cauchy's kernel, in deviations
+_SEARCH = GaussNewton(iterations=8, converged=1e-6)  # legs and radians
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """The robot as last estimated: number and time of the image, pose (3,), velocity (3,).
+
+    ``variances`` answers those of the pose, (3,); it is asked only where a feature waits to enter.
+    """
+
+    image: int
+    time: float
+    pose: FloatArray
+    velocity: FloatArray
+    variances: Callable[[], FloatArray]
+
+
+class HomingProblem:
+    """Turns a homing start and images into parts of the graph."""
+
+    def __init__(self, start: HomingStart, settings: HomingGraphSettings) -> None:
+        """Nothing is in the graph yet; see :meth:`first`."""
+        self._start, self._settings = start, settings
+        self._ids = start.local_map.ids
+        self._entered = np.zeros(len(self._ids), np.bool_)
+        self._tall = np.zeros(len(self._ids), np.bool_)  # their height is a variable
+        self._guesses = np.full((len(self._ids), 2), np.nan)
+        self._sighted = np.full((len(self._ids), 2), np.nan)  # distance and deviation, when waiting
+        self._agreed = np.zeros(len(self._ids), np.int64)
+        self._missed = np.zeros(len(self._ids), np.int64)
+
+    @property
+    def entered(self) -> IntArray:
+        """Identities of the features that are variables, ascending."""
+        return self._ids[self._entered]
+
+    def variables(self, ids: IntArray) -> IntArray:
+        """Numbers of the landmark variables of identities (k,)."""
+        return np.asarray(np.searchsorted(self._ids, ids))
+
+    def collapsed(self, points: FloatArray) -> dict[int, FloatArray]:
+        """Landmarks that fell upon the start, with their first guesses (2,) by row.
+
+        A long step may carry a landmark with few good bearings across the start, where any
+        bearing is as good as another; from there it does not come back, and its derivatives grow
+        beyond all bounds.
+
+        Args:
+            points: (n, 2) the present landmarks of :attr:`entered`.
+        """
+        rows = np.flatnonzero(self._entered)
+        guesses = self._guesses[rows]
+        nearer = np.linalg.norm(points, axis=1) / np.linalg.norm(guesses, axis=1)
+        fell = np.flatnonzero(~(nearer > _COLLAPSED))
+        return {int(rows[k]): guesses[k] for k in fell}
+
+    def first(self) -> NewPart:
+        """Start, target and the features that both views triangulate well."""
+        start, vector = self._start, self._start.vector
+        wider = 1.0 if self._settings.elevations == "none" else _WIDER
+        covariance = 0.5 * wider**2 * (vector.covariance + vector.covariance.T)
+        covariance = covariance + _LEAST_SIGMA**2 * np.eye(2)
+        target = np.append(unit(np.array(vector.direction)), vector.rotation)
+        beginning = Beginning(target, vector, covariance)
+        new = NewPart(0, np.zeros(3), np.zeros(3), (start.time, start.time), beginning)
+        chart = start.local_map
+        spread = np.sqrt(chart.covariance[:, 0, 0])
+        good = self._good(chart.distance, spread)
+        for row in np.flatnonzero(good).tolist():
+            self._enter(new, row, chart.points()[row], float(chart.distance[row]))
+        return new
+
+    def image(
+        self, tracked: TrackedBearings, taken: BoolArray, before: Motion, points: FloatArray
+    ) -> NewPart:
+        """The robot's next pose with what it sees.
+
+        Args:
+            tracked: the image.
+            taken: (m,) its rows that count.
+            before: the robot at the last image.
+            points: (n, 2) the present landmarks of :attr:`entered`.
+        """
+        image = before.image + 1
+        rows = np.searchsorted(self._ids, tracked.ids)
+        pose, fits = self._resected(tracked, taken & self._entered[rows], before, points)
+        new = NewPart(image, pose, before.velocity, (before.time, tracked.time))
+        entering = self._enter_seen(new, rows, tracked, taken & ~self._entered[rows], before)
+        for k in np.flatnonzero(fits | entering).tolist():
+            self._see(new, int(rows[k]), tracked, k)
+        return new
+
+    def _resected(
+        self, tracked: TrackedBearings, seen: BoolArray, before: Motion, points: FloatArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """First guess (3,) of the pose, and which bearings (m,) of those ``seen`` fit to it."""
+        step, settings = tracked.time - before.time, self._settings
+        predicted = compose(before.pose, _travelled(before.velocity, step))
+        rows = np.searchsorted(self.entered, tracked.ids[seen])
+        bearings, sigma = tracked.bearing[seen], tracked.sigma_bearing[seen]
+        spread = _drift(settings.motion, step)
+        pose = resected(predicted, spread**-2.0, points[rows], bearings, sigma)
+        if settings.gate_sigmas == 0.0:
+            return pose, seen
+        misses = np.abs(bearing(pose, points[rows], bearings)) > settings.gate_sigmas * sigma
+        if np.count_nonzero(misses) > 0.5 * len(misses):
+            return pose, seen
+        numbers = np.searchsorted(self._ids, tracked.ids[seen])
+        self._missed[numbers] = np.where(
+            misses | (self._missed[numbers] >= _JUMPED), self._missed[numbers] + 1, 0
+        )
+        fits = seen.copy()
+        fits[seen] = ~misses & (self._missed[numbers] == 0)
+        return pose, fits
+
+    def _see(self, new: NewPart, row: int, tracked: TrackedBearings, k: int) -> None:
+        measured, sigma = float(tracked.bearing[k]), float(tracked.sigma_bearing[k])
+        new.bearings.append(Sight(new.image, row, measured, sigma))
+        if self._tall[row] and np.isfinite(tracked.elevation[k]):
+            measured, sigma = float(tracked.elevation[k]), float(tracked.sigma_elevation[k])
+            new.elevations.append(Sight(new.image, row, measured, sigma))
+
+    # ----------------------------------------------------------------------------------------
+    # Landmarks
+
+    def _good(self, distance: FloatArray, spread: FloatArray) -> BoolArray:
+        limit = self._settings.max_relative_distance_sigma
+        with np.errstate(invalid="ignore"):
+            known = (distance > 0.0) & (spread <= limit * distance)
+        return np.asarray(known & np.isfinite(distance) & np.isfinite(spread))
+
+    def _enter(self, new: NewPart, row: int, point: FloatArray, distance: float) -> None:
+        """A landmark with its bearings from start and target."""
+        settings, matches = self._settings, self._start.matches
+        new.points[row] = (point, _PRIOR_DISTANCES * distance)
+        from_start, _, from_target, _ = matches.sigma[row].tolist()
+        new.bearings += [
+            Sight(0, row, float(matches.bearing_a[row]), from_start),
+            Sight(TARGET, row, float(matches.bearing_b[row]), from_target),
+        ]
+        known = bool(np.isfinite(self._elevations(row)).all())
+        if settings.elevations == "all" and known:
+            self._enter_height(new, row, distance)
+        elif settings.elevations == "two_views" and known:
+            vector = self._start.vector
+            at = unit(np.array(vector.direction))
+            first = np.array([*at, vector.rotation, *point])
+            sigmas = matches.sigma[row, [1, 3]]
+            new.pairs.append(Pair(row, self._elevations(row), sigmas, first))
+        self._entered[row], self._guesses[row] = True, point
+
+    def _elevations(self, row: int) -> FloatArray:
+        matches = self._start.matches
+        return np.array([matches.elevation_a[row], matches.elevation_b[row]])
+
+    def _enter_height(self, new: NewPart, row: int, distance: float) -> None:
+        """Its height, with its elevations from start and target."""
+        matches = self._start.matches
+        up, up_target = self._elevations(row).tolist()
+        _, sigma, _, sigma_target = matches.sigma[row].tolist()
+        self._tall[row] = True
+        tall = distance * float(np.tan(up))
+        new.heights[row] = (tall, _PRIOR_DISTANCES * distance)
+        new.elevations += [Sight(0, row, up, sigma), Sight(TARGET, row, up_target, sigma_target)]
+
+    def _enter_seen(
+        self,
+        new: NewPart,
+        rows: IntArray,
+        tracked: TrackedBearings,
+        candidates: BoolArray,
+        before: Motion,
+    ) -> BoolArray:
+        """Features that were too uncertain until now and have parallax to the last pose.
+
+        Judged with the bearing of this image from where the robot is expected. Answers which
+        (m,) of the candidates entered.
+        """
+        waiting = np.flatnonzero(candidates)
+        entering = np.zeros(len(candidates), np.bool_)
+        reach = float(np.hypot(*before.pose[:2]))
+        if len(waiting) == 0 or reach == 0.0:
+            return entering
+        pose = compose(before.pose, _travelled(before.velocity, tracked.time - before.time))
+        matches = self._start.matches
+        start = matches.bearing_a[rows[waiting]]
+        legs, by = triangulated(
+            (float(np.arctan2(pose[1], pose[0])), float(pose[2])), start, tracked.bearing[waiting]
+        )
+        length = float(np.hypot(*pose[:2]))
+        x, y, turn = before.variances().tolist()
+        variance = np.column_stack(
+            [
+                np.full(len(waiting), (x + y) / reach**2),
+                np.full(len(waiting), turn),
+                matches.sigma[rows[waiting], 0] ** 2,
+                tracked.sigma_bearing[waiting] ** 2,
+            ]
+        )
+        spread = np.sqrt((by**2 * variance).sum(axis=1))
+        self._compare(rows[waiting], length * legs, length * spread)
+        confirmed = self._good(legs, spread) & (self._agreed[rows[waiting]] >= _CONFIRMED)
+        confirmed &= self._seen_by_target(rows[waiting], length * legs, length * spread)
+        for k in np.flatnonzero(confirmed).tolist():
+            distance = float(length * legs[k])
+            self._enter(new, int(rows[waiting[k]]), distance * unit(start[k]), distance)
+            entering[waiting[k]] = True
+        return entering
+
+    def _seen_by_target(
+        self, rows: IntArray, distance: FloatArray, spread: FloatArray
+    ) -> BoolArray:
+        """Whether the target saw them where they would be, as far as both are known.
+
+        A track that jumped while its feature waited triangulates something else.
+        """
+        vector, matches = self._start.vector, self._start.matches
+        target = np.append(unit(np.array(vector.direction)), vector.rotation)
+        polar = np.column_stack([distance, matches.bearing_a[rows]])
+        points = polar_points(polar)
+        miss = bearing(target, points, matches.bearing_b[rows])
+        by_pose, by_point = bearing_jacobians(target, points)
+        along = np.einsum("ij,ij->i", by_point, unit(polar[:, 1])) * spread
+        turned = np.column_stack([by_pose[:, :2] @ [-target[1], target[0]], by_pose[:, 2]])
+        variance = np.einsum("ni,ij,nj->n", turned, vector.covariance, turned)
+        variance = variance + along**2 + matches.sigma[rows, 2] ** 2 + matches.sigma[rows, 0] ** 2
+        return np.asarray(miss**2 <= _SEEN_SIGMAS**2 * variance)
+
+    def _compare(self, rows: IntArray, distance: FloatArray, spread: FloatArray) -> None:
+        """Counts how often in a row a waiting feature was seen at one distance, within its noise.
+
+        A single wrong bearing makes a large parallax, and would pass for a good triangulation.
+        """
+        last = self._sighted[rows]
+        with np.errstate(invalid="ignore"):
+            same = np.abs(distance - last[:, 0]) <= _SAME_SIGMAS * np.hypot(spread, last[:, 1])
+        self._agreed[rows] = np.where(same, self._agreed[rows] + 1, 0)
+        self._sighted[rows] = np.column_stack([distance, spread])
+
+
+def _drift(motion: GraphMotionSettings, step: float) -> FloatArray:
+    """(3,) how far the robot may be from where it is expected: place in legs, heading."""
+    place = max(motion.forward, motion.sideways) * step**0.5
+    return np.array([place, place, np.deg2rad(motion.turning_deg) * step**0.5])
+
+
+def _travelled(velocity: FloatArray, step: float) -> FloatArray:
+    """Motion (3,) of a constant velocity (3,) in the robot's axes over ``step`` seconds."""
+    forward, left, turn = velocity * step
+    half = 0.5 * turn
+    chord = np.sinc(half / np.pi)
+    c, s = np.cos(half) * chord, np.sin(half) * chord
+    return np.array([c * forward - s * left, s * forward + c * left, wrap(turn)])
+
+
+def resected(
+    predicted: FloatArray,
+    information: FloatArray,
+    points: FloatArray,
+    measured: FloatArray,
+    sigma: FloatArray,
+) -> FloatArray:
+    """Pose (3,) that fits the bearings best, and the prediction as far as that is known.
+
+    Iteratively reweighted Gauss-Newton with Cauchy's kernel.
+
+    Args:
+        predicted: (3,) expected pose.
+        information: (3,) inverse variances of it, positive.
+        points: (n, 2) landmarks.
+        measured: (n,) bearings.
+        sigma: (n,) their deviations.
+    """
+
+    def linearised(poses: FloatArray, iteration: int) -> Linearised:
+        pose = poses[0]
+        residual = bearing(pose, points, measured) / sigma
+        by_pose = bearing_jacobians(pose, points)[0] / sigma[:, None]
+        weighted = by_pose / (1.0 + (residual / _WIDTH) ** 2)[:, None]
+        normal = weighted.T @ by_pose + np.diag(information)
+        gradient = weighted.T @ residual + information * (pose - predicted)
+        return normal[None], gradient[None]
+
+    return np.asarray(_SEARCH.minimise(predicted[None], linearised)[0])
 
 
 class HomingGraph:
     """Estimator of kind ``homing_graph``.
 
-    On :class:`fgslam.backend.homing.protocol.HomingEstimator`. Lost features simply get no more
+    On :class:`fgslam.backend.homing.estimator.HomingEstimator`. Lost features simply get no more
     factors; what they taught stays.
     """
 
@@ -95,3 +400,16 @@ def _blocks(covariance: FloatArray, count: int) -> FloatArray:
         return np.full((count, 2, 2), np.nan)
     every = np.arange(count)
     return np.asarray(covariance.reshape(count, 2, count, 2)[every, :, every, :])
+
+
+def make_solver(settings: HomingGraphSettings) -> Solver:
+    """The one of the settings."""
+    match settings.solver:
+        case "schur":
+            return SchurSolver(settings)
+        case "isam2":
+            return Isam2Solver(settings)
+        case "fixed_lag":
+            return FixedLagSolver(settings)
+        case "batch":
+            return BatchSolver(settings)

@@ -1,4 +1,4 @@
-"""What one image adds to the homing graph, as plain numbers, and as GTSAM's factors.
+"""What one image adds to the homing graph, as plain numbers, and what solvers of the graph offer.
 
 Views are numbered: the start is 0, images count from 1, :data:`TARGET` is the target. Landmarks
 are rows of the homing's matches.
@@ -7,25 +7,13 @@ are rows of the homing's matches.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
-import gtsam
 import numpy as np
 
 from fgslam.backend.homing.settings import GraphMotionSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import TwoViewVector
-from fgslam.factors.bearing import (
-    BearingFactors,
-    leg_factor,
-    motion_factor,
-    start_prior,
-    vector_factor,
-    velocity_prior,
-    weak_height_prior,
-    weak_landmark_prior,
-)
-from fgslam.factors.keys import height_key, landmark_key, pose_key, target_key, velocity_key
 
 _INITIAL_TURNING_DEG = 30.0  # of the turning rate at the start, degrees/s
 _INITIAL_SPEED = 0.5  # deviation of the speed at the start, around 0, legs/s
@@ -101,56 +89,36 @@ def first_speeds(motion: GraphMotionSettings) -> FloatArray:
     return np.array([_INITIAL_SPEED, motion.sideways, turning])
 
 
-class GtsamParts:
-    """Makes GTSAM's factors and values of parts."""
+class Solver(Protocol):
+    """Takes the graph in, part by part. Poses are (x, y, psi) in the start frame."""
 
-    def __init__(self, robust: BearingFactors, motion: GraphMotionSettings) -> None:
-        self._robust, self._motion = robust, motion
+    def add(self, new: NewPart, time: float) -> None:
+        """Brings an image in. Raises EstimatorError where the graph cannot be solved."""
+        ...
 
-    def of(self, new: NewPart) -> tuple[Any, Any, set[int]]:
-        """Factors, first guesses, and keys of what the image touches."""
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        pose, velocity = pose_key(new.image), velocity_key(new.image)
-        values.insert(pose, gtsam.Pose2(*new.pose))
-        values.insert(velocity, new.velocity)
-        if new.beginning is not None:
-            self._begin(graph, values, new.beginning)
-        else:
-            earlier = (pose_key(new.image - 1), velocity_key(new.image - 1), new.times[0])
-            now = (pose, velocity, new.times[1])
-            graph.add(motion_factor(earlier, now, motion_densities(self._motion)))
-        for row, (point, spread) in new.points.items():
-            values.insert(landmark_key(row), point)
-            graph.add(weak_landmark_prior(landmark_key(row), point, spread))
-        for row, (height, spread) in new.heights.items():
-            values.insert(height_key(row), height)
-            graph.add(weak_height_prior(height_key(row), height, spread))
-        return graph, values, self._see(graph, new) | {pose, velocity}
+    def move(self, points: dict[int, FloatArray], time: float) -> None:
+        """Puts landmarks, by row, back to places (2,) and goes on from there."""
+        ...
 
-    def _begin(self, graph: Any, values: Any, beginning: Beginning) -> None:
-        target, vector, covariance = beginning
-        values.insert(target_key(), gtsam.Pose2(*target))
-        graph.add(start_prior(pose_key(0)))
-        graph.add(velocity_prior(velocity_key(0), np.zeros(3), first_speeds(self._motion)))
-        graph.add(leg_factor(pose_key(0), target_key()))
-        graph.add(vector_factor(target_key(), vector.direction, vector.rotation, covariance))
+    def pose(self, image: int) -> FloatArray:
+        """(3,) the robot at an image."""
+        ...
 
-    def _see(self, graph: Any, new: NewPart) -> set[int]:
-        """All that is measured; keys of the landmarks and heights in it."""
-        robust, keys = self._robust, set[int]()
-        for sight in new.bearings:
-            landmark = landmark_key(sight.row)
-            graph.add(robust.bearing(_view(sight), landmark, sight.measured, sight.sigma))
-            keys.add(landmark)
-        for sight in new.elevations:
-            landmark, height = landmark_key(sight.row), height_key(sight.row)
-            at = (_view(sight), landmark, height)
-            graph.add(robust.elevation(*at, sight.measured, sight.sigma))
-            keys |= {landmark, height}
-        for pair in new.pairs:
-            graph.add(robust.elevation_pair(target_key(), landmark_key(pair.row), *pair[1:]))
-        return keys
+    def velocity(self, image: int) -> FloatArray:
+        """(3,) in the robot's axes: forward, left, turning."""
+        ...
 
+    def target(self) -> FloatArray:
+        """(3,)."""
+        ...
 
-def _view(sight: Sight) -> int:
-    return target_key() if sight.view == TARGET else pose_key(sight.view)
+    def points(self, rows: list[int]) -> FloatArray:
+        """(k, 2) landmarks of rows of the matches."""
+        ...
+
+    def covariance(self, rows: list[int]) -> FloatArray:
+        """Joint covariance (6 + 2 k) of the robot at the last image, the target, and landmarks.
+
+        NaN where the linearised graph does not determine them.
+        """
+        ...

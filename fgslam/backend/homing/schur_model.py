@@ -10,15 +10,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.backend.homing.graph_parts import NewPart, Pair, Sight, first_speeds, motion_densities
-from fgslam.backend.homing.schur_system import STATE, NormalEquations
 from fgslam.backend.homing.settings import HomingGraphSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import wrap
 from fgslam.factors.bearing import STIFF
-from fgslam.factors.bearing_residuals import direction_and_turn, elevation_pair
-from fgslam.factors.kernels import kernel_losses, kernel_weights
-from fgslam.factors.motion_residuals import constant_velocities, motion_informations
+from fgslam.factors.bearing_residuals import (
+    bearings_from_views,
+    constant_velocities,
+    direction_and_turn,
+    elevation_pair,
+    elevations_from_views,
+    motion_informations,
+    offsets,
+)
+from fgslam.factors.noise import kernel_losses, kernel_weights
 
+STATE = 6  # numbers of an image: pose and velocity
 _ROUNDING = 1e-9
 _SPARE = 16  # views and landmarks that tables have room for beyond those that are there
 
@@ -66,6 +73,32 @@ class Look:
     pairs: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
     motion: tuple[FloatArray, FloatArray, FloatArray]
     initial: tuple[FloatArray, FloatArray]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalEquations:
+    """Half the Hessian of the cost, and its gradient.
+
+    The chain of images (pose and velocity, six numbers each) is a block-tridiagonal matrix A,
+    target and landmarks are its border C, with what each image sees of them, B, between::
+
+        [A  B] [chain ]     [a]
+        [B' C] [border] = - [b]
+
+    Attributes:
+        diagonal: (n, 6, 6) of the chain.
+        below: (n - 1, 6, 6) rows of the later image, columns of the earlier.
+        cross: (n, 6, m) chain and border.
+        border: (m, m) target and landmarks.
+        chain_gradient, border_gradient: (n, 6) and (m,).
+    """
+
+    diagonal: FloatArray
+    below: FloatArray
+    cross: FloatArray
+    border: FloatArray
+    chain_gradient: FloatArray
+    border_gradient: FloatArray
 
 
 class Sights:
@@ -224,7 +257,7 @@ class SchurModel:
     def _seen(self, state: State) -> list[tuple[FloatArray, FloatArray]]:
         views = state.views()
         size = (len(views), len(state.points))
-        dx, dy = _offsets(views, state.points)
+        dx, dy = offsets(views, state.points)
         measured, information = self._bearings.first(*size)
         found = [(wrap(np.arctan2(dy, dx) - views[:, 2:] - measured), information)]
         if self._elevations.any:
@@ -304,11 +337,11 @@ class SchurModel:
     def _add_sights(self, e: NormalEquations, blocks: FloatArray, look: Look) -> None:
         state = look.state
         views = state.views()
-        dx, dy = _offsets(views, state.points)
+        dx, dy = offsets(views, state.points)
         squared = dx**2 + dy**2
-        derivatives = [_by_bearing(dx, dy, squared, self.numbers)]
+        derivatives = [bearings_from_views(dx, dy, squared, self.numbers)]
         if len(look.sights) > 1:
-            derivatives.append(_by_elevation(dx, dy, squared, state.points[:, 2]))
+            derivatives.append(elevations_from_views(dx, dy, squared, state.points[:, 2]))
         for (residual, weighed), (by_pose, by_point) in zip(look.sights, derivatives, strict=True):
             known = weighed[..., None] * by_pose
             of_pose = known.transpose(0, 2, 1) @ by_pose
@@ -374,8 +407,8 @@ class SchurModel:
         """
         count = len(look.state.points)
         rows, residual, known = np.zeros((count, 2, 5)), np.zeros((count, 2)), np.zeros((count, 2))
-        dx, dy = _offsets(look.state.target[None], look.state.points)
-        by_target, by_point = _by_bearing(dx, dy, dx**2 + dy**2, 2)
+        dx, dy = offsets(look.state.target[None], look.state.points)
+        by_target, by_point = bearings_from_views(dx, dy, dx**2 + dy**2, 2)
         rows[:, 0, :3], rows[:, 0, 3:] = by_target[0], by_point[0]
         residual[:, 0], known[:, 0] = look.sights[0][0][0], look.sights[0][1][0]
         of = self._pairs.landmarks
@@ -394,31 +427,3 @@ class SchurModel:
         self._bearings.drop(0, landmark)
         self._elevations.drop(0, landmark)
         self._pairs.drop(landmark)
-
-
-def _offsets(views: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(v, m) of points from views, along x and y."""
-    return points[:, 0] - views[:, :1], points[:, 1] - views[:, 1:2]
-
-
-def _by_bearing(
-    dx: FloatArray, dy: FloatArray, squared: FloatArray, numbers: int
-) -> tuple[FloatArray, FloatArray]:
-    """(v, m, 3) and (v, m, 2 or 3) derivatives of bearings by poses and points."""
-    by_pose, by_point = np.empty((*dx.shape, 3)), np.zeros((*dx.shape, numbers))
-    by_point[..., 0], by_point[..., 1] = -dy / squared, dx / squared
-    by_pose[..., :2], by_pose[..., 2] = -by_point[..., :2], -1.0
-    return by_pose, by_point
-
-
-def _by_elevation(
-    dx: FloatArray, dy: FloatArray, squared: FloatArray, heights: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """The same of elevations of points at heights (m,)."""
-    distance = np.sqrt(squared)
-    whole = squared + heights**2
-    by_pose, by_point = np.zeros((*dx.shape, 3)), np.empty((*dx.shape, 3))
-    down = heights / (whole * distance)
-    by_pose[..., 0], by_pose[..., 1] = down * dx, down * dy
-    by_point[..., :2], by_point[..., 2] = -by_pose[..., :2], distance / whole
-    return by_pose, by_point

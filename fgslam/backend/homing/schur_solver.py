@@ -2,21 +2,24 @@
 
 Gauss-Newton with reweighting from the last solution; steps that raise the cost are damped. Every
 few images the match that everything else contradicts most is put to the test.
+Derivation: docs/derivations/homing_graph.md.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.linalg import LinAlgError
+from scipy.linalg import cho_factor, cho_solve, lapack
 
 from fgslam.backend.homing.graph_parts import NewPart
-from fgslam.backend.homing.schur_model import Look, SchurModel, State
-from fgslam.backend.homing.schur_system import Factored
+from fgslam.backend.homing.schur_model import STATE, Look, NormalEquations, SchurModel, State
 from fgslam.backend.homing.settings import HomingGraphSettings
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.planar import wrap
 
+_ROWS, _COLUMNS = np.indices((STATE, STATE))
+_LOWER = np.tril_indices(STATE)
 _STILL = 0.3  # deviations, of all variables together: a shorter step ends the iteration
 _FIRST_DAMPING, _MORE, _MOST = 1e-3, 10.0, 1e6
 _ROUNDING = 1e-9
@@ -32,8 +35,80 @@ of freedom."""
 _FIRST_STEPS = 20  # with start and target alone, whose first guess is the initialisation's
 
 
+class Factored:
+    """Normal equations factored once: the step to the minimum, and covariances.
+
+    A is factored as a band, then the Schur complement C - B' A^-1 B. Everything is linearised anew
+    each time, and one covariance costs a few columns.
+
+    Raises:
+        numpy.linalg.LinAlgError: they do not determine every variable.
+    """
+
+    def __init__(self, equations: NormalEquations, damping: float = 0.0) -> None:
+        """``damping`` adds so many times the diagonal to itself (Marquardt)."""
+        e = equations
+        count, m = len(e.diagonal), len(e.border)
+        self._size = m
+        band, info = lapack.dpbtrf(_band(e, damping), lower=1, overwrite_ab=1)
+        if info != 0:
+            raise LinAlgError("the chain of images is not determined")
+        right = np.zeros((STATE * count, m + 4), order="F")
+        right[:, :m] = e.cross.reshape(-1, m)
+        right[:, m] = e.chain_gradient.ravel()
+        last = np.arange(3)
+        right[STATE * (count - 1) + last, m + 1 + last] = 1.0
+        solved, _ = lapack.dtbtrs(band, right, uplo="L", overwrite_b=1)
+        crossed, gradient, self._end = np.split(solved, [m, m + 1], axis=1)
+        reduced = e.border - crossed.T @ crossed
+        if damping > 0.0:
+            reduced[np.diag_indices(m)] += damping * np.diagonal(e.border)
+        self._reduced = cho_factor(reduced, lower=True, check_finite=False)
+        self.border = -cho_solve(
+            self._reduced, e.border_gradient - crossed.T @ gradient[:, 0], check_finite=False
+        )
+        left = gradient[:, 0] + crossed @ self.border
+        chain, _ = lapack.dtbtrs(band, left[:, None], uplo="L", trans="T")
+        self.chain = -chain.reshape(count, STATE)
+        fall = e.chain_gradient.ravel() @ chain[:, 0] - e.border_gradient @ self.border
+        self.decrement = float(np.sqrt(max(fall, 0.0)))
+        """Length of the step in its own deviations."""
+        self._carried = self._end.T @ crossed
+
+    def border_covariance(self) -> FloatArray:
+        """(m, m) of target and landmarks."""
+        return np.asarray(cho_solve(self._reduced, np.eye(self._size), check_finite=False))
+
+    def covariance(self, columns: IntArray) -> FloatArray:
+        """Joint covariance (3 + k) of the last image's pose and numbers (k,) of the border."""
+        k = len(columns)
+        chosen = np.zeros((self._size, k + 3))
+        chosen[columns, np.arange(k)] = 1.0
+        chosen[:, k:] = self._carried.T
+        solved = cho_solve(self._reduced, chosen, check_finite=False)
+        out = np.empty((3 + k, 3 + k))
+        out[:3, :3] = self._end.T @ self._end + self._carried @ solved[:, k:]
+        out[3:, :3] = -solved[columns, k:]
+        out[:3, 3:] = out[3:, :3].T
+        out[3:, 3:] = solved[columns, :k]
+        return np.asarray(0.5 * (out + out.T))
+
+
+def _band(e: NormalEquations, damping: float) -> FloatArray:
+    """(12, 6 n) lower band of the chain, column by column, as LAPACK wants it."""
+    count = len(e.diagonal)
+    band = np.zeros((2 * STATE, count * STATE), order="F")
+    blocks = band.T.reshape(count, STATE, 2 * STATE)
+    i, j = _LOWER
+    blocks[:, j, i - j] = e.diagonal[:, i, j]
+    blocks[:-1, _COLUMNS, STATE + _ROWS - _COLUMNS] = e.below
+    if damping > 0.0:
+        band[0] *= 1.0 + damping
+    return band
+
+
 class SchurSolver:
-    """On :class:`fgslam.backend.homing.graph_solvers.Solver`."""
+    """On :class:`fgslam.backend.homing.graph_parts.Solver`."""
 
     def __init__(self, settings: HomingGraphSettings) -> None:
         """Empty."""

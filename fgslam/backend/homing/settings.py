@@ -11,7 +11,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.backend.common_settings import KernelSettings, NamedSettings
+from fgslam.backend.settings import KernelSettings, NamedSettings
 from fgslam.core.settings import STRICT
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgslam.backend.smoothers.settings import GraphSettings
+from fgslam.backend.settings import GraphSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion, LandmarkMap
 from fgslam.core.geometry import (

@@ -8,30 +8,33 @@ from typing import Any, ClassVar
 import gtsam
 import numpy as np
 
-from fgslam.backend.common_settings import KernelSettings
-from fgslam.backend.filters.submaps import Constraint
-from fgslam.backend.graphs import poses_of_frame, solver_parameters
+from fgslam.backend.filters.loop_correction import Constraint
+from fgslam.backend.settings import BatchSettings, KernelSettings
 from fgslam.backend.smoothers.graph_builder import NewFactors
-from fgslam.backend.smoothers.graph_solution import (
-    Solution,
-    allowed_parts,
-)
 from fgslam.backend.smoothers.loop_closing import GraphLoops, solved
-from fgslam.backend.smoothers.outliers import (
+from fgslam.backend.smoothers.refinement import (
+    Refined,
+    WholeGraphAnswer,
     graduated,
+    refine,
     trimmed,
     with_kernel,
 )
-from fgslam.backend.smoothers.refinement import Refined, WholeGraphAnswer, refine
-from fgslam.backend.smoothers.settings import BatchSettings
 from fgslam.backend.smoothers.smoother import GraphProblem, MapSmoother
-from fgslam.backend.smoothers.solver import ClosedLoop, Drive, Smoothed, solver_failed
+from fgslam.backend.smoothers.solver import (
+    ClosedLoop,
+    Drive,
+    Smoothed,
+    Solution,
+    allowed_parts,
+    solver_failed,
+)
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import reorthonormalise
 from fgslam.core.sensors import Sensor
-from fgslam.factors.keys import pose_key
+from fgslam.factors.graphs import pose_key, poses_of_frame, solver_parameters
 
 _MAX_ITERATIONS = 100  # a bound, for graphs that do not settle
 _RELATIVE_TOLERANCE = 1e-9  # of the cost; the estimate then moves by less than a micrometre

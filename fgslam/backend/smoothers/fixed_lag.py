@@ -13,22 +13,28 @@ from typing import Any, ClassVar
 import gtsam
 import numpy as np
 
-from fgslam.backend.filters.loop_correction import refusal
-from fgslam.backend.filters.submaps import Constraint, constraint_factor, nearest_positive
-from fgslam.backend.graphs import poses_of_frame, without_gaps
+from fgslam.backend.filters.loop_correction import (
+    Constraint,
+    constraint_factor,
+    nearest_positive,
+    refusal,
+)
+from fgslam.backend.settings import FixedLagSettings
 from fgslam.backend.smoothers.graph_builder import NewFactors
-from fgslam.backend.smoothers.graph_solution import (
+from fgslam.backend.smoothers.loop_closing import misfit
+from fgslam.backend.smoothers.marginals import DenseMarginals, UndeterminedError
+from fgslam.backend.smoothers.smoother import GraphProblem, Smoother
+from fgslam.backend.smoothers.solver import (
+    ClosedLoop,
+    Drive,
+    Smoothed,
     Solution,
     allowed_joint,
     allowed_parts,
     points_of,
+    solver_failed,
     suspect,
 )
-from fgslam.backend.smoothers.loop_closing import misfit
-from fgslam.backend.smoothers.marginals import DenseMarginals, UndeterminedError
-from fgslam.backend.smoothers.settings import FixedLagSettings
-from fgslam.backend.smoothers.smoother import GraphProblem, Smoother
-from fgslam.backend.smoothers.solver import ClosedLoop, Drive, Smoothed, solver_failed
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import LandmarkMap, Prediction
@@ -45,7 +51,14 @@ from fgslam.core.geometry import (
     transform_to_world,
 )
 from fgslam.core.sensors import Sensor
-from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
+from fgslam.factors.graphs import (
+    is_pose,
+    landmark_key,
+    number,
+    pose_key,
+    poses_of_frame,
+    without_gaps,
+)
 from fgslam.factors.motion import pose_prior
 
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong

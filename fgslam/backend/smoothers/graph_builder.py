@@ -8,15 +8,15 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
-from fgslam.backend.graphs import without_gaps
+from fgslam.backend.settings import GraphSettings
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting, Track
-from fgslam.backend.smoothers.segments import TrackedFrame
-from fgslam.backend.smoothers.settings import GraphSettings
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
+from fgslam.core.measurements import Observations, Odometry
 from fgslam.core.sensors import CameraRig, Sensor
-from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.factors.graphs import landmark_key, pose_key, without_gaps
+from fgslam.factors.landmark import RangeBearingFactors, StereoFactors
 from fgslam.factors.motion import (
     floor_factors,
     odometry_factor,
@@ -25,8 +25,6 @@ from fgslam.factors.motion import (
     weak_point_prior,
 )
 from fgslam.factors.noise import Whitening
-from fgslam.factors.range_bearing import RangeBearingFactors
-from fgslam.factors.stereo import StereoFactors
 
 _WEAK_PRIOR_RANGES = 2.0  # keeps a first step before the camera: docs/derivations/smoothers.md
 
@@ -46,6 +44,23 @@ def landmark_factors(sensor: Sensor, whitening: Whitening) -> LandmarkFactors:
     if isinstance(sensor, CameraRig):
         return StereoFactors(sensor, whitening)
     return RangeBearingFactors(whitening)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackedFrame:
+    """A frame as the tracker has it.
+
+    Attributes:
+        frame: counted from 0.
+        wTc: (4, 4) its pose.
+        motion: from the frame before; None for the first.
+        accepted: observations that fit.
+    """
+
+    frame: int
+    wTc: FloatArray
+    motion: Odometry | None
+    accepted: Observations
 
 
 @dataclass(slots=True, eq=False)

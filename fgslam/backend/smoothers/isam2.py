@@ -7,29 +7,40 @@ from typing import Any, ClassVar
 import gtsam
 import numpy as np
 
-from fgslam.backend.filters.submaps import Constraint
-from fgslam.backend.graphs import poses_of_frame, solver_parameters
+from fgslam.backend.filters.loop_correction import Constraint
+from fgslam.backend.settings import Isam2Settings
 from fgslam.backend.smoothers.graph_builder import NewFactors
-from fgslam.backend.smoothers.graph_solution import (
-    Solution,
-    allowed_parts,
-    suspect,
-)
+from fgslam.backend.smoothers.keyframes import Segments
 from fgslam.backend.smoothers.loop_closing import GraphLoops
-from fgslam.backend.smoothers.outliers import (
+from fgslam.backend.smoothers.refinement import (
+    Refined,
+    WholeGraphAnswer,
+    refine,
     trimmed,
 )
-from fgslam.backend.smoothers.refinement import Refined, WholeGraphAnswer, refine
-from fgslam.backend.smoothers.segments import Segments
-from fgslam.backend.smoothers.settings import Isam2Settings
 from fgslam.backend.smoothers.smoother import GraphProblem, MapSmoother
-from fgslam.backend.smoothers.solver import ClosedLoop, Drive, Smoothed, solver_failed
+from fgslam.backend.smoothers.solver import (
+    ClosedLoop,
+    Drive,
+    Smoothed,
+    Solution,
+    allowed_parts,
+    solver_failed,
+    suspect,
+)
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import reorthonormalise
 from fgslam.core.sensors import Sensor
-from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
+from fgslam.factors.graphs import (
+    is_pose,
+    landmark_key,
+    number,
+    pose_key,
+    poses_of_frame,
+    solver_parameters,
+)
 
 _RELATIVE_TOLERANCE = 1e-9  # of the cost
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong

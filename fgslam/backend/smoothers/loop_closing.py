@@ -2,8 +2,9 @@
 
 The graph as solved before the loop and as it must be with it lie far apart. Linearised in between,
 landmarks would fly and kernels drop what is right: so poses and landmarks are first brought to
-where backward correction (:mod:`fgslam.backend.filters.submaps`) has them, each landmark along
-with the frame that saw it first. There every observation fits as before, and what is left is small.
+where backward correction (:mod:`fgslam.backend.filters.loop_correction`) has them, each landmark
+along with the frame that saw it first. There every observation fits as before, and what is left is
+small.
 """
 
 from __future__ import annotations
@@ -15,17 +16,16 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.backend.filters.loop_correction import refusal
-from fgslam.backend.filters.settings import LoopCorrectionSettings
-from fgslam.backend.filters.submaps import (
+from fgslam.backend.filters.loop_correction import (
     SUBMAP_FRAMES,
     Chain,
     Constraint,
     changes,
     constraint_factor,
     corrected,
+    refusal,
 )
-from fgslam.backend.graphs import poses_of_frame, solver_parameters
+from fgslam.backend.settings import LoopCorrectionSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.solver import Drive
 from fgslam.core.arrays import FloatArray, IntArray
@@ -33,7 +33,7 @@ from fgslam.core.estimates import EgoMotion
 from fgslam.core.geometry import adjoint, congruence, inverse, transform_to_world
 from fgslam.core.measurements import LoopClosure
 from fgslam.core.quantiles import chi_square_quantile
-from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame, solver_parameters
 
 _AGREES = chi_square_quantile(0.99, 6)  # 16.8: a loop that the graph meets as it is
 _ITERATIONS = 20

@@ -18,7 +18,7 @@ from scipy.sparse import csc_matrix, csr_matrix
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import inverse_spd3
-from fgslam.factors.keys import is_pose
+from fgslam.factors.graphs import is_pose
 
 _UNDETERMINED = "the measurements do not determine all variables; no covariances"
 

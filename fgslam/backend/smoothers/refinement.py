@@ -1,7 +1,9 @@
 """The final solution of a graph: what does not fit is left out, the rest solved once more.
 
-It changes neither the builder nor the solver that it starts from, so that asking for an estimate
-in the middle of a run leaves the run as it was.
+Wrong matches go by a kernel and then a trim, or by graduated non-convexity. Either way the last
+solution is plain least squares over the observations that fit, so that its covariances mean what
+they say. Neither the builder nor the solver that it starts from is changed, so that asking for an
+estimate in the middle of a run leaves the run as it was.
 """
 
 from __future__ import annotations
@@ -13,28 +15,136 @@ from typing import Any, TypeAlias
 import gtsam
 import numpy as np
 
-from fgslam.backend.graphs import poses_of_frame
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
-from fgslam.backend.smoothers.graph_solution import (
+from fgslam.backend.smoothers.marginals import marginals_of
+from fgslam.backend.smoothers.solver import (
     Solution,
     allowed_joint,
     allowed_parts,
     points_of,
     poses_of,
 )
-from fgslam.backend.smoothers.marginals import marginals_of
-from fgslam.backend.smoothers.outliers import observed_variables
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.floor import Floor
-from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
+from fgslam.core.quantiles import chi_square_quantile
+from fgslam.factors.graphs import (
+    is_pose,
+    landmark_key,
+    number,
+    pose_key,
+    poses_of_frame,
+    solver_parameters,
+)
+from fgslam.factors.noise import plain, robust
 
-_ROUNDS = 5  # solutions until no landmark lies behind a camera any more
+_GATE = float(chi_square_quantile(0.999, 3))  # 16.3, of a landmark observation's three numbers
+_KEPT = 0.5  # weights end at 0 or 1
+_ROUNDS = 10  # trims until the observations that fit do not change any more
+_QUICK_WIDTH = 3.0  # deviations, as the kernels' default
+_ROUGH = 1e-4  # of the cost: the minimum with the kernel only chooses what fits
+_SOLUTIONS = 5  # solutions until no landmark lies behind a camera any more
 _BEHIND = "came out behind a camera"
 _UNSEEN = "has no observation that fits the others"
 
 Minimise: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
 """From a graph and initial values to values at the minimum and the factors that count there."""
+
+
+def graduated(graph: Any, values: Any, inner: Any, noise_factor: float = 1.0) -> tuple[Any, Any]:
+    """Graduated non-convexity (Yang et al. 2020) with truncated least squares, by GTSAM.
+
+    Landmark observations are the possible outliers.
+
+    Args:
+        graph: factors without kernels.
+        values: initial values.
+        inner: parameters of the Levenberg-Marquardt steps.
+        noise_factor: by which the factors' deviations exceed the stated ones.
+
+    Returns:
+        Values at the minimum, and the graph without the observations that were rejected.
+    """
+    factors = [graph.at(row) for row in range(graph.size())]
+    observed = [_landmark(factor) is not None for factor in factors]
+    params = gtsam.GncLMParams(inner)
+    params.setLossType(gtsam.GncLossType.TLS)
+    params.setKnownInliers([row for row, is_one in enumerate(observed) if not is_one])
+    optimizer = gtsam.GncLMOptimizer(graph, values, params)
+    # GTSAM's threshold is on the cost, half of the squared residual.
+    optimizer.setInlierCostThresholds(0.5 * _GATE / noise_factor**2)
+    found = optimizer.optimize()
+    weights = optimizer.getWeights()
+    kept = gtsam.NonlinearFactorGraph()
+    for factor, weight, is_one in zip(factors, weights, observed, strict=True):
+        if weight > _KEPT or not is_one:
+            kept.add(factor)
+    return found, kept
+
+
+def trimmed(graph: Any, values: Any, params: Any, noise_factor: float = 1.0) -> tuple[Any, Any]:
+    """Minimises with the factors' own kernels, then without them over what fits.
+
+    Args:
+        graph: factors, landmark observations with a kernel.
+        values: initial values.
+        params: of Levenberg-Marquardt.
+        noise_factor: by which the factors' deviations exceed the stated ones, which judge.
+
+    Returns:
+        Values at the minimum, and the plain factors that were kept.
+    """
+    rough = solver_parameters(params.getMaxIterations(), _ROUGH)
+    values = gtsam.LevenbergMarquardtOptimizer(graph, values, rough).optimize()
+    factors = [graph.at(row) for row in range(graph.size())]
+    observed = [_landmark(factor) is not None for factor in factors]
+    # A robust factor whitens with its kernel's weight, after which everything would seem to fit.
+    # Loops keep their kernels: they are too few to be separated by a trim.
+    factors = [plain(f) if is_one else f for f, is_one in zip(factors, observed, strict=True)]
+    gate = _GATE / noise_factor**2
+    fits: list[bool] = []
+    for _ in range(_ROUNDS):
+        before = fits
+        pairs = zip(factors, observed, strict=True)
+        fits = [not is_one or _squared(factor, values) <= gate for factor, is_one in pairs]
+        if fits == before:
+            break
+        kept = gtsam.NonlinearFactorGraph()
+        for factor, fit in zip(factors, fits, strict=True):
+            if fit:
+                kept.add(factor)
+        values = gtsam.LevenbergMarquardtOptimizer(kept, values, rough).optimize()
+    return gtsam.LevenbergMarquardtOptimizer(kept, values, params).optimize(), kept
+
+
+def with_kernel(graph: Any) -> Any:
+    """The graph with Cauchy's kernel around its landmark observations, for a quick solution."""
+    out = gtsam.NonlinearFactorGraph()
+    for row in range(graph.size()):
+        factor = graph.at(row)
+        observed = _landmark(factor) is not None
+        out.add(robust(factor, "cauchy", _QUICK_WIDTH) if observed else factor)
+    return out
+
+
+def _squared(factor: Any, values: Any) -> float:
+    """Whitened residual squared of a plain factor."""
+    residual = factor.whitenedError(values)
+    return float(residual @ residual)
+
+
+def observed_variables(graph: Any) -> set[int]:
+    """Landmark variables that some pose observes."""
+    found = {_landmark(graph.at(row)) for row in range(graph.size())}
+    return {variable for variable in found if variable is not None}
+
+
+def _landmark(factor: Any) -> int | None:
+    """The landmark variable of an observation; None for other factors."""
+    keys = list(factor.keys())
+    if len(keys) != 2 or not is_pose(keys[0]) or is_pose(keys[1]):
+        return None
+    return number(keys[1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +171,7 @@ def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
     """Solves, without landmarks that come out behind a camera or that nothing supports."""
     graph = builder.kept_factors()
     remarks: list[str] = []
-    for _ in range(_ROUNDS):
+    for _ in range(_SOLUTIONS):
         found, kept = minimise(graph, values)
         lost = _lost(builder, found, kept)
         if not lost:

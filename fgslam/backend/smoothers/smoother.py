@@ -8,7 +8,7 @@ or once, and the front-end never waits for it.
 The parts: a tracker (:class:`~fgslam.backend.filters.landmark_kalman.LandmarkKalman`), a
 :class:`~fgslam.backend.smoothers.graph_builder.GraphBuilder`, a
 :class:`~fgslam.backend.smoothers.solver.GraphSolver`, and, if not every frame is a variable,
-:class:`~fgslam.backend.smoothers.segments.Segments`.
+:class:`~fgslam.backend.smoothers.keyframes.Segments`.
 """
 
 from __future__ import annotations
@@ -19,16 +19,13 @@ from typing import ClassVar
 import numpy as np
 
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
-from fgslam.backend.filters.settings import LandmarkKalmanSettings
-from fgslam.backend.filters.submaps import CLOSURE_FACTOR, FREE, Constraint
-from fgslam.backend.smoothers.between import fill_between
-from fgslam.backend.smoothers.graph_builder import GraphBuilder
-from fgslam.backend.smoothers.graph_solution import Solution
+from fgslam.backend.filters.loop_correction import CLOSURE_FACTOR, FREE, Constraint
+from fgslam.backend.settings import GraphSettings, LandmarkKalmanSettings
+from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
+from fgslam.backend.smoothers.keyframes import Segments, fill_between
 from fgslam.backend.smoothers.loop_closing import carried_to
 from fgslam.backend.smoothers.recorded_inputs import RecordedInputs, require_finite
-from fgslam.backend.smoothers.segments import Segments, TrackedFrame
-from fgslam.backend.smoothers.settings import GraphSettings
-from fgslam.backend.smoothers.solver import Drive, GraphSolver, Smoothed
+from fgslam.backend.smoothers.solver import Drive, GraphSolver, Smoothed, Solution
 from fgslam.backend.smoothers.tracker_map import TrackerMap
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
-from fgslam.backend.graphs import poses_of_frame
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting
-from fgslam.backend.smoothers.graph_solution import (
+from fgslam.backend.smoothers.solver import (
+    Smoothed,
     Solution,
 )
-from fgslam.backend.smoothers.solver import Smoothed
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.geometry import (
@@ -28,7 +27,7 @@ from fgslam.core.geometry import (
     triangulation_covariance,
 )
 from fgslam.core.sensors import Sensor
-from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame
 
 
 class TrackerMap:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.backend.filters.settings import LandmarkKalmanSettings
+from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Trajectory
 from fgslam.core.features import LandmarkAppearances, StereoFeatures

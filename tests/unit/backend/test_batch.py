@@ -21,8 +21,8 @@ from smoothing import (
     wrong_matches,
 )
 
+from fgslam.backend.settings import BatchSettings
 from fgslam.backend.smoothers import refinement
-from fgslam.backend.smoothers.settings import BatchSettings
 from fgslam.backend.smoothers.smoother import MapSmoother
 from fgslam.core.errors import EstimatorError
 from fgslam.evaluation.consistency import judge

@@ -9,9 +9,9 @@ import pytest
 from simulated import RIG, Simulation
 from smoothing import drawn
 
-from fgslam.backend.smoothers.between import fill_between
-from fgslam.backend.smoothers.graph_solution import Solution
-from fgslam.backend.smoothers.segments import TrackedFrame
+from fgslam.backend.smoothers.graph_builder import TrackedFrame
+from fgslam.backend.smoothers.keyframes import fill_between
+from fgslam.backend.smoothers.solver import Solution
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.floor import Floor

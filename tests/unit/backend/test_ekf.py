@@ -13,7 +13,7 @@ from simulated import RIG, Drive, Simulation, assert_same_bits, play, simulate, 
 from fgslam.backend.filters.ekf import FullEkf
 from fgslam.backend.filters.ekf_update import DivergedError, FloorMeasurement, Matches, correct
 from fgslam.backend.filters.growing_covariance import GrowingCovariance
-from fgslam.backend.filters.settings import EkfSettings
+from fgslam.backend.settings import EkfSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
@@ -21,10 +21,10 @@ from fgslam.core.estimates import Prediction, UpdateStats
 from fgslam.core.floor import Floor
 from fgslam.core.measurements import Increment, Odometry
 from fgslam.evaluation.consistency import judge, landmark_nees, pose_nees
-from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.factors.graphs import landmark_key, pose_key
+from fgslam.factors.landmark import StereoFactors
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior
 from fgslam.factors.noise import Whitening
-from fgslam.factors.stereo import StereoFactors
 from fgslam.frontend.settings import EgoMotionSettings
 
 FREE = Floor.under(RIG, 6)

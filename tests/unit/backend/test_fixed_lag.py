@@ -23,12 +23,12 @@ from smoothing import (
     unseen,
 )
 
-from fgslam.backend.smoothers.settings import FixedLagSettings
+from fgslam.backend.settings import FixedLagSettings
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Prediction
 from fgslam.evaluation.consistency import judge
-from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
+from fgslam.factors.graphs import is_pose, landmark_key, number, pose_key
 
 LAG = FixedLagSettings(lag_frames=5)
 

@@ -23,16 +23,15 @@ from smoothing import (
     unseen,
 )
 
-from fgslam.backend.smoothers.graph_builder import GraphBuilder
-from fgslam.backend.smoothers.segments import TrackedFrame
-from fgslam.backend.smoothers.settings import BatchSettings, GraphSettings
+from fgslam.backend.settings import BatchSettings, GraphSettings
+from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
 from fgslam.core import geometry as g
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Estimate, LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.measurements import Increment, Odometry
 from fgslam.evaluation.consistency import judge, landmark_nees
-from fgslam.factors.keys import is_pose, landmark_key, pose_key
+from fgslam.factors.graphs import is_pose, landmark_key, pose_key
 
 ORIGIN = Prediction(np.eye(4), np.zeros((6, 6)))
 STEP = g.se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.1]))

@@ -22,11 +22,11 @@ from smoothing import (
     unseen,
 )
 
-from fgslam.backend.smoothers.settings import Isam2Settings
+from fgslam.backend.settings import Isam2Settings
 from fgslam.backend.smoothers.smoother import MapSmoother
 from fgslam.core.errors import EstimatorError
 from fgslam.evaluation.consistency import judge
-from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.factors.graphs import landmark_key, pose_key
 
 EVERY_FRAME = Isam2Settings(update_every=1)
 FAILED = """

@@ -23,7 +23,7 @@ from simulated import (
 )
 
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
-from fgslam.backend.filters.settings import LandmarkKalmanSettings
+from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError

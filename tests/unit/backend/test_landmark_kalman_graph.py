@@ -22,17 +22,17 @@ from simulated import (
 
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
-from fgslam.backend.filters.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
+from fgslam.backend.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.measurements import Increment
 from fgslam.core.sensors import RangeBearingSensor
-from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.factors.graphs import landmark_key, pose_key
+from fgslam.factors.landmark import StereoFactors
 from fgslam.factors.motion import pose_prior
 from fgslam.factors.noise import Whitening
-from fgslam.factors.stereo import StereoFactors
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fgslam.backend.filters.loop_correction import DriveRecord
-from fgslam.backend.filters.settings import LoopCorrectionSettings
+from fgslam.backend.settings import LoopCorrectionSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus
 from fgslam.core.geometry import pose

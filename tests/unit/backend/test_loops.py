@@ -11,16 +11,18 @@ from loops import CLOSED, ROUND, Returned, Rounds, drive_rounds
 from simulated import Drive, assert_same_bits, play, play_directly, simulate
 from smoothing import FREE, PIXELS, build
 
-from fgslam.backend.filters.settings import (
+from fgslam.backend.protocol import Estimator
+from fgslam.backend.settings import (
+    BatchSettings,
     DeadReckoningSettings,
     EkfSettings,
+    EstimatorSettings,
+    FixedLagSettings,
+    Isam2Settings,
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
     LoopCorrectionSettings,
 )
-from fgslam.backend.protocol import Estimator
-from fgslam.backend.settings import EstimatorSettings
-from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 from factor_checks import assert_near, random_covariance, random_pose
+from factor_specifications import RawPixelFactors
 from simulated import RIG, points_in_view
 
 from fgslam.backend.smoothers.marginals import (
@@ -24,11 +25,10 @@ from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.measurements import Odometry
-from fgslam.factors.cameras import RawPixelFactors
-from fgslam.factors.keys import landmark_key, pose_key
+from fgslam.factors.graphs import landmark_key, pose_key
+from fgslam.factors.landmark import StereoFactors
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior
 from fgslam.factors.noise import Whitening
-from fgslam.factors.stereo import StereoFactors
 
 Whole = type[GraphMarginals] | type[ChainMarginals]
 BOTH: list[Whole] = [GraphMarginals, ChainMarginals]

@@ -9,16 +9,14 @@ import numpy as np
 import pytest
 from smoothing import SMOOTHERS, answer, ate, build, drawn, run, wrong_matches
 
-from fgslam.backend.common_settings import KernelSettings
-from fgslam.backend.graphs import solver_parameters
-from fgslam.backend.settings import EstimatorSettings
-from fgslam.backend.smoothers.outliers import (
+from fgslam.backend.settings import BatchSettings, EstimatorSettings, KernelSettings
+from fgslam.backend.smoothers.refinement import (
     graduated,
     observed_variables,
     trimmed,
 )
-from fgslam.backend.smoothers.settings import BatchSettings
 from fgslam.core.arrays import FloatArray
+from fgslam.factors.graphs import solver_parameters
 
 CAUCHY = KernelSettings("cauchy", 3.0)
 ROBUST: dict[str, EstimatorSettings] = SMOOTHERS | {

@@ -21,10 +21,14 @@ from rings import (
 )
 from simulated import RIG, assert_same_bits
 
-from fgslam.backend.filters.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
 from fgslam.backend.protocol import Estimator
-from fgslam.backend.settings import EstimatorSettings
-from fgslam.backend.smoothers.settings import BatchSettings, Isam2Settings
+from fgslam.backend.settings import (
+    BatchSettings,
+    EstimatorSettings,
+    Isam2Settings,
+    LandmarkKalmanGraphSettings,
+    LandmarkKalmanSettings,
+)
 from fgslam.core import geometry as g
 from fgslam.core.estimates import EgoMotionStatus, Prediction
 from fgslam.core.measurement_log import MeasurementLog

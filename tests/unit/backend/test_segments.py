@@ -9,8 +9,9 @@ import pytest
 from simulated import RIG, Drive, play, simulate
 from smoothing import FREE, answer, assert_finite, ate, blackout, build, drawn, moved, nees_of
 
-from fgslam.backend.smoothers.segments import Segments, TrackedFrame, summarise
-from fgslam.backend.smoothers.settings import Isam2Settings
+from fgslam.backend.settings import Isam2Settings
+from fgslam.backend.smoothers.graph_builder import TrackedFrame
+from fgslam.backend.smoothers.keyframes import Segments, summarise
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from simulated import assert_same_bits
 
-from fgslam.backend.filters.submaps import (
+from fgslam.backend.filters.loop_correction import (
     FREE,
     Chain,
     Constraint,

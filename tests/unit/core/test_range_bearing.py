@@ -7,7 +7,7 @@ import pytest
 from simulated import RIG, noisy_odometry_of, play
 
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
-from fgslam.backend.filters.settings import LandmarkKalmanSettings
+from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Prediction

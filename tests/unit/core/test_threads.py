@@ -23,7 +23,7 @@ from fgslam.runs.config import load_config
 from fgslam.datasets.opening import open_measurements
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.slam.replay import replay
-from fgslam.backend.filters.settings import EkfSettings
+from fgslam.backend.settings import EkfSettings
 
 config = load_config(Path("experiments/lab_trials.yaml"))
 whole = open_measurements(config.dataset, 0).log

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import factor_specifications as residuals
 import gtsam
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import bearings
 from fgslam.factors import bearing as f
 from fgslam.factors import bearing_residuals as r
-from fgslam.factors.keys import height_key, landmark_key, pose_key, target_key, velocity_key
+from fgslam.factors.graphs import height_key, landmark_key, pose_key, target_key, velocity_key
 
 POSE = np.array([1.2, -0.5, 0.7])
 POINTS = np.array([[3.0, 2.0], [-1.0, 0.4], [1.5, -3.0], [1.1, 2.0]])
@@ -207,11 +208,11 @@ def test_motion_factor_is_white_noise_on_acceleration() -> None:
     values.insert(pose_key(1), pose2(after))
     values.insert(velocity_key(0), speed)
     values.insert(velocity_key(1), next_speed)
-    residual = r.constant_velocity(before, speed, after, next_speed, step)
+    residual = residuals.constant_velocity(before, speed, after, next_speed, step)
     np.testing.assert_allclose(factor.unwhitenedError(values), residual, atol=1e-12)
     root = factor.noiseModel().R()
     covariance = np.linalg.inv(root.T @ root)
-    expected = r.constant_velocity_covariance(density, step)
+    expected = residuals.constant_velocity_covariance(density, step)
     np.testing.assert_allclose(covariance, expected, rtol=1e-9, atol=1e-12)
 
 

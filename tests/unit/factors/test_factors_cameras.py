@@ -9,6 +9,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+import factor_specifications as residuals
 import gtsam
 import numpy as np
 import pytest
@@ -20,15 +21,14 @@ from factor_checks import (
     random_pose,
     values_of,
 )
+from factor_specifications import RawPixelFactors
 from simulated import RIG
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.sensors import CameraRig, measurement_map, pixel_model, vertical_to_horizontal
-from fgslam.factors import residuals
-from fgslam.factors.cameras import RawPixelFactors
+from fgslam.factors.landmark import FROM_MEASUREMENT, StereoFactors
 from fgslam.factors.noise import Whitening
-from fgslam.factors.stereo import FROM_MEASUREMENT, StereoFactors
 
 RIGS = [RIG, UNEVEN_RIG]
 MEASURED = np.array([170.0, 131.0, 9.0])

@@ -5,10 +5,10 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
+from factor_specifications import constant_velocity, constant_velocity_covariance
 
-from fgslam.factors.bearing_residuals import constant_velocity, constant_velocity_covariance
-from fgslam.factors.kernels import KernelName, kernel_losses, kernel_weights
-from fgslam.factors.motion_residuals import constant_velocities, motion_informations
+from fgslam.factors.bearing_residuals import constant_velocities, motion_informations
+from fgslam.factors.noise import KernelName, kernel_losses, kernel_weights
 
 NAMES: list[KernelName] = ["none", "huber", "cauchy", "geman_mcclure", "tukey"]
 

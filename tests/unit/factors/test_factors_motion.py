@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+import factor_specifications as residuals
 import gtsam
 import numpy as np
 import pytest
@@ -22,7 +23,6 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Prediction
 from fgslam.core.floor import DegreesOfFreedom, Floor
 from fgslam.core.measurements import Odometry
-from fgslam.factors import residuals
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior, weak_point_prior
 from fgslam.factors.noise import STIFF_M, STIFF_RAD, positive_definite
 

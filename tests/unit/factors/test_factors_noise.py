@@ -12,10 +12,9 @@ from simulated import RIG
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.factors.kernels import KernelName
-from fgslam.factors.keys import is_pose, landmark_key, number, pose_key
-from fgslam.factors.noise import Whitening
-from fgslam.factors.stereo import FROM_MEASUREMENT, StereoFactors
+from fgslam.factors.graphs import is_pose, landmark_key, number, pose_key
+from fgslam.factors.landmark import FROM_MEASUREMENT, StereoFactors
+from fgslam.factors.noise import KernelName, Whitening
 
 WIDTH = 1.7
 WEIGHTS: dict[KernelName, Callable[[float], float]] = {

@@ -9,6 +9,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+import factor_specifications as residuals
 import gtsam
 import numpy as np
 import pytest
@@ -25,9 +26,8 @@ from factor_checks import (
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.sensors import RangeBearingSensor
-from fgslam.factors import residuals
+from fgslam.factors.landmark import RangeBearingFactors, bearing_axes
 from fgslam.factors.noise import Whitening
-from fgslam.factors.range_bearing import RangeBearingFactors, bearing_axes
 
 SENSOR = RangeBearingSensor(20.0, g.BODY_FORWARD_LEFT_UP_FROM_CAMERA)
 UNEVEN = np.diag([0.03, 0.005, 0.04]) ** 2

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from simulated import RIG, Drive, simulate
 
-from fgslam.backend.filters.settings import LandmarkKalmanSettings
-from fgslam.backend.smoothers.settings import Isam2Settings
+from fgslam.backend.settings import Isam2Settings, LandmarkKalmanSettings
 from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.measurement_log import MeasurementLog

@@ -7,15 +7,17 @@ import pytest
 
 from fgslam.backend.filters.ekf_update import FRONT, FloorMeasurement, Matches, correct
 from fgslam.backend.filters.growing_covariance import GrowingCovariance, rows_of
-from fgslam.backend.filters.settings import (
+from fgslam.backend.protocol import Estimator, MapUser
+from fgslam.backend.settings import (
+    BatchSettings,
     DeadReckoningSettings,
     EkfSettings,
+    EstimatorSettings,
+    FixedLagSettings,
+    Isam2Settings,
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
 )
-from fgslam.backend.protocol import Estimator, MapUser
-from fgslam.backend.settings import EstimatorSettings
-from fgslam.backend.smoothers.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError

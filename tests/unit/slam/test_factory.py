@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
-from fgslam.backend.filters.settings import LandmarkKalmanSettings
+from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core.errors import ConfigError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
 from fgslam.core.measurements import MeasurementType

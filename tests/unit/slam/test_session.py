@@ -13,7 +13,7 @@ from rings import on_ring, walls
 from simulated import RIG, FeatureWorld, assert_same_bits
 
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
-from fgslam.backend.filters.settings import LandmarkKalmanSettings
+from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import (

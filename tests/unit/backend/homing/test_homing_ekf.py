@@ -10,8 +10,7 @@ from homings import trial
 
 from fgslam.backend.homing import ekf
 from fgslam.backend.homing.baselines import AverageDisplacement, AverageLandmarkVector
-from fgslam.backend.homing.ekf import HomingEkf
-from fgslam.backend.homing.ekf_model import FilterState, initial_state, motion
+from fgslam.backend.homing.ekf import FilterState, HomingEkf, initial_state, motion
 from fgslam.backend.homing.settings import PAPER, FilterMotionSettings, HomingEkfSettings
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import HomingStart, LocalMap, TrackedBearings, TwoViewVector

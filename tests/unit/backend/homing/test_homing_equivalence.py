@@ -13,15 +13,16 @@ import numpy as np
 import pytest
 from homings import Trial, trial
 
-from fgslam.backend.homing.ekf import HomingEkf, updated
-from fgslam.backend.homing.ekf_model import (
+from fgslam.backend.homing.ekf import (
     _INITIAL_SPEED,
     FilterState,
+    HomingEkf,
     initial_state,
     motion,
     predicted,
     seen_from_robot,
     seen_from_target,
+    updated,
 )
 from fgslam.backend.homing.settings import PAPER, HomingEkfSettings
 from fgslam.core.arrays import FloatArray

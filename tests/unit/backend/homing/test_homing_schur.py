@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from homings import Trial, trial
 
-from fgslam.backend.common_settings import KernelSettings
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.backend.homing.schur_model import SchurModel, State
-from fgslam.backend.homing.schur_solver import SchurSolver
-from fgslam.backend.homing.schur_system import Factored
+from fgslam.backend.homing.schur_solver import Factored, SchurSolver
 from fgslam.backend.homing.settings import HomingGraphSettings
+from fgslam.backend.settings import KernelSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import HomingEstimate
@@ -61,8 +60,8 @@ def test_the_same_optimum_and_covariance_as_gtsams_batch(
 ) -> None:
     """Both driven to convergence, which reweighting reaches slowly: hundredths of a deviation."""
     monkeypatch.setattr("fgslam.backend.homing.schur_solver._STILL", 1e-7)
-    monkeypatch.setattr("fgslam.backend.homing.graph_solvers._RELATIVE_TOLERANCE", 1e-14)
-    monkeypatch.setattr("fgslam.backend.homing.graph_solvers._MAX_ITERATIONS", 200)
+    monkeypatch.setattr("fgslam.backend.homing.graph_gtsam._RELATIVE_TOLERANCE", 1e-14)
+    monkeypatch.setattr("fgslam.backend.homing.graph_gtsam._MAX_ITERATIONS", 200)
     settings = replace(EXACT, kernel=kernel, elevations=elevations)  # type: ignore[arg-type]
     own = estimated(settings)
     batch = estimated(replace(settings, solver="batch"))

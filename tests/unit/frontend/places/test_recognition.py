@@ -21,7 +21,7 @@ from rings import (
 )
 from simulated import RIG, assert_same_bits
 
-from fgslam.backend.filters.settings import LandmarkKalmanSettings, LoopCorrectionSettings
+from fgslam.backend.settings import LandmarkKalmanSettings, LoopCorrectionSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotionStatus

@@ -1,12 +1,18 @@
-"""Keys of the graph's variables: pose of frame k is ``x k``, the n-th landmark variable ``l n``.
+"""Keys of a graph's variables, and small helpers on GTSAM's graphs and values.
 
-A landmark's variable is numbered by the graph, not by its identity: an identity that starts anew
-(it moved, or left a fixed lag and came back) gets a new variable.
+The pose of frame k is ``x k``, the n-th landmark variable ``l n``: numbered by the graph, not by
+the landmark's identity. An identity that starts anew (it moved, or left a fixed lag and came back)
+gets a new variable.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import gtsam
+import numpy as np
+
+from fgslam.core.arrays import FloatArray
 
 _POSE, _LANDMARK = "x", "l"
 _TARGET, _VELOCITY, _HEIGHT = "t", "v", "h"
@@ -49,3 +55,26 @@ def velocity_key(image: int) -> int:
 def height_key(variable: int) -> int:
     """Key of the height of landmark ``variable``."""
     return int(gtsam.symbol(_HEIGHT, variable))
+
+
+def without_gaps(graph: Any) -> Any:
+    """A nonlinear graph without its empty slots."""
+    kept = gtsam.NonlinearFactorGraph()
+    for row in range(graph.size()):
+        if graph.exists(row):
+            kept.add(graph.at(row))
+    return kept
+
+
+def poses_of_frame(values: Any, frame: int) -> FloatArray:
+    """The pose ``wTc`` (4, 4) of one frame in GTSAM values."""
+    return np.asarray(values.atPose3(pose_key(frame)).matrix())
+
+
+def solver_parameters(max_iterations: int, relative_tolerance: float) -> Any:
+    """Parameters of Levenberg-Marquardt that stop by the relative change of the cost alone."""
+    params = gtsam.LevenbergMarquardtParams()
+    params.setMaxIterations(max_iterations)
+    params.setRelativeErrorTol(relative_tolerance)
+    params.setAbsoluteErrorTol(0.0)
+    return params

@@ -1,4 +1,7 @@
-"""Range-bearing factors: azimuth, elevation and range of a landmark from a pose of the sensor."""
+"""Factors of one landmark observation, by stereo or trinocular cameras, or by range and bearing.
+
+Derivation: docs/derivations/factors.md.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,55 @@ import gtsam
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
+from fgslam.core.sensors import CameraRig
 from fgslam.factors.noise import Whitening
 
+FROM_MEASUREMENT: FloatArray = np.array([[1.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""(u_left, u_right, v) of (column, row, disparity)."""
 _REACH_SIGMAS = 10.0  # how far from the measured direction the predicted one is expected
 _ISOTROPIC = 1e-9  # relative difference of bearing variances that makes no difference
 _UNIT_CAMERA = gtsam.Cal3_S2Stereo(1.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+
+class StereoFactors:
+    """Makes C++ stereo factors of one rig, of observations (column, row, disparity).
+
+    The paper's reference is the right camera, GTSAM's stereo camera the left one. The pose variable
+    stays the right camera's; the left one sits ``baseline`` along its -x axis and is given to the
+    factor as the sensor's place on the body. GTSAM measures (u_left, u_right, v), which is linear
+    in ours: ``u_left = c + d, u_right = c, v = r``; its covariance follows exactly.
+
+    A landmark behind the camera has a constant residual and no Jacobian, as GTSAM does it; who
+    builds graphs keeps such landmarks out.
+    """
+
+    def __init__(self, rig: CameraRig, whitening: Whitening) -> None:
+        """The rig and the noise models, robust or not."""
+        self._whitening = whitening
+        self._calibration = gtsam.Cal3_S2Stereo(rig.fx, rig.fy, 0.0, rig.cx, rig.cy, rig.baseline)
+        self._rTl = gtsam.Pose3(gtsam.Rot3(), np.array([-rig.baseline, 0.0, 0.0]))
+
+    def factor(
+        self, pose: int, landmark: int, measurement: FloatArray, covariance: FloatArray
+    ) -> Any:
+        """Factor between a pose ``wTc`` of the reference camera and a world point.
+
+        Args:
+            pose: its key.
+            landmark: its key.
+            measurement: (3,) column, row, disparity, pixels.
+            covariance: (3, 3) of it, pixels squared.
+        """
+        model = self._whitening.model(covariance, FROM_MEASUREMENT)
+        return self.with_model(pose, landmark, measurement, model)
+
+    def with_model(self, pose: int, landmark: int, measurement: FloatArray, model: Any) -> Any:
+        """The same with a noise model of (u_left, u_right, v)."""
+        column, row, disparity = measurement.tolist()
+        measured = gtsam.StereoPoint2(column + disparity, column, row)
+        return gtsam.GenericStereoFactor3D(
+            measured, model, pose, landmark, self._calibration, False, False, self._rTl
+        )
 
 
 class RangeBearingFactors:

@@ -1,25 +1,46 @@
-"""Solvers of the homing graph: what all of them offer, and GTSAM's: incremental, fixed lag, batch.
-
-The own one is :mod:`fgslam.backend.homing.schur_solver`.
+"""The homing graph in GTSAM's factors, and its solvers by GTSAM: incremental, fixed lag, batch.
 
 All keep the values of every variable that they still have, and answer joint covariances.
 """
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import gtsam
 import numpy as np
 
-from fgslam.backend.graphs import without_gaps
-from fgslam.backend.homing.graph_parts import GtsamParts, NewPart
-from fgslam.backend.homing.schur_solver import SchurSolver
-from fgslam.backend.homing.settings import HomingGraphSettings
+from fgslam.backend.homing.graph_parts import (
+    TARGET,
+    Beginning,
+    NewPart,
+    Sight,
+    first_speeds,
+    motion_densities,
+)
+from fgslam.backend.homing.settings import GraphMotionSettings, HomingGraphSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.factors.bearing import BearingFactors, tangent_to_pose
-from fgslam.factors.keys import is_pose, landmark_key, pose_key, target_key, velocity_key
+from fgslam.factors.bearing import (
+    BearingFactors,
+    leg_factor,
+    motion_factor,
+    start_prior,
+    tangent_to_pose,
+    vector_factor,
+    velocity_prior,
+    weak_height_prior,
+    weak_landmark_prior,
+)
+from fgslam.factors.graphs import (
+    height_key,
+    is_pose,
+    landmark_key,
+    pose_key,
+    target_key,
+    velocity_key,
+    without_gaps,
+)
 
 _TRUST_RADIUS = 1.0  # legs, radians: the first of Powell's dog leg
 _RELINEARISED = 0.01  # legs, radians: a variable that moves by more is linearised anew
@@ -27,39 +48,59 @@ _MAX_ITERATIONS = 50  # of Levenberg-Marquardt; from the last solution it takes 
 _RELATIVE_TOLERANCE = 1e-5  # of the cost: the estimate then moves by far less than its deviation
 
 
-class Solver(Protocol):
-    """Takes the graph in, part by part. Poses are (x, y, psi) in the start frame."""
+class GtsamParts:
+    """Makes GTSAM's factors and values of parts."""
 
-    def add(self, new: NewPart, time: float) -> None:
-        """Brings an image in. Raises EstimatorError where the graph cannot be solved."""
-        ...
+    def __init__(self, robust: BearingFactors, motion: GraphMotionSettings) -> None:
+        self._robust, self._motion = robust, motion
 
-    def move(self, points: dict[int, FloatArray], time: float) -> None:
-        """Puts landmarks, by row, back to places (2,) and goes on from there."""
-        ...
+    def of(self, new: NewPart) -> tuple[Any, Any, set[int]]:
+        """Factors, first guesses, and keys of what the image touches."""
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        pose, velocity = pose_key(new.image), velocity_key(new.image)
+        values.insert(pose, gtsam.Pose2(*new.pose))
+        values.insert(velocity, new.velocity)
+        if new.beginning is not None:
+            self._begin(graph, values, new.beginning)
+        else:
+            earlier = (pose_key(new.image - 1), velocity_key(new.image - 1), new.times[0])
+            now = (pose, velocity, new.times[1])
+            graph.add(motion_factor(earlier, now, motion_densities(self._motion)))
+        for row, (point, spread) in new.points.items():
+            values.insert(landmark_key(row), point)
+            graph.add(weak_landmark_prior(landmark_key(row), point, spread))
+        for row, (height, spread) in new.heights.items():
+            values.insert(height_key(row), height)
+            graph.add(weak_height_prior(height_key(row), height, spread))
+        return graph, values, self._see(graph, new) | {pose, velocity}
 
-    def pose(self, image: int) -> FloatArray:
-        """(3,) the robot at an image."""
-        ...
+    def _begin(self, graph: Any, values: Any, beginning: Beginning) -> None:
+        target, vector, covariance = beginning
+        values.insert(target_key(), gtsam.Pose2(*target))
+        graph.add(start_prior(pose_key(0)))
+        graph.add(velocity_prior(velocity_key(0), np.zeros(3), first_speeds(self._motion)))
+        graph.add(leg_factor(pose_key(0), target_key()))
+        graph.add(vector_factor(target_key(), vector.direction, vector.rotation, covariance))
 
-    def velocity(self, image: int) -> FloatArray:
-        """(3,) in the robot's axes: forward, left, turning."""
-        ...
+    def _see(self, graph: Any, new: NewPart) -> set[int]:
+        """All that is measured; keys of the landmarks and heights in it."""
+        robust, keys = self._robust, set[int]()
+        for sight in new.bearings:
+            landmark = landmark_key(sight.row)
+            graph.add(robust.bearing(_view(sight), landmark, sight.measured, sight.sigma))
+            keys.add(landmark)
+        for sight in new.elevations:
+            landmark, height = landmark_key(sight.row), height_key(sight.row)
+            at = (_view(sight), landmark, height)
+            graph.add(robust.elevation(*at, sight.measured, sight.sigma))
+            keys |= {landmark, height}
+        for pair in new.pairs:
+            graph.add(robust.elevation_pair(target_key(), landmark_key(pair.row), *pair[1:]))
+        return keys
 
-    def target(self) -> FloatArray:
-        """(3,)."""
-        ...
 
-    def points(self, rows: list[int]) -> FloatArray:
-        """(k, 2) landmarks of rows of the matches."""
-        ...
-
-    def covariance(self, rows: list[int]) -> FloatArray:
-        """Joint covariance (6 + 2 k) of the robot at the last image, the target, and landmarks.
-
-        NaN where the linearised graph does not determine them.
-        """
-        ...
+def _view(sight: Sight) -> int:
+    return target_key() if sight.view == TARGET else pose_key(sight.view)
 
 
 class GtsamSolver:
@@ -222,19 +263,6 @@ class BatchSolver(GtsamSolver):
         except RuntimeError:
             return undetermined(keys)
         return joint_of(marginals, keys)
-
-
-def make_solver(settings: HomingGraphSettings) -> Solver:
-    """The one of the settings."""
-    match settings.solver:
-        case "schur":
-            return SchurSolver(settings)
-        case "isam2":
-            return Isam2Solver(settings)
-        case "fixed_lag":
-            return FixedLagSolver(settings)
-        case "batch":
-            return BatchSolver(settings)
 
 
 def isam2_parameters() -> Any:
