@@ -71,7 +71,6 @@ def open_euroc(settings: EurocSettings) -> Recording:
         notes=notes + missing_notes(files, stamps),
         indices=chosen,
         load_images=RawPairs(files, raw).load,
-        odometry_source=None,
     )
 
 

@@ -63,7 +63,6 @@ def open_kitti(settings: KittiSettings) -> Recording:
         notes=missing_notes(files, stamps),
         indices=chosen,
         load_images=files.load,
-        odometry_source=None,
     )
 
 

@@ -122,7 +122,6 @@ def open_light_field(settings: LightFieldSettings) -> Recording:
         notes=_notes(walk, settings),
         indices=chosen,
         load_images=walk.load,
-        odometry_source=None,
     )
 
 

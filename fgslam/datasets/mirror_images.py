@@ -35,9 +35,6 @@ def open_omni_path(settings: OmniPathSettings) -> OmniRecording:
         ids=ids_of([path.stem for path in paths]),
         names=tuple(path.name for path in paths),
         timestamps=no_times(len(paths)),
-        poses=None,
-        rooms=None,
-        notes=(),
         load_image=lambda i: read_colour_image(paths[i]),
     )
     return recording.select(chosen)
@@ -70,9 +67,6 @@ def open_omni_video(settings: OmniVideoSettings) -> OmniRecording:
         ids=numbers,
         names=tuple(f"frame {k}" for k in range(frames.count)),
         timestamps=numbers / rate,
-        poses=None,
-        rooms=None,
-        notes=(),
         load_image=frames.load,
     )
     return recording.select(chosen)

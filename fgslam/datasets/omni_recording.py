@@ -32,11 +32,11 @@ class OmniRecording:
         ids: (n,) the recording's own numbers, all different.
         names: (n,) of the pictures, as people know them: file names, or frames of a video.
         timestamps: (n,) seconds, strictly increasing; NaN where times are unknown.
+        load_image: reads a picture by its place.
         poses: (n, 3) planar poses x, y in metres and heading of the camera (of the centre column
             of a panorama) in radians, in the recording's world; None where there is no truth.
         rooms: (n,) name of the room of each picture, or None.
         notes: what was tolerated when opening.
-        load_image: reads a picture by its place.
     """
 
     name: str
@@ -45,10 +45,10 @@ class OmniRecording:
     ids: IntArray
     names: tuple[str, ...]
     timestamps: FloatArray
-    poses: FloatArray | None
-    rooms: tuple[str, ...] | None
-    notes: tuple[str, ...]
     load_image: ColourLoader
+    poses: FloatArray | None = None
+    rooms: tuple[str, ...] | None = None
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -55,7 +55,7 @@ class Recording(Brief):
     notes: tuple[str, ...]
     indices: IntArray
     load_images: ImageLoader
-    odometry_source: OdometrySource | None
+    odometry_source: OdometrySource | None = None
 
     def __len__(self) -> int:
         return len(self.indices)

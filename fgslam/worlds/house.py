@@ -35,7 +35,7 @@ from fgslam.worlds.rendering.renderer import Renderer, surface_points, visible
 from fgslam.worlds.rendering.scene import Layer, bake
 from fgslam.worlds.rendering.texture_bank import ColourBank
 from fgslam.worlds.rendering.texture_library import build_colour_library
-from fgslam.worlds.rendering.views import OmniView
+from fgslam.worlds.rendering.views import omni_view
 
 Float32 = npt.NDArray[np.float32]
 
@@ -61,7 +61,6 @@ class HouseModel:
     """The house itself, the same for all worlds in it; safe to share, never changed.
 
     Attributes:
-        house: things, lamps and doors.
         space: where the wheelchair can stand.
         layer: the scene in full light, ready to be shaded; ``evening``: its other light.
         bank: all textures.
@@ -69,11 +68,10 @@ class HouseModel:
 
     def __init__(self, seed: int) -> None:
         """Builds everything, some seconds. Raises MissingDependencyError without Open3D."""
-        self.house = build_house(np.random.default_rng([seed, 2]))
-        patches = stack(self.house.things)
+        things, lamps = build_house(np.random.default_rng([seed, 2]))
+        patches = stack(things)
         caster = RayCaster(patches)
         self.bank = ColourBank(build_colour_library(np.random.default_rng([seed, 1])))
-        lamps = self.house.lamps
         lights = [
             bake(patches, caster, chosen, np.random.default_rng([seed, 3]), _LIGHT_SPACING_M)
             for chosen in (lamps, lamps[::2])
@@ -124,7 +122,7 @@ class OmniWorld:
         self.settings, self._seed = settings, seed
         self.model = open_house(settings.house_seed)
         self.camera: OmniCamera = make_house_camera(settings.camera)
-        self._renderer = Renderer(OmniView(self.camera), self.model.bank, _EDGE_CONTRAST)
+        self._renderer = Renderer(omni_view(self.camera), self.model.bank, _EDGE_CONTRAST)
         planner = PathPlanner(self.model.space, _PATH_CLEARANCE_M)
         within = None if settings.path.rooms == "house" else settings.path.rooms
         self.reference_poses = planner.reference_path(

@@ -45,7 +45,7 @@ from fgslam.worlds.rendering.texture_library import (
     corridor_library,
 )
 from fgslam.worlds.rendering.textures import Grey
-from fgslam.worlds.rendering.views import PinholeView
+from fgslam.worlds.rendering.views import pinhole_view
 
 _BEND_M = 2.3
 """Way of a quarter turn between two rooms: fits into a corridor, and into a lane of 3.3 m twice."""
@@ -268,7 +268,7 @@ class World:
 
     def __init__(self, rig: CameraRig, room: Room) -> None:
         self.room = room
-        view = PinholeView((rig.height, rig.width), rig.fx, rig.cx, rig.cy)
+        view = pinhole_view((rig.height, rig.width), rig.fx, rig.cx, rig.cy)
         self._renderer = Renderer(view, room.bank)
 
     def bodies(self, stance: Stance | None) -> list[Body]:

@@ -15,7 +15,7 @@ from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.planar import unit
 from fgslam.core.sensors import CameraRig
-from fgslam.worlds.driving.paths import PosesInTime
+from fgslam.worlds.driving.paths import PosesInTime, planar_poses
 from fgslam.worlds.lab_settings import LabPersonSettings, LabSettings
 from fgslam.worlds.rendering.patches import (
     Patch,
@@ -336,7 +336,8 @@ class People:
         for walker, shirt in zip(self._walkers, self._shirts, strict=True):
             stance = walker.stance()
             phase = int(stance.way / _STRIDE_M * _PHASES) % _PHASES
-            out.append(Body(self._layer(phase, shirt), _pose(stance), _BODY_RADIUS))
+            pose = planar_poses(np.array([[stance.x, stance.y, stance.heading]]))[0]
+            out.append(Body(self._layer(phase, shirt), pose, _BODY_RADIUS))
         return out
 
     def _layer(self, phase: int, shirt: int) -> Layer:
@@ -356,11 +357,3 @@ def _dressed(patch: Patch, shirt: int) -> Patch:
         return patch
     surface = Surface(f"shirt_{shirt}", patch.surface.tile_m)
     return Patch(patch.corner, patch.edge_u, patch.edge_v, surface)
-
-
-def _pose(stance: Stance) -> FloatArray:
-    out = np.eye(4)
-    c, s = np.cos(stance.heading), np.sin(stance.heading)
-    out[:2, :2] = [[c, -s], [s, c]]
-    out[:2, 3] = stance.x, stance.y
-    return out

@@ -11,7 +11,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.worlds.buildings import furniture
-from fgslam.worlds.buildings.floor_plan import DOOR_HEIGHT, HEIGHT
+from fgslam.worlds.buildings.floor_plan import DOOR_HEIGHT, HEIGHT, lamp_things
 from fgslam.worlds.rendering.patches import Patch, Surface, Thing, box, placed, rectangle
 
 SECTION, SECTIONS = 6.0, 4
@@ -58,10 +58,10 @@ def _turned(patches: list[Patch], quarter: int) -> list[Patch]:
     return placed(placed(centred, 0.0, 0.0, 0.0, 90.0 * quarter), SIDE / 2, SIDE / 2, 0.0, 0.0)
 
 
-def _lamps() -> list[FloatArray]:
-    """One in the middle of each half section."""
+def _lamps() -> FloatArray:
+    """(k, 3, 3) one in the middle of each half section of the leg along x."""
     at = (np.arange(2 * SECTIONS) + 0.5) * SECTION / 2.0
-    return [np.array([[x - 0.5, -0.2, HEIGHT - 0.02], [1.0, 0, 0], [0, 0.4, 0]]) for x in at]
+    return np.array([[[x - 0.5, -0.2, HEIGHT - 0.02], [1.0, 0, 0], [0, 0.4, 0]] for x in at])
 
 
 def _leg(rng: np.random.Generator) -> list[Thing]:
@@ -73,9 +73,7 @@ def _leg(rng: np.random.Generator) -> list[Thing]:
     outer = rectangle((SIDE + w, -w, h), (-SIDE - 2 * w, 0, 0), (0, 0, -h), _WALL)
     out = [Thing("floor", (floor,)), Thing("ceiling", (ceiling,))]
     out += [Thing("inner_wall", (inner,)), Thing("outer_wall", (outer,))]
-    for k, lamp in enumerate(_lamps()):
-        glowing = rectangle(lamp[0] - [0, 0, 0.003], lamp[1], lamp[2], Surface("lamp", None, 1.0))
-        out.append(Thing(f"lamp_{k}", (glowing,)))
+    out += lamp_things(_lamps())
     board = placed(furniture.hanging(1.5, 1.1, Surface("picture_1")), -0.1, 0.005 - w, 1.1, 180.0)
     out.append(Thing("corner_board", tuple(board)))
     section = _section(rng)

@@ -6,8 +6,6 @@ pictures hang in several rooms, so that places can be mistaken for one another.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
@@ -51,6 +49,19 @@ _LINES = (
 
 _LAMP_SPACING = 3.2
 _DOOR_WIDTH = 1.6  # a wheelchair passes with room to turn in
+# The opening between hall and office is half as wide again.
+_DOORS = (
+    Opening(2.5, 7.5, _DOOR_WIDTH, True),
+    Opening(8.5, 7.5, _DOOR_WIDTH, True),
+    Opening(16.5, 7.5, _DOOR_WIDTH, True),
+    Opening(11.0, 3.75, 1.5 * _DOOR_WIDTH, False),
+    Opening(3.5, 9.9, _DOOR_WIDTH, True),
+    Opening(10.25, 9.9, _DOOR_WIDTH, True),
+    Opening(17.0, 9.9, _DOOR_WIDTH, True),
+    Opening(7.0, 12.5, _DOOR_WIDTH, False),
+    Opening(13.5, 12.5, _DOOR_WIDTH, False),
+)
+PLAN = FloorPlan(ROOMS, _LINES, _DOORS, WIDTH, DEPTH, floor_tile_m=_FLOOR_TILE_M)
 _ROOMY = FittingStyle(
     ("shelf", "shelf", "desk", "cabinet", "sofa", "gap", "gap"),
     cloths=("cloth", "cloth_red", "cloth_green"),
@@ -60,34 +71,18 @@ _NARROW = FittingStyle(("gap", "cabinet"), (0.8, 0.2), cabinet_depth=0.3)
 _COMMON_PICTURES = ("painting_0", "poster_0")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class House:
-    """Everything that does not move.
-
-    Attributes:
-        things: with their patches.
-        lamps: (k, 3, 3) corner and two edges of the lamps in the ceilings, metres.
-        doors: openings between rooms.
-    """
-
-    things: tuple[Thing, ...]
-    lamps: FloatArray
-    doors: tuple[Opening, ...]
-
-
-def build_house(rng: np.random.Generator) -> House:
-    """The house with all its furniture.
+def build_house(rng: np.random.Generator) -> tuple[tuple[Thing, ...], FloatArray]:
+    """Everything in the house, and its lamps (k, 3, 3): corner and two edges, metres.
 
     Args:
         rng: for layout and small things.
     """
-    plan = house_plan()
-    lamps = ceiling_lamps(plan, _LAMP_SPACING)
-    things = [*shell(plan), *lamp_things(lamps)]
-    for room in plan.rooms:
+    lamps = ceiling_lamps(PLAN, _LAMP_SPACING)
+    things = [*shell(PLAN), *lamp_things(lamps)]
+    for room in PLAN.rooms:
         style = _NARROW if room.name == "corridor" else _ROOMY
-        things += RoomFitter(room, plan.doors, rng, style, _pictures(rng)).things()
-    return House((*things, *_islands(rng)), lamps, plan.doors)
+        things += RoomFitter(room, PLAN.doors, rng, style, _pictures(rng)).things()
+    return (*things, *_islands(rng)), lamps
 
 
 def _pictures(rng: np.random.Generator) -> list[str]:
@@ -121,19 +116,3 @@ def _islands(rng: np.random.Generator) -> list[Thing]:
         ("extinguisher", furniture.extinguisher(), 13.4, 7.5 + 2.4 - HALF_WALL, 0.0),
     ]
     return [Thing(name, tuple(placed(p, x, y, 0.0, yaw))) for name, p, x, y, yaw in pieces]
-
-
-def house_plan() -> FloorPlan:
-    """The whole plan; the opening between hall and office is half as wide again."""
-    doors = (
-        Opening(2.5, 7.5, _DOOR_WIDTH, True),
-        Opening(8.5, 7.5, _DOOR_WIDTH, True),
-        Opening(16.5, 7.5, _DOOR_WIDTH, True),
-        Opening(11.0, 3.75, 1.5 * _DOOR_WIDTH, False),
-        Opening(3.5, 9.9, _DOOR_WIDTH, True),
-        Opening(10.25, 9.9, _DOOR_WIDTH, True),
-        Opening(17.0, 9.9, _DOOR_WIDTH, True),
-        Opening(7.0, 12.5, _DOOR_WIDTH, False),
-        Opening(13.5, 12.5, _DOOR_WIDTH, False),
-    )
-    return FloorPlan(ROOMS, _LINES, doors, WIDTH, DEPTH, floor_tile_m=_FLOOR_TILE_M)

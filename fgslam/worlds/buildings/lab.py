@@ -12,6 +12,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.worlds.buildings import furniture
+from fgslam.worlds.buildings.floor_plan import lamp_things
 from fgslam.worlds.rendering.patches import Patch, Surface, Thing, placed, rectangle
 from fgslam.worlds.rendering.texture_library import PHOTOGRAPHS, POSTERS
 
@@ -59,9 +60,7 @@ def _shell() -> list[Thing]:
     floor = rectangle((-a, a, 0), (side, 0, 0), (0, -side, 0), Surface("floor", 10.0))
     ceiling = rectangle((-a, -a, h), (side, 0, 0), (0, side, 0), Surface("ceiling", 4.8))
     out = [Thing("floor", (floor,)), Thing("ceiling", (ceiling,))]
-    for k, (corner, u, v) in enumerate(lamps()):
-        lamp = rectangle(corner - [0, 0, 0.003], u, v, Surface("lamp", None, glow=1.0))
-        out.append(Thing(f"lamp_{k}", (lamp,)))
+    out += lamp_things(lamps())
     covers = {"north": "bricks", "east": "plaster", "south": "plaster_dark", "west": "plaster"}
     for wall, cover in covers.items():
         surface = Surface(cover, 3.2)

@@ -32,7 +32,6 @@ class Wheelchair:
         speed, turn_rate: as the wheels turn now, before slip; m/s and rad/s.
         time: seconds since the start.
         collided: whether an obstacle stopped it in the last :meth:`advance`.
-        collisions: how often it has run into something.
     """
 
     def __init__(
@@ -47,7 +46,7 @@ class Wheelchair:
         self._blocked: Blocked = blocked or (lambda _place: False)
         self.pose = np.array(pose, dtype=np.float64)
         self.speed, self.turn_rate, self.time = 0.0, 0.0, 0.0
-        self.collided, self.collisions = False, 0
+        self.collided = False
         drawn = rng.standard_normal(3)
         self._speed_scale = 1.0 + settings.speed_scale * drawn[0]
         self._turn_scale = 1.0 + settings.turn_scale * drawn[1]
@@ -82,7 +81,6 @@ class Wheelchair:
         self._asked += seconds
         for _ in range(round(self._asked / _STEP_S) - self._steps):
             touched |= self._step()
-        self.collisions += int(touched and not self.collided)
         self.collided = touched
 
     def _step(self) -> bool:

@@ -1,13 +1,13 @@
 """How cameras look at a scene: the rays of their pixels, and how those change within a pixel.
 
 A ray ``d`` has three coordinates. Shading needs of it the products ``g . d`` with a plane's
-coefficients and their derivatives by column and row (:meth:`Rays.along` and its companions).
+coefficients and their derivatives by column and row (``along`` and its companions).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -19,56 +19,6 @@ from fgslam.worlds.rendering.scene import Body
 Float32 = npt.NDArray[np.float32]
 
 _TILT_MARGIN = 0.1
-
-
-class Rays(Protocol):
-    """Rays of n pixels, in single precision."""
-
-    def along(self, g: Float32) -> Float32:
-        """(n,) products of coefficients (3, n) with the rays."""
-        ...
-
-    def by_column(self, g: Float32) -> Float32:
-        """(n,) derivative of :meth:`along` by the pixel's column."""
-        ...
-
-    def by_row(self, g: Float32) -> Float32:
-        """(n,) derivative of :meth:`along` by the pixel's row."""
-        ...
-
-    def shifted(self, chosen: IntArray, column: float, row: float) -> Self:
-        """Some of the rays, moved within their pixels."""
-        ...
-
-    def directions(self, pose: FloatArray) -> Float32:
-        """(n, 3) in the axes in which the camera has that pose (4, 4)."""
-        ...
-
-    def towards(self, body: Body, pose: FloatArray, distance: Float32) -> IntArray:
-        """Rays that may meet a body before what they meet at ``distance`` (n,)."""
-        ...
-
-
-class View(Protocol):
-    """A camera as the renderer sees it.
-
-    Attributes:
-        shape: rows and columns.
-        valid: (n,) flat indices of the pixels in its field of view, ascending.
-        rays: of those pixels.
-        exact: (n, 3) the same in double precision.
-        matrix: (3, 3) from the rays' coordinates to the camera's axes.
-    """
-
-    shape: tuple[int, int]
-    valid: IntArray
-    exact: FloatArray
-    matrix: FloatArray
-
-    @property
-    def rays(self) -> Rays:
-        """Of the valid pixels."""
-        ...
 
 
 # --------------------------------------------------------------------------------------------
@@ -108,22 +58,6 @@ class PixelRays:
     def towards(self, body: Body, pose: FloatArray, distance: Float32) -> IntArray:
         """All: the field of view is narrow."""
         return np.arange(len(distance))
-
-
-class PinholeView:
-    """A pinhole camera, axes x right, y down, z forward; distances along its rays are depths Z."""
-
-    def __init__(self, shape: tuple[int, int], focal: float, cx: float, cy: float) -> None:
-        """Rows and columns; focal length and principal point in pixels."""
-        self.shape, self.focal, self.cx, self.cy = shape, focal, cx, cy
-        columns, rows = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
-        pixels = np.column_stack([columns.ravel(), rows.ravel(), np.ones(rows.size)])
-        self.exact: FloatArray = pixels.astype(np.float64)
-        self.valid = np.arange(rows.size)
-        self.matrix = np.array(
-            [[1 / focal, 0, -cx / focal], [0, 1 / focal, -cy / focal], [0, 0, 1.0]]
-        )
-        self.rays = PixelRays(self.exact[:, :2].astype(np.float32), self.matrix)
 
 
 # --------------------------------------------------------------------------------------------
@@ -180,23 +114,54 @@ class OmniRays:
         )
 
 
-class OmniView:
+# --------------------------------------------------------------------------------------------
+# Cameras as the renderer sees them
+
+
+Rays: TypeAlias = PixelRays | OmniRays
+"""Rays of n pixels, in single precision."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A camera as the renderer sees it.
+
+    Attributes:
+        shape: rows and columns.
+        valid: (n,) flat indices of the pixels in its field of view, ascending.
+        exact: (n, 3) their rays in double precision.
+        matrix: (3, 3) from the rays' coordinates to the camera's axes.
+        rays: the same rays as they are shaded.
+    """
+
+    shape: tuple[int, int]
+    valid: IntArray
+    exact: FloatArray
+    matrix: FloatArray
+    rays: Rays
+
+
+def pinhole_view(shape: tuple[int, int], focal: float, cx: float, cy: float) -> View:
+    """A pinhole camera, axes x right, y down, z forward; distances along its rays are depths Z.
+
+    ``shape`` is rows and columns; focal length and principal point are in pixels.
+    """
+    columns, rows = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
+    exact = np.column_stack([columns.ravel(), rows.ravel(), np.ones(rows.size)]).astype(np.float64)
+    matrix = np.array([[1 / focal, 0, -cx / focal], [0, 1 / focal, -cy / focal], [0, 0, 1.0]])
+    seen = PixelRays(exact[:, :2].astype(np.float32), matrix)
+    return View(shape, np.arange(rows.size), exact, matrix, seen)
+
+
+def omni_view(camera: OmniCamera) -> View:
     """Any camera with a single viewpoint, axes x forward, y left, z up; distances are ranges."""
-
-    matrix = np.eye(3)
-
-    def __init__(self, camera: OmniCamera) -> None:
-        """Takes the camera's rays once."""
-        self.shape = (camera.height, camera.width)
-        rays, steps = _pixel_rays(camera)
-        self.valid = np.flatnonzero(np.isfinite(rays[:, 0]))
-        self.exact = rays[self.valid]
-        direction, column, row = (
-            np.ascontiguousarray(a[self.valid].T, np.float32) for a in (rays, *steps)
-        )
-        level = direction[:2]
-        level = level / np.maximum(np.linalg.norm(level, axis=0), np.float32(1e-9))
-        self.rays = OmniRays(direction, column, row, level)
+    rays, steps = _pixel_rays(camera)
+    valid = np.flatnonzero(np.isfinite(rays[:, 0]))
+    direction, column, row = (np.ascontiguousarray(a[valid].T, np.float32) for a in (rays, *steps))
+    level = direction[:2]
+    level = level / np.maximum(np.linalg.norm(level, axis=0), np.float32(1e-9))
+    seen = OmniRays(direction, column, row, level)
+    return View((camera.height, camera.width), valid, rays[valid], np.eye(3), seen)
 
 
 def _pixel_rays(camera: OmniCamera) -> tuple[FloatArray, tuple[FloatArray, FloatArray]]:

@@ -10,7 +10,7 @@ from fgslam.worlds.rendering.patches import RayCaster, Surface, Thing, box, stac
 from fgslam.worlds.rendering.renderer import Renderer, surface_points, visible
 from fgslam.worlds.rendering.scene import Body, Layer, flat_light
 from fgslam.worlds.rendering.texture_bank import ColourBank, GreyBank
-from fgslam.worlds.rendering.views import OmniView
+from fgslam.worlds.rendering.views import omni_view
 from tests.omni_house import PANORAMA, plain, room
 
 GREY, RED = (100, 100, 100), (250, 20, 30)
@@ -32,8 +32,8 @@ def scene(bank: ColourBank) -> Layer:
 @pytest.mark.parametrize("camera", [PANORAMA, MIRROR], ids=["panorama", "mirror"])
 def test_mark_is_drawn_where_truth_says(camera: OmniCamera, scene: Layer, bank: ColourBank) -> None:
     """Each mark's centre of redness lies on the pixel of its centre, to a fifth of a pixel."""
-    image = Renderer(OmniView(camera), bank, 24.0).levels(scene, POSE)
-    renderer = Renderer(OmniView(camera), bank, 24.0)
+    image = Renderer(omni_view(camera), bank, 24.0).levels(scene, POSE)
+    renderer = Renderer(omni_view(camera), bank, 24.0)
     red = np.zeros(renderer.valid.shape)
     red[renderer.valid] = (image[0] - GREY[0]) / (RED[0] - GREY[0])
     pixels, shows = visible(scene, camera, POSE, MARKS - [0.0, 0.002, 0.0])
@@ -50,7 +50,7 @@ def test_mark_is_drawn_where_truth_says(camera: OmniCamera, scene: Layer, bank: 
 def test_pictures_have_red_first_and_are_black_outside_the_mirror(
     scene: Layer, bank: ColourBank
 ) -> None:
-    renderer = Renderer(OmniView(MIRROR), bank, 24.0)
+    renderer = Renderer(omni_view(MIRROR), bank, 24.0)
     image = renderer.assemble(renderer.levels(scene, POSE))
     assert image.shape == (240, 320, 3)
     assert image.dtype == np.uint8
@@ -75,7 +75,7 @@ def test_points_and_ranges_are_exact(scene: Layer, bank: ColourBank) -> None:
     again, seen = visible(scene, MIRROR, POSE, points[shown])
     assert seen.all()
     np.testing.assert_allclose(again, pixels[shown], atol=1e-9)
-    ranges = Renderer(OmniView(MIRROR), bank, 24.0).distances(scene, POSE)
+    ranges = Renderer(omni_view(MIRROR), bank, 24.0).distances(scene, POSE)
     assert np.isnan(ranges[0, 0])
     centres = np.array([[150.0, 60.0], [200.0, 130.0]])
     far = np.linalg.norm(surface_points(scene, MIRROR, POSE, centres) - POSE[:3, 3], axis=1)
@@ -91,7 +91,7 @@ def test_edge_pixels_are_mixed(bank: ColourBank) -> None:
     """Over a mark's border redness goes through intermediate levels in proportion to coverage."""
     layer = room(bank, np.array([[0.0, 3.0, 1.2]]), side=1.0)
     upright = camera_pose(np.array([0.0, 0.5, np.pi / 2]), 1.2, np.zeros(2))
-    levels = Renderer(OmniView(PANORAMA), bank, 24.0).levels(layer, upright).reshape(3, 256, 512)
+    levels = Renderer(omni_view(PANORAMA), bank, 24.0).levels(layer, upright).reshape(3, 256, 512)
     share = (levels[0] - GREY[0]) / (RED[0] - GREY[0])
     # On the horizon's row the mark spans +-atan(0.5 / 2.498): its width in pixels is known.
     width = 2.0 * np.arctan(0.5 / 2.498) * 511 / (2 * np.pi)
@@ -105,7 +105,7 @@ def test_body_hides_what_is_behind_it_and_nothing_before_it(bank: ColourBank) ->
     light = flat_light(things, np.array([0.0, 0.0, 1.0]))
     light.values[:] = 1.0
     mover = Layer(things, RayCaster(things), light, bank)
-    renderer = Renderer(OmniView(PANORAMA), bank, 24.0)
+    renderer = Renderer(omni_view(PANORAMA), bank, 24.0)
     clean = renderer.levels(layer, POSE)
     for place, hidden in (([1.5, 1.5, 0.0], True), ([0.4, 9.0, 0.0], False)):
         wTo = np.eye(4)

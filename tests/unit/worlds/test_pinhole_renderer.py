@@ -16,10 +16,11 @@ from fgslam.worlds.rendering.patches import (
 from fgslam.worlds.rendering.renderer import Renderer
 from fgslam.worlds.rendering.scene import Body, Layer, flat_light
 from fgslam.worlds.rendering.texture_bank import GreyBank
-from fgslam.worlds.rendering.views import PinholeView
+from fgslam.worlds.rendering.views import pinhole_view
 
 HEIGHT, WIDTH = 48, 64
-CAMERA = PinholeView((HEIGHT, WIDTH), 60.0, 31.5, 23.5)
+FOCAL, CX, CY = 60.0, 31.5, 23.5
+CAMERA = pinhole_view((HEIGHT, WIDTH), FOCAL, CX, CY)
 
 
 def make_layer(things: list[Thing], bank: GreyBank) -> Layer:
@@ -46,8 +47,8 @@ def test_patch_is_seen_upright_and_in_place(texture: str) -> None:
     side = 256
     bank = ramps(side)
     image = Renderer(CAMERA, bank).image(make_layer([wall(texture, 5.0)], bank), np.eye(4))[..., 0]
-    centre, size = (CAMERA.cx, WIDTH) if texture == "across" else (CAMERA.cy, HEIGHT)
-    metres = (np.arange(size) - centre) / CAMERA.focal * 5.0
+    centre, size = (CX, WIDTH) if texture == "across" else (CY, HEIGHT)
+    metres = (np.arange(size) - centre) / FOCAL * 5.0
     texels = (metres + 4.0) / 8.0 * side - 0.5
     expected = 10 + 230 * texels / (side - 1)
     seen = image[HEIGHT // 2] if texture == "across" else image[:, WIDTH // 2]
@@ -62,8 +63,8 @@ def test_depth_is_exact_on_a_slanted_wall() -> None:
     rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH]
     rays = np.stack(
         [
-            (columns - CAMERA.cx) / CAMERA.focal,
-            (rows - CAMERA.cy) / CAMERA.focal,
+            (columns - CX) / FOCAL,
+            (rows - CY) / FOCAL,
             np.ones(rows.shape),
         ],
         axis=-1,
@@ -102,7 +103,7 @@ def test_shift_of_a_tenth_of_a_pixel_shows_as_such() -> None:
     bank = GreyBank({"smooth": smooth.astype(np.float32)})
     renderer, layer = Renderer(CAMERA, bank), make_layer([wall("smooth", 4.0)], bank)
     here = renderer.image(layer, np.eye(4)).astype(float)[..., 0]
-    moved = geometry.pose(np.eye(3), np.array([0.1 * 4.0 / CAMERA.focal, 0.0, 0.0]))
+    moved = geometry.pose(np.eye(3), np.array([0.1 * 4.0 / FOCAL, 0.0, 0.0]))
     there = renderer.image(layer, moved).astype(float)[..., 0]
     gradient = np.gradient(here, axis=1)
     shift = np.sum((there - here) * gradient) / np.sum(gradient**2)

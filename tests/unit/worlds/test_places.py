@@ -32,7 +32,7 @@ from fgslam.worlds.rendering.patches import RayCaster, Surface, Thing, box, rect
 from fgslam.worlds.rendering.renderer import Renderer
 from fgslam.worlds.rendering.scene import Layer, bake
 from fgslam.worlds.rendering.texture_bank import GreyBank
-from fgslam.worlds.rendering.views import PinholeView
+from fgslam.worlds.rendering.views import pinhole_view
 
 RIG = make_rig(LabRigSettings(width=80, height=60))
 ROOMS = PlaceChoice("rooms", 0, 1, identical_posters=False)
@@ -178,7 +178,7 @@ def test_legs_look_alike_in_the_images() -> None:
     caster = RayCaster(patches)
     light = bake(patches, caster, place.lamps, rng, 0.5, place.light_reach_m)
     layer = Layer(patches, caster, light, bank)
-    renderer = Renderer(PinholeView((RIG.height, RIG.width), RIG.fx, RIG.cx, RIG.cy), bank)
+    renderer = Renderer(pinhole_view((RIG.height, RIG.width), RIG.fx, RIG.cx, RIG.cy), bank)
     turn = np.eye(4)
     turn[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     turn[:2, 3] = [alike.SIDE, 0.0]
