@@ -6,7 +6,6 @@ The tasks ``homing_pairs`` and ``path_following`` run the same parts; nothing is
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from types import TracebackType
 from typing import Any
 
 import numpy.typing as npt
@@ -235,12 +234,7 @@ class PathFollower:
     def __enter__(self) -> PathFollower:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _require_open(self) -> None:

@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import FloatArray
-from fgslam.core.errors import CalibrationError
+from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.errors import CalibrationError, FrameError
 from fgslam.core.planar import wrap
 
 
@@ -37,6 +37,16 @@ class OmniCamera(Protocol):
     def pixels(self, rays: FloatArray) -> FloatArray:
         """(n, 2) pixels of rays (n, 3) of any length; NaN where the camera does not see them."""
         ...
+
+
+def require_own_image(camera: OmniCamera, image: Image) -> None:
+    """Raises FrameError unless an image is (height, width, 3) uint8 of the camera's size."""
+    wanted = (camera.height, camera.width, 3)
+    if image.shape != wanted or image.dtype != np.uint8:
+        raise FrameError(
+            f"an image is {image.dtype} {image.shape}, but the camera's are uint8 {wanted} "
+            "(rows, columns, R G B); take the calibration of this camera at this size"
+        )
 
 
 # --------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from fgslam.cameras.omni.camera import OmniCamera, unit_rays, unwrap_maps
+from fgslam.cameras.omni.camera import OmniCamera, require_own_image, unit_rays, unwrap_maps
 from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
 from fgslam.core.arrays import Image
 from fgslam.core.errors import FrameError
@@ -68,7 +68,7 @@ class OmniFeatureExtractor:
 
     def extract_sift(self, image: Image) -> UprightFeatures:
         """Upright SIFT features alone; none where the settings exclude them."""
-        self._check(image)
+        require_own_image(self._camera, image)
         if self._kinds == "columns":
             return empty_features()
         if self._sift_view is None:
@@ -78,18 +78,10 @@ class OmniFeatureExtractor:
 
     def extract_columns(self, image: Image) -> ColumnSegments:
         """Column segments alone; none where the settings exclude them."""
-        self._check(image)
+        require_own_image(self._camera, image)
         if self._kinds == "sift":
             return empty_segments()
         return self._columns.extract(self._cylinder.of(image))
-
-    def _check(self, image: Image) -> None:
-        wanted = (self._camera.height, self._camera.width, 3)
-        if image.shape != wanted or image.dtype != np.uint8:
-            raise FrameError(
-                f"an image is {image.dtype} {image.shape}, but the camera's are uint8 {wanted} "
-                "(rows, columns, R G B); take the calibration of this camera at this size"
-            )
 
     def _view_for_sift(self, settings: OmniFeatureSettings, resolution: float) -> _View | None:
         if wrapping_period(self._camera) is not None or settings.sift.view == "raw":

@@ -21,7 +21,7 @@ from fgslam.frontend.homing.matching import (
     match_features,
     right_probability,
 )
-from fgslam.frontend.homing.refinement import HomingRefinement, Refined, RefinementPrior
+from fgslam.frontend.homing.refinement import HomingRefinement, Refined
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view_geometry import EpipolarTest, TwoPointSamples, solve_two_point
 
@@ -90,10 +90,7 @@ class _Search:
         tilt = np.deg2rad(settings.tilt_sigma_deg)
         self._test = EpipolarTest.of(matches, tilt)
         self._refinement = HomingRefinement(
-            matches,
-            RefinementPrior(tilt, settings.height_sigma),
-            _INLIER_SIGMAS,
-            self._least_parallax,
+            matches, (tilt, settings.height_sigma), _INLIER_SIGMAS, self._least_parallax
         )
         self._cells = _cells(matches)
         self._tilt = tilt

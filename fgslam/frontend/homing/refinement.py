@@ -16,6 +16,7 @@ import numpy as np
 from fgslam.cameras.omni.camera import unit_rays
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.gauss_newton import GaussNewton, Linearised
+from fgslam.core.geometry import skew
 from fgslam.core.homing import BearingMatches
 from fgslam.core.planar import wrap
 from fgslam.frontend.homing.matching import COMMON_CHANCE, gain, right_probability
@@ -53,29 +54,24 @@ class Refined:
     inliers: BoolArray
 
 
-@dataclass(frozen=True, slots=True)
-class RefinementPrior:
-    """Standard deviations of the nuisance parameters: tilt in radians, height in legs."""
-
-    tilt_sigma: float
-    height_sigma: float
-
-    def information(self) -> FloatArray:
-        """(7,) diagonal; theta and psi have none."""
-        held = np.array([*[self.tilt_sigma] * 4, self.height_sigma])
-        return np.concatenate([np.zeros(2), 1.0 / np.maximum(held, _LEAST_SIGMA) ** 2])
-
-
 class HomingRefinement:
     """The matches, prepared for refining any number of hypotheses."""
 
     def __init__(
         self,
         matches: BearingMatches,
-        prior: RefinementPrior,
+        prior: tuple[float, float],
         inlier_sigmas: float,
         least_parallax: float,
     ) -> None:
+        """Prepares the matches.
+
+        Args:
+            matches: inliers and outliers.
+            prior: standard deviations of the tilts (radians) and of the height (legs).
+            inlier_sigmas: largest normalised residual of an inlier.
+            least_parallax: radians; below, the signs of distances are noise.
+        """
         a = unit_rays(matches.bearing_a, matches.elevation_a)
         b = unit_rays(matches.bearing_b, matches.elevation_b)
         by_a = ray_derivatives(matches.bearing_a, matches.elevation_a)
@@ -86,7 +82,9 @@ class HomingRefinement:
         noisy += [_outer(a, d * matches.sigma[:, k + 2, None]) for k, d in enumerate(by_b)]
         self._noisy = np.concatenate(noisy)
         self._bearings = matches.bearing_a, matches.bearing_b
-        self._prior = prior.information()
+        tilt_sigma, height_sigma = prior
+        held = np.maximum([*[tilt_sigma] * 4, height_sigma], _LEAST_SIGMA)
+        self._prior = np.concatenate([np.zeros(2), 1.0 / held**2])  # theta and psi are free
         right = right_probability(matches)
         self._odds = right / (1.0 - right)
         self._sigmas = inlier_sigmas
@@ -173,12 +171,12 @@ def _essential(p: FloatArray) -> tuple[FloatArray, FloatArray]:
     c, s, none = np.cos(p[:, 0]), np.sin(p[:, 0]), np.zeros(len(p))
     tilt_a, tilt_b = _tilt(p[:, 2:4]).transpose(0, 2, 1), _tilt(p[:, 4:6])
     turn = _turn(p[:, 1])
-    skew = _skew(np.column_stack([c, s, p[:, 6]]))
-    right, left = turn @ tilt_b, tilt_a @ skew
-    middle, turned = skew @ right, left @ turn
+    leg = skew(np.column_stack([c, s, p[:, 6]]))
+    right, left = turn @ tilt_b, tilt_a @ leg
+    middle, turned = leg @ right, left @ turn
     derivatives = np.stack(
         [
-            tilt_a @ _skew(np.column_stack([-s, c, none])) @ right,
+            tilt_a @ skew(np.column_stack([-s, c, none])) @ right,
             turned @ _AXES[2] @ tilt_b,
             -tilt_a @ _AXES[0] @ middle,
             -tilt_a @ _AXES[1] @ middle,
@@ -191,15 +189,7 @@ def _essential(p: FloatArray) -> tuple[FloatArray, FloatArray]:
     return left @ right, derivatives
 
 
-def _skew(v: FloatArray) -> FloatArray:
-    """(c, 3, 3) matrices of the cross product with (c, 3)."""
-    return np.asarray((v @ _CROSS).reshape(-1, 3, 3))
-
-
-# The matrices of the axes, row by row: they are added up by a vector's coordinates.
-_CROSS = np.array([[0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0],
-                   [0, -1, 0, 1, 0, 0, 0, 0, 0]])  # fmt: skip
-_AXES = _skew(np.eye(3))
+_AXES = skew(np.eye(3))
 
 
 def _turn(angle: FloatArray) -> FloatArray:
@@ -211,7 +201,7 @@ def _turn(angle: FloatArray) -> FloatArray:
 def _tilt(vector: FloatArray) -> FloatArray:
     """(c, 3, 3) rotations by small vectors (roll, pitch, 0), (c, 2): Rodrigues' formula."""
     angle = np.hypot(vector[:, 0], vector[:, 1])[:, None, None]
-    cross = _skew(np.column_stack([vector, np.zeros(len(vector))]))
+    cross = skew(np.column_stack([vector, np.zeros(len(vector))]))
     # sin(x) / x and (1 - cos(x)) / x^2, also where x vanishes.
     first, half = np.sinc(angle / np.pi), np.sinc(0.5 * angle / np.pi)
     return np.asarray(np.eye(3) + first * cross + 0.5 * half**2 * (cross @ cross))

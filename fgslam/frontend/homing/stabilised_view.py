@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import next_fast_len
 
-from fgslam.cameras.omni.camera import Float32, OmniCamera, unwrap_maps
+from fgslam.cameras.omni.camera import Float32, OmniCamera, require_own_image, unwrap_maps
 from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import FrameError
@@ -46,7 +46,7 @@ class StabilisedView:
     """Makes views of one camera's images."""
 
     def __init__(self, camera: OmniCamera, max_width: int, window: int, levels: int) -> None:
-        self._size = (camera.height, camera.width)
+        self._camera = camera
         resolution = pixels_a_radian(camera)
         width = _fast_period(min(max_width, round(2.0 * np.pi * resolution)) - 1) + 1
         bottom, top = _seen_elevations(camera)
@@ -64,11 +64,7 @@ class StabilisedView:
         Raises:
             FrameError: the image is not the camera's.
         """
-        if image.shape != (*self._size, 3) or image.dtype != np.uint8:
-            raise FrameError(
-                f"an image is {image.dtype} {image.shape}, but the camera's are uint8 "
-                f"{(*self._size, 3)}; take the calibration of this camera at this size"
-            )
+        require_own_image(self._camera, image)
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         view = cv2.remap(grey, *self._maps, cv2.INTER_LINEAR, borderMode=self._border)
         return np.asarray(view, dtype=np.uint8)

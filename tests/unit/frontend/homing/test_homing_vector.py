@@ -12,7 +12,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import BearingMatches, LocalMap, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
 from fgslam.frontend.homing.homing_vector import _cells, estimate_homing_vector
-from fgslam.frontend.homing.refinement import HomingRefinement, RefinementPrior
+from fgslam.frontend.homing.refinement import HomingRefinement
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view_geometry import (
     EpipolarTest,
@@ -175,7 +175,7 @@ def test_refinement_covariance_is_that_of_monte_carlo() -> None:
         noisy = make_matches(
             angles + rng.normal(0.0, np.deg2rad(0.2), angles.shape), np.deg2rad(0.2)
         )
-        prior = RefinementPrior(1e-6, 1e-6)
+        prior = (1e-6, 1e-6)
         start = np.array([[views.direction], [views.rotation]])
         refined = HomingRefinement(noisy, prior, 5.0, 0.05).refine(*start)[0]
         found.append(
@@ -193,7 +193,7 @@ def test_refinement_covariance_is_that_of_monte_carlo() -> None:
 def test_hypotheses_refined_side_by_side_are_refined_as_if_alone() -> None:
     """Each ends when it has converged, whatever the others do; one that is right stays."""
     views = two_views(3, 40, HALF_DEGREE, 0.3)
-    refinement = HomingRefinement(views.matches, RefinementPrior(0.02, 0.05), 3.0, 0.0)
+    refinement = HomingRefinement(views.matches, (0.02, 0.05), 3.0, 0.0)
     offsets = np.array([0.0, 0.02, 0.5, 2.0, -1.0])
     directions, rotations = views.direction + offsets, views.rotation - 0.5 * offsets
     together = refinement.refine(directions, rotations)
