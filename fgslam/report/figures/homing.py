@@ -17,11 +17,12 @@ from fgslam.report.figures.traces import (
     Switch,
     Trace,
     equal_axes,
-    joined,
+    line,
     outlines,
     peaks,
     thinned,
     trace,
+    xy,
 )
 
 MAX_POINTS = 2_500
@@ -63,7 +64,7 @@ def curve_figure(
         switches: checkboxes above it.
         y: more of Plotly's y axis.
     """
-    traces = [_drawn(line) for line in lines if np.isfinite(line.y).any()]
+    traces = [_drawn(one) for one in lines if np.isfinite(one.y).any()]
     layout = {
         "xaxis": {"title": {"text": axes[0]}},
         "yaxis": {"title": {"text": axes[1]}, **(y or {})},
@@ -107,10 +108,8 @@ def claimed_against_true(
         )
     top = max((float(np.max(values)) for values in claimed.values() if len(values)), default=1.0)
     for k in (1.0, 2.0, 3.0):
-        ends = {"x": np.array([0.0, top]), "y": np.array([0.0, k * top])}
         owner = Owner(f"{k:.0f} sigma", paint="grey")
-        line = {"width": 1, "dash": "dot"}
-        traces.append(trace(owner, ends, mode="lines", line=line, hoverinfo="skip"))
+        traces.append(line(owner, np.array([[0.0, 0.0], [top, k * top]]), 1, "dot"))
     layout = {
         "xaxis": {"title": {"text": "stated standard deviation (degrees)"}, "rangemode": "tozero"},
         "yaxis": {"title": {"text": "true error (degrees)"}, "rangemode": "tozero"},
@@ -126,14 +125,14 @@ def claimed_against_true(
     )
 
 
-def _drawn(line: Line) -> Trace:
-    rows = peaks(line.y, MAX_POINTS)
-    owner = Owner(line.name, line.series, (line.switch,) if line.switch else ())
+def _drawn(curve: Line) -> Trace:
+    rows = peaks(curve.y, MAX_POINTS)
+    owner = Owner(curve.name, curve.series, (curve.switch,) if curve.switch else ())
     return trace(
         owner,
-        {"x": line.x[rows], "y": line.y[rows]},
+        {"x": curve.x[rows], "y": curve.y[rows]},
         mode="lines",
-        line={"width": 1.8, "dash": line.dash},
+        line={"width": 1.8, "dash": curve.dash},
         hovertemplate="%{y:.4g}",
     )
 
@@ -185,8 +184,11 @@ def local_map_figure(
 
 def upwards(points: FloatArray) -> dict[str, FloatArray]:
     """Coordinates of points (n, 2), x ahead and y left, on a page where ahead is up."""
-    points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
-    return {"x": -points[:, 1], "y": points[:, 0]}
+    return xy(_turned(np.asarray(points, dtype=np.float64).reshape(-1, 2)))
+
+
+def _turned(points: FloatArray) -> FloatArray:
+    return np.stack([-points[..., 1], points[..., 0]], axis=-1)
 
 
 def _moment(
@@ -201,7 +203,7 @@ def _moment(
     yield from _features(estimates, row, step)
     path = np.array([e.robot[:2] for e in estimates[: row + 1]])
     owner = Owner("estimated path", colour=0, step=step)
-    yield trace(owner, upwards(path), mode="lines", line={"width": 1.6}, hoverinfo="skip")
+    yield line(owner, _turned(path), 1.6)
     for name, pose, block, number in (
         ("robot", now.robot, now.covariance[:3, :3], 0),
         ("target", now.target, now.covariance[3:, 3:], 1),
@@ -218,14 +220,13 @@ def _place(
     """A square with its heading and its ellipse."""
     ahead = pose[:2] + _HEADING * np.array([np.cos(pose[2]), np.sin(pose[2])])
     owner = Owner(name, colour=number, step=step)
-    line: dict[str, Any] = {"line": {"width": 2}, "hoverinfo": "skip"}
-    yield trace(owner, upwards(np.array([pose[:2], ahead])), mode="lines", **line)
+    yield line(owner, _turned(np.array([pose[:2], ahead])), 2)
     marker = {"symbol": "square", "size": 13}
     yield trace(owner, upwards(pose[:2]), mode="markers", marker=marker, hovertemplate=_HOVER)
     if np.isfinite(covariance).all():
         outline = outlines(pose[None, :2], covariance[None])[0]
         claimed = Owner(f"{name}, {SIGMAS:.0f} sigma", when=("ellipses",), colour=number, step=step)
-        yield trace(claimed, upwards(outline), mode="lines", line={"width": 1}, hoverinfo="skip")
+        yield line(claimed, _turned(outline), 1)
 
 
 def _features(estimates: Sequence[HomingEstimate], row: int, step: int) -> Iterator[Trace]:
@@ -246,9 +247,9 @@ def _features(estimates: Sequence[HomingEstimate], row: int, step: int) -> Itera
         yield _dots("lost feature", step, lost, "star", paint="grey", when=("features",), size=7)
     known = np.isfinite(now.landmark_covariances).all(axis=(1, 2))
     if known.any():
-        around = joined(outlines(now.landmarks[known], now.landmark_covariances[known]))
+        around = outlines(now.landmarks[known], now.landmark_covariances[known])
         owner = Owner("features, 3 sigma", paint="grey", when=("feature-ellipses",), step=step)
-        yield trace(owner, upwards(around), mode="lines", line={"width": 1}, hoverinfo="skip")
+        yield line(owner, _turned(around), 1)
 
 
 def _lost(estimates: Sequence[HomingEstimate], row: int) -> FloatArray:
@@ -279,8 +280,7 @@ def _true_path(truth: HomingTruth | None) -> Iterator[Trace]:
     if truth is not None:
         path = np.vstack([np.zeros((1, 2)), truth.robots[:, :2] / truth.leg_m])
         owner = Owner("true path", paint="truth", when=("truth",))
-        line = {"width": 1.4, "dash": "dash"}
-        yield trace(owner, upwards(path), mode="lines", line=line, hoverinfo="skip")
+        yield line(owner, _turned(path), 1.4, "dash")
 
 
 def _layout(estimates: Sequence[HomingEstimate]) -> dict[str, Any]:

@@ -17,11 +17,12 @@ from fgslam.report.figures.traces import (
     equal_axes,
     exaggeration,
     in_plane,
-    joined,
+    line,
     outlines,
     thinned,
     trace,
     world_position_covariances,
+    xy,
 )
 from fgslam.report.figures.trajectory import bulk_limits, level_axes
 
@@ -75,7 +76,7 @@ def located_figure(located: Located, key: str, heading: str) -> Figure:
         "ones. Grey: landmarks, and the drive that made the map.",
         (
             *_surroundings(located, plane),
-            _line(Owner("uncertainty", colour=0, when=("ellipses",)), ellipses, 1.0),
+            line(Owner("uncertainty", colour=0, when=("ellipses",)), ellipses, 1.0),
             *_answers(located, known, plane, _HEADING * span),
         ),
         equal_axes(ranges=(x, y)),
@@ -89,9 +90,7 @@ def _surroundings(located: Located, plane: FloatArray) -> Iterator[Trace]:
     points = located.landmarks[rows] @ plane.T
     owner = Owner("landmark", paint="grey", when=("landmarks",))
     yield _dots(owner, points, {"size": 3})
-    yield _line(
-        Owner("drive of the map", paint="grey"), located.path[None, :, :3, 3] @ plane.T, 1.5
-    )
+    yield line(Owner("drive of the map", paint="grey"), located.path[None, :, :3, 3] @ plane.T, 1.5)
 
 
 def _answers(
@@ -105,19 +104,12 @@ def _answers(
         if len(poses):
             at, ahead = poses[:, :3, 3] @ plane.T, poses[:, :3, 2] @ plane.T
             yield _dots(owner, at, {"size": 7, "symbol": symbol})
-            yield _line(owner, np.stack([at, at + length * ahead], axis=1), 1.5)
+            yield line(owner, np.stack([at, at + length * ahead], axis=1), 1.5)
     astray = located.false & known
     if astray.any():
         ends = np.stack([located.poses[astray, :3, 3], located.truth[astray, :3, 3]], axis=1)
-        yield _line(Owner("to the true pose", colour=1), ends @ plane.T, 1.0)
+        yield line(Owner("to the true pose", colour=1), ends @ plane.T, 1.0)
 
 
 def _dots(owner: Owner, points: FloatArray, marker: dict[str, object]) -> Trace:
-    axes = {"x": points[:, 0], "y": points[:, 1]}
-    return trace(owner, axes, mode="markers", marker=marker, hovertemplate=_HOVER)
-
-
-def _line(owner: Owner, polylines: FloatArray, width: float) -> Trace:
-    x, y = joined(polylines).T
-    axes = {"x": x, "y": y}
-    return trace(owner, axes, mode="lines", line={"width": width}, hoverinfo="skip")
+    return trace(owner, xy(points), mode="markers", marker=marker, hovertemplate=_HOVER)

@@ -15,10 +15,11 @@ from fgslam.report.figures.traces import (
     Switch,
     Trace,
     equal_axes,
-    joined,
+    line,
     plain_texts,
     thinned,
     trace,
+    xy,
 )
 
 MAX_MOMENTS = 80
@@ -122,21 +123,20 @@ def _paths(drive: Drive) -> Iterator[Trace]:
         last = min(inside[-1] + 1, len(rows) - 1)
         own = drive.poses[rows[inside[0] : last + 1], :2]
         owner = Owner(f"leg {leg + 1}", colour=leg)
-        yield trace(owner, _xy(own), mode="lines", line={"width": 2}, hovertemplate=_HOVER)
+        yield trace(owner, xy(own), mode="lines", line={"width": 2}, hovertemplate=_HOVER)
 
 
 def _robot(drive: Drive, row: int, step: int) -> Iterator[Trace]:
     pose, leg = drive.poses[row], int(drive.legs[row])
     owner = Owner("robot", colour=leg, step=step)
     ahead = np.array([pose[:2], pose[:2] + _HEADING_M * _unit(pose[2])])
-    yield trace(owner, _xy(ahead), mode="lines", line={"width": 4}, hoverinfo="skip")
+    yield line(owner, ahead, 4)
     marker = {"symbol": "circle", "size": 12}
-    yield trace(owner, _xy(pose[None, :2]), mode="markers", marker=marker, hovertemplate=_HOVER)
+    yield trace(owner, xy(pose[None, :2]), mode="markers", marker=marker, hovertemplate=_HOVER)
     if np.isfinite(drive.headings[row]):
         arrow = np.array([pose[:2], pose[:2] + 2.0 * _HEADING_M * _unit(drive.headings[row])])
         home = Owner("direction of home", colour=leg, step=step)
-        line = {"width": 2, "dash": "dot"}
-        yield trace(home, _xy(arrow), mode="lines", line=line, hoverinfo="skip")
+        yield line(home, arrow, 2, "dot")
 
 
 def _targets(drive: Drive) -> Iterator[Trace]:
@@ -149,10 +149,10 @@ def _targets(drive: Drive) -> Iterator[Trace]:
     )
     owner = Owner("targets", paint="truth", when=("targets",))
     for lines in (circles, ticks):
-        yield trace(owner, _xy(joined(lines)), mode="lines", line={"width": 1}, hoverinfo="skip")
+        yield line(owner, lines, 1)
     yield trace(
         owner,
-        _xy(drive.targets[:, :2]),
+        xy(drive.targets[:, :2]),
         mode="markers+text",
         marker={"symbol": "square-open", "size": 10},
         text=[str(i + 1) for i in range(len(drive.targets))],
@@ -165,11 +165,7 @@ def _outlines(drive: Drive) -> Iterator[Trace]:
     if drive.outlines:
         lines = np.vstack([np.vstack([one, np.full((1, 2), np.nan)]) for one in drive.outlines])
         owner = Owner("walls", paint="grey", when=("outlines",))
-        yield trace(owner, _xy(lines), mode="lines", line={"width": 1}, hoverinfo="skip")
-
-
-def _xy(points: FloatArray) -> dict[str, FloatArray]:
-    return {"x": points[:, 0], "y": points[:, 1]}
+        yield line(owner, lines, 1)
 
 
 def _unit(angle: FloatArray) -> FloatArray:
@@ -218,7 +214,7 @@ def network_figure(
     traces = [one for k, kind in enumerate(kinds) for one in _lines(kind, places, f"kind{k}")]
     nodes = trace(
         Owner("views", paint="truth"),
-        {"x": places[:, 0], "y": places[:, 1]},
+        xy(places),
         mode="markers+text",
         marker={"symbol": "square", "size": 9},
         text=plain_texts(names),
@@ -263,15 +259,13 @@ def _lines(kind: Links, places: FloatArray, key: str) -> list[Trace]:
     """The lines, and a mark in the middle of each with its text."""
     ends = places[np.array(kind.pairs, dtype=np.int64).reshape(-1, 2)]
     owner = Owner(kind.name, when=(key,), colour=kind.colour)
-    x, y = joined(ends).T
     middle = ends.mean(axis=1)
-    line = trace(owner, {"x": x, "y": y}, mode="lines", line={"width": 1.4}, hoverinfo="skip")
     marks = trace(
         owner,
-        {"x": middle[:, 0], "y": middle[:, 1]},
+        xy(middle),
         mode="markers",
         marker={"size": 4},
         text=plain_texts(kind.texts),
         hovertemplate=_HOVER_TEXT,
     )
-    return [line, marks]
+    return [line(owner, ends, 1.4), marks]

@@ -145,6 +145,20 @@ def trace(owner: Owner, axes: Mapping[str, FloatArray], **more: Any) -> Trace:
     }
 
 
+def xy(points: FloatArray) -> dict[str, FloatArray]:
+    """Coordinates of points (n, 2) as axes of a trace."""
+    return {"x": points[:, 0], "y": points[:, 1]}
+
+
+def line(owner: Owner, points: FloatArray, width: float, dash: str = "solid") -> Trace:
+    """A polyline (n, 2), or several (k, m, 2) with gaps between them, silent at the pointer."""
+    style: dict[str, Any] = {"width": width}
+    if dash != "solid":
+        style["dash"] = dash
+    axes = xy(points if points.ndim == 2 else joined(points))
+    return trace(owner, axes, mode="lines", line=style, hoverinfo="skip")
+
+
 def plain_texts(texts: Iterable[str]) -> list[str]:
     """Texts as Plotly shall show them: it reads a little HTML, which they are not."""
     return [html.escape(text) for text in texts]

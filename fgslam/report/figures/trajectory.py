@@ -24,11 +24,13 @@ from fgslam.report.figures.traces import (
     exaggeration,
     in_plane,
     joined,
+    line,
     outlines,
     packed,
     thinned,
     trace,
     world_position_covariances,
+    xy,
 )
 from fgslam.report.run_results import EstimatorReport, ReportData
 
@@ -236,9 +238,8 @@ def _returns(data: ReportData, level: FloatArray) -> Iterator[Trace]:
     if data.closures:
         pairs = np.array(data.closures)
         ends = data.estimators[0].final_poses[pairs, :3, 3] @ level[:2].T
-        x, y = joined(ends).T
         owner = Owner("loop closed", 0, ("returns",), paint="grey")
-        axes = {"x": x, "y": y}
+        axes = xy(joined(ends))
         yield trace(owner, axes, mode="lines+markers", line={"width": 1.5}, hoverinfo="name")
 
 
@@ -290,8 +291,7 @@ def _uncertainty(data: ReportData, level: FloatArray) -> tuple[list[Trace], list
 
 
 def _ellipses(owner: Owner, centres: FloatArray, covariances: FloatArray, scale: int) -> Trace:
-    x, y = joined(outlines(centres, covariances, scale)).T
-    return trace(owner, {"x": x, "y": y}, mode="lines", line={"width": 1.2}, hoverinfo="skip")
+    return line(owner, outlines(centres, covariances, scale), 1.2)
 
 
 def _claimed(estimator: EstimatorReport, plane: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -337,8 +337,7 @@ def _dots_above(data: ReportData, level: FloatArray, detail: Detail) -> Iterator
             low, high = np.percentile(points[:, 2], [2.0, 98.0]).tolist()
             marker |= _by_height(points[:, 2], low, high)
         owner = _map_of(i, estimator, "own" if alone else "grey")
-        axes = {"x": points[:, 0], "y": points[:, 1]}
-        yield trace(owner, axes, mode="markers", marker=marker, hoverinfo="skip")
+        yield trace(owner, xy(points), mode="markers", marker=marker, hoverinfo="skip")
 
 
 def _landmark_ellipses(i: int, estimator: EstimatorReport, plane: FloatArray, most: int) -> Trace:
@@ -346,8 +345,7 @@ def _landmark_ellipses(i: int, estimator: EstimatorReport, plane: FloatArray, mo
     rows = thinned(len(landmarks), most)
     centres = landmarks.positions[rows] @ plane.T
     owner = Owner("uncertainty of a landmark", i, ("landmark-ellipses",), paint="grey")
-    x, y = joined(outlines(centres, in_plane(landmarks.covariances[rows], plane))).T
-    return trace(owner, {"x": x, "y": y}, mode="lines", line={"width": 0.6}, hoverinfo="skip")
+    return line(owner, outlines(centres, in_plane(landmarks.covariances[rows], plane)), 0.6)
 
 
 def _by_height(heights: FloatArray, low: float, high: float) -> dict[str, Any]:
