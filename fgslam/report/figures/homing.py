@@ -17,6 +17,7 @@ from fgslam.report.figures.traces import (
     Switch,
     Trace,
     equal_axes,
+    joined,
     line,
     outlines,
     peaks,
@@ -247,7 +248,7 @@ def _features(estimates: Sequence[HomingEstimate], row: int, step: int) -> Itera
         yield _dots("lost feature", step, lost, "star", paint="grey", when=("features",), size=7)
     known = np.isfinite(now.landmark_covariances).all(axis=(1, 2))
     if known.any():
-        around = outlines(now.landmarks[known], now.landmark_covariances[known])
+        around = joined(outlines(now.landmarks[known], now.landmark_covariances[known]))
         owner = Owner("features, 3 sigma", paint="grey", when=("feature-ellipses",), step=step)
         yield line(owner, _turned(around), 1)
 
