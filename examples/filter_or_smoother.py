@@ -31,7 +31,7 @@ answers = {kind: fg.replay(log, kind) for kind in kinds}
 # %%
 truth = recording.ground_truth
 table = fg.compare(answers, truth)
-print(table[["ate_m", "rpe_trans_m", "nees", "landmarks", "ms"]].round(4).to_string())
+print(table.round(4))
 
 # %% [markdown]
 # ## The figure

@@ -87,6 +87,6 @@ with fg.Slam(recording.rig, estimator=FirstSight(recording.rig)) as slam:
 answers = {"first_sight": fg.replay(slam.log, FirstSight(recording.rig))}
 answers |= {kind: fg.replay(slam.log, kind) for kind in ("landmark_kalman", "isam2")}
 table = fg.compare(answers, recording.ground_truth)
-print(table[["ate_m", "nees", "landmarks", "failure"]].round(4).to_string())
-assert (table["failure"] == "").all()
+print(table.round(4))
+assert "failure" not in table  # a column that is there where an estimator ended early
 assert table["ate_m"].idxmax() == "first_sight"

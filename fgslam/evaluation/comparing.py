@@ -45,7 +45,10 @@ COLUMNS: tuple[tuple[str, str], ...] = (
     ("ms_max", "update_ms.max"),
     ("failure", "failure"),
 )
-"""Columns of :func:`compare`, and where each value is in metrics.json."""
+"""All columns of :func:`compare`, and where each value is in metrics.json."""
+
+_MAIN = ("ate_m", "rpe_trans_m", "rpe_rot_deg", "nees", "ms")
+"""Those that a person compares; with names of estimators they fit a terminal of 80 columns."""
 
 _TEXT = frozenset({"kind", "consistency", "failure"})
 
@@ -54,10 +57,12 @@ def compare(
     answers: Mapping[str, Comparable],
     truth: Trajectory | None = None,
     landmark_truth: LandmarkTruth | None = None,
+    full: bool = False,
 ) -> pandas.DataFrame:
     """Accuracy, consistency and speed of estimators on one recording, a row each.
 
-    Columns (NaN where a value cannot be known):
+    Columns are ``ate_m``, ``rpe_trans_m``, ``rpe_rot_deg``, ``nees`` and ``ms``; where an estimator
+    ended early ``failure``, too. With ``full`` all of these (NaN where a value cannot be known):
 
     * ``kind``, ``frames``, ``landmarks``: which estimator, and how much it estimated.
     * ``ate_m``: absolute trajectory error, root mean square, after SE3 alignment (Sturm et al.
@@ -77,6 +82,7 @@ def compare(
         answers: results by the name that their row shall have.
         truth: true poses of the reference camera, in any world frame.
         landmark_truth: true positions of landmarks, in the same world as ``truth``.
+        full: all columns.
 
     Raises:
         ConfigError: one of the answers is none, or they have no names, or the truth is no
@@ -84,7 +90,11 @@ def compare(
     """
     require_named(answers, truth)
     known = Truth(truth, landmark_truth)
-    return metrics_frame({name: _judged(name, one, known) for name, one in answers.items()})
+    table = _frame({name: _judged(name, one, known) for name, one in answers.items()})
+    if full:
+        return table
+    failed = ["failure"] if (table["failure"] != "").any() else []
+    return table[[*_MAIN, *failed]]
 
 
 def require_named(answers: Mapping[str, Comparable], truth: Trajectory | None) -> None:
@@ -101,17 +111,15 @@ def require_named(answers: Mapping[str, Comparable], truth: Trajectory | None) -
         )
 
 
-def metrics_frame(
-    estimators: Mapping[str, EstimatorMetrics], columns: tuple[tuple[str, str], ...] = COLUMNS
-) -> pandas.DataFrame:
-    """Metrics as a data frame with the names as index; ``columns`` as :data:`COLUMNS`."""
+def _frame(estimators: Mapping[str, EstimatorMetrics]) -> pandas.DataFrame:
+    """Metrics under :data:`COLUMNS`, with the names as index."""
     import pandas  # half a second, and only tables need it
 
     rows = {
-        name: [value_at(metrics.as_json(), path) for _, path in columns]
+        name: [value_at(metrics.as_json(), path) for _, path in COLUMNS]
         for name, metrics in estimators.items()
     }
-    names = [name for name, _ in columns]
+    names = [name for name, _ in COLUMNS]
     frame = pandas.DataFrame.from_dict(rows, orient="index", columns=names)
     frame.index.name = "estimator"
     for name in names:

@@ -5,13 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from reports import landmark_map, loop
+from simulated import RIG, Drive, simulate
 
+from fgslam.backend.filters.settings import DeadReckoningSettings, EkfSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Estimate, Trajectory
+from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LandmarkTruth
 from fgslam.evaluation.comparing import COLUMNS, compare
 from fgslam.evaluation.judging import Answer
+from fgslam.runs.library import replay
 
 
 def estimate(shift_m: float, frames: int = 40) -> Estimate:
@@ -31,7 +35,7 @@ def with_times(found: Estimate, update_ms: FloatArray) -> Answer:
 
 
 def test_each_estimator_has_a_row_in_the_order_given() -> None:
-    table = compare({"worse": estimate(0.4), "better": estimate(0.1)}, loop(40))
+    table = compare({"worse": estimate(0.4), "better": estimate(0.1)}, loop(40), full=True)
     assert table.index.tolist() == ["worse", "better"]
     assert table.columns.tolist() == [name for name, _ in COLUMNS]
     assert table.loc["better", "ate_m"] == pytest.approx(table.loc["worse", "ate_m"] / 4, rel=0.05)
@@ -40,15 +44,33 @@ def test_each_estimator_has_a_row_in_the_order_given() -> None:
     assert table["failure"].tolist() == ["", ""]
 
 
+def test_what_a_person_compares_fits_a_terminal() -> None:
+    table = compare({"landmark_kalman": estimate(0.4), "isam2": estimate(0.1)}, loop(40))
+    assert table.columns.tolist() == ["ate_m", "rpe_trans_m", "rpe_rot_deg", "nees", "ms"]
+    assert max(map(len, table.to_string().splitlines())) <= 80
+
+
+def test_a_failure_is_never_left_out() -> None:
+    log = MeasurementLog(RIG, {}, simulate(Drive(frames=6), np.random.default_rng(4)).increments)
+    answers = {
+        "ends": replay(log, EkfSettings(max_landmarks=3)),
+        "goes_on": replay(log, DeadReckoningSettings()),
+    }
+    table = compare(answers)
+    assert table.columns[-1] == "failure"
+    assert table.loc["ends", "failure"].startswith("frame ")
+    assert table.loc["goes_on", "failure"] == ""
+
+
 def test_consistency_follows_the_size_of_the_error() -> None:
-    table = compare({"sure": estimate(2.0), "right": estimate(0.05)}, loop(40))
+    table = compare({"sure": estimate(2.0), "right": estimate(0.05)}, loop(40), full=True)
     assert table["consistency"].tolist()[0] == "overconfident"
     assert table.loc["sure", "nees"] > 100.0 * table.loc["right", "nees"]
 
 
 def test_times_and_online_poses_come_from_the_answer() -> None:
     answer = with_times(estimate(0.1), np.linspace(1.0, 40.0, 40))
-    table = compare({"timed": answer, "untimed": estimate(0.1)}, loop(40))
+    table = compare({"timed": answer, "untimed": estimate(0.1)}, loop(40), full=True)
     assert table.loc["timed", "ms"] == pytest.approx(20.5)
     assert table.loc["timed", "ate_online_m"] == pytest.approx(table.loc["timed", "ate_m"])
     assert np.isnan(table.loc["untimed", "ms"])
@@ -56,7 +78,7 @@ def test_times_and_online_poses_come_from_the_answer() -> None:
 
 
 def test_without_truth_the_errors_are_not_known() -> None:
-    table = compare({"a": estimate(0.1)})
+    table = compare({"a": estimate(0.1)}, full=True)
     assert np.isnan(table.loc["a", "ate_m"])
     assert table.loc["a", "consistency"] == ""
     assert table.loc["a", "landmarks"] == 12
@@ -65,7 +87,7 @@ def test_without_truth_the_errors_are_not_known() -> None:
 def test_landmarks_are_compared_with_their_true_positions() -> None:
     found = estimate(0.0)
     off = found.landmarks.positions + np.array([0.0, 0.0, 0.3])
-    table = compare({"a": found}, loop(40), LandmarkTruth(found.landmarks.ids, off))
+    table = compare({"a": found}, loop(40), LandmarkTruth(found.landmarks.ids, off), full=True)
     assert table.loc["a", "landmark_rmse_m"] == pytest.approx(0.3)
 
 

@@ -96,7 +96,7 @@ def test_live_and_replayed_results_stand_in_one_table(
 ) -> None:
     slam, live = driven
     answers: dict[str, Any] = {"live": live, "isam2": fg.replay(slam.log, "isam2")}
-    table = fg.compare(answers, fg.open_recording(folder).ground_truth)
+    table = fg.compare(answers, fg.open_recording(folder).ground_truth, full=True)
     assert table.index.tolist() == ["live", "isam2"]
     assert table["frames"].tolist() == [FRAMES, FRAMES]
     assert (table["ate_m"] < 0.05).all()
