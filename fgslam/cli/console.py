@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _NOTES_SHOWN = 8
 _LABEL_WIDTH = 12
-_WIDTH_OF_FILES = 130
+_WIDTH_OF_FILES = 120
 
 
 @contextmanager
@@ -80,7 +80,7 @@ def show_parts(
     for line in lines:
         console.out(line)
     for table in tables:
-        console.print(_table(table))
+        console.print(rich_table(table))
     for label, text in labelled:
         console.out(f"{label:<{_LABEL_WIDTH}}{text}")
 
@@ -100,7 +100,8 @@ def _console() -> Console:
     return console if console.is_terminal else Console(width=_WIDTH_OF_FILES)
 
 
-def _table(found: TextTable) -> Table:
+def rich_table(found: TextTable) -> Table:
+    """A table for the terminal."""
     headed = bool(found.first) or any(column.name for column in found.columns)
     table = Table(title=found.heading, title_justify="left", show_header=headed)
     table.add_column(found.first, no_wrap=True)

@@ -201,7 +201,9 @@ def _signed(value: float) -> str:
 def _interval(scale: float, digits: int) -> Callable[..., str]:
     def text(found: Mapping[str, Any]) -> str:
         mean, lower, upper = found["mean"], found["lower"], found["upper"]
-        ends = "" if lower is None else f" [{scale * lower:.{digits}f}, {scale * upper:.{digits}f}]"
+        ends = (
+            "" if lower is None else f"\n[{scale * lower:.{digits}f}, {scale * upper:.{digits}f}]"
+        )
         return f"{scale * mean:.{digits}f}{ends}"
 
     return text
@@ -209,7 +211,7 @@ def _interval(scale: float, digits: int) -> Callable[..., str]:
 
 def _pooled(found: Mapping[str, Any]) -> str:
     band = f"{found['lower']:.2f}-{found['upper']:.2f}"
-    return f"{_ratio(found['per_dof'])} {found['verdict']} ({band})"
+    return f"{_ratio(found['per_dof'])} {found['verdict']}\n{band}"
 
 
 _NO_TRUTH = "no ground truth, or fewer than three poses matched"
@@ -257,9 +259,7 @@ _COST = (
         _times,
         "no frame was processed",
     ),
-    MetricColumn(
-        "growth\nlast/2nd fifth", ("update_growth.ratio",), _ratio, "fewer than 25 frames"
-    ),
+    MetricColumn("growth\n1 is flat", ("update_growth.ratio",), _ratio, "fewer than 25 frames"),
     MetricColumn(
         "slope ms /\n1000 frames",
         ("update_growth.slope_ms_per_1000",),
@@ -270,8 +270,8 @@ _COST = (
         "pose solve\nmedian ms", ("solve_ms.median",), _ratio, "timed with the live front-end"
     ),
     MetricColumn("final\nestimate s", ("final_ms",), _seconds, "not timed apart in a live run"),
-    MetricColumn("peak memory\nMiB", ("peak_memory_mb",), _whole, "this system does not tell"),
-    MetricColumn("landmarks\nin the map", ("landmarks",), _whole, "no frame was processed"),
+    MetricColumn("memory\nMiB", ("peak_memory_mb",), _whole, "this system does not tell"),
+    MetricColumn("map\nlandmarks", ("landmarks",), _whole, "no frame was processed"),
 )
 TRIAL_COLUMNS = (
     MetricColumn("ATE final cm", ("intervals.ate_rmse_m",), _interval(100.0, 3), _NO_TRUTH),

@@ -7,7 +7,7 @@ import pytest
 from reports import landmark_map, loop
 from simulated import RIG, Drive, simulate
 
-from fgslam.backend.filters.settings import DeadReckoningSettings, EkfSettings
+from fgslam.backend.settings import DeadReckoningSettings, EkfSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Estimate, Trajectory

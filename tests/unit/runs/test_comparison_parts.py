@@ -10,9 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
+from rich.measure import Measurement
 from simulated import RIG, Drive, simulate
 
 from fgslam.backend.settings import Isam2Settings, LandmarkKalmanSettings
+from fgslam.cli.console import rich_table
 from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.measurement_log import MeasurementLog
@@ -33,7 +36,12 @@ from fgslam.runs.baseline import check_baseline, read_baseline, write_baseline
 from fgslam.runs.choosing import Choice, all_kinds, choose
 from fgslam.runs.config import ExperimentConfig, parse_config
 from fgslam.runs.estimator_files import points_from_log
-from fgslam.runs.metric_tables import comparison_particulars, comparison_tables
+from fgslam.runs.metric_tables import (
+    TRIAL_COLUMNS,
+    comparison_particulars,
+    comparison_tables,
+    metrics_table,
+)
 from fgslam.runs.tasks.truth import points_under
 from fgslam.runs.trials import Trial, summarise, together
 
@@ -170,6 +178,52 @@ def test_columns_that_no_estimator_fills_are_left_out_with_the_reason() -> None:
     assert table.rows == (("isam2", ("1.00 2.00 3.0",)),)
     reasons = [text for label, text in particulars(untrue) if label == "left out"]
     assert any(r.startswith("ATE final cm, ") and "no ground truth" in r for r in reasons)
+
+
+def test_tables_fit_120_columns_without_a_broken_cell() -> None:
+    band = {"lower": 0.07, "upper": 3.12, "verdict": "overconfident", "per_dof": 17.88}
+    wide = {"mean": 0.0234, "lower": 0.0123, "upper": 0.0345}
+    every: dict[str, Any] = EstimatorMetrics(
+        ate_rmse_m=0.1234,
+        rpe_trans_m=0.1234,
+        rpe_rot_deg=1.234,
+        end_error_m=0.1234,
+        end_error_deg=1.234,
+        landmarks=12345,
+        nees_pose_per_dof=17.88,
+        nees_landmark_per_dof=17.88,
+        update_ms=UpdateTime(12.34, 56.78, 123.4),
+        peak_memory_mb=1234.0,
+        more={
+            "online": {
+                "ate_rmse_m": 0.1234,
+                "rpe_trans_m": 0.1234,
+                "rpe_rot_deg": 1.234,
+                "nees_pose_per_dof": 17.88,
+                "nees_pose": band,
+            },
+            "nees_pose": band,
+            "nees_landmark": band,
+            "nis_per_dof": 1.23,
+            "landmark_rmse_m": 0.1234,
+            "landmark_median_m": 0.1234,
+            "last_pose_sigma": {"position_m": 0.1234, "rotation_deg": 1.234},
+            "update_growth": {"ratio": 1.23, "slope_ms_per_1000": -12.34},
+            "solve_ms": {"median": 12.34},
+            "final_ms": 12345.0,
+            "intervals": {"ate_rmse_m": wide, "landmark_median_m": wide},
+            "intervals_online": {"ate_rmse_m": wide},
+        },
+    ).as_json()
+    values = {"landmark_kalman": every}
+    shown = (
+        *comparison_tables("drive", 999, values),
+        metrics_table("trials", TRIAL_COLUMNS, values),
+    )
+    console = Console(width=1000)
+    for one in shown:
+        width = Measurement.get(console, console.options, rich_table(one)).maximum
+        assert width <= 120, one.heading
 
 
 def test_a_column_that_one_estimator_fills_stays() -> None:
