@@ -203,7 +203,7 @@ def _of_folder(folder: Path, size: Size | None) -> CameraRig | Rectifier:
     raise CalibrationError(f"{folder}: holds no calibration of a stereo rig; {_KNOWN}")
 
 
-def _ours(path: Path, _: Size | None) -> CameraRig | Rectifier:
+def _own_format(path: Path, _: Size | None) -> CameraRig | Rectifier:
     three = "vertical_baseline_m" in read_json_object(path)
     return read_calibration(path, three)
 
@@ -257,11 +257,11 @@ def _known_size(path: Path, size: Size | None) -> Size:
 
 
 _MARKS: tuple[tuple[str, Callable[[Path, Size | None], CameraRig | Rectifier]], ...] = (
-    ('"baseline_m"', _ours),
+    ('"baseline_m"', _own_format),
     ("opencv-matrix", _opencv),
     ("projection_matrix:", _of_camera_info),
     ("P_rect_00:", _kitti_raw),
     ("P0:", _kitti),
     ("camera_model:", _kalibr),
 )
-"""Texts that tell a format, and its reader; the first that is found counts."""
+"""Texts by which a format is recognised, and its reader; the first that is found counts."""

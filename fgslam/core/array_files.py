@@ -58,7 +58,7 @@ class ArrayFile:
 
     @property
     def short(self) -> str:
-        """The name without ours before it."""
+        """The name without the leading `fgslam`."""
         return self.name.removeprefix("fgslam ")
 
     def header(self, version: int | None = None, **values: Any) -> StateArrays:

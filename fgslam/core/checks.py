@@ -16,19 +16,19 @@ def is_finite_number(value: object) -> bool:
     return number and not isinstance(value, bool) and math.isfinite(float(value))  # type: ignore[arg-type]
 
 
-def later_time(time: object, last: float | None, who: str, error: type[FgslamError]) -> float:
+def later_time(time: object, last: float | None, what: str, error: type[FgslamError]) -> float:
     """The time in seconds; raises ``error`` where it is none, or not after ``last`` (None: any)."""
     try:
         if isinstance(time, str):
             raise TypeError("text")
         seconds = float(time)  # type: ignore[arg-type]  # what is no number raises
     except (TypeError, ValueError, OverflowError):
-        raise error(f"{who}: the time stamp {time!r} is not a number; give seconds") from None
+        raise error(f"{what}: the time stamp {time!r} is not a number; give seconds") from None
     if not math.isfinite(seconds):
-        raise error(f"{who}: the time stamp {seconds} is not finite; give seconds")
+        raise error(f"{what}: the time stamp {seconds} is not finite; give seconds")
     if last is not None and not seconds > last:
         raise error(
-            f"{who}: the time stamp {seconds:.9f} s does not come after {last:.9f} s; give images "
+            f"{what}: the time stamp {seconds:.9f} s does not come after {last:.9f} s; give images "
             "in the order of their times, each once"
         )
     return seconds
@@ -37,4 +37,4 @@ def later_time(time: object, last: float | None, who: str, error: type[FgslamErr
 def require_seed(seed: object, where: str) -> None:
     """Raises ConfigError where a random generator cannot begin with it."""
     if not isinstance(seed, Integral) or isinstance(seed, bool) or seed < 0:
-        raise ConfigError(f"{where}: seed is {seed!r}; give a whole number, 0 or larger")
+        raise ConfigError(f"{where}: seed is {seed!r}; give a whatle number, 0 or larger")

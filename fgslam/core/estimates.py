@@ -71,7 +71,7 @@ class EgoMotionStatus(str, Enum):
 
     @property
     def measured(self) -> bool:
-        """Whether the landmarks had a say in the pose (otherwise it is the odometry's)."""
+        """Whether landmarks contributed to the pose (otherwise it is the odometry's)."""
         return self in (
             EgoMotionStatus.OK,
             EgoMotionStatus.CAPPED,
@@ -136,7 +136,7 @@ class RelocalisationStatus(str, Enum):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Relocalisation(Brief):
-    """The pose of a frame in a map, found without a prior, and why it is believed or refused.
+    """The pose of a frame in a map, found without a prior, and why it is accepted or refused.
 
     Attributes:
         status: FOUND, or why the best pose is refused.
@@ -164,7 +164,7 @@ class Relocalisation(Brief):
 
     @property
     def found(self) -> bool:
-        """Whether the pose is to be believed."""
+        """Whether the pose is accepted."""
         return self.status is RelocalisationStatus.FOUND
 
 

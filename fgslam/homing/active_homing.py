@@ -42,7 +42,7 @@ bearings)."""
 
 EstimatorMaker: TypeAlias = Callable[[HomingStart], HomingEstimator]
 
-_FARTHEST = 3.0  # legs; whoever believes to be farther away has diverged
+_FARTHEST = 3.0  # legs; an estimate farther away has diverged
 _TURN_MARGIN = np.deg2rad(20.0)  # what near features and noise make of a common turn
 _KEPT_SHARE = 0.7  # of the tracks; fewer count as weak even where there were few to begin with
 _SIGMAS = 4.0  # between two homing vectors of which one must be wrong
@@ -50,7 +50,7 @@ _SIGMAS = 4.0  # between two homing vectors of which one must be wrong
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What is wrong with a homing under way, and whether its estimate may still be driven by."""
+    """What is wrong with a homing under way, and whether its estimate is still usable."""
 
     reason: str
     usable: bool
@@ -84,7 +84,7 @@ class ActiveHoming:
         self._settings = settings
         self._estimator = make_estimator(start)
         self.estimate = self._estimator.estimate()
-        # Averages of bearings know neither map nor covariance; who has a map must know both.
+        # Averages of bearings have neither map nor covariance; estimators with a map have both.
         self._maps = bool(np.isfinite(self.estimate.landmarks).all())
         self.home = self._home()
         self.tracked = _seen_at(start)
@@ -99,7 +99,7 @@ class ActiveHoming:
 
     @property
     def supported(self) -> bool:
-        """Whether tracks in the map and a covariance stand behind the estimate.
+        """Whether the estimate rests on tracks in the map and has a covariance.
 
         Without them a filter or graph only carries the last motion on, and so might into the
         target. Always so of estimators that never have either.
@@ -112,7 +112,7 @@ class ActiveHoming:
         return bool(np.isfinite(self.estimate.covariance).all())
 
     def update(self, tracked: TrackedBearings) -> Fault | None:
-        """Takes in one image; what is wrong afterwards, the worst first, or None."""
+        """Updates the estimate by one image; the worst fault afterwards, or None."""
         fault = self._unusable(tracked)
         if fault is not None:
             return fault
@@ -127,7 +127,7 @@ class ActiveHoming:
         return self._divergence() or self._weakness()
 
     def _unusable(self, tracked: TrackedBearings) -> Fault | None:
-        """Too little to estimate from, or a picture that was turned rather than the robot."""
+        """The fault of an image with too few tracks, or turned faster than a robot can turn."""
         s = self._settings
         if len(tracked) < _FEWEST_TRACKS:
             return Fault(f"{len(tracked)} tracks left", False)
@@ -166,23 +166,23 @@ class ActiveHoming:
         return None
 
     def part_left(self, seen: float) -> float:
-        """Part of the leg that is left by the parallax (radians) the target is seen under; rough.
+        """Part of the leg that is left, by the target's parallax (radians) over that at the start.
 
-        As the present one is to that at the start; 1 at most.
+        Rough; 1 at most.
         """
         before = parallax(self.start.matches, self.start.vector.rotation)
         return min(1.0, self.unit * seen / before) if before > 0.0 else 1.0
 
     def contradicts(self, vector: TwoViewVector) -> bool:
-        """Whether a new homing vector from the present place cannot be true if the estimate is."""
+        """Whether direction or rotation of a new homing vector contradicts the estimate."""
         return bool(self._contradictions(vector).any())
 
     def turned_otherwise(self, vector: TwoViewVector) -> bool:
-        """Whether that is so of its rotation."""
+        """Whether the rotation of a new homing vector contradicts the estimate."""
         return bool(self._contradictions(vector)[1])
 
     def _contradictions(self, vector: TwoViewVector) -> BoolArray:
-        """(2,) of direction and rotation."""
+        """(2,) whether direction and rotation differ by more than their limits."""
         home = self.home
         turns = [vector.direction - home.direction, vector.rotation - home.rotation]
         variance = np.diag(vector.covariance) + np.nan_to_num(np.diag(home.covariance)[1:])
@@ -192,7 +192,7 @@ class ActiveHoming:
 
 
 def _seen_at(start: HomingStart) -> TrackedBearings:
-    """The start's own image as if it had been tracked."""
+    """Bearings of the start image, in the form of a tracked image."""
     seen = start.matches
     return TrackedBearings(
         time=start.time,
@@ -223,7 +223,7 @@ def tracked_misfit(estimate: HomingEstimate, tracked: TrackedBearings) -> float:
 
 
 def target_misfit(estimate: HomingEstimate, start: HomingStart) -> float:
-    """The same of the bearings from the target, predicted from where the target is estimated."""
+    """Median absolute difference of the target's bearings from their prediction, radians."""
     ids = start.local_map.ids
     mine, other = among(estimate.ids, ids), among(ids, estimate.ids)
     return _misfit(estimate.target, estimate.landmarks[mine], start.matches.bearing_b[other])
@@ -246,7 +246,7 @@ def parallax(matches: BearingMatches, rotation: float) -> float:
 
 
 def common_turn(before: TrackedBearings, now: TrackedBearings) -> float:
-    """By how much the robot turned between two images, radians; NaN without common features.
+    """Turn of the robot between two images, radians; NaN without common features.
 
     The circular median of the bearings' changes, the other way round: translation moves bearings,
     too, but to both sides.

@@ -20,11 +20,11 @@ from fgslam.homing.steering import ObstacleAvoider, RangeScan, Steering
 
 
 class World(Protocol):
-    """What the robot is in: simulated, or real."""
+    """The robot and its surroundings, simulated or real."""
 
     @property
     def true_pose(self) -> FloatArray:
-        """(3,) planar pose; NaN where nobody knows."""
+        """(3,) planar pose; NaN where it is not known."""
         ...
 
     def image(self, time: float) -> ByteArray:
@@ -36,7 +36,7 @@ class World(Protocol):
         ...
 
     def drive(self, speed: float, turn_rate: float, dt: float) -> object:
-        """Lets ``dt`` seconds pass under this command; what it returns is not looked at."""
+        """Drives for ``dt`` seconds; what is returned is ignored."""
         ...
 
 
@@ -45,7 +45,7 @@ Watcher = Callable[[Command, ByteArray], None]
 
 @dataclass(frozen=True, slots=True)
 class Driver:
-    """Who turns commands into motion."""
+    """Steering and avoidance, which turn commands into motion."""
 
     steering: Steering
     avoider: ObstacleAvoider
@@ -110,7 +110,7 @@ def follow(
 
 
 class _Clock:
-    """Wall time between laps."""
+    """Wall times between laps, seconds."""
 
     def __init__(self) -> None:
         self.laps: list[float] = []
@@ -123,7 +123,7 @@ class _Clock:
 
 
 class _Recorder:
-    """Gathers rows, and closes them into a record."""
+    """Rows of a drive, gathered into a record."""
 
     def __init__(self) -> None:
         self._poses: list[FloatArray] = []
@@ -142,7 +142,7 @@ class _Recorder:
         homing: ActiveHoming | None,
         laps: list[float],
     ) -> None:
-        """One step."""
+        """Adds the row of one step."""
         self._poses.append(pose)
         self._drives.append(drive)
         self._laps.append(laps)
@@ -170,7 +170,7 @@ class _Recorder:
     def record(
         self, end: FloatArray, follower: HomingChain, targets: FloatArray | None
     ) -> DriveRecord:
-        """All of it."""
+        """The record of all steps."""
         commands, drives, known = self._commands, self._drives, self._estimates
         unknown, blank = np.full(3, np.nan), np.full((6, 6), np.nan)
         laps = np.array(self._laps)

@@ -1,4 +1,4 @@
-"""What a homing tells the wheels with every image."""
+"""What a homing commands after every image."""
 
 from __future__ import annotations
 

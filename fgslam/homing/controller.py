@@ -80,7 +80,7 @@ class HomingController:
         self._obstacle = ""  # the last refusal's words, while there is nothing newer to say
 
     def step(self, image: ByteArray, time: float) -> Command:
-        """Takes in one image.
+        """The command after one more image.
 
         Args:
             image: (h, w, 3) uint8.
@@ -97,7 +97,7 @@ class HomingController:
         return self._go_on(self.active, image, time)
 
     def held_up(self, seconds: float) -> None:
-        """Obstacles, not homing, decided on the last ``seconds``: that is no lack of progress."""
+        """Excludes seconds in which avoidance decided, not homing, from the search for a stall."""
         self._progress.excuse(min(seconds, self._patience))
         self._patience = max(self._patience - seconds, 0.0)
 
@@ -127,7 +127,7 @@ class HomingController:
         return self._renew(homing, image, time, fault.reason)
 
     def _arrival(self, unit: float) -> str:
-        """Why the target counts as reached; empty if it does not."""
+        """Reason for which the target counts as reached; empty if it does not."""
         behind = abs(self._heading) > np.pi / 2
         if self.remaining <= self._settings.switch_fraction:
             return f"reached: {self.remaining:.2f} of the leg left"
@@ -141,7 +141,7 @@ class HomingController:
     def _recognise(
         self, homing: ActiveHoming, image: ByteArray, time: float, arrival: str
     ) -> Command | None:
-        """Near the target, it must be seen where the estimate has it; None to go on.
+        """Checks near the target that it is seen where the estimate has it; None to go on.
 
         A homing vector may be wrong and sure of itself: where things repeat, its tracks fit a
         target that is not there. So near, right matches are many: the look is a test of its own.
@@ -162,9 +162,10 @@ class HomingController:
         return None
 
     def _seen_elsewhere(self, homing: ActiveHoming, seen: Sighting, time: float) -> Command:
-        """At the target itself directions mean little: how near it is tells an error from that.
+        """The target is seen in another direction than estimated: reached, passed, or an error.
 
-        Not so rotations: if they contradict, the parallaxes are of another place.
+        At the target itself directions mean little, so the parallax decides; rotations that
+        contradict mean that the parallaxes are of another place.
         """
         if homing.turned_otherwise(seen.vector):
             return self._doubt(time, "near the target it is seen elsewhere", seen.vector)
@@ -178,7 +179,7 @@ class HomingController:
     def _doubt(
         self, time: float, why: str, vector: TwoViewVector | None = None, left: float = 1.0
     ) -> Command:
-        """The estimate is given up, and homing begins anew where the robot stands.
+        """Gives the estimate up; homing begins anew where the robot stands.
 
         Args:
             time: now.
@@ -195,7 +196,7 @@ class HomingController:
         return self._hold(time, why)
 
     def _renew(self, homing: ActiveHoming, image: ByteArray, time: float, why: str) -> Command:
-        """The estimate is usable, but weak: match anew while driving on by it."""
+        """Matches the target anew while driving on by an estimate that is usable, but weak."""
         if time < self._next_try:
             return self._drive(homing, time, why)
         answer = self._begin(image, time)
@@ -210,7 +211,7 @@ class HomingController:
         return self._accept(answer, f"matched anew: {why}")
 
     def _lose(self, image: ByteArray, time: float, why: str) -> Command:
-        """The estimate is not usable: match anew at once, or drive blind for a while."""
+        """Matches the target anew at once; where that fails, drives blind for a while."""
         ahead = abs(self._heading) <= np.deg2rad(_BLIND_HEADING_DEG)
         self._blind_until = time + _BLIND_S if ahead else -np.inf
         self.active, self._next_try = None, time
@@ -220,7 +221,7 @@ class HomingController:
     # Matching the target, for the first time or anew
 
     def _seek(self, image: ByteArray, time: float, why: str = "") -> Command:
-        """There is no estimate to drive by: match, or stand (or drive blind) and try again.
+        """Tries to match the target without an estimate; else stands, or drives blind.
 
         ``why`` is what went wrong just now; empty if nothing did.
         """
@@ -275,7 +276,7 @@ class HomingController:
     def _refused(self, time: float, refusal: Refusal) -> Command:
         """Stands, or drives blind, until there was nothing but refusals for too long.
 
-        Then it looks from farther on, the way it came: other images tell more than the same again.
+        Then it looks from farther on: another image says more than the same one again.
         """
         if refusal.reason is RefusalReason.AT_TARGET:
             return self._end(time, HomingState.ARRIVED, refusal.details)
@@ -314,7 +315,7 @@ class HomingController:
         )
 
     def _hold(self, time: float, why: str) -> Command:
-        """Without an estimate: blind, or searching, while that is allowed, then standing."""
+        """Command without an estimate: blind or searching while that is allowed, then standing."""
         if self._pending is None and time < self._blind_until:
             return self._without_estimate(time, HomingState.BLIND, why)
         if self._pending is None and time < self._search_until:
@@ -352,7 +353,7 @@ class HomingController:
 
 
 class _Progress:
-    """Notices a robot that does not come nearer: held up, or driving by a wrong estimate.
+    """Detection of a stall: the robot is held up, or drives by a wrong estimate.
 
     Attributes:
         stalls: how often it was noticed.
@@ -373,14 +374,14 @@ class _Progress:
         return late
 
     def begin_anew(self, time: float) -> None:
-        """What seemed progress was none: that counts as one stall."""
+        """Starts again after an estimate that was wrong; counts as one stall."""
         self._best, self._since = np.inf, time
         self.stalls += 1
 
     def excuse(self, seconds: float) -> None:
-        """So much of the time does not count."""
+        """Leaves so many seconds out."""
         self._since += seconds
 
     def pause(self, time: float) -> None:
-        """The robot stood until now; that is not driving without progress."""
+        """Leaves out the time until now, in which the robot stood."""
         self._since = time

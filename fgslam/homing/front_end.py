@@ -30,7 +30,7 @@ from fgslam.homing.settings import FrontEndSettings
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
-    """A target seen by the side, without tracks of its features.
+    """A target seen in passing, without tracks of its features.
 
     Attributes:
         vector: the homing vector.
@@ -50,7 +50,7 @@ class HomingFrontEnd(Protocol):
     """
 
     def describe(self, image: ByteArray) -> OmniFeatures:
-        """What is remembered of a path image; changes nothing."""
+        """Features of a path image; changes nothing."""
         ...
 
     def begin(self, image: ByteArray, target: OmniFeatures, time: float) -> HomingStart | Refusal:
@@ -83,7 +83,7 @@ an image's cost grows with them."""
 _STREAM = 8  # of the seed's random numbers; the simulated worlds have others
 _SECTORS = 8  # of 45 degrees
 _DARK = 8.0  # mean grey value of what the camera sees
-_MAX_RELATIVE_SIGMA = 1.0  # of a distance; whoever knows less of a feature waits for parallax
+_MAX_RELATIVE_SIGMA = 1.0  # of a distance; features known less well wait for parallax
 
 
 class ImageFrontEnd:
@@ -135,7 +135,7 @@ class ImageFrontEnd:
     def _matched(
         self, image: ByteArray, target: OmniFeatures
     ) -> tuple[OmniFeatures, BearingMatches, TwoViewVector] | Refusal:
-        """The image's features, their matches with the target's, and what these say."""
+        """Features of the image, their matches with the target's, and the homing vector."""
         present = self.describe(image)
         refusal = unusable(image, present)
         if refusal is not None:
@@ -222,7 +222,7 @@ def mixed_with_wrong(
 
 
 def unusable(image: ByteArray, present: OmniFeatures) -> Refusal | None:
-    """Why nothing can be recognised in an image (h, w, 3) with these features; None if it can."""
+    """Refusal of an image (h, w, 3) that is too dark or has no features; None if it is usable."""
     # What is black is not seen, and adds nothing to the sum.
     lit = int(np.count_nonzero(image[..., 0] | image[..., 1] | image[..., 2]))
     brightness = float(np.sum(image)) / (3.0 * max(lit, 1))

@@ -34,13 +34,13 @@ _HUBER = np.deg2rad(5.0)  # residual from which on a link's rotation counts less
 
 
 class LinkConsistency:
-    """All links of a map under examination."""
+    """Links of a map, those that contradict others taken out."""
 
     def __init__(self, count: int, links: Iterable[Link]) -> None:
         """Takes links between ``count`` images, one a pair."""
         self._count = count
         self._links = {(link.a, link.b): link for link in links}
-        self._verdicts = self._judge_triangles()
+        self._holding = self._test_triangles()
 
     def accepted(
         self, *, ordered: bool, confirmed: Collection[Pair] = ()
@@ -61,7 +61,7 @@ class LinkConsistency:
     # ----------------------------------------------------------------------------------------
     # Triangles
 
-    def _judge_triangles(self) -> dict[tuple[int, int, int], bool]:
+    def _test_triangles(self) -> dict[tuple[int, int, int], bool]:
         neighbours: list[set[int]] = [set() for _ in range(self._count)]
         for a, b in self._links:
             neighbours[a].add(b)
@@ -87,14 +87,14 @@ class LinkConsistency:
     def votes(self) -> dict[Pair, tuple[int, int]]:
         """Triangles that each link keeps, and that it breaks."""
         out = dict.fromkeys(self._links, (0, 0))
-        for triangle, holds in self._verdicts.items():
+        for triangle, holds in self._holding.items():
             for pair in itertools.combinations(triangle, 2):
                 good, bad = out[pair]
                 out[pair] = (good + holds, bad + (not holds))
         return out
 
     def _drop_contradicted(self, rejected: dict[Pair, str], *, ordered: bool) -> None:
-        """The worst first; that images follow each other counts as one more triangle kept."""
+        """Drops links, the worst first; following each other counts as one triangle kept."""
         while True:
             votes = self.votes()
             excess = {
@@ -125,9 +125,9 @@ class LinkConsistency:
     def _drop(self, pair: Pair, why: str, rejected: dict[Pair, str]) -> None:
         del self._links[pair]
         rejected[pair] = why
-        self._verdicts = {
+        self._holding = {
             triangle: holds
-            for triangle, holds in self._verdicts.items()
+            for triangle, holds in self._holding.items()
             if not set(pair) <= set(triangle)
         }
 
@@ -135,7 +135,7 @@ class LinkConsistency:
     # Headings
 
     def _drop_turned(self, rejected: dict[Pair, str], *, ordered: bool) -> None:
-        """Of an ordered set neighbours weigh more than any other link: headings follow the walk."""
+        """Drops links whose rotation contradicts all others; neighbours on a walk weigh most."""
         limit = np.deg2rad(_HEADING_DEG)
         while self._links:
             pairs = list(self._links)
@@ -153,7 +153,7 @@ class LinkConsistency:
 
 
 def between_misfit(first: float, second: float, whole: float, slack: float = 0.0) -> float:
-    """By how much a triangle's long side leaves the cone of its two steps, radians.
+    """Angle by which a triangle's long side leaves the cone of its two steps, radians.
 
     Args:
         first: direction of the first step.
@@ -232,8 +232,8 @@ InlierRows: TypeAlias = Mapping[Pair, IntArray]
 _SAME = 0.02  # radians, in bearing and elevation: one thing has several features side by side
 
 _ORDER_REACH = 3
-"""Images farther apart than this in the order need third views, these neighbours of theirs, that
-confirm their link's features."""
+"""A link of images farther apart than this in the order needs third views (neighbours this near)
+that confirm its features."""
 
 _THIRD_VIEWS = 1.0
 """Such confirmations an inlier, on average, that a link so far needs; `docs/concepts/homing.md` has
@@ -268,7 +268,7 @@ class ThirdViewConsistency:
     def confirmed(self) -> tuple[list[Link], set[Pair], dict[Pair, str]]:
         """Links that are accepted so far, those of them that third views confirm, why others not.
 
-        The walk itself vouches for links of a few steps.
+        Links of a few steps need none: the walk itself connects them.
         """
         kept: list[Link] = []
         seen: set[Pair] = set()
@@ -301,7 +301,7 @@ class ThirdViewConsistency:
         return count / max(link.support, 1)
 
     def _confirmations(self, a: int, b: int) -> int:
-        """How often a feature of a is the same one in a neighbour of b, directly and by b."""
+        """Features of a that are the same in a neighbour of b, matched directly and by way of b."""
         count = 0
         for c in range(max(0, b - _ORDER_REACH), min(len(self._images), b + _ORDER_REACH + 1)):
             if c in (a, b) or (b, c) not in self._maps or (a, c) not in self._maps:

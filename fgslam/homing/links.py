@@ -89,7 +89,7 @@ def link_pair(pair: Pair, there: Answer, back: Answer) -> Link | str:
 
 
 def _one_way(pair: Pair, there: Answer, back: Answer) -> Link | str:
-    """One direction is answered, the other cannot decide: what holds there holds back.
+    """Link of a pair that is answered in one direction and undecided in the other.
 
     Which of the two solutions the few decisive features support, or which minimum of a
     valley, may hang on the draw; that is no contradiction. Any other refusal is, as both answers
@@ -124,7 +124,7 @@ def _opposite(vector: TwoViewVector) -> TwoViewVector:
 
 
 def _same_place(pair: Pair, there: Refusal, back: Refusal) -> Link | str:
-    """Images from one place are linked, too: by a turn without a direction."""
+    """Link of two images from one place: a turn without a direction."""
     if RefusalReason.AT_TARGET not in (there.reason, back.reason):
         return there.details
     if there.rotation is None or back.rotation is None:

@@ -1,4 +1,4 @@
-"""Where on the map is this? A Bayes filter over its nodes (I).
+"""Localisation in a topological map: a Bayes filter over its nodes (I).
 
 Images are compared as nodes are: by how many of their features agree on one homing. The belief is
 a distribution over nodes; between two images it stays, moves along an edge, or, rarely, leaps
@@ -23,7 +23,7 @@ _STAY = 0.5  # chance to be still at the node of the last image
 
 
 class Localiser:
-    """Tells at which node the robot is, or nearest to it.
+    """Probability of each node to be where the robot is, or nearest to it.
 
     Attributes:
         belief: (n,) probabilities; uniform before the first image.
@@ -36,7 +36,7 @@ class Localiser:
         linker: Linker,
         settings: LocalisationSettings,
     ) -> None:
-        """Knows nothing yet.
+        """Begins with a uniform belief.
 
         Args:
             topology: the map.
@@ -53,7 +53,7 @@ class Localiser:
         self._fresh = True
 
     def update(self, image: OmniFeatures) -> FloatArray:
-        """Takes in one image.
+        """The belief after one more image.
 
         Returns:
             (n,) the belief, a copy.
@@ -98,7 +98,7 @@ class Localiser:
 
 
 def likelihoods(supports: IntArray, background: float) -> FloatArray:
-    """(n,) of an image at each node, up to a factor: its inliers and what chance gives anyhow.
+    """(n,) of an image at each node, up to a factor: its inliers and those of a wrong place.
 
     Linear, not exponential as independent inliers would have it: features of one image stand and
     fall together (a poster that hangs in two rooms brings all of its own), and a single image must

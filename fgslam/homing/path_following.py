@@ -85,7 +85,7 @@ class HomingChain:
         return self._ended is not None
 
     def step(self, image: ByteArray, time: float) -> Command:
-        """Takes in one image; see :meth:`HomingController.step`."""
+        """The command after one more image; see :meth:`HomingController.step`."""
         if self._ended is not None:
             return replace(self._ended, time=time)
         if self._began is None:

@@ -121,7 +121,7 @@ class RangeScan(NamedTuple):
 
 
 class ObstacleAvoider(Protocol):
-    """Looks at what the steering wants and at the scan, and has the last word."""
+    """Decides, from the steering's wish and the scan, what is driven."""
 
     def override(self, wanted: Drive, heading: float, scan: RangeScan) -> Drive:
         """What is driven in the end.
@@ -198,7 +198,7 @@ class CorridorAvoidance:
 
     def _in_corridor(self, wanted: Drive, heading: float, scan: RangeScan) -> Drive:
         if wanted.speed <= 0.0 and self._chosen is None:
-            return wanted  # turning on the spot endangers nobody
+            return wanted  # turning on the spot is safe
         s = self._settings
         points = _points(scan)
         needed = _LOOK_AHEAD_M + _LOOK_AHEAD_S * max(wanted.speed, 0.0)

@@ -262,8 +262,8 @@ PAPER_DEGREE = 5
 class RadialPolynomial(RadialCamera):
     """Elevation = sum of ``coefficients[k] x^k``, x = radius scaled to [-1, 1]; rising or falling.
 
-    The paper names the degree, five, and a calibration image; the argument is ours: the radius,
-    scaled so that the ring's inner and outer rim lie at -1 and 1, which keeps the fit well
+    The paper names the degree, five, and a calibration image, not the argument. Here it is the
+    radius, scaled so that the ring's inner and outer rim lie at -1 and 1, which keeps the fit well
     conditioned.
 
     It falls with the radius where the picture's middle looks up: a mirror that is looked at from

@@ -275,7 +275,7 @@ def _fit_circle(points: FloatArray) -> tuple[FloatArray, float, FloatArray]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RingCalibration:
-    """What a picture of rings at known elevations tells.
+    """The camera that a picture of rings at known elevations gives.
 
     Attributes:
         fit: the polynomial camera; its residuals are one a ring.

@@ -7,7 +7,7 @@ back to where it came from, when it no longer looks as it did when its tracking 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -73,15 +73,17 @@ class TrackerState:
 
 
 class BearingTracker:
-    """Tracks points of one camera's images and tells their bearings."""
+    """Tracks points over one camera's images and gives their bearings.
+
+    Attributes:
+        stabilised: makes the view that points are tracked in.
+        state: all that is carried over; None before the first image. A tracker that is given
+            another one's state goes on from there, to the same bits.
+    """
 
     def __init__(self, camera: OmniCamera) -> None:
         self.stabilised = StabilisedView(camera, _MAX_VIEW_WIDTH, WINDOW_PX, _PYRAMID_LEVELS)
-        self._last: StabilisedImage | None = None
-        self._places: FloatArray = np.empty((0, 2))
-        self._patches: ReferencePatches | None = None
-        self._ids: IntArray = np.empty(0, dtype=np.int64)
-        self._time = -np.inf
+        self.state: TrackerState | None = None
 
     @property
     def view(self) -> OmniCamera:
@@ -97,19 +99,20 @@ class BearingTracker:
             ids: (n,) ascending.
             pixels: (n, 2) in the view.
         """
-        self._last = self.stabilised.make(image, None, 0.0)
-        self._places = self.stabilised.to_stabilised(pixels, self._last)
-        self._patches = self._anchored(self._last, self._places)
-        self._ids, self._time = ids.copy(), time
+        last = self.stabilised.make(image, None, 0.0)
+        places = self.stabilised.to_stabilised(pixels, last)
+        self.state = TrackerState(last, places, _anchored(last, places), ids.copy(), time)
 
     def add(self, ids: IntArray, pixels: FloatArray) -> None:
         """Tracks these points of the last image, too; identities above those before."""
-        if self._last is None or self._patches is None:
-            raise EstimatorError("no image was tracked yet: start before adding points")
-        places = self.stabilised.to_stabilised(pixels, self._last)
-        self._patches = self._patches.join(self._anchored(self._last, places))
-        self._places = np.vstack([self._places, places])
-        self._ids = np.concatenate([self._ids, ids])
+        state = self._started()
+        places = self.stabilised.to_stabilised(pixels, state.last)
+        self.state = replace(
+            state,
+            places=np.vstack([state.places, places]),
+            patches=state.patches.join(_anchored(state.last, places)),
+            ids=np.concatenate([state.ids, ids]),
+        )
 
     def track(self, image: Image, time: float) -> TrackedBearings:
         """Finds the points in the next image; those not found are forgotten.
@@ -118,62 +121,52 @@ class BearingTracker:
             EstimatorError: tracking was not started, or time does not increase.
             FrameError: the image is not the camera's.
         """
-        if self._last is None or self._patches is None:
-            raise EstimatorError("no image was tracked yet: start before tracking")
-        later_time(time, self._time, "tracking", EstimatorError)
+        before = self._started()
+        later_time(time, before.time, "tracking", EstimatorError)
         turn = _MAX_TURN * self.stabilised.period / (2.0 * np.pi)
-        now = self.stabilised.make(image, self._last, turn)
-        if len(self._ids):
-            places, kept = self._follow(self._last, now)
-            self._settle(now, places[kept], self._ids[kept], self._patches.select(kept))
-        self._last, self._time = now, time
-        return self._bearings(time)
+        now = self.stabilised.make(image, before.last, turn)
+        found = replace(before, last=now, time=time)
+        if len(before.ids):
+            places, kept = self._follow(before, now)
+            found = self._settled(replace(found, places=places), kept)
+        self.state = found
+        return self.bearings()
 
-    def state(self) -> TrackerState | None:
-        """What it takes to go on later; None before the first image."""
-        if self._last is None or self._patches is None:
-            return None
-        return TrackerState(self._last, self._places, self._patches, self._ids, self._time)
-
-    def restore(self, state: TrackerState | None) -> None:
-        """Goes on from :meth:`state`, to the same bits."""
-        if state is not None:
-            self._last, self._places, self._patches = state.last, state.places, state.patches
-            self._ids, self._time = state.ids, state.time
-
-    def bearings(self) -> TrackedBearings:
-        """The points as the last image shows them."""
-        return self._bearings(self._time)
+    def _started(self) -> TrackerState:
+        if self.state is None:
+            raise EstimatorError(
+                "no image was tracked yet: start before tracking, or adding points"
+            )
+        return self.state
 
     def pixels(self) -> FloatArray:
         """(n, 2) where the points are in the view of the last image."""
-        if self._last is None:
+        if self.state is None:
             return np.empty((0, 2))
-        return self.stabilised.from_stabilised(self._places, self._last)
+        return self.stabilised.from_stabilised(self.state.places, self.state.last)
 
-    def _anchored(self, image: StabilisedImage, places: FloatArray) -> ReferencePatches:
-        return anchor(image.grey, places, PATCH_PX, _PATCH_NOISE_GREY, _PATCH_DEFORMATION)
-
-    def _settle(
-        self, now: StabilisedImage, places: FloatArray, ids: IntArray, patches: ReferencePatches
-    ) -> None:
-        """Aligns each point with its first patch, and keeps those that look like it."""
-        patches, places, correlation = align(patches, now.grey, places)
-        kept = (correlation >= _MIN_CORRELATION) & (patches.deformation() <= _MAX_DEFORMATION)
-        kept &= self._inside(places)
-        self._places, self._ids = self._centred(places[kept]), ids[kept]
-        self._patches = patches.select(kept)
+    def _settled(self, state: TrackerState, kept: BoolArray) -> TrackerState:
+        """The points ``kept``, each aligned with its first patch, that still look like it."""
+        patches, places, correlation = align(
+            state.patches.select(kept), state.last.grey, state.places[kept]
+        )
+        good = (correlation >= _MIN_CORRELATION) & (patches.deformation() <= _MAX_DEFORMATION)
+        good &= self._inside(places)
+        return replace(
+            state,
+            places=self._centred(places[good]),
+            patches=patches.select(good),
+            ids=state.ids[kept][good],
+        )
 
     def _centred(self, places: FloatArray) -> FloatArray:
-        """Places between the margins; who crossed the seam goes on at the other end."""
+        """Places between the margins; a point that crossed the seam goes on at the other end."""
         margin, period = self.stabilised.margin, self.stabilised.period
         return np.column_stack([(places[:, 0] - margin) % period + margin, places[:, 1]])
 
-    def _follow(
-        self, before: StabilisedImage, now: StabilisedImage
-    ) -> tuple[FloatArray, BoolArray]:
-        """(n, 2) places in the new view, and (n,) whether they are to be trusted."""
-        origin = self._places.astype(np.float32)
+    def _follow(self, state: TrackerState, now: StabilisedImage) -> tuple[FloatArray, BoolArray]:
+        """(n, 2) places in the new view, and (n,) whether the way back confirms them."""
+        before, origin = state.last, state.places.astype(np.float32)
         window = (WINDOW_PX, WINDOW_PX)
         kinds = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT
         criteria = (kinds, _ITERATIONS, _PRECISION_PX)
@@ -201,21 +194,24 @@ class BearingTracker:
         columns = 2 * self.stabilised.margin + self.stabilised.period
         return np.asarray(good & (places[:, 0] >= 0.0) & (places[:, 0] <= columns - 1.0))
 
-    def _bearings(self, time: float) -> TrackedBearings:
-        view = self.stabilised.view
-        pixels = self.pixels()
+    def bearings(self) -> TrackedBearings:
+        """The points as the last image shows them."""
+        state, view, pixels = self._started(), self.stabilised.view, self.pixels()
         a_column = 2.0 * np.pi / self.stabilised.period
         a_row = (view.top_elevation - view.bottom_elevation) / (view.height - 1)
-        deformation = np.empty(0) if self._patches is None else self._patches.deformation()
-        sigma = np.hypot(SIGMA_PX, _SIGMA_DEFORMED_PX * deformation)
+        sigma = np.hypot(SIGMA_PX, _SIGMA_DEFORMED_PX * state.patches.deformation())
         return TrackedBearings(
-            time=time,
-            ids=self._ids.copy(),
+            time=state.time,
+            ids=state.ids.copy(),
             bearing=np.pi - pixels[:, 0] * a_column,
             sigma_bearing=sigma * a_column,
             elevation=view.top_elevation - pixels[:, 1] * a_row,
             sigma_elevation=sigma * a_row,
         )
+
+
+def _anchored(image: StabilisedImage, places: FloatArray) -> ReferencePatches:
+    return anchor(image.grey, places, PATCH_PX, _PATCH_NOISE_GREY, _PATCH_DEFORMATION)
 
 
 def _in_light_of(before: Image, now: Image) -> Image:
@@ -274,7 +270,6 @@ class ReplenishedTracker:
         self._tracker = BearingTracker(camera)
         self._least, self._most = least, most
         self._next = 0
-        self._started = False
 
     def take(self, image: Image, time: float) -> TrackedImage:
         """Tracks into the next image (h, w, 3), and adds points where too few are left.
@@ -283,10 +278,9 @@ class ReplenishedTracker:
             EstimatorError: time does not increase.
             FrameError: the image is not the camera's.
         """
-        if not self._started:
+        if self._tracker.state is None:
             none = np.empty(0, np.int64)
             self._tracker.start(image, time, none, np.empty((0, 2)))
-            self._started = True
             survivors = 0
             tracked = None
         else:
@@ -299,12 +293,11 @@ class ReplenishedTracker:
 
     def state(self) -> VideoState:
         """What it takes to go on later."""
-        return VideoState(self._tracker.state(), self._next)
+        return VideoState(self._tracker.state, self._next)
 
     def restore(self, state: VideoState) -> None:
         """Goes on from :meth:`state`, to the same bits."""
-        self._tracker.restore(state.tracker)
-        self._next, self._started = state.next, state.tracker is not None
+        self._tracker.state, self._next = state.tracker, state.next
 
     def pixels(self) -> FloatArray:
         """(n, 2) where the points are in the view (:meth:`view`) of the last image."""

@@ -268,7 +268,7 @@ class _Search:
         """Log of the number of equally supported hypotheses expected if all matches were wrong.
 
         How often a wrong match agrees with this hypothesis is read off wrong matches: the same
-        features paired by lot (an *a contrario* test, Moisan and Stival 2004).
+        features paired at random (an *a contrario* test, Moisan and Stival 2004).
         """
         n, sigmas = len(self._matches), _INLIER_SIGMAS
         shuffled = np.concatenate([self._rng.permutation(n) for _ in range(_SHUFFLES)])

@@ -71,7 +71,7 @@ def anchor(
         size: side of a patch, pixels; odd.
         noise: sigma of a grey value, including what no affine map explains.
         deformation: sigma of each entry of the map from one image to the next; it keeps patches
-            with little contrast from being deformed at will.
+            with little contrast from being deformed arbitrarily.
     """
     maps = np.broadcast_to(np.eye(2), (len(places), 2, 2)).copy()
     first = _sampled(grey, places, maps, size)

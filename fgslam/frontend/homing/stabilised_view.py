@@ -22,7 +22,7 @@ from fgslam.core.errors import FrameError
 from fgslam.frontend.features.colour_sift import wrapping_period
 from fgslam.frontend.features.omni_features import pixels_a_radian
 
-_BANDS = 8  # of rows, averaged, that tell the common shift
+_BANDS = 8  # of rows, averaged, from which the common shift is estimated
 _PROBED = np.deg2rad(np.arange(-89.0, 90.0, 1.0))
 _HIGHEST = np.deg2rad(60.0)  # beyond, a panorama's rows are stretched many times
 
