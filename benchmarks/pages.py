@@ -49,7 +49,7 @@ def all_pages(results: Path = RESULTS) -> dict[str, str]:
 
 
 def overview(records: dict[str, Record]) -> str:
-    """Every bound of every page in one list, with what was measured."""
+    """How many bounds each page has and how many are met, then every one that is missed."""
     rows = [row for record in records.values() for row in record.rows]
     missed = sum(row.met is False for row in rows)
     lines = [
@@ -59,31 +59,31 @@ def overview(records: dict[str, Record]) -> str:
         "",
         *_wrapped(
             f"{len(rows)} bounds, {len(rows) - missed} met, {missed} missed. Each page gives the "
-            "number, the bound and the command that measures it; slow tests hold most bounds."
+            "numbers, their bounds and the commands that measure them; slow tests hold most bounds."
         ),
     ]
     for group, names in GROUPS.items():
-        lines += ["", f"## {group}"]
-        for name in names:
-            record = records[name]
-            lines += ["", f"### [{record.title}]({name}.md)", "", *_overview(record)]
+        counts = [_counted(records[name]) for name in names]
+        lines += ["", f"## {group}", "", *grid(("", "bounds", "met", "missed"), counts)]
+    lines += ["", "## Missed", "", *_missed(records.values())]
     return _joined(lines)
 
 
-def _overview(record: Record) -> list[str]:
-    """Bounds of one page, each beside the experiment that it belongs to."""
+def _counted(record: Record) -> tuple[str, ...]:
+    met = sum(row.met is True for row in record.rows)
+    missed = len(record.rows) - met
+    link = f"[{record.title}]({record.name}.md)"
+    return link, str(len(record.rows)), str(met), f"**{missed}**" if missed else ""
+
+
+def _missed(records: Iterable[Record]) -> list[str]:
     rows = [
-        (section.title, row.name, shown_number(row), shown_bound(row), _WORDS[row.met])
-        for section in record.sections
-        for row in section.rows
-        if row.bound is not None
+        (record.title, row.name, shown_number(row), shown_bound(row))
+        for record in records
+        for row in record.rows
+        if row.met is False
     ]
-    before = ["", *(row[0] for row in rows)]
-    once = [
-        ("" if row[0] == last else row[0], *row[1:])
-        for row, last in zip(rows, before, strict=False)
-    ]
-    return grid(("experiment", "", "measured", "bound", ""), once) if rows else ["No bounds."]
+    return grid(("page", "", "measured", "bound"), rows) if rows else ["None."]
 
 
 def page(record: Record) -> str:
