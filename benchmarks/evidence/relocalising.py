@@ -25,7 +25,7 @@ from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.engine import run_task
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.tasks.localisation import open_localisation
-from fgslam.runs.tasks.localisation_submap import Window, submap_features
+from fgslam.runs.tasks.localisation_queries import submap_features
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map, trusted
 from fgslam.runs.tasks.truth import truth_in_map
 from fgslam.slam.factory import make_relocaliser, make_stereo_matcher, make_stream
@@ -149,8 +149,7 @@ def _queries(
 def _submap(
     config: LocalisationConfig, sequence: Sequence, held: list[FeatureFrame]
 ) -> StereoFeatures:
-    window = Window(sequence, held[0].i, len(held))
-    return submap_features(window, held, config.frontend, config.odometry)[0]
+    return submap_features(sequence, held, config.frontend, config.odometry)[0]
 
 
 def _learnt(

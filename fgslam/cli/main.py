@@ -214,8 +214,8 @@ def localize(
     A pose is given only where it is beyond doubt, with the reasons. Exits with 0 whatever the
     answers are, with 2 where map or recording cannot be used.
     """
-    from fgslam.runs.tasks.localisation_command import Wanted
-    from fgslam.runs.tasks.localisation_command import localize as locate
+    from fgslam.runs.tasks.localisation import Wanted
+    from fgslam.runs.tasks.localisation import localize as locate
 
     wanted = Wanted(
         map_file, recording, tuple(overrides or ()), frame, frames, out, _existing(overwrite)

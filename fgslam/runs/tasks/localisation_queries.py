@@ -6,25 +6,39 @@ import dataclasses
 import time
 from collections import deque
 from collections.abc import Iterator
+from collections.abc import Sequence as Items
 from dataclasses import dataclass
 
 import numpy as np
 
+from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, MapError
 from fgslam.core.estimates import LandmarkMap, Relocalisation
+from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.floor import Floor
+from fgslam.core.geometry import (
+    congruence,
+    project,
+    projection_jacobian,
+    rotate_covariances,
+    transform_to_camera,
+)
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import require_rig
+from fgslam.core.sensors import CameraRig
+from fgslam.datasets.settings import OdometrySettings
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
+from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.engine import Context
-from fgslam.runs.tasks.localisation_submap import Window, submap_features
 from fgslam.runs.tasks.slam_map_entry import GivenMap, trusted
 from fgslam.runs.tasks.truth import Sighted, TrueSights, TruthInMap, truth_in_map
-from fgslam.slam.factory import make_relocaliser, make_stereo_matcher, make_stream
+from fgslam.slam.factory import make_pipeline, make_relocaliser, make_stereo_matcher, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.motion import body_motion
+from fgslam.slam.pipeline import SlamPipeline
 
 _STREAM = 13  # of random numbers, beside those of the recording
 _STAGE = "queries"
@@ -145,9 +159,8 @@ class Asker:
         if len(found) == 1:
             features, spread = self._stereo.match(last.features), None
         else:
-            window = Window(self._sequence, found[0].i, len(found))
             features, spread = submap_features(
-                window, found, self._config.frontend, self._config.odometry
+                self._sequence, found, self._config.frontend, self._config.odometry
             )
         matched = time.perf_counter()
         answer = self._relocaliser.locate(features, rng)
@@ -241,3 +254,82 @@ def _queries(
                 yield k, list(held)
     finally:
         stream.close()
+
+
+_NEAREST_M = 0.1  # of the last camera's plane: nearer ones have no size in its image
+
+
+def submap_features(
+    sequence: Sequence,
+    found: Items[FeatureFrame],
+    frontend: FrontendSettings,
+    odometry: OdometrySettings,
+) -> tuple[StereoFeatures, FloatArray]:
+    """Landmarks of a few consecutive frames that the ordinary loop has tracked.
+
+    Args:
+        sequence: the recording.
+        found: the frames' features, in order, at least one.
+        frontend: the configuration's; neither loops are closed nor lost cameras found.
+        odometry: the configuration's; what was before the first of the frames is not used.
+
+    Returns:
+        The submap's landmarks in the last camera's frame, with fused covariances and their last
+        looks; those outside its image, too. And the covariance (6, 6) of that camera in the
+        submap, which whoever is located by the submap has beside the map's.
+    """
+    plain = dataclasses.replace(frontend, loops=None, lost=None)
+    pipeline = make_pipeline(sequence.rig, plain, odometry, LandmarkKalmanSettings())
+    for k, one in enumerate(found):
+        timestamp = float(sequence.timestamps[one.i])
+        body = body_motion(sequence, one.i, pipeline.motion) if k else None
+        stats = pipeline.process(dataclasses.replace(one, i=k), k, timestamp, body).stats
+    return _as_features(pipeline, sequence.rig, stats.wTc), stats.covariance
+
+
+def _as_features(pipeline: SlamPipeline, rig: CameraRig, wTc: FloatArray) -> StereoFeatures:
+    """The landmarks as the camera at ``wTc`` would measure them, were its image large enough."""
+    landmarks = pipeline.estimator.landmarks()
+    looks = _last_looks(pipeline.tracker.database.appearances(landmarks.ids))
+    points = transform_to_camera(wTc, landmarks.positions)
+    covariances = rotate_covariances(wTc[:3, :3].T, landmarks.covariances)
+    keep = np.abs(points[:, 2]) > _NEAREST_M
+    points, covariances = points[keep], covariances[keep]
+    looks = looks.of(landmarks.ids[keep])
+    measurement, noise = _measured(rig, points, covariances)
+    pixels = np.full((len(points), 3, 2), np.nan)
+    pixels[:, 0] = measurement[:, :2]
+    return StereoFeatures(
+        measurement=measurement,
+        measurement_covariance=noise,
+        scale=looks.size / np.abs(points[:, 2]),
+        orientation=looks.orientation,
+        descriptors=looks.descriptors,
+        position=points,
+        position_covariance=covariances,
+        pixels=pixels,
+    )
+
+
+def _last_looks(appearances: LandmarkAppearances) -> LandmarkAppearances:
+    """The view of each landmark that was seen last."""
+    last = np.flatnonzero(np.diff(appearances.ids, append=-1))
+    return LandmarkAppearances(
+        appearances.ids[last],
+        appearances.descriptors[last],
+        appearances.size[last],
+        appearances.orientation[last],
+        appearances.direction[last],
+    )
+
+
+def _measured(
+    rig: CameraRig, points: FloatArray, covariances: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Image measurements (n, 3) of points and their covariances; NaN of those behind the camera."""
+    before = points[:, 2] > 0.0
+    measurement = np.full((len(points), 3), np.nan)
+    noise = np.full((len(points), 3, 3), np.nan)
+    measurement[before] = project(rig, points[before])
+    noise[before] = congruence(projection_jacobian(rig, points[before]), covariances[before])
+    return measurement, noise
