@@ -28,9 +28,16 @@ from fgslam.runs.tasks.homing_map_localising import (
     localised_numbers,
     write_localised,
 )
-from fgslam.runs.tasks.homing_pair_answers import PairAnswer
-from fgslam.runs.tasks.homing_pair_search import PairSearch, answer_pairs, draw_pair, inlier_rows
-from fgslam.runs.tasks.homing_views import Views, extract_features, open_views
+from fgslam.runs.tasks.homing_views import (
+    PairAnswer,
+    PairSearch,
+    Views,
+    answer_pairs,
+    draw_pair,
+    extract_features,
+    inlier_rows,
+    open_views,
+)
 
 MAP_FILE = "map.npz"
 LINKS_FILE = "links.csv"

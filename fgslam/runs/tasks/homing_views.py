@@ -1,26 +1,39 @@
-"""The views of a recording, its mirror checked, and their features, found once."""
+"""Views of a recording, its mirror checked; their features, found once; homing vectors of pairs."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.cameras.omni.mirrors import RadialCamera
 from fgslam.cameras.omni.ring_calibration import MirrorCircle, find_mirror_circle
-from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, OutputError
-from fgslam.core.homing import OmniFeatures
+from fgslam.core.files import make_subfolder
+from fgslam.core.homing import (
+    BearingMatches,
+    FeatureKind,
+    OmniFeatures,
+    Refusal,
+    TwoViewVector,
+)
 from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.datasets.omni_settings import OmniDatasetSettings
 from fgslam.datasets.opening import open_omni
 from fgslam.frontend.features.column_segments import empty_segments
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
-from fgslam.frontend.features.settings import OmniFeatureSettings
+from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
+from fgslam.frontend.homing.homing_vector import pair_generator, vector_between
 from fgslam.frontend.homing.matching import plain_sift
+from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.report.content import Picture
 from fgslam.runs.engine import Context
-from fgslam.runs.units import Stage, in_blocks
+from fgslam.runs.units import Stage, in_blocks, interleaved
 
 _PICTURES = 3  # the rim may be as dark as its holder in one of them
 _CLEARLY_OFF = 0.025
@@ -174,3 +187,135 @@ def _extract(block: _Block) -> list[OmniFeatures]:
         ]
     extractor = OmniFeatureExtractor(recording.camera, block.features)
     return [extractor.extract(recording.image(i)) for i in block.views]
+
+
+_BLOCKS_A_JOB = 4  # so that progress moves, and no process waits long for the last one
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairAnswer:
+    """What was found about one pair.
+
+    Attributes:
+        a, b: numbers of the views; b is the target.
+        found: the homing vector, or why there is none.
+        matches: tentative ones.
+        rows: (k, 2) SIFT features of both views that are inliers; None where they were not kept.
+    """
+
+    a: int
+    b: int
+    found: TwoViewVector | Refusal
+    matches: int
+    rows: IntArray | None = None
+
+    @property
+    def answered(self) -> bool:
+        """Whether there is a homing vector."""
+        return isinstance(self.found, TwoViewVector)
+
+    @property
+    def inliers(self) -> int:
+        """Of the answer; 0 where there is none."""
+        return self.found.support if isinstance(self.found, TwoViewVector) else 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairSearch:
+    """Some pairs for one process.
+
+    Attributes:
+        features: of all views.
+        pairs: numbers (a, b) of views; b is the target.
+        matching, vector: settings.
+        seed: of the experiment; each pair draws from a generator of its own.
+    """
+
+    features: tuple[OmniFeatures, ...]
+    pairs: tuple[tuple[int, int], ...]
+    matching: OmniMatchingSettings
+    vector: HomingVectorSettings
+    seed: int
+
+
+def answer_pair(search: PairSearch, a: int, b: int) -> tuple[PairAnswer, BearingMatches]:
+    """One pair's answer and its tentative matches."""
+    views, rng = (search.features[a], search.features[b]), pair_generator(search.seed, a, b)
+    found, matches = vector_between(*views, search.matching, search.vector, rng)
+    return PairAnswer(a, b, found, len(matches), _inlier_rows(found, matches)), matches
+
+
+def answer_pairs(
+    search: PairSearch, context: Context, what: str = "pairs"
+) -> tuple[list[PairAnswer], list[str]]:
+    """All pairs in their order (stopped early, those that are done), and what went wrong."""
+    stage = Stage(
+        # Their numbers depend on how many views there are: fewer where a run was stopped.
+        name=f"{what.replace(' ', '_')}_of_{len(search.features)}_views",
+        label=what,
+        count=len(search.pairs),
+        work=_perform,
+        argument=lambda units: replace(search, pairs=tuple(search.pairs[k] for k in units)),
+        kind=PairAnswer,
+        blocks=interleaved(_BLOCKS_A_JOB * context.jobs),
+    )
+    done = context.perform(stage)
+    failures = [f"{len(units)} pairs: {why}" for units, why in done.ended]
+    return list(done.results.values()), failures
+
+
+def inlier_rows(answers: Sequence[PairAnswer]) -> dict[tuple[int, int], IntArray]:
+    """Of each answered pair (a, b): (k, 2) SIFT features of both views that are inliers."""
+    return {(k.a, k.b): k.rows for k in answers if k.rows is not None}
+
+
+def _inlier_rows(found: TwoViewVector | Refusal, matches: BearingMatches) -> IntArray | None:
+    if isinstance(found, Refusal):
+        return None
+    kept = matches.select(found.inliers & (matches.kind == FeatureKind.SIFT))
+    return np.column_stack([kept.index_a, kept.index_b])
+
+
+def _perform(search: PairSearch) -> list[PairAnswer]:
+    return [answer_pair(search, a, b)[0] for a, b in search.pairs]
+
+
+FOLDER = "pictures"
+
+
+def draw_pair(folder: Path, views: Views, search: PairSearch, answer: PairAnswer) -> Picture:
+    """One pair: its accepted matches on both views."""
+    from fgslam.report.pictures.image_overlays import MatchedPixels, draw_view_matches
+
+    found, matches = answer_pair(search, answer.a, answer.b)
+    a, b = views.names[answer.a], views.names[answer.b]
+    vector = found.found
+    kept = (
+        matches.select(vector.inliers)
+        if isinstance(vector, TwoViewVector)
+        else matches.select(np.zeros(len(matches), np.bool_))
+    )
+    camera = views.recording.camera
+    pixels = MatchedPixels(
+        _pixels(camera, kept.bearing_a, kept.elevation_a),
+        _pixels(camera, kept.bearing_b, kept.elevation_b),
+        kept.kind == FeatureKind.COLUMN,
+    )
+    caption = _caption(vector, matches) if isinstance(vector, TwoViewVector) else "refused"
+    path = make_subfolder(folder, FOLDER) / f"matches_{a}_{b}.png"
+    images = views.recording.image(answer.a), views.recording.image(answer.b)
+    draw_view_matches(path, images, pixels, (f"view {a}: {caption}", f"view {b}"))
+    return Picture(f"Matches of views {a} and {b}: {caption}", path.read_bytes())
+
+
+def _caption(vector: TwoViewVector, matches: BearingMatches) -> str:
+    direction, rotation = np.rad2deg([vector.direction, vector.rotation])
+    return (
+        f"{vector.support} of {len(matches)} matches, direction {direction:.1f}, "
+        f"rotation {rotation:.1f} degrees"
+    )
+
+
+def _pixels(camera: OmniCamera, bearing: FloatArray, elevation: FloatArray) -> FloatArray:
+    rays = np.column_stack([np.cos(bearing), np.sin(bearing), np.tan(elevation)])
+    return camera.pixels(rays)

@@ -11,14 +11,14 @@ import pytest
 from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import compose, wrap
-from fgslam.runs.tasks.homing_pair_answers import (
-    PairAnswer,
+from fgslam.runs.tasks.homing_pairs import (
     answer_numbers,
     error_numbers,
     pair_errors,
     true_pair,
     write_pairs,
 )
+from fgslam.runs.tasks.homing_views import PairAnswer
 
 SIGMA = np.deg2rad(1.0)
 
