@@ -24,10 +24,19 @@ from fgslam.runs.config import parse_homing
 from fgslam.runs.config_models import HomingConfig, PathFollowingConfig
 from fgslam.runs.folder import write_config
 from fgslam.runs.homing_comparison import load_bearing_logs, replay_homing
-from fgslam.runs.tasks.homing_drive_files import DrivenSeed, bearing_log, drive_of
-from fgslam.runs.tasks.homing_drive_pictures import DriveWatcher, Unwrapping, draw_leg_views
-from fgslam.runs.tasks.homing_drive_results import drive_numbers, finish_drives
-from fgslam.runs.tasks.homing_drives import _displaced
+from fgslam.runs.tasks.homing_drive_results import (
+    bearing_log,
+    drive_numbers,
+    drive_of,
+)
+from fgslam.runs.tasks.homing_drives import (
+    DrivenSeed,
+    DriveWatcher,
+    Unwrapping,
+    _displaced,
+    draw_leg_views,
+    finish_drives,
+)
 
 EKF = {"kind": "homing_ekf"}
 

@@ -1,4 +1,4 @@
-"""What follows from drives: arrivals, distances to targets, whether errors build up; figures."""
+"""What follows from drives: arrivals, distances to targets, whether errors build up; files."""
 
 from __future__ import annotations
 
@@ -9,12 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.planar import between
+from fgslam.core.bearing_log import BearingLog
+from fgslam.core.homing import HomingTruth
+from fgslam.core.planar import between, wrap
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
+from fgslam.homing.command import HomingState
 from fgslam.homing.drive_record import (
     ARRIVED_M,
     STAGES,
     DriveRecord,
+    HomingLog,
     Slope,
     corners,
     cross_track,
@@ -24,52 +28,11 @@ from fgslam.homing.drive_record import (
     truly_arrived,
 )
 from fgslam.report.content import Column, TextTable
-from fgslam.report.figures.homing import Line, curve_figure, local_map_figure
-from fgslam.report.figures.plan import PASS_RADIUS_M, catchment_figure, drive_figure
-from fgslam.report.figures.traces import Figure
-from fgslam.runs.config_models import DrivingConfig
-from fgslam.runs.documents import write_document, write_page
-from fgslam.runs.engine import RunResult, Status
-from fgslam.runs.homing_comparison import replay_homing
-from fgslam.runs.tasks.homing_drive_files import (
-    DrivenSeed,
-    bearing_log,
-    drive_of,
-    write_drive,
-    write_legs,
-    write_logs,
-)
-from fgslam.runs.tasks.homing_drive_pictures import draw_leg_views
+from fgslam.report.figures.plan import PASS_RADIUS_M, Drive
+from fgslam.report.tables import Cell, write_csv
+from fgslam.runs.homing_comparison import save_bearing_logs
 
-MEMORY_FILE = "path_memory.npz"
 _UNKNOWN = "-"
-
-
-def finish_drives(
-    config: DrivingConfig,
-    folder: Path,
-    status: Status,
-    driven: Sequence[DrivenSeed],
-    failures: Sequence[str],
-) -> RunResult:
-    """All files, numbers and the page of drives. Raises OutputError."""
-    records = [(one.seed, one.record) for one in driven]
-    write_legs(folder, records)
-    write_drive(folder, records)
-    for one in driven[: config.output.logs]:
-        write_logs(folder, one.seed, one.record)
-    numbers = drive_numbers([record for _, record in records], len(failures))
-    if driven:
-        numbers["kilobytes_per_image"] = driven[0].memory.save(folder / MEMORY_FILE)
-    numbers["seeds"] = [one.seed for one in driven]
-    result = RunResult(config, folder, status, _verdict(numbers), _tables(driven), tuple(failures))
-    write_document(result, numbers)
-    subtitle = f"seeds {config.seed} to {config.seed + config.trials - 1}, {len(driven)} driven"
-    if config.trials == 1:
-        subtitle = f"one drive, seed {config.seed}"
-    pictures = draw_leg_views(folder, driven[0].seed, driven[0].views) if driven else ()
-    write_page(result, subtitle, figures=tuple(_figures(config, driven)), pictures=pictures)
-    return result
 
 
 def drive_numbers(records: Sequence[DriveRecord], failed: int = 0) -> dict[str, JsonValue]:
@@ -154,7 +117,8 @@ def _stages(records: Sequence[DriveRecord]) -> dict[str, JsonValue]:
     }
 
 
-def _verdict(numbers: dict[str, JsonValue]) -> tuple[str, ...]:
+def drive_sentences(numbers: dict[str, JsonValue]) -> tuple[str, ...]:
+    """What the numbers of :func:`drive_numbers` say, in sentences."""
     lines = [
         f"{numbers['arrived']} of {numbers['drives']} drives arrive at the last target (within "
         f"{ARRIVED_M:g} m)."
@@ -190,9 +154,10 @@ _COLUMNS = (
 )
 
 
-def _tables(driven: Sequence[DrivenSeed]) -> tuple[TextTable, ...]:
-    count = max((len(one.record.targets) for one in driven), default=0)
-    rows = tuple((f"leg {k + 1}", _row([one.record for one in driven], k)) for k in range(count))
+def leg_tables(records: Sequence[DriveRecord]) -> tuple[TextTable, ...]:
+    """A table with a row for each leg of the path; none without drives."""
+    count = max((len(record.targets) for record in records), default=0)
+    rows = tuple((f"leg {k + 1}", _row(records, k)) for k in range(count))
     return (TextTable("legs", "The legs", "leg", _COLUMNS, rows),) if rows else ()
 
 
@@ -212,54 +177,132 @@ def _row(records: Sequence[DriveRecord], k: int) -> tuple[str, ...]:
 
 
 # --------------------------------------------------------------------------------------------
-# Figures
+# Files
 
 
-def _figures(config: DrivingConfig, driven: Sequence[DrivenSeed]) -> Iterator[Figure]:
-    if not driven:
-        return
-    first = driven[0]
-    words = f"The drive of seed {first.seed}, from above"
-    yield drive_figure(drive_of(first.record, first.outlines), heading=words)
-    homing = next((h for h in first.record.homings if h.tracks), None)
-    if homing is not None:
-        log = bearing_log(first.record, homing)
-        replayed = replay_homing(log.start, log.images, config.estimator, landmarks=True)
-        heading = f"The local map on the way to target {homing.target + 1}"
-        # Averages of bearings have no map to show.
-        if replayed.estimates and np.isfinite(replayed.estimates[-1].landmarks).all():
-            yield local_map_figure(replayed.estimates, log.truth, heading=heading)
-    yield _remaining(driven[: config.output.logs] or driven[:1])
-    if config.start_offset_m > 0.0 and len(driven) > 1:
-        yield _catchment(driven)
+LEGS_FILE = "legs.csv"
+COMMANDS_FILE = "commands.csv"
+TRAJECTORY_FILE = "trajectory.csv"
+LEG_COLUMNS = (
+    "seed",
+    "leg",
+    "result",
+    "began_s",
+    "ended_s",
+    "initialisations",
+    "remaining",
+    "pass_distance_m",
+    "cross_track_m",
+    "reason",
+)
+_COMMAND_COLUMNS = (
+    "seed",
+    "time",
+    "target",
+    "state",
+    "heading_deg",
+    "sigma_heading_deg",
+    "remaining",
+    "sigma_remaining",
+    "rotation_deg",
+    "speed_mps",
+    "turn_deg_s",
+    "overridden",
+    "reason",
+)
+_TRAJECTORY_COLUMNS = ("seed", "time", "x_m", "y_m", "heading_deg", "target")
 
 
-def _remaining(driven: Sequence[DrivenSeed]) -> Figure:
-    lines = [
-        Line(f"seed {one.seed}", k, one.record.time, one.record.remaining)
-        for k, one in enumerate(driven)
-    ]
-    words = (
-        "remaining",
-        "Part of the leg that is left",
-        "As the robot believes it; each leg begins at 1.",
+def write_legs(folder: Path, records: Sequence[tuple[int, DriveRecord]]) -> None:
+    """legs.csv: a row for each leg of each seed. Raises OutputError."""
+    rows = (row for seed, record in records for row in _legs(seed, record))
+    write_csv(folder / LEGS_FILE, LEG_COLUMNS, rows)
+
+
+def write_drive(folder: Path, records: Sequence[tuple[int, DriveRecord]]) -> None:
+    """commands.csv and trajectory.csv: a row for each step of each seed. Raises OutputError."""
+    commands = (row for seed, record in records for row in _commands(seed, record))
+    write_csv(folder / COMMANDS_FILE, _COMMAND_COLUMNS, commands)
+    poses = (row for seed, record in records for row in _poses(seed, record))
+    write_csv(folder / TRAJECTORY_FILE, _TRAJECTORY_COLUMNS, poses)
+
+
+def write_logs(folder: Path, seed: int, record: DriveRecord) -> None:
+    """A bearing log for each homing of a drive, with its truth. Raises OutputError."""
+    logs = {
+        f"seed_{seed:04d}_leg_{homing.target + 1:02d}_homing_{k:03d}": bearing_log(record, homing)
+        for k, homing in enumerate(record.homings)
+        if homing.tracks
+    }
+    save_bearing_logs(folder, logs)
+
+
+def bearing_log(record: DriveRecord, homing: HomingLog) -> BearingLog:
+    """One homing as estimators were given it; true places of its features are not known."""
+    start = record.truth[homing.first_step]
+    truth = None
+    if homing.target < len(record.targets) and np.isfinite(record.targets[homing.target]).all():
+        truth = HomingTruth(
+            target=between(start, record.targets[homing.target]),
+            robots=between(start, record.truth[homing.steps]),
+            landmarks=np.full((len(homing.start.local_map), 2), np.nan),
+        )
+    provenance = {"target": homing.target, "first_step": homing.first_step}
+    return BearingLog(homing.start, list(homing.tracks), truth, provenance)
+
+
+def drive_of(record: DriveRecord, outlines: Sequence[FloatArray] = ()) -> Drive:
+    """What the figure of the drive shows; headings are those of the estimator, in the world.
+
+    There is none while the robot stands or drives blind: its command's heading means nothing then.
+    """
+    known = np.array([state == HomingState.DRIVE.value for state in record.state], np.bool_)
+    headings = np.where(known, wrap(record.truth[:, 2] + record.heading), np.nan)
+    return Drive(
+        record.time, record.truth, record.target, headings, record.targets, tuple(outlines)
     )
-    return curve_figure(words, lines, ("time (s)", "left (legs)"), y={"rangemode": "tozero"})
 
 
-def _catchment(driven: Sequence[DrivenSeed]) -> Figure:
-    known = [one for one in driven if len(one.record)]
-    offsets = [between(one.record.targets[0], one.record.truth[0])[:2] for one in known]
-    arrived = np.array([_reached_first(record) for record in _records(known)])
-    reasons = [f"seed {one.seed}: {one.record.legs[0].reason}" for one in known if one.record.legs]
-    return catchment_figure(np.array(offsets), arrived, reasons)
+def _legs(seed: int, record: DriveRecord) -> Iterator[list[Cell]]:
+    passed, across = pass_distances(record), cross_track(record)
+    for leg in record.legs:
+        known = leg.target < len(passed)
+        yield [
+            seed,
+            leg.target + 1,
+            leg.result,
+            leg.began,
+            leg.ended,
+            leg.initialisations,
+            leg.remaining,
+            float(passed[leg.target]) if known else None,
+            float(across[leg.target]) if known else None,
+            leg.reason,
+        ]
 
 
-def _reached_first(record: DriveRecord) -> bool:
-    """Whether the first target was reached: by what the robot says, and in truth."""
-    said = bool(record.legs) and record.legs[0].result == "arrived"
-    return said and bool(pass_distances(record)[0] <= ARRIVED_M)
+def _commands(seed: int, record: DriveRecord) -> Iterator[list[Cell]]:
+    with np.errstate(invalid="ignore"):
+        sigma = np.sqrt(np.diagonal(record.covariance, axis1=1, axis2=2))
+    for k in range(len(record)):
+        yield [
+            seed,
+            float(record.time[k]),
+            int(record.target[k]) + 1,
+            record.state[k],
+            float(np.rad2deg(record.heading[k])),
+            float(np.rad2deg(sigma[k, 1])),
+            float(record.remaining[k]),
+            float(sigma[k, 0]),
+            float(np.rad2deg(record.rotation[k])),
+            float(record.speed[k]),
+            float(np.rad2deg(record.turn_rate[k])),
+            bool(record.overridden[k]),
+            record.reason[k],
+        ]
 
 
-def _records(driven: Sequence[DrivenSeed]) -> list[DriveRecord]:
-    return [one.record for one in driven]
+def _poses(seed: int, record: DriveRecord) -> Iterator[list[Cell]]:
+    for k, (x, y, heading) in enumerate(record.truth.tolist()):
+        time, target = float(record.time[k]), int(record.target[k]) + 1
+        yield [seed, time, x, y, float(np.rad2deg(heading)), target]
