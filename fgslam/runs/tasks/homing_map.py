@@ -1,19 +1,27 @@
-"""Task `topological_map`: views as nodes, homings that agree as edges, routes and localisation."""
+"""Task `topological_map`: views as nodes, homings that agree as edges, routes and localisation.
+
+Units: features of a view, pairs of views. Files: map.npz, links.csv, routes.csv, localisation.csv,
+metrics.json, pictures of doubtful links, the page. Numbers: links, parts, routes and views found.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from fgslam.core.errors import ConfigError, StoredMapError
-from fgslam.core.homing import OmniFeatures
+from fgslam.core.homing import OmniFeatures, Refusal, TwoViewVector
 from fgslam.evaluation.metrics import JsonValue
+from fgslam.frontend.homing.homing_vector import vector_between
 from fgslam.homing.link_consistency import InlierRows
 from fgslam.homing.links import Answer, Link, Pair
+from fgslam.homing.localisation import Localiser
+from fgslam.homing.retrieval import VisualWords
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
 from fgslam.report.content import Column, Picture, TextTable
 from fgslam.report.figures.plan import Links, network_figure, unfolded
@@ -22,12 +30,6 @@ from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.config_models import TopologicalMapConfig
 from fgslam.runs.documents import write_document, write_page
 from fgslam.runs.engine import Context, Opening, RunResult, Task
-from fgslam.runs.tasks.homing_map_localising import (
-    Localised,
-    localise,
-    localised_numbers,
-    write_localised,
-)
 from fgslam.runs.tasks.homing_views import (
     PairAnswer,
     PairSearch,
@@ -56,6 +58,7 @@ _LINK_COLUMNS = (
     "distance_m",
 )
 _UNKNOWN = "-"
+Found = TypeVar("Found")
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -97,21 +100,23 @@ def _run(config: TopologicalMapConfig, views: Views, context: Context) -> RunRes
     topology = map_of_answers(features, answers, ordered=config.ordered, names=names, rows=rows)
     kilobytes = topology.save(folder / MAP_FILE)
     routes = [_route(topology, asked) for asked in config.routes]
-    located = _localised(config, features, answers, rows, names, context)
+    located = _localise(config, features, answers, rows, names, context)
     whole = len(features) == len(views) and len(found) == len(pairs) and not context.stopped()
     numbers = _numbers(topology, views, answers, kilobytes) | _of_routes(routes)
-    numbers |= {"localisation": localised_numbers(located)}
+    numbers |= {"localisation": _localised_numbers(located)}
+    missing = [f"route {'-'.join(r.asked)}: {r.reason}" for r in routes if r.reason]
     result = RunResult(
         config,
         folder,
         "finished" if whole else "interrupted",
         _verdict(topology, routes, located),
         (_table(topology, views),),
-        _remarks(views, failures, routes),
+        (*views.recording.notes, *failures, *missing),
     )
     write_csv(folder / LINKS_FILE, _LINK_COLUMNS, _link_rows(topology, views))
     write_csv(folder / ROUTES_FILE, ("asked", "found", "reason"), _route_rows(routes))
-    write_localised(folder, located)
+    if located is not None:
+        write_csv(folder / LOCALISATION_FILE, Localised._fields, located)
     write_document(result, numbers)
     pictures = _pictures(folder, views, search, topology, answers, config.output.pictures)
     write_page(
@@ -150,26 +155,8 @@ def _route(topology: TopologicalMap, asked: tuple[str, ...]) -> Route:
     return Route(asked, tuple(topology.names[k] for k in way), reason)
 
 
-def _localised(
-    config: TopologicalMapConfig,
-    features: Sequence[OmniFeatures],
-    answers: dict[Pair, Answer],
-    rows: InlierRows,
-    names: Sequence[str],
-    context: Context,
-) -> Localised | None:
-    if not config.held_out_every or context.stopped():
-        return None
-    return localise(config, features, answers, rows, names, context)
-
-
 # --------------------------------------------------------------------------------------------
 # Numbers and words
-
-
-def _remarks(views: Views, failures: Sequence[str], routes: Sequence[Route]) -> tuple[str, ...]:
-    missing = [f"route {'-'.join(r.asked)}: {r.reason}" for r in routes if r.reason]
-    return (*views.recording.notes, *failures, *missing)
 
 
 def _numbers(
@@ -209,7 +196,7 @@ def _of_routes(routes: Sequence[Route]) -> dict[str, JsonValue]:
 
 
 def _verdict(
-    topology: TopologicalMap, routes: Sequence[Route], located: Localised | None
+    topology: TopologicalMap, routes: Sequence[Route], located: list[Localised] | None
 ) -> tuple[str, ...]:
     parts = topology.components()
     largest = len(parts[0]) if parts else 0
@@ -220,10 +207,9 @@ def _verdict(
     lines += [
         f"From {r.asked[0]} to {r.asked[-1]}: {'-'.join(r.found) or 'no way'}." for r in routes
     ]
-    if located is not None and len(located):
-        lines.append(
-            f"Localisation finds {located.right} of {len(located)} held-out views at a neighbour."
-        )
+    if located:
+        right = sum(one.neighbour for one in located)
+        lines.append(f"Localisation finds {right} of {len(located)} held-out views at a neighbour.")
     return tuple(lines)
 
 
@@ -331,3 +317,98 @@ def _pictures(
     return tuple(
         draw_pair(folder, views, search, PairAnswer(k.a, k.b, answers[k.a, k.b], 0)) for k in chosen
     )
+
+
+# --------------------------------------------------------------------------------------------
+# Localisation of views that are held out
+
+LOCALISATION_FILE = "localisation.csv"
+
+
+class Localised(NamedTuple):
+    """What became of one held-out view: a row of localisation.csv.
+
+    Attributes:
+        view: its name.
+        node: name of the node that the belief then liked best.
+        probability: of this node.
+        neighbour: whether the node is the next one before or after the view in the recording.
+    """
+
+    view: str
+    node: str
+    probability: float
+    neighbour: bool
+
+
+def _localise(
+    config: TopologicalMapConfig,
+    features: Sequence[OmniFeatures],
+    answers: dict[Pair, Answer],
+    rows: InlierRows,
+    names: Sequence[str],
+    context: Context,
+) -> list[Localised] | None:
+    """Holds out every so many views, maps the others, and walks through those held out.
+
+    Nothing is known at first; from then on the belief goes along the map's links. None where
+    nothing is held out, or there is no time.
+    """
+    every = config.held_out_every
+    if not every or context.stopped():
+        return None
+    out = list(range(every - 1, len(features), every))
+    kept = [k for k in range(len(features)) if k not in set(out)]
+    nodes = [features[k] for k in kept]
+    topology = map_of_answers(
+        nodes,
+        _among(kept, answers),
+        ordered=config.ordered,
+        names=[names[k] for k in kept],
+        rows=_among(kept, rows),
+    )
+    rng = np.random.default_rng((config.seed, 1))
+
+    def linker(image: OmniFeatures, node: OmniFeatures) -> TwoViewVector | Refusal:
+        return vector_between(image, node, config.features.matching, config.homing_vector, rng)[0]
+
+    words = VisualWords(nodes, rng)
+    localiser = Localiser(topology, words, linker, config.localisation)
+    located: list[Localised] = []
+    context.progress("localising", 0, len(out))
+    for done, view in enumerate(out):
+        if context.stopped():
+            break
+        localiser.update(features[view])
+        node, probability = localiser.best()
+        near = _next_to(view, kept, node)
+        located.append(Localised(names[view], names[kept[node]], probability, near))
+        context.progress("localising", done + 1, len(out))
+    return located
+
+
+def _among(kept: Sequence[int], pairs: Mapping[Pair, Found]) -> dict[Pair, Found]:
+    """What was found about the pairs of those views alone, numbered anew."""
+    number = {view: k for k, view in enumerate(kept)}
+    return {
+        (number[a], number[b]): found
+        for (a, b), found in pairs.items()
+        if a in number and b in number
+    }
+
+
+def _localised_numbers(located: list[Localised] | None) -> JsonValue:
+    """For metrics.json; null where nothing was held out."""
+    if located is None:
+        return None
+    return {
+        "held_out": len(located),
+        "at_a_neighbour": sum(one.neighbour for one in located),
+        "last_probability": located[-1].probability if located else None,
+    }
+
+
+def _next_to(view: int, kept: Sequence[int], node: int) -> bool:
+    """Whether no other node lies between a view and its node in the recording."""
+    low, high = sorted((view, kept[node]))
+    return not any(low < k < high for k in kept if k != kept[node])
