@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import signal
 import sys
@@ -313,6 +314,8 @@ def _keep_close_options(error: Exception) -> None:
 
 def main() -> None:
     """Entry point: runs a command, turns a user's mistake into one line and exit status 2."""
+    # None is used, and the search through all installed packages is a tenth of reading settings.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     arguments = sys.argv[1:] or ["--help"]
     try:
         raise SystemExit(app(arguments, prog_name="fgslam", standalone_mode=False))

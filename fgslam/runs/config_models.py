@@ -67,12 +67,21 @@ SYNTHETIC_REMARK = "odometry: SYNTHETIC (ground truth plus stated noise, see con
 class Experiment(BaseModel):
     """What the experiments of all tasks have."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        allow_inf_nan=False,
+        defer_build=True,  # of eight models a command needs one
+    )
     taken_folders: ClassVar[tuple[str, ...]] = ("pictures", "compare", "trials", "first")
     """Folders of a run that no estimator may be called."""
 
     name: Annotated[
-        str, Field(pattern=r"^[\w.-]+$", description="short name; the default run folder's")
+        str,
+        Field(
+            pattern=r"^[.-]*\w[\w.-]*$",  # with a letter or digit: `.` and `..` are other folders
+            description="short name; the default run folder's",
+        ),
     ]
     seed: Annotated[int, Field(ge=0, description="of everything random in the run")] = 0
     provenance: Annotated[

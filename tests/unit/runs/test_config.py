@@ -112,6 +112,9 @@ def test_kinds_are_listed(tmp_path: Path) -> None:
     ("key", "value"),
     [
         ("name", "a/b"),
+        ("name", "."),
+        ("name", ".."),
+        ("name", "..-"),
         ("name", ""),
         ("name", 7),
         ("seed", -1),
