@@ -14,6 +14,7 @@ import yaml
 from fgslam.core.arrays import FloatArray
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
+from fgslam.core.files import read_text
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, is_rigid, pose, so3_exp
 from fgslam.core.sensors import CameraRig
 
@@ -49,13 +50,10 @@ def read_calibration(path: Path, three_cameras: bool) -> CameraRig:
 
 def read_json_object(path: Path) -> Mapping[str, Any]:
     """A JSON file's outermost object. Raises CalibrationError when there is none."""
+    remedy = "give a calibration (docs/datasets/image_folder.md has its keys), check dataset.path"
+    text = read_text(path, CalibrationError, remedy)
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as cause:
-        raise CalibrationError(
-            f"calibration {path} cannot be read: {cause.strerror}; put it there (its keys are in "
-            "docs/datasets/image_folder.md), and check dataset.path"
-        ) from cause
+        values = json.loads(text)
     except RecursionError:
         raise CalibrationError(f"{path} is nested too deeply; correct the file") from None
     except ValueError as cause:
@@ -134,12 +132,7 @@ def level_mounting(camera_yaw_deg: float, lever_arm_m: tuple[float, float, float
 
 def read_calibration_yaml(path: Path) -> Mapping[str, Any]:
     """Keys and values of a YAML file. Raises CalibrationError where there are none."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as cause:
-        raise CalibrationError(
-            f"calibration {path} cannot be read: {cause.strerror}; restore the file"
-        ) from cause
+    text = read_text(path, CalibrationError)
     # OpenCV writes a directive that is no YAML: "%YAML:1.0".
     lines = [line for line in text.splitlines() if not line.startswith("%YAML:")]
     try:

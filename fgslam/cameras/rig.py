@@ -22,7 +22,7 @@ from fgslam.cameras.rectification import Rectifier, rectifier, right_and_left
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
-from fgslam.core.files import read_lines
+from fgslam.core.files import read_lines, read_text
 from fgslam.core.geometry import is_rigid
 from fgslam.core.sensors import CameraRig
 
@@ -164,7 +164,7 @@ def read_rig(path: Path, size: Size | None = None) -> CameraRig | Rectifier:
         raise CalibrationError(f"size is {size!r}; give (width, height) of the images in pixels")
     if path.is_dir():
         return _of_folder(path, size)
-    text = _text(path)
+    text = read_text(path, CalibrationError, _KNOWN)
     for mark, read in _MARKS:
         if mark in text:
             return read(path, size)
@@ -176,17 +176,6 @@ _KNOWN = (
     "R, T), a folder with left.yaml and right.yaml of ROS camera_info, KITTI's calib.txt, a EuRoC "
     "folder with cam0/sensor.yaml"
 )
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as cause:
-        raise CalibrationError(
-            f"calibration {path} cannot be read: {cause.strerror}; check the path"
-        ) from cause
-    except UnicodeDecodeError:
-        raise CalibrationError(f"{path} is not a text file; {_KNOWN}") from None
 
 
 def _of_folder(folder: Path, size: Size | None) -> CameraRig | Rectifier:

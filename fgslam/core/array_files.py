@@ -203,3 +203,11 @@ def by_field(value: Any, prefix: str) -> StateArrays:
 def fields_from(kind: type, arrays: StateArrays, prefix: str) -> dict[str, Any]:
     """The arrays of :func:`by_field` by field name, to make the dataclass ``kind`` of."""
     return {field.name: arrays[f"{prefix}{field.name}"] for field in fields(kind)}
+
+
+def from_upper(upper: np.ndarray[Any, Any], size: int) -> np.ndarray[Any, Any]:
+    """Symmetric matrices (n, size, size) of their upper triangles (n, m), row by row."""
+    rows, columns = np.triu_indices(size)
+    out = np.empty((len(upper), size, size), upper.dtype)
+    out[:, rows, columns] = out[:, columns, rows] = upper
+    return out

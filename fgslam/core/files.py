@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from fgslam.core.errors import DatasetError, OutputError
+from fgslam.core.errors import DatasetError, FgslamError, OutputError
 
 _REMEDIES = {
     errno.ENOSPC: "the disk is full; free some space or choose another folder",
@@ -107,12 +107,18 @@ def make_subfolder(run: Path, name: str) -> Path:
 # Text files of other tools, line by line
 
 
-def read_lines(path: Path, error: type[DatasetError] = DatasetError) -> list[tuple[int, str]]:
-    """Numbered lines, without blank ones and comments (``#``). Raises ``error`` if unreadable."""
+def read_text(
+    path: Path, error: type[FgslamError] = DatasetError, remedy: str = "restore the file"
+) -> str:
+    """The text of a UTF-8 file. Raises ``error`` with the remedy where it cannot be read."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as cause:
         reason = "it is not text" if isinstance(cause, UnicodeDecodeError) else cause.strerror
-        raise error(f"cannot read {path}: {reason}; restore the file") from cause
-    stripped = ((k, line.strip()) for k, line in enumerate(text.splitlines(), 1))
+        raise error(f"cannot read {path}: {reason}; {remedy}") from cause
+
+
+def read_lines(path: Path, error: type[DatasetError] = DatasetError) -> list[tuple[int, str]]:
+    """Numbered lines, without blank ones and comments (``#``). Raises ``error`` if unreadable."""
+    stripped = ((k, line.strip()) for k, line in enumerate(read_text(path, error).splitlines(), 1))
     return [(k, line) for k, line in stripped if line and not line.startswith("#")]

@@ -20,6 +20,7 @@ import numpy as np
 from fgslam.core.array_files import (
     ArrayFile,
     Items,
+    from_upper,
     joined,
     of_rows,
     offsets,
@@ -296,14 +297,10 @@ def _split(arrays: StateArrays, name: str) -> list[IntArray]:
 
 
 def _split_observations(arrays: StateArrays, prefix: str) -> list[Observations]:
-    upper = arrays[f"{prefix}measurement_covariance"]
-    covariance = np.empty((len(upper), 3, 3))
-    covariance[:, _UPPER[0], _UPPER[1]] = upper
-    covariance[:, _UPPER[1], _UPPER[0]] = upper
     everything = Observations(
         arrays[f"{prefix}observation_id"],
         arrays[f"{prefix}measurement"],
-        covariance,
+        from_upper(arrays[f"{prefix}measurement_covariance"], 3),
         arrays[f"{prefix}pixels"],
         arrays[f"{prefix}is_new"],
     )

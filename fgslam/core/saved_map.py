@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.core.array_files import ArrayFile, Items, of_rows
+from fgslam.core.array_files import ArrayFile, Items, from_upper, of_rows
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MapError
 from fgslam.core.estimates import LandmarkMap, Trajectory
@@ -228,10 +228,7 @@ def _with_mirrors(arrays: StateArrays, header: dict[str, Any], where: str) -> St
         upper = arrays.get(name)
         if upper is None or upper.ndim != 2 or upper.shape[1] != 6:
             raise FILE.damaged(name, where)
-        full = np.empty((len(upper), 3, 3), upper.dtype)
-        full[:, _UPPER[0], _UPPER[1]] = upper
-        full[:, _UPPER[1], _UPPER[0]] = upper
-        out[name] = full
+        out[name] = from_upper(upper, 3)
     return out
 
 

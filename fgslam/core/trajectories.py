@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.core.array_files import from_upper
 from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray
 from fgslam.core.errors import DatasetError, OutputError
-from fgslam.core.files import write_text
+from fgslam.core.files import read_text, write_text
 from fgslam.core.geometry import pose, quaternion_from_rotation, rotation_from_quaternion
 
 _TUM_FORMAT = "%.9f" + 7 * " %.12f"
@@ -78,7 +79,9 @@ class Trajectory(Brief):
         """
         path = Path(path)
         expected = "timestamp tx ty tz qx qy qz qw on each line"
-        values, lines = _parse_rows(path, _read_text(path, expected), _TUM_COLUMNS, expected)
+        values, lines = _parse_rows(
+            path, read_text(path, remedy=f"give {expected}"), _TUM_COLUMNS, expected
+        )
         _refuse(path, lines, np.asarray(~np.isfinite(values).all(axis=1)), _NOT_FINITE)
         norms = np.linalg.norm(values[:, 4:], axis=1)
         _refuse(path, lines, norms < 0.5, "the quaternion has no length; repair or remove the line")
@@ -134,14 +137,11 @@ def read_covariances(path: Path) -> tuple[FloatArray, FloatArray]:
     Raises:
         DatasetError: the file is missing, or a line is malformed; the message names the line.
     """
-    text = _read_text(path, "a covariance.csv").replace(_COVARIANCE_HEADER, "", 1)
+    text = read_text(path, remedy="give a covariance.csv").replace(_COVARIANCE_HEADER, "", 1)
     columns = 1 + len(_COVARIANCE_NAMES)
     expected = "timestamp and 21 covariances, separated by commas"
     values, _ = _parse_rows(path, text.replace(",", " "), columns, expected)
-    out = np.zeros((len(values), 6, 6))
-    out[:, _UPPER[0], _UPPER[1]] = values[:, 1:]
-    out[:, _UPPER[1], _UPPER[0]] = values[:, 1:]
-    return values[:, 0].copy(), out
+    return values[:, 0].copy(), from_upper(values[:, 1:], 6)
 
 
 # --------------------------------------------------------------------------------------------
@@ -176,15 +176,6 @@ def _require_finite(path: Path, trajectory: Trajectory) -> None:
             f"cannot write {path}: pose {row} (t = {trajectory.timestamps[row]:.9f} s) is not "
             "finite; the estimator diverged there, check its input before that time"
         )
-
-
-def _read_text(path: Path, expected: str) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise DatasetError(f"cannot read {path}: {error.strerror}; check the path") from error
-    except UnicodeDecodeError as error:
-        raise DatasetError(f"{path} is not a text file; give {expected}") from error
 
 
 def _parse_rows(path: Path, text: str, columns: int, expected: str) -> tuple[FloatArray, IntArray]:

@@ -14,6 +14,7 @@ from scipy import sparse
 from fgslam.cameras.omni.camera_files import make_camera
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError, FrameError
+from fgslam.core.files import read_text
 from fgslam.core.planar import wrap
 from fgslam.datasets.images import IMAGE_SUFFIXES, read_colour_image, require_folder
 from fgslam.datasets.omni_recording import (
@@ -128,11 +129,7 @@ def _loader(paths: Sequence[Path], size: tuple[int, int], reduced: tuple[int, in
 
 
 def _read_places(path: Path) -> list[_Place]:
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as cause:
-        reason = "it is not text" if isinstance(cause, UnicodeDecodeError) else cause.strerror
-        raise DatasetError(f"cannot read {path}: {reason}; restore the file") from cause
+    lines = read_text(path).splitlines()
     reader = csv.DictReader(lines, strict=True)
     try:
         header = reader.fieldnames or ()

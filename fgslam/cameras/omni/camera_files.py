@@ -29,7 +29,7 @@ from fgslam.cameras.omni.settings import (
     RadialPolynomialSettings,
 )
 from fgslam.core.errors import CalibrationError
-from fgslam.core.files import read_lines
+from fgslam.core.files import read_lines, read_text
 from fgslam.core.settings import make_settings
 
 Size = tuple[int, int]
@@ -136,10 +136,9 @@ def _read(source: str | Path) -> tuple[OmniCameraKind, Path | None]:
 
 
 def _read_keys(path: Path) -> Any:
+    text = read_text(path, CalibrationError, "give a YAML text file")
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"cannot read {path} ({error}); give a YAML text file") from None
+        return yaml.safe_load(text)
     except yaml.YAMLError as error:
         message = " ".join(str(error).split())
         raise CalibrationError(f"{path}: not valid YAML ({message}); correct it") from None

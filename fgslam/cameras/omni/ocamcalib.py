@@ -17,6 +17,7 @@ from numpy.polynomial import polynomial
 from fgslam.cameras.omni.mirrors import AHEAD_IS_UP, MirrorFrame, MonotoneInverse, RadialCamera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
+from fgslam.core.files import read_text
 
 _MAX_TERMS = 32
 # The file's two polynomials are fits of one another: further apart, one of them is damaged.
@@ -171,16 +172,7 @@ class _Entry:
 
 def _entries(path: Path) -> list[_Entry]:
     """Lines of numbers, each with the comment before it."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise CalibrationError(
-            f"cannot read calibration {path}: it is not text; give OCamCalib's calib_results.txt"
-        ) from None
-    except OSError as cause:
-        raise CalibrationError(
-            f"cannot read calibration {path}: {cause.strerror}; correct the path"
-        ) from cause
+    text = read_text(path, CalibrationError, "give OCamCalib's calib_results.txt")
     entries, comment = [], ""
     for number, line in enumerate(text.splitlines(), 1):
         if line.lstrip().startswith("#"):

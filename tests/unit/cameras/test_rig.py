@@ -251,7 +251,7 @@ def test_camera_info_of_no_pair_is_refused(tmp_path: Path) -> None:
 def test_what_is_no_calibration_is_refused_with_what_is_known(tmp_path: Path, name: str) -> None:
     (tmp_path / "other.yaml").write_text("a: 1\n")
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
-    words = "cannot be read" if name == "nothing.yaml" else "known: calib.json"
+    words = "cannot read" if name == "nothing.yaml" else "known: calib.json"
     with pytest.raises(CalibrationError, match=words):
         StereoRig.load(tmp_path / name)
 

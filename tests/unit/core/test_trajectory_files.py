@@ -123,7 +123,7 @@ def test_missing_and_binary_files(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="No such file"):
         Trajectory.load(tmp_path / "absent.tum")
     (tmp_path / "image.tum").write_bytes(b"\x89PNG\xff\xfe")
-    with pytest.raises(DatasetError, match="not a text file"):
+    with pytest.raises(DatasetError, match="it is not text"):
         Trajectory.load(tmp_path / "image.tum")
 
 
