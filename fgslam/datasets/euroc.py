@@ -30,6 +30,7 @@ from fgslam.datasets.tables import (
 
 CAMERA_FOLDERS = ("cam0", "cam1")
 _MAX_TRUTH_GAP_S = 0.1
+_RECTIFY_ALPHA = 0.0  # crops to valid pixels: black borders would be matched
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +59,7 @@ def open_euroc(settings: EurocSettings) -> Recording:
     for folder in folders:
         require_folder(folder, "a stereo pair needs two cameras, but the folder")
     right, left, right_folder, left_folder = _right_and_left(folders)
-    raw = rectifier(right, left, settings.rectify_alpha)
+    raw = rectifier(right, left, _RECTIFY_ALPHA)
     stamps, files, notes = _pairs(right_folder, left_folder, right, settings)
     chosen = select_frames(len(stamps), settings)
     check_sizes(files, root)

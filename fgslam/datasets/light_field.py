@@ -30,6 +30,7 @@ from fgslam.datasets.recording import Recording, recording_identity, select_fram
 from fgslam.datasets.settings import LightFieldSettings
 
 _POSITION_COLUMNS = "file, row, column, v, u"
+_METRES_PER_UNIT = 0.001  # of positions.csv, whose unit nobody states: taken as mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +110,7 @@ def open_light_field(settings: LightFieldSettings) -> Recording:
     walk = _plan_walk(grid, settings)
     chosen = select_frames(len(walk.views), settings)
     stamps = np.arange(len(walk.views), dtype=np.float64)
-    truth = _true_poses(walk, settings.metres_per_unit)
+    truth = _true_poses(walk)
     return Recording(
         name=root.resolve().name,
         rig=_rig(walk, settings),
@@ -203,7 +204,7 @@ def _shifts(
 
 
 def _rig(walk: Walk, settings: LightFieldSettings) -> CameraRig:
-    horizontal, vertical = walk.baselines() * settings.metres_per_unit
+    horizontal, vertical = walk.baselines() * _METRES_PER_UNIT
     width, height = walk.grid.width, walk.grid.height
     return CameraRig(
         width=width,
@@ -218,11 +219,11 @@ def _rig(walk: Walk, settings: LightFieldSettings) -> CameraRig:
     )
 
 
-def _true_poses(walk: Walk, metres_per_unit: float) -> FloatArray:
+def _true_poses(walk: Walk) -> FloatArray:
     """Poses (n, 4, 4) of the reference in its first frame: x with u, y (down) with v."""
     places = np.array([walk.grid.positions[group[0]] for group in walk.views])
     poses = np.tile(np.eye(4), (len(places), 1, 1))
-    poses[:, :2, 3] = (places - places[0]) * metres_per_unit
+    poses[:, :2, 3] = (places - places[0]) * _METRES_PER_UNIT
     return poses
 
 

@@ -22,7 +22,8 @@ from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
 from fgslam.worlds.driving import wheel_odometry
-from fgslam.worlds.driving.paths import PosesInTime
+from fgslam.worlds.driving.paths import MAX_ACCELERATION_M_S2, PosesInTime
+from fgslam.worlds.driving.wheel_odometry import CONSTANTS as WHEEL_CONSTANTS
 from fgslam.worlds.lab import (
     PlaceChoice,
     World,
@@ -325,9 +326,12 @@ def _render_description(settings: LabSettings) -> dict[str, Any]:
 def _without_later_keys(settings: LabSettings) -> dict[str, Any]:
     """Settings as plain values, without those of other places where this is the plain lab.
 
-    So what was rendered before there were other places keeps its name.
+    So what was rendered before there were other places keeps its name, as does what was rendered
+    when constants were settings.
     """
     out = asdict(settings)
+    out["odometry"] |= WHEEL_CONSTANTS
+    out["drive"]["max_acceleration_m_s2"] = MAX_ACCELERATION_M_S2
     del out["drive"]["world_from"]
     if settings.drive.path != "random_poses":
         del out["drive"]["random_poses"]

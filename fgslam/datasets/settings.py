@@ -80,14 +80,6 @@ class EurocSettings(RecordingSettings):
         float,
         Field(ge=0.0, le=50.0, description="largest time between the two images of a pair, ms"),
     ] = 2.0
-    rectify_alpha: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            le=1.0,
-            description="0 crops the rectified image to valid pixels, 1 keeps all (black borders)",
-        ),
-    ] = 0.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -115,9 +107,6 @@ class LightFieldSettings(RecordingSettings):
             "disparities are positive (measured without: -0.3 to 1.5 px a step)"
         ),
     ] = 1.0
-    metres_per_unit: Annotated[
-        float, Field(gt=0.0, description="metres in one unit of positions.csv (taken as mm)")
-    ] = 0.001
 
 
 # --------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from dataclasses import asdict
 from fgslam.core.recordings import LandmarkTruth, MeasurementRecording
 from fgslam.datasets.measurement_files import make_log
 from fgslam.datasets.settings import OdometrySettings
+from fgslam.worlds.driving.wheel_odometry import CONSTANTS as WHEEL_CONSTANTS
 from fgslam.worlds.rendering.cache import content_hash
 from fgslam.worlds.simulated.measurements import SimulatedMeasurements, simulate_measurements
 from fgslam.worlds.simulated.settings import (
@@ -39,10 +40,10 @@ def open_simulated_measurements(
 
 
 def _identity(settings: SimulatedMeasurementsSettings, seed: int) -> str:
-    """SHA-256 of all settings, the seed and the simulation's version."""
-    return content_hash(
-        {"settings": asdict(settings), "seed": seed, "simulation": SIMULATION_VERSION}
-    )
+    """SHA-256 of all settings, of the wheels' constants, the seed and the simulation's version."""
+    values = asdict(settings)
+    values["odometry"] |= WHEEL_CONSTANTS
+    return content_hash({"settings": values, "seed": seed, "simulation": SIMULATION_VERSION})
 
 
 def _notes(

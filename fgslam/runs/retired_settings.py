@@ -78,6 +78,9 @@ RETIRED: dict[str, dict[str, Any]] = {
     "EkfSettings": {
         "loop_gate_sigmas": 10.0,
     },
+    "EurocSettings": {
+        "rectify_alpha": 0.0,
+    },
     "FilterMotionSettings": {
         "initial_speed": 0.5,
     },
@@ -128,6 +131,11 @@ RETIRED: dict[str, dict[str, Any]] = {
         "offset": 0.0,
         "gamma": 1.0,
     },
+    "HouseMirrorSettings": {
+        "xi": 0.92,
+        "top_elevation_deg": 15.0,
+        "bottom_elevation_deg": -65.0,
+    },
     "HousePathSettings": {
         "clearance_m": 0.55,
     },
@@ -137,6 +145,12 @@ RETIRED: dict[str, dict[str, Any]] = {
     "Isam2Settings": {
         "weak_prior_ranges": 2.0,
         "relinearize_skip": 1,
+    },
+    "LabDriveSettings": {
+        "max_acceleration_m_s2": 0.3,
+    },
+    "LightFieldSettings": {
+        "metres_per_unit": 0.001,
     },
     "LocalisationSettings": {
         "background": 4.0,
@@ -165,6 +179,14 @@ RETIRED: dict[str, dict[str, Any]] = {
             "heights_m": [0.15, 0.45, 0.72, 1.0],
             "max_range_m": 5.0,
             "noise_m": 0.02,
+        },
+        "target_light": {"level": 0.9, "warmth": 0.04, "evening": 0.3},
+        "target_exposure": {
+            "gain": 1.25,
+            "wave": 0.0,
+            "period_s": 20.0,
+            "offset": 0.0,
+            "gamma": 1.0,
         },
     },
     "OmniMatchingSettings": {
@@ -261,7 +283,24 @@ RETIRED: dict[str, dict[str, Any]] = {
     "WheelchairSettings": {
         "max_acceleration_m_s2": 0.5,
         "max_turn_acceleration_deg_s2": 120.0,
+        "max_speed_m_s": 0.5,
+        "max_turn_deg_s": 45.0,
+        "speed_scale": 0.03,
+        "turn_scale": 0.03,
+        "pull_deg_m": 1.0,
         "radius_m": 0.35,
+    },
+    "WheelOdometrySettings": {
+        "height_m_sqrt_m": 0.002,
+        "tilt_deg_sqrt_m": 0.1,
+        "floor_m": 1e-4,
+        "floor_deg": 0.01,
+    },
+    "WhiteWheelOdometrySettings": {
+        "height_m_sqrt_m": 0.002,
+        "tilt_deg_sqrt_m": 0.1,
+        "floor_m": 1e-4,
+        "floor_deg": 0.01,
     },
 }
 """By the class of the group: key and value."""

@@ -51,8 +51,15 @@ CAMERA_HEIGHT_M = 1.2
 _PATH_CLEARANCE_M = 0.55
 # Nearer than this to an obstacle's coarse distance, contact is decided exactly; metres.
 _CONTACT_M = 0.06
+# The mirror, Goedemé et al. 2005: eccentricity of the unified model; elevations at the inner edge,
+# below which the camera sees itself, and at its rim, which touches the image's border.
+_MIRROR_XI = 0.92
+_MIRROR_ELEVATIONS_DEG = (-65.0, 15.0)
 # Between the mirror's rim and the nearest border of the image.
 _MARGIN_PX = 0.5
+# The target images are taken at another time of day.
+_TARGET_LIGHT = HouseLightSettings(level=0.9, warmth=0.04, evening=0.3)
+_TARGET_EXPOSURE = HouseExposureSettings()
 _WAVE_PERIOD_S = 20.0  # automatic exposure follows the scene slowly
 _SWAY_PERIOD_S = 7.0  # of a wheelchair on a soft floor
 
@@ -95,10 +102,10 @@ def make_house_camera(settings: HouseCameraSettings) -> OmniCamera:
     """
     if isinstance(settings, HousePanoramaSettings):
         return Equirectangular(settings.width, settings.height)
-    bottom, top = np.deg2rad([settings.bottom_elevation_deg, settings.top_elevation_deg])
+    bottom, top = np.deg2rad(_MIRROR_ELEVATIONS_DEG)
     size = (settings.width, settings.height)
     return HyperbolicMirror.with_view(
-        size, settings.xi, (float(bottom), float(top)), margin_px=_MARGIN_PX
+        size, _MIRROR_XI, (float(bottom), float(top)), margin_px=_MARGIN_PX
     )
 
 
@@ -202,12 +209,11 @@ class OmniWorld:
 
     def picture(self, pose: FloatArray, number: int, tilt: FloatArray | None = None) -> Image:
         """(h, w, 3) as target images are taken, from any planar pose (3,); ``number`` seeds it."""
-        s = self.settings
-        scene = lit(self.model.layer, self.model.evening, s.target_light)
+        scene = lit(self.model.layer, self.model.evening, _TARGET_LIGHT)
         upright = np.zeros(2) if tilt is None else tilt
         seen_from = camera_pose(pose, CAMERA_HEIGHT_M, upright)
         levels = self._renderer.levels(scene, seen_from)
-        seen = exposed(levels * white_balance(s.target_light), s.target_exposure, 0.0)
+        seen = exposed(levels * white_balance(_TARGET_LIGHT), _TARGET_EXPOSURE, 0.0)
         return self._with_noise(seen, 2, number)
 
     def _with_noise(self, levels: Float32, stream: int, number: int) -> Image:

@@ -22,21 +22,6 @@ class HouseMirrorSettings:
     kind: Literal["mirror"] = "mirror"
     width: Annotated[int, Field(ge=64, le=4096, description="image width, pixels")] = 320
     height: Annotated[int, Field(ge=64, le=4096, description="image height, pixels")] = 240
-    xi: Annotated[
-        float, Field(gt=0.0, lt=1.0, description="eccentricity parameter of the unified model")
-    ] = 0.92
-    top_elevation_deg: Annotated[
-        float,
-        Field(
-            gt=-20.0, lt=60.0, description="at the mirror's rim, which touches the image's border"
-        ),
-    ] = 15.0
-    bottom_elevation_deg: Annotated[
-        float,
-        Field(
-            gt=-89.0, lt=0.0, description="at the inner edge, below which the camera sees itself"
-        ),
-    ] = -65.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -55,27 +40,11 @@ HouseCameraSettings: TypeAlias = Annotated[
 
 @dataclass(frozen=True, config=STRICT)
 class WheelchairSettings:
-    """The simulated wheelchair: a unicycle with limits, latency and slip."""
+    """The simulated wheelchair: how late it obeys and how much it slips."""
 
-    max_speed_m_s: Annotated[float, Field(gt=0.0, le=3.0, description="limit, forwards")] = 0.5
-    max_turn_deg_s: Annotated[float, Field(gt=0.0, le=180.0, description="limit, either way")] = (
-        45.0
-    )
     latency_s: Annotated[
         float, Field(ge=0.0, le=2.0, description="from a command to its effect, seconds")
     ] = 0.1
-    speed_scale: Annotated[
-        float,
-        Field(ge=0.0, le=0.5, description="relative error of speed, drawn once a drive (sigma)"),
-    ] = 0.03
-    turn_scale: Annotated[
-        float,
-        Field(ge=0.0, le=0.5, description="relative error of turns, drawn once a drive (sigma)"),
-    ] = 0.03
-    pull_deg_m: Annotated[
-        float,
-        Field(ge=0.0, le=30.0, description="turn per metre unasked for, once a drive (sigma)"),
-    ] = 1.0
     slip_m_sqrt_m: Annotated[
         float, Field(ge=0.0, le=0.5, description="noise along the way, metres per root metre")
     ] = 0.02
@@ -156,9 +125,3 @@ class OmniHouseSettings:
     exposure: HouseExposureSettings = HouseExposureSettings()
     light: HouseLightSettings = HouseLightSettings()
     tilt: HouseTiltSettings = HouseTiltSettings()
-    target_light: Annotated[
-        HouseLightSettings, Field(description="when the target images were taken")
-    ] = HouseLightSettings(level=0.9, warmth=0.04, evening=0.3)
-    target_exposure: Annotated[HouseExposureSettings, Field(description="of the target images")] = (
-        HouseExposureSettings()
-    )

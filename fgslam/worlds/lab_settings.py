@@ -90,9 +90,6 @@ class LabDriveSettings:
     max_turn_deg_s: Annotated[
         float, Field(gt=0.0, le=180.0, description="limit, degrees a second")
     ] = 10.0
-    max_acceleration_m_s2: Annotated[
-        float, Field(gt=0.0, le=10.0, description="limit, metres a second squared")
-    ] = 0.30
     laps: Annotated[
         int,
         Field(ge=1, le=1000, description="times around the room, for `laps`; rounds of a `tour`"),
@@ -137,24 +134,12 @@ class WheelOdometrySettings:
     sideways_m_sqrt_m: Annotated[
         float, Field(ge=0.0, le=1.0, description="across the way, metres per root metre")
     ] = 0.01
-    height_m_sqrt_m: Annotated[
-        float, Field(ge=0.0, le=1.0, description="vertical, metres per root metre")
-    ] = 0.002
     yaw_deg_sqrt_m: Annotated[
         float, Field(ge=0.0, le=45.0, description="heading, degrees per root metre driven")
     ] = 0.5
     yaw_deg_sqrt_rad: Annotated[
         float, Field(ge=0.0, le=45.0, description="heading, degrees per root radian turned")
     ] = 0.8
-    tilt_deg_sqrt_m: Annotated[
-        float, Field(ge=0.0, le=45.0, description="pitch and roll, degrees per root metre")
-    ] = 0.1
-    floor_m: Annotated[
-        float, Field(gt=0.0, le=0.1, description="least position noise of an increment, metres")
-    ] = 1e-4
-    floor_deg: Annotated[
-        float, Field(gt=0.0, le=5.0, description="least angle noise of an increment, degrees")
-    ] = 0.01
 
 
 @dataclass(frozen=True, config=STRICT)

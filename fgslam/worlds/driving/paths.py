@@ -24,6 +24,7 @@ _LEAST_RADIUS_M = 0.08
 _RAMP = 0.3
 # Speed used, as a fraction of the limits, where the number of frames is free.
 _CRUISE = 0.9
+MAX_ACCELERATION_M_S2 = 0.30  # along the path; gentle for a robot of the paper's size
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -336,7 +337,7 @@ def drive_along(path: PlanarPath, settings: LabDriveSettings) -> Drive:
         path,
         settings.max_speed_m_s,
         np.deg2rad(settings.max_turn_deg_s),
-        settings.max_acceleration_m_s2,
+        MAX_ACCELERATION_M_S2,
     )
     rate = settings.frame_rate_hz
     least = int(np.ceil(law.duration * rate - 1e-9)) + 1

@@ -20,6 +20,17 @@ from fgslam.core.measurements import Odometry
 from fgslam.worlds.lab_settings import WheelOdometrySettings
 
 _YAW, _ALONG = 2, 3
+# What a planar robot does not drive: height, and pitch and roll, each a root metre; and the least
+# noise of an increment, for that of a robot at rest must have a covariance that can be inverted.
+HEIGHT_M_SQRT_M, TILT_DEG_SQRT_M = 0.002, 0.1
+FLOOR_M, FLOOR_DEG = 1e-4, 0.01
+CONSTANTS = {
+    "height_m_sqrt_m": HEIGHT_M_SQRT_M,
+    "tilt_deg_sqrt_m": TILT_DEG_SQRT_M,
+    "floor_m": FLOOR_M,
+    "floor_deg": FLOOR_DEG,
+}
+"""By the names under which they are part of a recording's identity."""
 
 
 def increment_variances(
@@ -34,14 +45,14 @@ def increment_variances(
     """
     out = np.empty((len(way), 6))
     tilt, yaw_m, yaw_rad = np.deg2rad(
-        [settings.tilt_deg_sqrt_m, settings.yaw_deg_sqrt_m, settings.yaw_deg_sqrt_rad]
+        [TILT_DEG_SQRT_M, settings.yaw_deg_sqrt_m, settings.yaw_deg_sqrt_rad]
     )
     out[:, :2] = (tilt**2 * way)[:, None]
     out[:, _YAW] = yaw_m**2 * way + yaw_rad**2 * np.abs(turn)
-    sides = (settings.distance_m_sqrt_m, settings.sideways_m_sqrt_m, settings.height_m_sqrt_m)
+    sides = (settings.distance_m_sqrt_m, settings.sideways_m_sqrt_m, HEIGHT_M_SQRT_M)
     out[:, 3:] = way[:, None] * np.square(sides)
-    out[:, :3] += np.deg2rad(settings.floor_deg) ** 2
-    out[:, 3:] += settings.floor_m**2
+    out[:, :3] += np.deg2rad(FLOOR_DEG) ** 2
+    out[:, 3:] += FLOOR_M**2
     return out
 
 

@@ -17,6 +17,10 @@ _STEP_S = 0.01
 # without holding on.
 MAX_ACCELERATION_M_S2 = 0.5
 MAX_TURN_ACCELERATION_DEG_S2 = 120.0
+MAX_SPEED_M_S, MAX_TURN_DEG_S = 0.5, 45.0  # one that is driven slowly
+# Deviations of what is drawn once a drive: relative errors of speed and of turns, and the turn a
+# metre that nobody asked for.
+SPEED_SCALE, TURN_SCALE, PULL_DEG_M = 0.03, 0.03, 1.0
 RADIUS_M = 0.35
 """Of the disc that must not touch anything; a door is twice as wide and a half."""
 
@@ -48,9 +52,9 @@ class Wheelchair:
         self.speed, self.turn_rate, self.time = 0.0, 0.0, 0.0
         self.collided = False
         drawn = rng.standard_normal(3)
-        self._speed_scale = 1.0 + settings.speed_scale * drawn[0]
-        self._turn_scale = 1.0 + settings.turn_scale * drawn[1]
-        self._pull = np.deg2rad(settings.pull_deg_m) * drawn[2]
+        self._speed_scale = 1.0 + SPEED_SCALE * drawn[0]
+        self._turn_scale = 1.0 + TURN_SCALE * drawn[1]
+        self._pull = np.deg2rad(PULL_DEG_M) * drawn[2]
         self._pending: deque[tuple[float, float, float]] = deque()
         self._aim = (0.0, 0.0)
         self._steps, self._asked = 0, 0.0
@@ -63,11 +67,10 @@ class Wheelchair:
         """
         if not (np.isfinite(speed) and np.isfinite(turn_rate)):
             raise ValueError(f"command ({speed}, {turn_rate}) is not finite")
-        s = self._settings
-        top = np.deg2rad(s.max_turn_deg_s)
-        limited = float(np.clip(speed, -s.max_speed_m_s, s.max_speed_m_s))
+        top = np.deg2rad(MAX_TURN_DEG_S)
+        limited = float(np.clip(speed, -MAX_SPEED_M_S, MAX_SPEED_M_S))
         turn = float(np.clip(turn_rate, -top, top))
-        self._pending.append((self.time + s.latency_s, limited, turn))
+        self._pending.append((self.time + self._settings.latency_s, limited, turn))
 
     def advance(self, seconds: float) -> None:
         """Moves on, in steps of a hundredth of a second; what is left over is made up for later.

@@ -6,6 +6,7 @@ import pytest
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.planar import between, wrap
+from fgslam.worlds import house as house_world
 from fgslam.worlds.buildings.house import DEPTH, PLAN, WIDTH, build_house
 from fgslam.worlds.driving import wheelchair
 from fgslam.worlds.driving.floor_space import FloorSpace
@@ -22,9 +23,13 @@ from fgslam.worlds.people import Walker
 from fgslam.worlds.rendering.image_effects import noisy
 from fgslam.worlds.rendering.patches import PatchArrays, RayCaster, Surface, Thing, box, stack
 
-EXACT = WheelchairSettings(
-    speed_scale=0.0, turn_scale=0.0, pull_deg_m=0.0, slip_m_sqrt_m=0.0, slip_deg_sqrt_m=0.0
-)
+EXACT = WheelchairSettings(slip_m_sqrt_m=0.0, slip_deg_sqrt_m=0.0)
+
+
+@pytest.fixture
+def exact_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("SPEED_SCALE", "TURN_SCALE", "PULL_DEG_M"):
+        monkeypatch.setattr(wheelchair, name, 0.0)
 
 
 def rng(seed: int = 0) -> np.random.Generator:
@@ -47,12 +52,13 @@ def test_speed_follows_command_after_the_latency_and_within_limits() -> None:
     assert np.array_equal(speeds[:waiting], np.zeros(waiting))
     assert speeds[waiting] == pytest.approx(wheelchair.MAX_ACCELERATION_M_S2 * 0.01)
     assert np.diff(speeds).max() <= wheelchair.MAX_ACCELERATION_M_S2 * 0.01 + 1e-12
-    assert max(speeds) == pytest.approx(EXACT.max_speed_m_s)
-    assert min(turns) == pytest.approx(-np.deg2rad(EXACT.max_turn_deg_s))
+    assert max(speeds) == pytest.approx(wheelchair.MAX_SPEED_M_S)
+    assert min(turns) == pytest.approx(-np.deg2rad(wheelchair.MAX_TURN_DEG_S))
     limit = np.deg2rad(wheelchair.MAX_TURN_ACCELERATION_DEG_S2) * 0.01
     assert np.abs(np.diff(turns)).max() <= limit + 1e-12
 
 
+@pytest.mark.usefixtures("exact_drive")
 def test_without_slip_it_drives_the_circle_of_its_command() -> None:
     chair = Wheelchair(EXACT, np.array([1.0, 2.0, 0.4]), rng())
     chair.command(0.3, 0.2)
@@ -67,10 +73,7 @@ def test_without_slip_it_drives_the_circle_of_its_command() -> None:
 
 def test_slip_has_the_stated_size(monkeypatch: pytest.MonkeyPatch) -> None:
     """End points of 200 drives of 2 m scatter as the settings say."""
-    settings = WheelchairSettings(
-        speed_scale=0.03, turn_scale=0.0, pull_deg_m=1.0, slip_m_sqrt_m=0.02, slip_deg_sqrt_m=1.0,
-        latency_s=0.0,
-    )  # fmt: skip
+    settings = WheelchairSettings(slip_m_sqrt_m=0.02, slip_deg_sqrt_m=1.0, latency_s=0.0)
     monkeypatch.setattr(wheelchair, "MAX_ACCELERATION_M_S2", 10.0)
     ends = []
     for seed in range(200):
@@ -87,6 +90,7 @@ def test_slip_has_the_stated_size(monkeypatch: pytest.MonkeyPatch) -> None:
     assert abs(heading.mean()) < 4 * expected / 14
 
 
+@pytest.mark.usefixtures("exact_drive")
 def test_a_wall_stops_it_but_lets_it_turn_and_back_out() -> None:
     chair = Wheelchair(EXACT, np.zeros(3), rng(), lambda place: bool(place[0] > 0.5))
     chair.command(0.5, 0.0)
@@ -322,13 +326,15 @@ def test_exposure_and_noise() -> None:
     np.testing.assert_array_equal(levels, np.full((3, 20_000), 100.0, np.float32))
 
 
-def test_mirror_shows_the_elevations_asked_for() -> None:
-    camera = make_house_camera(HouseMirrorSettings(top_elevation_deg=20.0))
+def test_mirror_shows_its_elevations(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = make_house_camera(HouseMirrorSettings())
     rays = camera.rays(
         np.indices((camera.height, camera.width)).reshape(2, -1)[::-1].T.astype(float)
     )
     elevation = np.rad2deg(np.arcsin(rays[np.isfinite(rays[:, 0]), 2]))
-    assert elevation.max() == pytest.approx(20.0, abs=0.5)
+    assert elevation.max() == pytest.approx(15.0, abs=0.5)
     assert elevation.min() == pytest.approx(-65.0, abs=3.0)
+    monkeypatch.setattr(house_world, "_MIRROR_XI", 0.5)
+    monkeypatch.setattr(house_world, "_MIRROR_ELEVATIONS_DEG", (-65.0, 40.0))
     with pytest.raises(CalibrationError, match="below arcsin"):
-        make_house_camera(HouseMirrorSettings(xi=0.5, top_elevation_deg=40.0))
+        make_house_camera(HouseMirrorSettings())

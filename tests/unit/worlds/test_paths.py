@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import ConfigError
-from fgslam.worlds.driving.paths import Drive, plan_drive
+from fgslam.worlds.driving.paths import MAX_ACCELERATION_M_S2, Drive, plan_drive
 from fgslam.worlds.lab_settings import LabDriveSettings
 
 SQUARE = ((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0))
@@ -56,7 +56,7 @@ def test_acceleration_limit(settings: LabDriveSettings) -> None:
     middle = 0.5 * (law.seconds[1:] + law.seconds[:-1])
     acceleration = np.abs(np.diff(speed) / np.diff(middle))
     # The first and last cell have the mean speed of a start from rest.
-    assert acceleration[2:-2].max() <= settings.max_acceleration_m_s2 * 1.05
+    assert acceleration[2:-2].max() <= MAX_ACCELERATION_M_S2 * 1.05
 
 
 @pytest.mark.parametrize("settings", DRIVES, ids=names)
