@@ -136,7 +136,7 @@ def test_a_replay_is_the_three_calls(settings: EstimatorSettings) -> None:
 # A live run, from ideal features on, against the replay of its log
 
 
-FRAMES = 14
+FRAMES, POINTS = 14, 150
 NO_IMAGE, NO_ODOMETRY = (5, 6), (4, 9)
 
 
@@ -158,7 +158,9 @@ def live_run(
     poses = [np.eye(4)]
     for _ in range(FRAMES - 1):
         poses.append(poses[-1] @ g.se3_exp(np.array(TURN_AND_GO)))
-    world = FeatureWorld(points_in_views(dataclasses.replace(DRIVE, points=250), poses, rng), rng)
+    world = FeatureWorld(
+        points_in_views(dataclasses.replace(DRIVE, points=POINTS), poses, rng), rng
+    )
     stand_in = ConstantVelocityMotion(ConstantVelocitySettings())
     odometry = camera_odometry(rng)
     pipeline = SlamPipeline(
@@ -170,7 +172,7 @@ def live_run(
     image = np.zeros((RIG.height, RIG.width), np.uint8)
     reports = []
     for i, wTc in enumerate(poses):
-        features = world.features(wTc, sigma_px=0.2, hidden=rng.choice(250, 25))
+        features = world.features(wTc, sigma_px=0.2, hidden=rng.choice(POINTS, POINTS // 10))
         frame = Frame(i, 0.5 * i, (image,) * 3)
         found = FeatureFrame(i, frame, features, "", 0.0, 0.0)
         if i in NO_IMAGE:

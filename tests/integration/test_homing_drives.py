@@ -68,7 +68,7 @@ def test_a_homing_s_log_is_in_its_start_frame(record: DriveRecord) -> None:
     assert left < 0.2 * away
 
 
-def test_a_replayed_log_tells_the_true_way_home(record: DriveRecord) -> None:
+def test_a_replayed_log_gives_the_true_home_direction(record: DriveRecord) -> None:
     log = bearing_log(record, record.homings[0])
     replayed = replay_homing(log.start, log.images, configuration().estimator)
     assert replayed.failure == ""
@@ -150,7 +150,7 @@ def test_arrival_counts_the_last_target(record: DriveRecord) -> None:
     assert numbers["arrival_rate"] == 1.0
 
 
-def test_an_arrival_elsewhere_is_none(record: DriveRecord) -> None:
+def test_an_arrival_away_from_the_target_does_not_count(record: DriveRecord) -> None:
     """What the robot says counts only where it stands near the last target in truth."""
     off = np.array([0.6, 0.0, 0.0])
     assert truly_arrived(record)

@@ -76,6 +76,6 @@ def test_a_switch_hides_what_it_names(browser: Browser) -> None:
     browser.wait(f"!({shown})")
 
 
-def test_it_fits_on_a_phone(browser: Browser) -> None:
+def test_page_fits_on_a_phone(browser: Browser) -> None:
     browser.size(*PHONE, phone=True)
     assert browser.js("document.documentElement.scrollWidth") <= PHONE[0]

@@ -39,7 +39,7 @@ def test_blocked_cameras_cost_nothing_of_a_lasting_map() -> None:
 
 
 @pytest.mark.slow
-def test_who_lasts_and_who_is_demoted() -> None:
+def test_static_landmarks_stay_permanent_and_moved_ones_are_demoted() -> None:
     """The defaults' reasons: docs/results, thresholds."""
     visits = lasting.visit_twice()
     demotion = lasting.demotion_table(visits)

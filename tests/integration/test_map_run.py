@@ -206,7 +206,7 @@ def test_frames_before_the_first_that_is_located_are_left_out(
 
 
 @pytest.mark.parametrize("kind", EVERY[:2])
-def test_a_map_that_is_left_as_it_is(
+def test_a_map_that_is_not_extended_keeps_its_landmarks(
     kind: str, recording: Path, map_file: Path, tmp_path: Path
 ) -> None:
     before = load_map(map_file)
@@ -333,7 +333,9 @@ def test_a_changed_recording_is_no_continuation(own_recording: Path, tmp_path: P
 
 
 @pytest.mark.slow
-def test_a_map_without_its_session(recording: Path, tmp_path: Path) -> None:
+def test_a_map_saved_without_its_session_cannot_be_continued(
+    recording: Path, tmp_path: Path
+) -> None:
     with_it, without = tmp_path / "with.fgmap", tmp_path / "without.fgmap"
     run_values(mapped(recording, stop=CUT, save=str(with_it)), tmp_path / "a")
     run_values(mapped(recording, stop=CUT, save=str(without), session=False), tmp_path / "b")
@@ -392,7 +394,7 @@ def test_exported_as_of_a_run(
         (("--map", "x.stl"), "x.stl"),
     ],
 )
-def test_what_a_map_cannot_be_exported_to(
+def test_unsupported_exports_of_a_map_are_refused(
     arguments: tuple[str, str],
     reported: str,
     map_file: Path,

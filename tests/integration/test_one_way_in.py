@@ -46,11 +46,11 @@ def assert_same_files(live: Path, runs: list[Path], estimator: str) -> None:
 
 
 def test_rendered_frames_give_the_same_bytes_on_every_way_in(tmp_path: Path) -> None:
-    overrides = QUIET | {"dataset.stop": 12, "estimator.kind": "isam2", "compare": []}
+    overrides = QUIET | {"dataset.stop": 8, "estimator.kind": "isam2", "compare": []}
     live = pushed("lab_loop", overrides, tmp_path / "live")
     run = fg.run("lab_loop", tmp_path / "run", overrides)
     assert run.status == "finished"
-    assert run.metrics["frames"] == 12
+    assert run.metrics["frames"] == 8
     command = by_command("lab_loop", overrides, tmp_path / "command")
     assert_same_files(live, [run.folder, command], "isam2")
 

@@ -57,7 +57,7 @@ def test_replay_to_the_bit(
     ).read_bytes()
 
 
-def test_the_log_matters(recording: Path, tmp_path: Path) -> None:
+def test_a_changed_measurement_changes_the_replay(recording: Path, tmp_path: Path) -> None:
     """Another measurement, another pose: the equality above is no accident."""
     values = experiment(recording)
     run = run_values(values, tmp_path / "run")

@@ -68,7 +68,7 @@ def figure_switch(figure: str, key: str) -> str:
     return f'input[data-figure="{figure}"][data-switch="{key}"]'
 
 
-def test_it_loads_offline_without_a_complaint_or_a_request(browser: Browser) -> None:
+def test_page_loads_offline_without_error_or_request(browser: Browser) -> None:
     browser.complaints(), browser.requests()  # forget what came before
     browser.driver.refresh()
     browser.wait("document.documentElement.dataset.drawn === 'yes'")

@@ -266,7 +266,9 @@ def test_signals(
     assert not list(folder.rglob("*partial*"))
 
 
-def test_a_second_ctrl_c_ends_at_once(long_values: dict[str, Any], tmp_path: Path) -> None:
+def test_a_second_interrupt_ends_the_run_at_once(
+    long_values: dict[str, Any], tmp_path: Path
+) -> None:
     """Whatever it hits, files are whole and the run can go on."""
     folder = tmp_path / "run"
     process = start("run", write_config(tmp_path / "c.yaml", long_values), "--out", folder)

@@ -55,7 +55,7 @@ def test_each_window_may_have_its_own_reach(center, others, data) -> None:
 
 
 @given(pairs)
-def test_unambiguous_pairs_are_those_without_rivals(found) -> None:
+def test_unambiguous_pairs_are_those_without_competing_candidates(found) -> None:
     i = np.array([a for a, _ in found], np.int64)
     j = np.array([b for _, b in found], np.int64)
     expected = [

@@ -145,7 +145,11 @@ def load_package(root: Path) -> list[Module]:
 
 def check_package(root: Path) -> list[Violation]:
     """Every violation in the package folder ``root``, sorted."""
-    modules = load_package(root)
+    return check_modules(load_package(root))
+
+
+def check_modules(modules: list[Module]) -> list[Violation]:
+    """Every violation in the modules of a package, sorted."""
     found: list[Violation] = []
     imports = {module.name: list(imports_of(module, modules)) for module in modules}
     for module in modules:

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
-from architecture_rules import ROOMS, check_package, load_package
+from architecture_rules import ROOMS, Module, check_modules, check_package, load_package
 
 PACKAGE = Path(__file__).parents[2] / "fgslam"
+
+
+@cache
+def whole_package() -> list[Module]:
+    """The modules of fgslam, parsed once."""
+    return load_package(PACKAGE)
 
 
 def write_package(folder: Path, files: dict[str, str]) -> Path:
@@ -30,12 +37,12 @@ def findings(folder: Path, files: dict[str, str]) -> list[str]:
 
 
 def test_fgslam_keeps_the_house_rules() -> None:
-    violations = check_package(PACKAGE)
+    violations = check_modules(whole_package())
     assert not violations, "\n" + "\n".join(map(str, violations))
 
 
 def test_the_checker_sees_the_whole_package() -> None:
-    names = {module.name for module in load_package(PACKAGE)}
+    names = {module.name for module in whole_package()}
     assert {
         "fgslam",
         "fgslam.core.arrays",
@@ -211,7 +218,7 @@ def test_a_new_room_needs_a_place_in_the_order(tmp_path: Path) -> None:
 
 
 def test_every_room_of_the_order_exists() -> None:
-    rooms = {module.layer for module in load_package(PACKAGE)}
+    rooms = {module.layer for module in whole_package()}
     assert set(ROOMS) <= rooms
 
 

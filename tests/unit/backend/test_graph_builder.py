@@ -392,7 +392,7 @@ def test_behind_names_variables_that_any_of_their_cameras_has_behind_it() -> Non
 
 
 @pytest.mark.parametrize("name", ["batch", "isam2", "isam2, keyframes"])
-def test_what_came_out_behind_a_camera_is_taken_out(
+def test_landmarks_behind_a_camera_are_removed(
     name: str, drive: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     estimator, _ = run(SMOOTHERS[name], drive.increments)

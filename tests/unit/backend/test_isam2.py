@@ -104,7 +104,7 @@ def test_after_the_repair_it_is_as_if_the_landmark_had_never_been_in() -> None:
     assert np.abs(offset / sigma).max() < 0.05
 
 
-def test_one_taken_out_comes_back_when_it_is_known_twice_as_well() -> None:
+def test_a_removed_landmark_returns_at_twice_the_parallax() -> None:
     simulation, estimator = played(6)
     before = estimator._builder.admission.tracks[5].variable
     spoil(estimator, landmark_key(before))

@@ -225,7 +225,7 @@ def test_running_mean_counts_only_hits(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(estimator.landmarks().positions[0], mean, rtol=0, atol=1e-12)
 
 
-def test_half_forgets_by_halves(rng: np.random.Generator) -> None:
+def test_update_half_weighs_each_older_measurement_by_half(rng: np.random.Generator) -> None:
     """Without a count, averaging can only be half old, half new."""
     estimator, points = started(2, rng, update="half", pose_covariance=False)
     expected = estimator.landmarks().positions.copy()

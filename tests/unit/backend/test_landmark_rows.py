@@ -14,7 +14,7 @@ def fill(rows: LandmarkRows, ids: IntArray, rng: np.random.Generator, home: int)
     rows.add(ids, rng.standard_normal((len(ids), 3)), rng.standard_normal((len(ids), 3, 3)), home)
 
 
-def test_they_are_those_added_and_not_removed(rng: np.random.Generator) -> None:
+def test_rows_hold_the_landmarks_added_and_not_removed(rng: np.random.Generator) -> None:
     rows, known = LandmarkRows(), {}
     for step in range(60):
         some = rng.choice(5000, size=rng.integers(0, 90), replace=False)

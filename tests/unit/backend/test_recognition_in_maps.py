@@ -132,7 +132,7 @@ def test_where_it_is_not_lost_no_loop_is_closed() -> None:
     assert error_m(reports[-1], path[-1]) < 0.1
 
 
-def test_what_was_made_since_the_map_was_left_ends_as_its_double() -> None:
+def test_landmarks_made_since_the_map_was_left_end_as_duplicates() -> None:
     pipeline, reports = returned()
     first = closings(reports)[0]
     given = int(half_a_ring().landmarks.ids.max())

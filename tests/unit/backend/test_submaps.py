@@ -168,7 +168,7 @@ def test_a_chain_is_restored_to_the_bit(rng: np.random.Generator) -> None:
     assert_same_bits(back.solve(back.constraints, 2), chain.solve(chain.constraints, 2))
 
 
-def test_points_go_along_with_their_homes(rng: np.random.Generator) -> None:
+def test_points_move_with_the_frame_that_they_belong_to(rng: np.random.Generator) -> None:
     before, after = drifted(rng), drifted(rng)
     homes = np.array([3, -1, 40, 3])
     points = rng.standard_normal((4, 3))
@@ -203,7 +203,7 @@ def test_many_motions_are_those_of_single_ones(rng: np.random.Generator) -> None
     np.testing.assert_allclose(_motions(twists), expected, rtol=0, atol=1e-13)
 
 
-def test_a_doubted_loop_yields_to_those_that_agree(rng: np.random.Generator) -> None:
+def test_a_doubted_loop_is_overruled_by_loops_that_agree(rng: np.random.Generator) -> None:
     poses, steps = chained([STEP] * (COUNT - 1)), uncertain()
     wrong = g.inverse(poses[2]) @ poses[30] @ g.se3_exp(np.array([0, 0.3, 0, 0.5, 0, 0.5]))
     sure = 1e-6 * np.eye(6)

@@ -205,7 +205,9 @@ def test_a_number_that_is_not_stored_is_refused(
         load_record(written(tmp_path / "page.json", section))
 
 
-def test_keep_needs_something_to_keep(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_keep_without_a_measurement_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert runner.main(["keep"]) == 2
     assert runner.main(["keep", str(tmp_path / "none.json")]) == 2
     assert capsys.readouterr().err.count("error: ") == 2

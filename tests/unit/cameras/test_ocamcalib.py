@@ -49,7 +49,7 @@ def read(folder: Path, content: str) -> OCamCalibration:
     return read_ocamcalib(path)
 
 
-def test_the_file(calibration: OCamCalibration) -> None:
+def test_calibration_file_is_read_in_full(calibration: OCamCalibration) -> None:
     assert calibration.direct == DIRECT
     assert calibration.centre == (545.872616, 674.318875)
     assert calibration.affine == (0.999, 0.003, 0.002)

@@ -75,7 +75,7 @@ def test_outside_and_at_the_border() -> None:
     np.testing.assert_allclose(covariance[0], within[0], rtol=0.05, atol=1e-7)
 
 
-def test_no_pixels() -> None:
+def test_measuring_no_pixels_gives_empty_arrays() -> None:
     bearing, elevation, covariance = measure(MIRROR, np.empty((0, 2)), 1.0)
     assert bearing.shape == elevation.shape == (0,)
     assert covariance.shape == (0, 2, 2)

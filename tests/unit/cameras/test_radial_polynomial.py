@@ -50,7 +50,7 @@ def test_elevation_may_fall_with_the_radius() -> None:
     np.testing.assert_allclose(camera.radius(np.array([0.8, 0.2, -0.4])), [30.0, 70.0, 110.0])
 
 
-def test_weights_count() -> None:
+def test_a_low_weight_lets_the_fit_ignore_a_point() -> None:
     radius = np.linspace(20.0, 110.0, 40)
     elevation = np.linspace(-1.0, 0.3, 40)
     elevation[7] += 0.3

@@ -57,7 +57,7 @@ def test_a_problem_that_is_done_is_left_out() -> None:
 
 
 @pytest.mark.parametrize(("settling", "calls"), [(0, 1), (3, 4)])
-def test_no_problem_is_done_while_it_settles(settling: int, calls: int) -> None:
+def test_no_problem_ends_during_the_settling_iterations(settling: int, calls: int) -> None:
     seen: list[int] = []
 
     def at_rest(unknowns: FloatArray, iteration: int) -> Linearised:

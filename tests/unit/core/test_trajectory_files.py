@@ -19,7 +19,7 @@ def trajectory(seed: int = 1, n: int = 50) -> Trajectory:
     return Trajectory(1.5e9 + np.cumsum(rng.uniform(0.01, 1, n)), np.array([*map(se3_exp, xi)]))
 
 
-def test_tum_there_and_back(tmp_path: Path) -> None:
+def test_tum_file_round_trip_keeps_the_poses(tmp_path: Path) -> None:
     written = trajectory()
     written.save(tmp_path / "a.tum")
     read = Trajectory.load(tmp_path / "a.tum")
@@ -68,7 +68,7 @@ def test_evo_reads_both(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.array(kitti.poses_se3), written.poses, atol=1e-10)
 
 
-def test_kitti_there_and_back(tmp_path: Path) -> None:
+def test_kitti_file_round_trip_keeps_the_poses(tmp_path: Path) -> None:
     written = trajectory(2)
     written.save(tmp_path / "a.kitti")
     read = np.loadtxt(tmp_path / "a.kitti").reshape(-1, 3, 4)

@@ -106,7 +106,7 @@ def test_pairs_are_compared_pair_by_pair(rng: np.random.Generator) -> None:
     assert found.ratio == pytest.approx(a[:12].mean() / b[:12].mean())
 
 
-def test_ties_prove_nothing() -> None:
+def test_ties_are_no_evidence_of_a_difference() -> None:
     found = paired_test(np.ones(5), np.ones(5))
     assert found is not None
     assert (found.wins, found.losses, found.p_value) == (0, 0, None)

@@ -53,7 +53,7 @@ def test_constrained_poses_count_only_their_free_directions(free: int) -> None:
     assert result.per_dof == pytest.approx(1.0, abs=4 * np.sqrt(2 / (400 * free)))
 
 
-def test_an_exactly_known_pose_has_no_say() -> None:
+def test_an_exactly_known_pose_adds_no_degrees_of_freedom() -> None:
     result = nees(np.ones((2, 6)), np.stack([np.zeros((6, 6)), np.eye(6)]))
     np.testing.assert_array_equal(result.dof, [0, 6])
     np.testing.assert_allclose(result.values, [0.0, 6.0])

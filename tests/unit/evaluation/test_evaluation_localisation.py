@@ -62,7 +62,7 @@ def test_share_of_errors_inside_the_claimed_95_percent_region() -> None:
     assert found.nees_per_dof == pytest.approx((0 + 1 + 100) / 18)
 
 
-def test_nothing_asked_is_nothing_known() -> None:
+def test_no_queries_give_no_rates() -> None:
     found = score(answers([], [], []), BOUNDS)
     assert found.share_right is None
     assert found.held is None

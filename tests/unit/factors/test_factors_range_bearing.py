@@ -268,7 +268,7 @@ def test_gtsams_own_factor_jumps_where_its_directions_do() -> None:
 
 
 @pytest.mark.parametrize("covariance", [EVEN, UNEVEN], ids=["even", "uneven"])
-def test_dead_astern_nothing_jumps(covariance: FloatArray) -> None:
+def test_residual_is_continuous_directly_behind_the_camera(covariance: FloatArray) -> None:
     """Azimuth pi - 0.001 measured, -pi + 0.001 expected: two milliradians off, not a whole turn."""
     measured = np.array([np.pi - 1e-3, 0.0, 5.0])
     point = point_at(np.eye(4), np.array([-np.pi + 1e-3, 0.0, 5.0]))

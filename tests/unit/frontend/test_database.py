@@ -179,7 +179,7 @@ def test_expected_landmarks_carry_their_own_appearance() -> None:
     np.testing.assert_array_equal(expected.orientation, features.orientation[[0, 2, 3]])
 
 
-def test_ids_need_not_be_rows() -> None:
+def test_landmark_ids_may_differ_from_row_numbers() -> None:
     points = at_pixels([(80, 60, 8), (100, 110, 12), (150, 150, 20), (200, 100, 5)])
     database = database_of(points, DatabaseSettings(prune_after_misses=1, border_px=0.0))
     database.record_misses(np.array([1]))
@@ -268,7 +268,7 @@ def test_an_unconfirmed_landmark_is_forgotten_in_view_or_not() -> None:
     assert database.ids.tolist() == [1]
 
 
-def test_by_default_what_is_out_of_view_stays() -> None:
+def test_landmarks_out_of_view_are_kept_by_default() -> None:
     """The paper's Type I: its miss count remains unchanged."""
     database = database_of(at_pixels([(80, 60, 8)]))
     for _ in range(500):

@@ -233,7 +233,9 @@ def height(rig: CameraRig, wTc: FloatArray) -> float:
 @pytest.mark.parametrize("pitch", [0.0, 25.0])
 @pytest.mark.parametrize("dof", [6, 5, 3])
 @pytest.mark.parametrize("prior", [False, True])
-def test_exact_recovery(dof: int, pitch: float, residuals: str, prior: bool) -> None:
+def test_ego_motion_is_exact_without_noise(
+    dof: int, pitch: float, residuals: str, prior: bool
+) -> None:
     rng = np.random.default_rng(8)
     rig = tilted_rig(pitch)
     for _ in range(5):
@@ -705,7 +707,7 @@ def test_a_problem_takes_the_matched_landmarks() -> None:
 
 
 @pytest.mark.parametrize("status", [EgoMotionStatus.FIRST, EgoMotionStatus.NO_IMAGE])
-def test_unmeasured_is_the_prediction(status: EgoMotionStatus) -> None:
+def test_without_measurements_the_pose_is_the_prediction(status: EgoMotionStatus) -> None:
     prediction = Prediction(FORWARD, PRIOR)
     found = unmeasured(prediction, status)
     assert found.status is status

@@ -64,7 +64,7 @@ def test_a_permanent_landmark_is_not_pruned() -> None:
     assert (database.hits[0], database.misses[0], database.permanent[0]) == (3, 53, True)
 
 
-def test_nor_forgotten_when_too_seldom_seen() -> None:
+def test_a_permanent_landmark_is_not_forgotten_when_seldom_seen() -> None:
     settings = DatabaseSettings(
         valid_hits=2,
         forget_unconfirmed_after=2,
@@ -77,7 +77,7 @@ def test_nor_forgotten_when_too_seldom_seen() -> None:
     assert database.permanent.tolist() == [True]
 
 
-def test_a_demoted_one_goes_as_any_other_and_a_hit_makes_it_permanent_again() -> None:
+def test_a_demoted_landmark_is_pruned_like_any_other_and_a_hit_makes_it_permanent_again() -> None:
     database = database_of(PLACES, LASTING)
     for _ in range(2):
         hit(database, 0, 1)
@@ -125,7 +125,7 @@ def test_merging_adds_counts_and_keeps_the_later_look() -> None:
     assert database.new_ids(1).tolist() == [4]
 
 
-def test_several_may_end_in_one() -> None:
+def test_several_landmarks_are_merged_into_one() -> None:
     database = database_of(PLACES, VIEWS)
     for i in range(4):
         hit(database, i, directions=towards(50.0 * i))
@@ -156,7 +156,7 @@ def test_what_cannot_be_merged_is_refused_and_nothing_done(pairs, why) -> None:
     assert_same_bits(database.state(), before)
 
 
-def test_merging_nothing_does_nothing() -> None:
+def test_merging_no_pairs_changes_nothing() -> None:
     database = database_of(PLACES, LASTING)
     before = copy.deepcopy(database.state())
     database.merge(np.empty((0, 2), np.int64))
@@ -283,7 +283,7 @@ def test_an_empty_map() -> None:
     assert database.new_ids(1).tolist() == [0]
 
 
-def test_memory_is_what_is_said() -> None:
+def test_memory_a_landmark_is_as_documented() -> None:
     """docs/concepts/maps.md tells it."""
     assert LandmarkDatabase(RIG, DatabaseSettings(), 40.0).bytes_per_landmark == 54 + 166
     several = LandmarkDatabase(RIG, VIEWS, 40.0)

@@ -182,7 +182,7 @@ def test_recall_falls_beyond_the_window() -> None:
         np.testing.assert_array_equal(found.features, found.landmarks)
 
 
-def test_nothing_against_nothing() -> None:
+def test_matching_without_landmarks_or_features_finds_nothing() -> None:
     none, one = np.empty((0, 3)), [AT]
     for rows, seen in ((none, none), (none, one), (one, none)):
         for appearance in (PAPER, DESCRIPTOR):
@@ -192,7 +192,7 @@ def test_nothing_against_nothing() -> None:
             assert not found.had_candidates.any()
 
 
-def test_what_the_settings_switch_on() -> None:
+def test_matching_settings_switch_widening_refinement_and_rescue() -> None:
     plain = MapMatcher(FIXED, PAPER)
     assert [plain.widens, plain.refines, plain.rescues] == [False, False, False]
     everything = dataclasses.replace(FIXED, widen_sigmas=1.0, refine=True, rescue=True)

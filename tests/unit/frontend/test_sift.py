@@ -125,7 +125,7 @@ def test_all_levels_are_all_features() -> None:
     assert len(extract(image, scale_levels=64)) == len(detector.detect(image, None))
 
 
-def test_what_a_feature_is_made_of() -> None:
+def test_features_have_the_documented_shapes_and_types() -> None:
     found = extract(as_image(texture()))
     count = len(found)
     assert count > 50
@@ -160,7 +160,7 @@ def test_the_same_image_gives_the_same_bits() -> None:
     np.testing.assert_array_equal(image, kept)
 
 
-def test_in_parallel_as_one_after_the_other() -> None:
+def test_parallel_extraction_gives_the_same_features() -> None:
     images = [as_image(texture(seed=seed)) for seed in range(4)]
     extractor = SiftExtractor(SETTINGS, "descriptor")
     with ThreadPoolExecutor(4) as pool:

@@ -260,7 +260,7 @@ def test_two_cameras_leave_the_top_pixels_unknown() -> None:
     assert np.isfinite(found.pixels[0, :2]).all()
 
 
-def test_the_papers_covariance_is_that_of_b4() -> None:
+def test_the_papers_measurement_has_correlated_coordinates() -> None:
     m = measurement_map("paper", 3, 1.0)
     expected = [[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [-0.5, -0.5, 1.0]]
     np.testing.assert_allclose(m @ m.T, expected, atol=1e-15)

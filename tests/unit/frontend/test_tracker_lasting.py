@@ -216,7 +216,7 @@ def test_a_blocked_camera_takes_nothing_from_a_lasting_map(blind_below: float) -
     np.testing.assert_array_equal(association.observations.ids, ids)
 
 
-def test_what_is_not_yet_permanent_survives_a_blocked_view_as_well() -> None:
+def test_landmarks_not_yet_permanent_survive_a_blocked_view() -> None:
     things = Things(cloud(), settings(permanence=dataclasses.replace(LASTING, blind_below=0.05)))
     things.step(from_angle(HERE))
     ids = things.map.ids.copy()

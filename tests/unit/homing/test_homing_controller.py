@@ -476,7 +476,7 @@ def test_refused_target_is_looked_for_from_farther_on() -> None:
     assert b.controller.initialisations == 1
 
 
-def test_search_is_bounded() -> None:
+def test_search_for_a_refused_target_ends_after_the_stated_tries() -> None:
     """So many drives of that length, standing and trying in between; then the refusal."""
     b = bench(FEW)
     states = [b.step().state for _ in range(400)]

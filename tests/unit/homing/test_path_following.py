@@ -82,7 +82,7 @@ def test_record_fits_together(record: DriveRecord) -> None:
         assert record.robot[rows[-1], :2] * leg == pytest.approx(moved[:2], abs=0.15)
 
 
-def test_remaining_falls_and_tells_the_truth(record: DriveRecord) -> None:
+def test_remaining_share_of_the_way_falls_and_matches_the_truth(record: DriveRecord) -> None:
     """Monotone but for noise, and right to a tenth at mid-leg."""
     for k in range(4):
         rows = np.flatnonzero((record.target == k) & (record.homing >= 0))

@@ -84,7 +84,7 @@ def test_far_link_that_no_neighbour_shares_is_dropped() -> None:
     assert set(views.confirmed()[2]) == {FAR}
 
 
-def test_walk_vouches_for_a_few_steps_but_not_across_a_gap() -> None:
+def test_consecutive_images_confirm_links_of_a_few_steps_but_not_across_a_gap() -> None:
     """Two steps on, confirmed by nothing: believed, unless one of the steps is missing."""
     walk = [(k, k + 1) for k in range(COUNT - 1)]
     short = (4, 6)

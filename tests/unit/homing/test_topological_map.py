@@ -263,7 +263,7 @@ def hops(a: int, b: int) -> int:
     return min((a - b) % PLACES, (b - a) % PLACES)
 
 
-def test_map_is_one_and_true(built: tuple[FloatArray, TopologicalMap]) -> None:
+def test_map_is_connected_and_its_links_are_true(built: tuple[FloatArray, TopologicalMap]) -> None:
     """Every link is near its truth, none is long, and the round is closed."""
     poses, topology = built
     assert [len(c) for c in topology.components()] == [PLACES]

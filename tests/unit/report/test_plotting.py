@@ -47,7 +47,7 @@ def test_the_legend_names_each_estimator_and_the_truth_once() -> None:
     assert len(set(colours.values())) == 3
 
 
-def test_what_is_not_known_has_no_panel() -> None:
+def test_unknown_quantities_have_no_panel() -> None:
     figure = plot({"a": estimate(0.1)})
     assert {trace.yaxis for trace in figure.data} == {"y", "y2"}  # claims stay without a truth
     assert not [t for t in figure.data if t.name == "truth"]

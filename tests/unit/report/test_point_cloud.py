@@ -113,7 +113,7 @@ def test_open3d_reads_the_off(tmp_path: Path, open3d) -> None:
     np.testing.assert_allclose(np.asarray(mesh.vertices), points.positions, atol=1e-9)
 
 
-def test_off_text(tmp_path: Path) -> None:
+def test_off_file_lists_positions_and_colours(tmp_path: Path) -> None:
     points = a_map(2)
     write_off(tmp_path / "map.off", points)
     lines = (tmp_path / "map.off").read_text().splitlines()

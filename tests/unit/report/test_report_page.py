@@ -107,7 +107,7 @@ def test_the_best_is_named_with_its_lead() -> None:
     assert any(line.startswith("Conservative") and "odometry" in line for line in lines)
 
 
-def test_near_ties_are_ties() -> None:
+def test_errors_within_the_tolerance_count_as_ties() -> None:
     lines = sentences(("a", 0.0100, 1.0, None), ("b", 0.0102, 1.0, None), ("c", 0.02, 1.0, None))
     assert lines[0].startswith("a and b are about equally accurate: 1.00 cm")
     assert lines[-1] == "Whether the covariances of a, b and c can be believed is not known."
@@ -119,14 +119,14 @@ def test_a_perfect_path_divides_by_nothing() -> None:
     assert sentences(("a", 0.0, None, None))[0].startswith("a is off by 0.00 cm")
 
 
-def test_what_is_not_known_is_said() -> None:
+def test_unknown_values_are_stated() -> None:
     lines = headline(without_truth(full_report()))
     assert lines[0] == "How accurate the path is, is not known: there is no ground truth."
     assert lines[-1] == "ekf failed: the map of 4,000 landmarks needs 1.2 GB"
     assert headline(ReportData("t", "", ())) == ("No estimator gave a result.",)
 
 
-def test_the_best_one_s_map_is_shown_first() -> None:
+def test_the_map_of_the_best_estimator_is_shown_first() -> None:
     assert full_report().best == 1
     assert without_truth(full_report()).best == 0
     assert ReportData("t", "", ()).best == 0
@@ -353,7 +353,7 @@ def test_long_runs_stay_small() -> None:
     assert text.count("Left out to keep this page small: noise") >= 1  # pictures at their worst
 
 
-def test_a_disk_that_refuses_is_said(tmp_path: Path) -> None:
+def test_an_error_of_the_disk_is_reported(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"nowhere.*choose another folder"):
         write_report(tmp_path / "nowhere" / "report.html", full_report())
 
@@ -387,7 +387,7 @@ def test_small_pictures_are_kept_and_large_ones_shrunk(rng: np.random.Generator)
         assert opened.size == (MAX_WIDTH, 630)
 
 
-def test_what_cannot_be_shown_is_said(rng: np.random.Generator) -> None:
+def test_pictures_that_cannot_be_shown_are_listed(rng: np.random.Generator) -> None:
     content = picture(rng)
     shown, left_out = embed([Picture("torn", content[:100]), Picture("text", b"hello")])
     assert shown == []

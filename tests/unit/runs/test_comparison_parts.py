@@ -352,7 +352,7 @@ def trial(seed: int, filter_ate: float, smoother_ate: float, failure: str = "") 
 KINDS = {"kalman": "landmark_kalman", "worse": "ekf", "smooth": "isam2"}
 
 
-def test_trials_say_who_beats_whom() -> None:
+def test_trials_report_which_estimator_is_better() -> None:
     rows = [trial(k, 0.02 + 0.001 * k, 0.01 + 0.0005 * k) for k in range(8)]
     summary = summarise(rows, KINDS)
     first, second = summary.pairs
@@ -367,7 +367,7 @@ def test_trials_say_who_beats_whom() -> None:
     assert together(summary, "kalman").ate_rmse_m == pytest.approx(0.0235)
 
 
-def test_the_filter_may_win_and_few_trials_show_nothing() -> None:
+def test_the_filter_can_be_better_and_few_trials_show_no_difference() -> None:
     won = summarise([trial(k, 0.01 + 0.001 * k, 0.03) for k in range(8)], KINDS).pairs[0]
     assert won.sentence.startswith("kalman (the best filter) beats smooth in 8 of 8 trials; ")
     assert "higher by" in won.sentence

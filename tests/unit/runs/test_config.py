@@ -440,7 +440,7 @@ def test_maps_that_contradict_themselves(maps: dict[str, Any], expected: str) ->
         parse_config({**MINIMAL, "map": maps}, "test")
 
 
-def test_a_map_that_stays_as_it_is_may_be_returned_to() -> None:
+def test_a_map_that_is_not_extended_allows_loops() -> None:
     values = {**MINIMAL, "map": {"load": "a", "extend": False}, "frontend": {"loops": {}}}
     config = parse_config(values, "test")
     assert not config.map.extend

@@ -44,7 +44,7 @@ def message_of(values: object, tmp_path: Path, *overrides: str) -> str:
     return message
 
 
-def test_the_task_tells_which(tmp_path: Path) -> None:
+def test_configuration_class_follows_from_the_task(tmp_path: Path) -> None:
     assert isinstance(load_experiment(written(tmp_path, TRIALS)), HomingTrialsConfig)
     assert isinstance(load_experiment(written(tmp_path, SLAM)), ExperimentConfig)
     assert is_homing(written(tmp_path, TRIALS))

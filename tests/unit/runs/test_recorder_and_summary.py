@@ -95,7 +95,7 @@ def estimate_of(count: int) -> Estimate:
 # Recorder
 
 
-def test_a_frame_is_booked_with_what_it_gave() -> None:
+def test_a_frames_row_holds_its_status_and_counts() -> None:
     row = recorder_of(1).rows[0]
     assert (row.status, row.features, row.matched, row.inliers) == ("ok", 9, 10, 9)
     assert row.mean_residual_px == 0.5  # of those used

@@ -99,7 +99,7 @@ def tracked(increment: Increment) -> EgoMotion:
 
 
 @pytest.mark.parametrize("settings", USERS, ids=lambda s: s.kind)
-def test_the_map_is_theirs_before_the_first_frame(
+def test_estimators_hold_the_map_before_the_first_frame(
     settings: EstimatorSettings, saved: SavedMap
 ) -> None:
     found = begun(settings, saved).landmarks()
@@ -109,7 +109,7 @@ def test_the_map_is_theirs_before_the_first_frame(
 
 
 @pytest.mark.parametrize("settings", USERS, ids=lambda s: s.kind)
-def test_what_is_seen_becomes_better_known_and_the_rest_stays(
+def test_observed_landmarks_become_more_certain_and_others_stay(
     settings: EstimatorSettings, saved: SavedMap
 ) -> None:
     estimator = begun(settings, saved)
@@ -176,7 +176,7 @@ def test_state_and_restore_to_the_bit(
 
 
 @pytest.mark.parametrize("settings", [DeadReckoningSettings(), FixedLagSettings()])
-def test_others_are_refused(settings: EstimatorSettings) -> None:
+def test_estimators_that_cannot_use_a_map_are_refused(settings: EstimatorSettings) -> None:
     estimator = make_estimator(RIG, settings, prior=PRIOR)
     assert not isinstance(estimator, MapUser)
     with pytest.raises(ConfigError, match=f"{settings.kind} cannot begin in a saved map"):

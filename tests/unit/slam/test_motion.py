@@ -193,7 +193,7 @@ def test_an_unmeasured_start_teaches_no_standstill() -> None:
 
 
 @pytest.mark.parametrize("carried", [False, True])
-def test_a_displacement_is_no_velocity(carried: bool) -> None:
+def test_a_displacement_does_not_change_the_velocity(carried: bool) -> None:
     """Corrected, it keeps the one that it had; carried, it begins as at first."""
     motion, rested = (ConstantVelocityMotion(ConstantVelocitySettings()) for _ in range(2))
     motion.observe(0.0, np.eye(4), measured=True)
@@ -212,7 +212,7 @@ def test_a_displacement_is_no_velocity(carried: bool) -> None:
     np.testing.assert_allclose(motion.between(2.0).motion, g.se3_exp(0.5 * TWIST), atol=1e-12)
 
 
-def test_at_first_it_rests_and_knows_little() -> None:
+def test_velocity_is_zero_and_uncertain_at_first() -> None:
     motion = ConstantVelocityMotion(SETTINGS)
     motion.observe(3.0, g.se3_exp(TWIST), measured=True)
     for dt in (0.1, 0.5):
@@ -227,7 +227,7 @@ def test_at_first_it_rests_and_knows_little() -> None:
         )
 
 
-def test_asking_changes_nothing() -> None:
+def test_asking_for_the_motion_changes_nothing() -> None:
     motion = ConstantVelocityMotion(SETTINGS)
     motion.observe(0.0, np.eye(4), measured=True)
     motion.observe(0.5, g.se3_exp(0.5 * TWIST), measured=True)

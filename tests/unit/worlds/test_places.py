@@ -156,7 +156,7 @@ def test_each_leg_is_the_one_before_turned_by_a_quarter() -> None:
         assert [s.texture for s in a.surfaces] == [s.texture for s in b.surfaces]
 
 
-def test_sections_are_copies() -> None:
+def test_array_sections_are_copies() -> None:
     things, _ = alike.build_alike(np.random.default_rng(0))
     first = stack(t for t in things if t.name.startswith("leg_1_section_1_"))
     for k in (2, 3, 4):

@@ -40,7 +40,7 @@ def test_every_kind_of_damage_is_seen(cache: RenderCache) -> None:
     np.testing.assert_array_equal(cache.read(0), images(0))
 
 
-def test_length_alone_decides_presence(cache: RenderCache) -> None:
+def test_a_cached_frame_of_the_wrong_length_counts_as_absent(cache: RenderCache) -> None:
     cache.write(1, images(1))
     cache.path(1).write_bytes(cache.path(1).read_bytes()[:50])
     assert not cache.present(1)

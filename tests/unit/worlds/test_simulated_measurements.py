@@ -263,7 +263,7 @@ def test_range_limits_hold() -> None:
 # What goes wrong on purpose
 
 
-def test_the_wanted_share_of_matches_is_wrong() -> None:
+def test_outlier_fraction_is_the_share_of_wrong_matches() -> None:
     recording = recorded(stop=None, outlier_fraction=0.2)
     error = np.linalg.norm(differences(recording), axis=1)
     matched = sum(int((~i.observations.is_new).sum()) for i in recording.log)

@@ -42,7 +42,7 @@ def test_deleting_features_is_marginalising_them() -> None:
     np.testing.assert_array_equal(left.mean, state.mean[rows])
 
 
-def test_what_has_no_variance_never_moves() -> None:
+def test_states_without_variance_never_move() -> None:
     """Printed initial variances."""
     case = trial(4, SimulatedBearingsSettings(lost_per_s=0.0))
     estimator = HomingEkf(case.start, PAPER)

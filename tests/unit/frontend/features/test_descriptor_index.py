@@ -129,7 +129,7 @@ def test_words_are_the_nearest_centres(rng: np.random.Generator) -> None:
     assert np.array_equal(descriptor_index.nearest_words(descriptors[:50], 12), order[:50, :12])
 
 
-def test_a_word_is_found_once_in_a_views_life(
+def test_a_view_is_quantised_to_words_once(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[int] = []

@@ -47,7 +47,7 @@ def extractor(**sift: object) -> OmniFeatureExtractor:
     )
 
 
-def test_periods() -> None:
+def test_wrapping_period_is_the_width_of_a_full_circle_and_none_for_a_mirror() -> None:
     assert wrapping_period(PANORAMA) == 512
     assert wrapping_period(Cylinder(301, 100, -1.0, 1.0)) == 300
     assert wrapping_period(MIRROR) is None

@@ -93,7 +93,9 @@ def test_turns_between_two_images(start_image: Image, turn_deg: float) -> None:
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(0.6, 25.0), (1.3, 0.0), (0.8, -15.0)])
-def test_light_may_change(start_image: Image, gain: float, offset: float) -> None:
+def test_tracking_tolerates_gain_and_offset_of_the_image(
+    start_image: Image, gain: float, offset: float
+) -> None:
     tracker = started(start_image)
     pose = way(1)[0]
     image = np.clip(gain * picture(pose).astype(np.float64) + offset, 0, 255).astype(np.uint8)

@@ -90,7 +90,7 @@ def test_tilted_cameras_are_estimated() -> None:
     assert np.median(free) < 0.3 * np.median(level)
 
 
-def test_matches_by_lot_are_refused() -> None:
+def test_random_matches_are_refused() -> None:
     refused = 0
     for seed in range(60):
         rng = np.random.default_rng(seed)

@@ -266,7 +266,7 @@ def test_a_relocalised_frame_is_replayed_to_the_bit() -> None:
         np.testing.assert_array_equal(stats.wTc, report.stats.wTc)
 
 
-def test_lost_in_unmapped_surroundings_it_gives_up_and_maps_on() -> None:
+def test_robot_lost_in_unmapped_surroundings_gives_up_and_maps_on() -> None:
     poses = [on_ring(k) for k in range(12)] + [on_ring(k) for k in range(36, 64)]
     settings = dataclasses.replace(
         SETTINGS, lost=LostSettings(after=2, give_up_after=6), loops=None

@@ -267,7 +267,7 @@ def test_an_offset_that_jumps_is_never_confirmed() -> None:
         assert not confirmation.offer(turned(0.0, x=0.5 * (k % 2)) @ estimated, estimated)
 
 
-def test_a_look_that_fails_begins_the_count_anew() -> None:
+def test_a_failed_confirmation_restarts_the_count() -> None:
     confirmation = Confirmation(dataclasses.replace(LOOPS, confirm=2))
     assert not confirmation.offer(np.eye(4), np.eye(4))
     confirmation.forget()
