@@ -19,6 +19,9 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import inverse, pose, yaw_pitch_roll
 
+SAME_TIME_S = 0.01
+"""Largest difference of time between poses that belong together; evo's default, too."""
+
 # Three points are the fewest that fix a rigid motion in space.
 _MIN_POSES_TO_ALIGN = 3
 
@@ -26,36 +29,8 @@ _MIN_POSES_TO_ALIGN = 3
 class Alignment(str, Enum):
     """How the estimate was brought into the frame of the truth."""
 
-    NONE = "none"
     FIRST_POSE = "first_pose"
     SE3 = "se3"
-    SIM3 = "sim3"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Similarity:
-    """``target = scale * rotation @ source + translation``.
-
-    Attributes:
-        rotation: (3, 3).
-        translation: (3,) metres of the target.
-        scale: 1 for a rigid motion.
-    """
-
-    rotation: FloatArray
-    translation: FloatArray
-    scale: float = 1.0
-
-    def poses(self, sTc: FloatArray) -> FloatArray:
-        """Poses (n, 4, 4) of the source frame in the target frame; only positions are scaled."""
-        out = np.array(sTc, dtype=np.float64)
-        out[:, :3, :3] = self.rotation @ sTc[:, :3, :3]
-        out[:, :3, 3] = self.points(sTc[:, :3, 3])
-        return out
-
-    def points(self, source: FloatArray) -> FloatArray:
-        """Points (n, 3) of the source frame in the target frame."""
-        return np.asarray(self.scale * source @ self.rotation.T + self.translation)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +40,10 @@ class TrajectoryError:
     Attributes:
         alignment: alignment behind the ATE and the RPE.
         matched_poses: poses of the estimate that found a true one.
-        scale: scale of the alignment (1 unless Sim3).
         ate_rmse_m: absolute trajectory error, root mean square of the positions' distances.
         ate_max_m: the largest of those distances.
-        rpe_delta_frames: span of the relative error, in matched poses.
-        rpe_trans_m: relative pose error, root mean square of translation, per span.
-        rpe_rot_deg: relative pose error, root mean square of rotation angle, per span.
+        rpe_trans_m: relative pose error from pose to pose, root mean square of translation.
+        rpe_rot_deg: the same of the rotation angle.
         path_length_m: length of the true path over the matched poses.
         drift_percent: ``end_error_m`` over ``path_length_m``, in percent.
         end_error_m: distance of the last pose from the true one, with the *first* pose aligned.
@@ -79,10 +52,8 @@ class TrajectoryError:
 
     alignment: Alignment
     matched_poses: int = 0
-    scale: float | None = None
     ate_rmse_m: float | None = None
     ate_max_m: float | None = None
-    rpe_delta_frames: int = 1
     rpe_trans_m: float | None = None
     rpe_rot_deg: float | None = None
     path_length_m: float | None = None
@@ -115,7 +86,7 @@ class EndPose:
 
 
 def associate(
-    estimate_times: FloatArray, truth_times: FloatArray, tolerance_s: float
+    estimate_times: FloatArray, truth_times: FloatArray, tolerance_s: float = SAME_TIME_S
 ) -> tuple[IntArray, IntArray]:
     """Rows of estimate and truth that belong together: mutual nearest neighbours in time.
 
@@ -151,8 +122,8 @@ def _nearest(sorted_values: FloatArray, queries: FloatArray) -> IntArray:
 # Alignment
 
 
-def umeyama(source: FloatArray, target: FloatArray, *, with_scale: bool) -> Similarity | None:
-    """The least-squares similarity from source to target points (Umeyama 1991, eqs. 40-42).
+def umeyama(source: FloatArray, target: FloatArray) -> FloatArray | None:
+    """The least-squares rigid motion (4, 4) from source to target (Umeyama 1991, eqs. 40-42).
 
     Of points on one line the rotation about that line is free: some minimiser is returned, and
     the remaining distances are the same for all of them.
@@ -160,33 +131,25 @@ def umeyama(source: FloatArray, target: FloatArray, *, with_scale: bool) -> Simi
     Args:
         source: (n, 3) metres.
         target: (n, 3) metres.
-        with_scale: estimate the scale too, else it is 1.
 
     Returns:
-        The alignment, or None when fewer than three points are given, when a value is not
-        finite, or when a scale is asked of points that coincide.
+        The motion, or None when fewer than three points are given or a value is not finite.
     """
     finite = bool(np.isfinite(source).all() and np.isfinite(target).all())
     if len(source) < _MIN_POSES_TO_ALIGN or not finite:
         return None
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     centred_source, centred_target = source - source_mean, target - target_mean
-    u, singular_values, vt = np.linalg.svd(centred_target.T @ centred_source / len(source))
+    u, _, vt = np.linalg.svd(centred_target.T @ centred_source / len(source))
     signs = np.array([1.0, 1.0, 1.0 if np.linalg.det(u @ vt) > 0.0 else -1.0])
     rotation = (u * signs) @ vt
-    scale = 1.0
-    if with_scale:
-        variance = float((centred_source**2).sum() / len(source))
-        if variance == 0.0:
-            return None
-        scale = float(singular_values @ signs) / variance
-    return Similarity(rotation, target_mean - scale * rotation @ source_mean, scale)
+    return pose(rotation, target_mean - rotation @ source_mean)
 
 
 def align(
     estimate: FloatArray, truth: FloatArray, alignment: Alignment = Alignment.SE3
-) -> Similarity | None:
-    """The motion that brings the estimate's world into the truth's.
+) -> FloatArray | None:
+    """The motion (4, 4) that brings the estimate's world into the truth's.
 
     Args:
         estimate: (n, 4, 4) poses, row by row the same instants as ``truth``.
@@ -194,16 +157,19 @@ def align(
         alignment: which kind.
 
     Returns:
-        The alignment, or None when it cannot be found (see :func:`umeyama`).
+        The motion, or None when it cannot be found (see :func:`umeyama`).
     """
-    if alignment is Alignment.NONE:
-        return Similarity(np.eye(3), np.zeros(3))
-    if alignment is Alignment.FIRST_POSE:
-        if len(estimate) == 0:
-            return None
-        tTe = truth[0] @ inverse(estimate[0])
-        return Similarity(tTe[:3, :3], tTe[:3, 3])
-    return umeyama(estimate[:, :3, 3], truth[:, :3, 3], with_scale=alignment is Alignment.SIM3)
+    if alignment is Alignment.SE3:
+        return umeyama(estimate[:, :3, 3], truth[:, :3, 3])
+    return truth[0] @ inverse(estimate[0]) if len(estimate) else None
+
+
+def moved(tTe: FloatArray, poses: FloatArray) -> FloatArray:
+    """Poses (n, 4, 4) of one world in another, to which ``tTe`` (4, 4) leads."""
+    out = np.array(poses, dtype=np.float64)
+    out[:, :3, :3] = tTe[:3, :3] @ poses[:, :3, :3]
+    out[:, :3, 3] = poses[:, :3, 3] @ tTe[:3, :3].T + tTe[:3, 3]
+    return out
 
 
 # --------------------------------------------------------------------------------------------
@@ -223,26 +189,18 @@ def rotation_angles(rotations: FloatArray) -> FloatArray:
     return np.asarray(np.arctan2(sine, cosine))
 
 
-def relative_errors(
-    estimate: FloatArray, truth: FloatArray, delta: int = 1
-) -> tuple[FloatArray, FloatArray]:
-    """Errors of every motion over ``delta`` poses (Sturm et al. 2012, eq. 1).
+def relative_errors(estimate: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Errors of every motion from pose to pose (Sturm et al. 2012, eq. 1).
 
     Args:
         estimate: (n, 4, 4) poses.
         truth: (n, 4, 4) poses of the same instants.
-        delta: span in poses, at least 1.
 
     Returns:
-        Translations (n - delta,) in metres and rotation angles (n - delta,) in radians.
-
-    Raises:
-        ValueError: ``delta`` is less than 1.
+        Translations (n - 1,) in metres and rotation angles (n - 1,) in radians.
     """
-    if delta < 1:
-        raise ValueError(f"a relative error needs a span of at least one pose, not {delta}")
-    estimated_motion = inverse(estimate[:-delta]) @ estimate[delta:]
-    true_motion = inverse(truth[:-delta]) @ truth[delta:]
+    estimated_motion = inverse(estimate[:-1]) @ estimate[1:]
+    true_motion = inverse(truth[:-1]) @ truth[1:]
     error = inverse(true_motion) @ estimated_motion
     return np.linalg.norm(error[:, :3, 3], axis=1), rotation_angles(error[:, :3, :3])
 
@@ -253,12 +211,7 @@ def path_length(poses: FloatArray) -> float:
 
 
 def evaluate_trajectory(
-    estimate: Trajectory,
-    truth: Trajectory | None,
-    alignment: Alignment = Alignment.SE3,
-    *,
-    tolerance_s: float = 0.01,
-    rpe_delta: int = 1,
+    estimate: Trajectory, truth: Trajectory | None, alignment: Alignment = Alignment.SE3
 ) -> TrajectoryError:
     """All errors of a trajectory, in one value.
 
@@ -267,30 +220,25 @@ def evaluate_trajectory(
         truth: the true poses, in any world frame; None where there are none.
         alignment: how ATE and RPE are aligned. The end pose is always judged with the first
             matched pose aligned, since a drift is measured from the start.
-        tolerance_s: largest difference of time between an estimated and a true pose.
-        rpe_delta: span of the relative error, in matched poses; at least 1.
 
     Returns:
         The errors; a value that cannot be known is None.
     """
-    unknown = TrajectoryError(alignment, rpe_delta_frames=rpe_delta)
     if truth is None:
-        return unknown
-    rows, true_rows = associate(estimate.timestamps, truth.timestamps, tolerance_s)
+        return TrajectoryError(alignment)
+    rows, true_rows = associate(estimate.timestamps, truth.timestamps)
     estimated, true = estimate.poses[rows], truth.poses[true_rows]
     if len(rows) == 0 or not (np.isfinite(estimated).all() and np.isfinite(true).all()):
-        return TrajectoryError(alignment, len(rows), rpe_delta_frames=rpe_delta)
-    found = align(estimated, true, alignment)
-    ate = None if found is None else position_errors(found.poses(estimated), true)
-    rpe_trans, rpe_rot = _rpe_rmse(estimated, true, found, rpe_delta)
+        return TrajectoryError(alignment, len(rows))
+    tTe = align(estimated, true, alignment)
+    ate = None if tTe is None else position_errors(moved(tTe, estimated), true)
+    rpe_trans, rpe_rot = _rpe_rmse(estimated, true, tTe)
     length, drift, end_m, end_deg = _end_errors(estimated, true)
     return TrajectoryError(
         alignment=alignment,
         matched_poses=len(rows),
-        scale=None if found is None else found.scale,
         ate_rmse_m=None if ate is None else _rmse(ate),
         ate_max_m=None if ate is None else float(ate.max()),
-        rpe_delta_frames=rpe_delta,
         rpe_trans_m=rpe_trans,
         rpe_rot_deg=rpe_rot,
         path_length_m=length,
@@ -312,7 +260,7 @@ def end_pose(trajectory: Trajectory) -> EndPose | None:
 
 
 def to_estimate_world(
-    estimate: Trajectory, truth: Trajectory, *, tolerance_s: float = 0.01
+    estimate: Trajectory, truth: Trajectory
 ) -> tuple[IntArray, FloatArray] | None:
     """True poses in the estimate's world, with the first matched pose aligned.
 
@@ -320,23 +268,18 @@ def to_estimate_world(
         Rows (k,) of the estimate that have a truth, and their true poses (k, 4, 4) ``wTc``; None
         when no pose matches.
     """
-    rows, true_rows = associate(estimate.timestamps, truth.timestamps, tolerance_s)
-    eTt = estimate_from_truth(estimate, truth, tolerance_s=tolerance_s)
+    rows, true_rows = associate(estimate.timestamps, truth.timestamps)
+    eTt = estimate_from_truth(estimate, truth)
     return None if eTt is None else (rows, eTt @ truth.poses[true_rows])
 
 
-def estimate_from_truth(
-    estimate: Trajectory, truth: Trajectory, *, tolerance_s: float = 0.01
-) -> FloatArray | None:
+def estimate_from_truth(estimate: Trajectory, truth: Trajectory) -> FloatArray | None:
     """(4, 4) from the truth's world to the estimate's, with the first matched pose aligned.
 
     None when no pose matches.
     """
-    rows, true_rows = associate(estimate.timestamps, truth.timestamps, tolerance_s)
-    if len(rows) == 0:
-        return None
-    found = align(truth.poses[true_rows], estimate.poses[rows], Alignment.FIRST_POSE)
-    return None if found is None else pose(found.rotation, found.translation)
+    rows, true_rows = associate(estimate.timestamps, truth.timestamps)
+    return align(truth.poses[true_rows], estimate.poses[rows], Alignment.FIRST_POSE)
 
 
 def _rmse(values: FloatArray) -> float:
@@ -344,11 +287,11 @@ def _rmse(values: FloatArray) -> float:
 
 
 def _rpe_rmse(
-    estimate: FloatArray, truth: FloatArray, found: Similarity | None, delta: int
+    estimate: FloatArray, truth: FloatArray, tTe: FloatArray | None
 ) -> tuple[float | None, float | None]:
-    if found is None or len(estimate) <= delta:
+    if tTe is None or len(estimate) <= 1:
         return None, None
-    translation, rotation = relative_errors(found.poses(estimate), truth, delta)
+    translation, rotation = relative_errors(moved(tTe, estimate), truth)
     return _rmse(translation), float(np.degrees(_rmse(rotation)))
 
 

@@ -40,15 +40,13 @@ def test_tum_file_keeps_every_pose(tmp_path_factory, many: list[FloatArray], sta
     np.testing.assert_allclose(read.poses, written.poses, atol=5e-12)
 
 
-@given(poses(reach=100.0), st.floats(0.01, 100.0), st.integers(0, 2**31))
+@given(poses(reach=100.0), st.integers(0, 2**31))
 @settings(max_examples=60, deadline=None)
-def test_alignment_undoes_any_similarity(world: FloatArray, scale: float, seed: int) -> None:
+def test_alignment_undoes_any_rigid_motion(world: FloatArray, seed: int) -> None:
     source = np.random.default_rng(seed).normal(size=(12, 3))
-    target = scale * source @ world[:3, :3].T + world[:3, 3]
-    found = umeyama(source, target, with_scale=True)
+    found = umeyama(source, source @ world[:3, :3].T + world[:3, 3])
     assert found is not None
-    np.testing.assert_allclose(found.scale, scale, rtol=1e-9)
-    np.testing.assert_allclose(found.points(source), target, atol=1e-9 * max(scale, 100.0))
+    np.testing.assert_allclose(found, world, rtol=0, atol=1e-9)
 
 
 @given(poses(reach=100.0), st.integers(0, 2**31))

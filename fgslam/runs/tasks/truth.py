@@ -12,7 +12,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import FgslamError
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import StereoFeatures
-from fgslam.core.geometry import inverse, pose, transform_to_world
+from fgslam.core.geometry import inverse, transform_to_world
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LandmarkTruth, Sequence
 from fgslam.core.saved_map import SavedMap
@@ -292,10 +292,9 @@ def _of_recorded(
         return None
     rows, true_rows = associate(saved.trajectory.timestamps, truth.timestamps, _SAME_TIME_S)
     true, own = truth.poses[true_rows], saved.trajectory.poses[rows]
-    found = align(true, own)
-    if found is None:
+    mTw = align(true, own)
+    if mTw is None:
         return None
-    mTw = pose(found.rotation, found.translation)
     return mTw, len(rows), alignment_slack(transform_to_world(mTw, true[:, :3, 3]), own[:, :3, 3])
 
 
