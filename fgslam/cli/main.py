@@ -143,8 +143,7 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     from fgslam.cli.console import show_parts
     from fgslam.core.errors import ConfigError
     from fgslam.runs.baseline import read_baseline
-    from fgslam.runs.choosing import Choice
-    from fgslam.runs.compare import ate_tables, compare_runs, metrics_of
+    from fgslam.runs.compare import Choice, ate_tables, compare_runs, metrics_of
     from fgslam.runs.trials import Seeds, run_trials
 
     names = None if estimators is None else tuple(estimators.split(","))

@@ -16,11 +16,15 @@ from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.core.threads import one_blas_thread
-from fgslam.report.content import TextTable
+from fgslam.evaluation.metrics import JsonValue
+from fgslam.report.content import Page, TextTable
+from fgslam.report.page import write_html
+from fgslam.report.tables import write_json
 from fgslam.runs.config import load_experiment
 from fgslam.runs.config_models import Experiment
 from fgslam.runs.folder import (
     METRICS_FILE,
+    REPORT_FILE,
     RUN_MARKER,
     STATE_FILE,
     ExistingFolder,
@@ -243,3 +247,40 @@ def resume_command(folder: Path) -> str:
     """What to type to continue the run in ``folder``, whatever overrides it was started with."""
     run = shlex.quote(str(folder))
     return f"fgslam run {shlex.quote(str(folder / RUN_MARKER))} --out {run} --resume"
+
+
+# --------------------------------------------------------------------------------------------
+# metrics.json and the page of tasks whose results are tables: homing and localisation
+
+
+def write_document(
+    result: RunResult,
+    numbers: Mapping[str, JsonValue],
+    estimators: Mapping[str, JsonValue] | None = None,
+) -> None:
+    """metrics.json: what every homing task has, then its own numbers. Raises OutputError."""
+    about: dict[str, JsonValue] = {
+        "name": result.config.name,
+        "task": result.config.task_name,
+        "status": result.status,
+        "remarks": list(result.notes),
+    }
+    document = {**about, **numbers, "estimators": dict(estimators or {})}
+    write_json(result.folder / METRICS_FILE, document)
+
+
+def write_page(result: RunResult, subtitle: str, **parts: Any) -> None:
+    """report.html, unless the configuration does without; ``parts`` as of Page."""
+    if not result.config.wants_report:
+        return
+    page = Page(
+        title=result.config.name,
+        subtitle=subtitle,
+        headline=result.lines,
+        tables=result.tables,
+        notes=result.notes,
+        config_yaml=(result.folder / RUN_MARKER).read_text(encoding="utf-8"),
+        versions=versions(),
+        **parts,
+    )
+    write_html(result.folder / REPORT_FILE, page)

@@ -30,8 +30,7 @@ from fgslam.report.figures.homing import Line, curve_figure, local_map_figure
 from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.config_models import HomingExperiment
-from fgslam.runs.documents import write_document, write_page
-from fgslam.runs.engine import Context, RunResult, Status, Task
+from fgslam.runs.engine import Context, RunResult, Status, Task, write_document, write_page
 from fgslam.runs.folder import COMPARISON_FILE, digest_of
 from fgslam.runs.units import each_apart
 

@@ -23,8 +23,7 @@ from fgslam.evaluation.consistency import Consistency, Nees, judge
 from fgslam.evaluation.judging import judge_replay
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, value_at
 from fgslam.report.tables import RESULT_COLUMNS, TIME_COLUMNS, write_comparison_csv, write_metrics
-from fgslam.runs.choosing import EVERY, Choice, choose
-from fgslam.runs.compare import require_room
+from fgslam.runs.compare import EVERY, Choice, choose, require_room
 from fgslam.runs.config import load_experiment
 from fgslam.runs.config_models import Experiment, ExperimentConfig, HomingTrialsConfig
 from fgslam.runs.engine import Context, Opener, Opening, RunResult, Status, Task, run_task

@@ -30,8 +30,7 @@ from recordings import experiment
 from fgslam.core import files
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.report.tables import write_comparison_csv
-from fgslam.runs.choosing import Choice
-from fgslam.runs.compare import compare_runs
+from fgslam.runs.compare import Choice, compare_runs
 from fgslam.runs.config import parse_experiment
 from fgslam.runs.engine import RunResult
 from fgslam.runs.folder import ExistingFolder

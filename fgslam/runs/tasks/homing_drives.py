@@ -39,8 +39,7 @@ from fgslam.report.figures.homing import Line, curve_figure, local_map_figure
 from fgslam.report.figures.plan import catchment_figure, drive_figure
 from fgslam.report.figures.traces import Figure
 from fgslam.runs.config_models import DrivingConfig
-from fgslam.runs.documents import write_document, write_page
-from fgslam.runs.engine import Context, Opening, RunResult, Status, Task
+from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, write_document, write_page
 from fgslam.runs.homing_comparison import replay_homing
 from fgslam.runs.tasks.homing_drive_results import (
     bearing_log,

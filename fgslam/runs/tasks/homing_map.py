@@ -28,8 +28,7 @@ from fgslam.report.figures.plan import Links, network_figure, unfolded
 from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.config_models import TopologicalMapConfig
-from fgslam.runs.documents import write_document, write_page
-from fgslam.runs.engine import Context, Opening, RunResult, Task
+from fgslam.runs.engine import Context, Opening, RunResult, Task, write_document, write_page
 from fgslam.runs.tasks.homing_views import (
     PairAnswer,
     PairSearch,

@@ -25,8 +25,7 @@ from fgslam.report.figures.homing import sorted_errors
 from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.config_models import HomingTrialsConfig
-from fgslam.runs.documents import write_document, write_page
-from fgslam.runs.engine import Context, Opening, RunResult, Status, Task
+from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, write_document, write_page
 from fgslam.runs.folder import TIMING_FILE, TRIALS_FILE
 from fgslam.runs.homing_comparison import (
     ESTIMATOR_COLUMNS,

@@ -18,8 +18,7 @@ from fgslam.report.content import Column, Picture, TextTable
 from fgslam.report.figures.homing import Line, curve_figure
 from fgslam.report.tables import write_csv
 from fgslam.runs.config_models import OmniVideoConfig
-from fgslam.runs.documents import write_document, write_page
-from fgslam.runs.engine import Context, Opening, RunResult, Status, Task
+from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, write_document, write_page
 from fgslam.runs.tasks.homing_views import open_checked
 
 FRAMES_FILE = "frames.csv"

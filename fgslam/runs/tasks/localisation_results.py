@@ -29,8 +29,7 @@ from fgslam.report.figures.located import Located, located_figure
 from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv, write_json
 from fgslam.runs.config_models import LocalisationConfig
-from fgslam.runs.documents import write_page
-from fgslam.runs.engine import RunResult
+from fgslam.runs.engine import RunResult, write_page
 from fgslam.runs.folder import METRICS_FILE
 from fgslam.runs.tasks.localisation_queries import Asked, Attempt
 from fgslam.runs.tasks.slam_map_entry import GivenMap

@@ -33,7 +33,7 @@ from fgslam.report.tables import (
     write_landmark_truth,
 )
 from fgslam.runs.baseline import check_baseline, read_baseline, write_baseline
-from fgslam.runs.choosing import Choice, all_kinds, choose
+from fgslam.runs.compare import Choice, all_kinds, choose
 from fgslam.runs.config import ExperimentConfig, parse_config
 from fgslam.runs.estimator_files import points_from_log
 from fgslam.runs.metric_tables import (
