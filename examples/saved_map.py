@@ -40,6 +40,20 @@ assert found.found
 assert error < 0.05
 
 # %% [markdown]
+# ## Going on in it
+#
+# A session can begin in the map. Its first pose is found without a prior; a frame before that has
+# the status `not_located` and no pose. `extend_map=False` leaves the map as it is (estimators
+# `landmark_kalman` and `ekf`); otherwise the session's result holds what became of it.
+
+# %%
+with fg.Slam(recording.rig, "landmark_kalman", start_map=place, extend_map=False) as later:
+    steps = [later.track(*recording[k]) for k in range(7, 12)]
+print([step.status.value for step in steps])
+error = np.linalg.norm(steps[0].wTc[:3, 3] - (np.linalg.inv(first) @ true)[:3, 3])
+assert error < 0.05
+
+# %% [markdown]
 # ## Where there is nothing to see
 #
 # A blank wall is refused with the reason, instead of being given some pose.

@@ -26,8 +26,9 @@ from fgslam.runs.engine import run_task
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.tasks.localisation import open_localisation
 from fgslam.runs.tasks.localisation_queries import submap_features
-from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map, trusted
+from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map
 from fgslam.runs.tasks.truth import truth_in_map
+from fgslam.slam.arrival import trusted
 from fgslam.slam.factory import make_relocaliser, make_stereo_matcher, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 

@@ -68,6 +68,7 @@ class EgoMotionStatus(str, Enum):
     TOO_FEW_MATCHES = "too_few_matches"
     DIVERGED = "diverged"
     NO_IMAGE = "no_image"
+    NOT_LOCATED = "not_located"
 
     @property
     def measured(self) -> bool:

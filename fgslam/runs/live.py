@@ -10,15 +10,21 @@ from typing import Any, Self
 import numpy as np
 import yaml
 
+from fgslam.backend.protocol import Estimator
+from fgslam.backend.settings import EstimatorSettings
 from fgslam.core import __version__
 from fgslam.core.errors import ConfigError
+from fgslam.core.saved_map import load_map
 from fgslam.core.sensors import CameraRig
+from fgslam.datasets.settings import OdometrySettings
+from fgslam.frontend.settings import FrontendSettings
 from fgslam.runs.config import ExperimentConfig, load_config
-from fgslam.runs.maps import Map, map_points
+from fgslam.runs.maps import Map, drives_of, map_points
 from fgslam.runs.named_experiments import find_experiment
 from fgslam.runs.opening import open_sequence
-from fgslam.slam.arrival import saved_map
+from fgslam.slam.arrival import MapStart, saved_map
 from fgslam.slam.feature_stream import FeatureExtractor
+from fgslam.slam.map_settings import MapSettings
 from fgslam.slam.results import SessionResult
 from fgslam.slam.session import Session
 
@@ -59,6 +65,62 @@ class Slam(Session):
 
     _remark = ""
 
+    def __init__(
+        self,
+        rig: CameraRig,
+        estimator: str | EstimatorSettings | Estimator = "isam2",
+        *,
+        frontend: FrontendSettings | Mapping[str, Any] | None = None,
+        odometry: OdometrySettings | None = None,
+        features: FeatureExtractor | None = None,
+        seed: int = 0,
+        start_map: Map | MapStart | None = None,
+        extend_map: bool = True,
+    ) -> None:
+        """Begins with an empty map, or in a saved one.
+
+        In a saved map the first pose is found without a prior. Until a frame can be located by the
+        map's landmarks, :meth:`track` answers with status `not_located` and no pose; those frames
+        are in no result. The map itself is not changed; :meth:`result` has what became of it.
+
+        Args:
+            rig: the rectified cameras, two or three; those that made ``start_map``.
+            estimator: the kind (`odometry`, `landmark_kalman`, `landmark_kalman_graph`,
+                `ekf`, `fixed_lag`, `isam2` or `batch`), settings of one, or an own object with the
+                members of :class:`fgslam.Estimator`. In a saved map `landmark_kalman`, `ekf`,
+                `isam2` or `batch`.
+            frontend: settings of features, matching and tracking; None for the defaults; a mapping
+                for what differs from these: ``{"stereo": {"max_disparity_px": 80}}``.
+            odometry: what predicts the motion. None: the odometry that is handed in, and constant
+                velocity over frames without any. With `constant_velocity` what is handed in is
+                ignored.
+            features: an own extractor, from a grey image (height, width) uint8 to
+                :class:`~fgslam.core.features.Features`; it is called from several threads. None
+                for SIFT.
+            seed: of everything random: samples of place recognition.
+            start_map: where to begin, as :meth:`fgslam.Map.load` gives it; None: an empty map.
+            extend_map: False leaves the map as it is, and the session only localises in it
+                (`landmark_kalman` or `ekf`).
+
+        Raises:
+            CalibrationError: the rig is impossible.
+            ConfigError: no such estimator, it cannot use what will be measured or begin in a map,
+                the seed is negative, or a setting of the front-end is not known or not usable.
+            MapError: other cameras made the map, or it is empty.
+        """
+        if isinstance(start_map, Map):
+            start_map = MapStart(start_map.saved, MapSettings(extend=extend_map))
+        self._before = None if start_map is None else start_map.saved
+        super().__init__(
+            rig,
+            estimator,
+            frontend=frontend,
+            odometry=odometry,
+            features=features,
+            seed=seed,
+            beginning=start_map,
+        )
+
     @classmethod
     def from_config(
         cls,
@@ -82,15 +144,12 @@ class Slam(Session):
             features: an own extractor, as for :class:`Slam`.
 
         Raises:
-            ConfigError: no such experiment, a key or value is wrong, or it begins in a saved map.
+            ConfigError: no such experiment, a key or value is wrong, or its map is made by a drive
+                of its own (`map.made_from`) or goes on with another run (`map.start: continue`).
             DatasetError: the recording cannot be opened.
+            MapError: the map of `map.load` cannot be read, is empty, or was made by other cameras.
         """
         settings = slam_config(config, overrides)
-        if settings.map.given:
-            raise ConfigError(
-                f"{settings.name}: begins in a saved map, which a run finds its place in; use "
-                "fgslam.run"
-            )
         slam = cls(
             open_sequence(settings).rig if rig is None else rig,
             settings.estimator,
@@ -98,6 +157,7 @@ class Slam(Session):
             odometry=settings.odometry,
             features=features,
             seed=settings.seed,
+            start_map=_beginning(settings),
         )
         slam.numbering = (settings.dataset.start, settings.dataset.stride)
         slam._remark = settings.remark
@@ -111,7 +171,8 @@ class Slam(Session):
         """
         found = super().result()
         points = map_points(found.estimate.landmarks, self.pipeline.tracker.database)
-        about = {"drives": [self._drive(found)]}
+        drives = [] if self._before is None else drives_of(self._before)
+        about = {"drives": [*drives, self._drive(found)]}
         saved = saved_map(self.pipeline, self.rig, found.estimate, about)
         values = {name: getattr(found, name) for name in found.__dataclass_fields__}
         return Result(**values, map=Map(saved, points, self._remark))
@@ -126,6 +187,19 @@ class Slam(Session):
             "remark": self._remark,
             "remarks": list(found.remarks),
         }
+
+
+def _beginning(config: ExperimentConfig) -> MapStart | None:
+    """The map that an experiment loads; None where it begins with an empty one."""
+    settings = config.map
+    if settings.made_from is not None or (settings.given and settings.start == "continue"):
+        raise ConfigError(
+            f"{config.name}: its map is made by a drive of its own, or another run goes on; use "
+            "fgslam.run, or Slam(start_map=...) with a map that is there"
+        )
+    if settings.load is None:
+        return None
+    return MapStart(load_map(Path(settings.load)), settings, settings.load)
 
 
 def slam_config(

@@ -5,12 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from fgslam.backend.protocol import Estimator, MapUser
-from fgslam.core.arrays import StateArrays
-from fgslam.core.errors import ConfigError
-from fgslam.core.estimates import Estimate, Prediction
-from fgslam.core.saved_map import SavedMap
+from fgslam.core.arrays import FloatArray, StateArrays
+from fgslam.core.errors import ConfigError, MapError
+from fgslam.core.estimates import Estimate, LandmarkMap, Prediction
+from fgslam.core.features import LandmarkAppearances
+from fgslam.core.saved_map import SavedMap, require_rig
 from fgslam.core.sensors import CameraRig
+from fgslam.slam.map_settings import MapSettings
 from fgslam.slam.pipeline import SlamPipeline
 
 
@@ -30,6 +34,55 @@ class Arrival:
     prior: Prediction
     relocalised: bool
     extends: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapStart:
+    """A saved map in which a session begins, and how it finds its first pose there.
+
+    Attributes:
+        saved: the map; its world is the session's.
+        settings: ``start`` (`relocalise`, `origin` or `last`), ``extend`` and ``begin`` count.
+        name: of the map, for messages.
+    """
+
+    saved: SavedMap
+    settings: MapSettings
+    name: str = "the map"
+
+    def require_usable(self, rig: CameraRig) -> None:
+        """Refuses a map of other cameras, and an empty one. Raises MapError."""
+        require_rig(self.saved, rig, self.name)
+        if not len(self.saved):
+            raise MapError(f"{self.name}: holds no landmark; make the map anew")
+
+    def known(self) -> Arrival | None:
+        """Where the map itself tells the first pose; None where a frame is to be located in it.
+
+        Raises:
+            MapError: it is to be the map's last pose, and the map has no trajectory.
+        """
+        if self.settings.start == "relocalise":
+            return None
+        if self.settings.start != "last":
+            return self.at(np.eye(4), relocalised=False)
+        if not len(self.saved.trajectory):
+            raise MapError(f"{self.name}: knows no last pose; use map.start relocalise")
+        return self.at(self.saved.trajectory.poses[-1], relocalised=False)
+
+    def at(self, wTc: FloatArray, relocalised: bool) -> Arrival:
+        """A first pose that is known roughly: what is known better its landmarks will tell."""
+        begin = self.settings.begin
+        sigma = np.repeat([np.deg2rad(begin.sigma_deg), begin.sigma_m], 3)
+        prior = Prediction(wTc, np.diag(sigma**2))
+        return Arrival(self.saved, prior, relocalised, self.settings.extend)
+
+
+def trusted(saved: SavedMap, valid_hits: int) -> tuple[LandmarkMap, LandmarkAppearances]:
+    """Landmarks seen often enough to be there (Se et al. 6.1), with their looks."""
+    sure = saved.permanent | (saved.hits >= valid_hits)
+    landmarks = saved.landmarks.select(sure)
+    return landmarks, saved.appearances.of(landmarks.ids)
 
 
 def take_over(estimator: Estimator, arrival: Arrival) -> None:

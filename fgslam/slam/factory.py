@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, TypeGuard, cast, get_args
 
 import numpy as np
@@ -26,10 +26,11 @@ from fgslam.backend.settings import (
     LandmarkKalmanSettings,
 )
 from fgslam.core.errors import ConfigError
-from fgslam.core.estimates import Prediction
+from fgslam.core.estimates import Prediction, Relocalisation
 from fgslam.core.floor import DegreesOfFreedom, Floor
 from fgslam.core.measurements import MeasurementType
 from fgslam.core.recordings import Sequence
+from fgslam.core.saved_map import SavedMap
 from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.datasets.settings import (
     ConstantVelocitySettings,
@@ -43,14 +44,16 @@ from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.map_matching import MapMatcher
 from fgslam.frontend.tracking.tracker import LandmarkTracker
-from fgslam.slam.arrival import Arrival, take_over
-from fgslam.slam.feature_stream import FeatureExtractor, FeatureStream
+from fgslam.slam.arrival import Arrival, take_over, trusted
+from fgslam.slam.feature_stream import FeatureExtractor, FeatureFrame, FeatureStream
 from fgslam.slam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
 from fgslam.slam.pipeline import SlamPipeline
 
 if TYPE_CHECKING:
     from fgslam.frontend.places.recognition import PlaceRecognition
     from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
+
+_LOCATING_STREAM = 12  # of random numbers, beside those of the recording
 
 
 def make_stream(sequence: Sequence, settings: FrontendSettings) -> FeatureStream:
@@ -223,6 +226,21 @@ def make_relocaliser(rig: CameraRig, settings: FrontendSettings) -> Relocaliser:
 
     floor = Floor.under(rig, settings.ego_motion.dof)
     return Relocaliser(rig, floor, settings.relocalisation)
+
+
+def make_locator(
+    rig: CameraRig, settings: FrontendSettings, saved: SavedMap, seed: int
+) -> Callable[[FeatureFrame], Relocalisation]:
+    """Locates the frames of a recording in a saved map, each alone and without a prior."""
+    relocaliser = make_relocaliser(rig, settings)
+    relocaliser.learn(*trusted(saved, settings.database.valid_hits))
+    stereo = make_stereo_matcher(rig, settings)
+
+    def locate(found: FeatureFrame) -> Relocalisation:
+        rng = np.random.default_rng([seed, _LOCATING_STREAM, found.i])
+        return relocaliser.locate(stereo.match(found.features), rng)
+
+    return locate
 
 
 def require_support(estimator: Estimator, measured_odometry: bool, loops: bool = False) -> None:

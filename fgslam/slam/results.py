@@ -13,6 +13,7 @@ from fgslam.backend.protocol import Estimator
 from fgslam.core.arrays import BoolArray, Brief, FloatArray, StateArrays
 from fgslam.core.errors import FgslamError
 from fgslam.core.estimates import EgoMotionStatus, Estimate, LandmarkMap, Trajectory
+from fgslam.core.features import StereoFeatures
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Observations
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
@@ -126,13 +127,15 @@ class Step(Brief):
     """Pose of one tracked frame, and what was matched in it.
 
     Attributes:
-        index: number of the frame in the session, from 0.
+        index: number of the frame in the session, from 0; -1 of one that was not located in the
+            map that the session is to begin in.
         timestamp: seconds.
         wTc: (4, 4) pose of the right camera in the world, metres.
         covariance: (6, 6) of it, [rotation, translation], radians and metres, in the tangent space
             at ``wTc``: ``T = wTc * Exp(xi)``.
         status: how the pose was found: `first`, `ok`, `capped`, `relocalised`; or, by odometry
-            alone, `too_few_matches`, `diverged`, `no_image`.
+            alone, `too_few_matches`, `diverged`, `no_image`; or not at all, `not_located` in the
+            map that the session is to begin in: pose and covariance are NaN.
         matches: the k landmarks of the map that the frame sees again: ids (k,), (column, row,
             disparity) (k, 3) in pixels with covariance, raw pixels (k, 3, 2) in right, left, top.
         inliers: (k,) which of the matches agree with the pose.
@@ -151,6 +154,25 @@ class Step(Brief):
     new: Observations
     landmarks: int
     closed: tuple[bool, ...]
+
+    @staticmethod
+    def not_located(timestamp: float, landmarks: int) -> Step:
+        """Step of a frame that was not located in the map that its session is to begin in."""
+        none = StereoFeatures.empty().observations(
+            np.empty(0, np.int64), np.empty(0, np.int64), is_new=False
+        )
+        return Step(
+            index=-1,
+            timestamp=timestamp,
+            wTc=np.full((4, 4), np.nan),
+            covariance=np.full((6, 6), np.nan),
+            status=EgoMotionStatus.NOT_LOCATED,
+            matches=none,
+            inliers=np.empty(0, np.bool_),
+            new=none,
+            landmarks=landmarks,
+            closed=(),
+        )
 
     @staticmethod
     def of(report: FrameReport) -> Step:
@@ -182,6 +204,7 @@ class SessionResult(Brief):
         online_covariances: (n, 6, 6) of those.
         closed: of all loop closures offered so far, whether the estimator took them.
         frames: the record of every frame, by name of the column.
+        notes: what is to be said of the images, and of frames left out.
     """
 
     kind: str
@@ -190,6 +213,7 @@ class SessionResult(Brief):
     online_covariances: FloatArray
     closed: tuple[bool, ...]
     frames: dict[str, npt.NDArray[Any]]
+    notes: tuple[str, ...]
 
     # What a comparison of estimators asks of a replay, and a live session does not know.
     failure = ""
@@ -209,15 +233,17 @@ class SessionResult(Brief):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What the estimator left out or had to repair, in words."""
-        return self.estimate.remarks
+        """What is to be said of the images, and what the estimator left out or had to repair."""
+        return (*self.notes, *self.estimate.remarks)
 
     def column(self, name: str) -> npt.NDArray[Any]:
         """(n,) one number of every frame: `status`, `matched`, `inliers`, `nis`, `update_ms`..."""
         return self.frames[name]
 
 
-def result_of(pipeline: SlamPipeline, recorder: RunRecorder, failed: bool = False) -> SessionResult:
+def result_of(
+    pipeline: SlamPipeline, recorder: RunRecorder, notes: tuple[str, ...], failed: bool
+) -> SessionResult:
     """The result of the frames so far; nothing is changed.
 
     Where the estimator ``failed`` in the frame after them, it may have taken in a part of that
@@ -239,6 +265,7 @@ def result_of(pipeline: SlamPipeline, recorder: RunRecorder, failed: bool = Fals
         online_covariances=covariances,
         closed=() if pipeline.places is None else tuple(pipeline.places.taken),
         frames=_columns(recorder),
+        notes=notes,
     )
 
 

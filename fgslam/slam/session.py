@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Self
 
+import numpy as np
 import numpy.typing as npt
 
 from fgslam.backend.protocol import Estimator
@@ -12,7 +15,7 @@ from fgslam.backend.settings import EstimatorSettings
 from fgslam.cameras.rig import require_rig
 from fgslam.core.arrays import FloatArray
 from fgslam.core.checks import later_time, require_seed
-from fgslam.core.errors import FrameError, SessionError
+from fgslam.core.errors import ConfigError, FrameError, SessionError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
@@ -20,12 +23,29 @@ from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.datasets.settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.frontend.settings import FrontendSettings
-from fgslam.slam.arrival import Arrival
-from fgslam.slam.factory import chosen_estimator, chosen_frontend, make_extractor, make_pipeline
+from fgslam.slam.arrival import Arrival, MapStart
+from fgslam.slam.factory import (
+    chosen_estimator,
+    chosen_frontend,
+    is_settings,
+    make_extractor,
+    make_locator,
+    make_pipeline,
+)
 from fgslam.slam.feature_stream import FeatureExtractor, FeatureFrame, FrameDescriber
+from fgslam.slam.first_images import FirstImages, any_uint16, stereo_remarks
 from fgslam.slam.inputs import Images, checked_images, checked_odometry
 from fgslam.slam.pipeline import FrameReport
 from fgslam.slam.results import RunRecorder, SessionResult, Step, result_of
+
+
+@dataclass(frozen=True)
+class _LeftOut:
+    """Frames before the first that was located in the map: how many, the last one's time, why."""
+
+    count: int = 0
+    timestamp: float | None = None
+    why: str = ""
 
 
 class Session:
@@ -56,9 +76,9 @@ class Session:
         odometry: OdometrySettings | None = None,
         features: FeatureExtractor | None = None,
         seed: int = 0,
-        arrival: Arrival | None = None,
+        beginning: Arrival | MapStart | None = None,
     ) -> None:
-        """Begins with an empty map, or where ``arrival`` says in a saved one.
+        """Begins with an empty map, or in a saved one.
 
         Args:
             rig: the rectified cameras, two or three.
@@ -74,12 +94,14 @@ class Session:
                 :class:`~fgslam.core.features.Features`; it is called from several threads. None
                 for SIFT.
             seed: of everything random: samples of place recognition.
-            arrival: where to begin in a saved map.
+            beginning: a saved map: with the first frame's place in it, or to be located in by the
+                first frames. Those before the first one that could be located have no pose.
 
         Raises:
             CalibrationError: the rig is impossible.
-            ConfigError: no such estimator, it cannot use what will be measured, the seed is
-                negative, or a setting of the front-end is not known or not usable.
+            ConfigError: no such estimator, it cannot use what will be measured or begin in a map,
+                the seed is negative, or a setting of the front-end is not known or not usable.
+            MapError: other cameras made the map, or it is empty.
         """
         require_rig(rig)
         require_seed(seed, "session")
@@ -88,14 +110,36 @@ class Session:
         self.rig = rig
         self.frontend = frontend
         self.numbering = (0, 1)
-        self.pipeline = make_pipeline(
-            rig, frontend, odometry, chosen_estimator(estimator), seed, arrival
-        )
+        chosen = chosen_estimator(estimator)
+        self._make = partial(make_pipeline, rig, frontend, odometry, chosen, seed)
+        self._start: MapStart | None = None
+        if isinstance(beginning, MapStart):
+            beginning = self._begun(beginning, chosen, seed)
+        self.pipeline = self._make(beginning)
         self.recorder = RunRecorder(MeasurementLog(rig, self.pipeline.motion.description()))
+        self._left_out = _LeftOut()
+        self._seen = FirstImages()
         self._odometry = odometry
         self._describer = FrameDescriber(features or make_extractor(frontend))
         self._ended = ""
         self._failed = False
+
+    def _begun(
+        self, start: MapStart, estimator: EstimatorSettings | Estimator, seed: int
+    ) -> Arrival:
+        """The first pose in a saved map; until a frame is located, that of the map's world."""
+        if not is_settings(estimator):
+            raise ConfigError(
+                "estimator: an own estimator begins at a pose of its own, not where the first "
+                "frame is located in the map; give a kind or its settings"
+            )
+        start.require_usable(self.rig)
+        known = start.known()
+        if known is not None:
+            return known
+        self._start, self._map = start, start.name
+        self._locate = make_locator(self.rig, self.frontend, start.saved, seed)
+        return start.at(np.eye(4), relocalised=True)
 
     # -- frames ------------------------------------------------------------------------------
 
@@ -127,14 +171,35 @@ class Session:
                 with :meth:`result` of the frames before.
         """
         self._require_open()
-        i = len(self.recorder)
+        i = self._left_out.count if self._start is not None else len(self.recorder)
         timestamp = later_time(t, self._last_time(), "session", FrameError)
         body = checked_odometry(odometry, self._odometry) if i else None
         checked = None if images is None else checked_images(images, self.rig)
         frame = None if checked is None else Frame(i, timestamp, checked)
         with one_blas_thread():
-            report = self.advance(self._describer.describe(i, frame), timestamp, body)
-        return Step.of(report)
+            found = self._describer.describe(i, frame)
+            if images is not None:
+                self._seen.add(found, any_uint16(images))
+            if self._start is None:
+                return Step.of(self.advance(found, timestamp, body))
+            if not self._arrives(self._start, found, timestamp):
+                return Step.not_located(timestamp, len(self.pipeline.tracker.database))
+            return Step.of(self.advance(replace(found, i=0), timestamp))
+
+    def _arrives(self, start: MapStart, found: FeatureFrame, timestamp: float) -> bool:
+        """True if the frame can be located in the map: the session then begins with it."""
+        left_out, why = self._left_out, found.problem
+        if found.frame is not None:
+            located = self._locate(found)
+            why = located.why
+            if located.found:
+                self.pipeline = self._make(start.at(located.wTc, relocalised=True))
+                first, stride = self.numbering
+                self.numbering = (first + stride * left_out.count, stride)
+                self._start = None
+                return True
+        self._left_out = _LeftOut(left_out.count + 1, timestamp, why)
+        return False
 
     def advance(
         self,
@@ -186,10 +251,19 @@ class Session:
         Raises:
             SessionError: there is no frame yet.
         """
+        left_out = self._left_out
         if not len(self.recorder):
+            if left_out.count:
+                raise SessionError(
+                    f"none of {left_out.count} frames could be located in {self._map}: "
+                    f"{left_out.why}"
+                )
             raise SessionError("no frame has been tracked yet; call track first")
+        notes = stereo_remarks(self.recorder, self._seen)
+        if left_out.count:
+            notes = (*notes, f"the first {left_out.count} frames could not be located: left out")
         with one_blas_thread():
-            return result_of(self.pipeline, self.recorder, self._failed)
+            return result_of(self.pipeline, self.recorder, notes, self._failed)
 
     def close(self) -> None:
         """Ends the session and its threads; results can still be asked for."""
@@ -210,7 +284,7 @@ class Session:
 
     def _last_time(self) -> float | None:
         increments = self.recorder.log.increments
-        return increments[-1].timestamp if increments else None
+        return increments[-1].timestamp if increments else self._left_out.timestamp
 
     def _usable(self, body: Odometry | None) -> Odometry | None:
         return body if self.pipeline.motion.uses_odometry else None

@@ -33,8 +33,9 @@ from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.engine import Context
-from fgslam.runs.tasks.slam_map_entry import GivenMap, trusted
+from fgslam.runs.tasks.slam_map_entry import GivenMap
 from fgslam.runs.tasks.truth import Sighted, TrueSights, TruthInMap, truth_in_map
+from fgslam.slam.arrival import trusted
 from fgslam.slam.factory import make_pipeline, make_relocaliser, make_stereo_matcher, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion

@@ -133,7 +133,7 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
         frontend=config.frontend,
         odometry=config.odometry,
         seed=config.seed,
-        arrival=arrival,
+        beginning=arrival,
     )
     first_frame = opened.dataset.start
     outputs = RunOutputs(run.folder, config, sequence, session, first_frame, notes, given)

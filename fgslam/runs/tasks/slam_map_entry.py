@@ -10,22 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, MapError
-from fgslam.core.estimates import LandmarkMap, Prediction, Relocalisation
-from fgslam.core.features import LandmarkAppearances
+from fgslam.core.estimates import Prediction, Relocalisation
 from fgslam.core.recordings import Sequence
-from fgslam.core.saved_map import SavedMap, load_map, require_rig
+from fgslam.core.saved_map import SavedMap, load_map
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
-from fgslam.slam.arrival import Arrival
-from fgslam.slam.factory import make_relocaliser, make_stereo_matcher, make_stream
-from fgslam.slam.map_settings import MapSettings, MapStartSettings
+from fgslam.slam.arrival import Arrival, MapStart
+from fgslam.slam.factory import make_locator, make_stream
+from fgslam.slam.map_settings import MapSettings
 
 FIRST_FOLDER = "first"
 MAP_FILE = "map.fgmap"
-
-_STREAM = 12  # of random numbers, beside those of the recording
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,46 +115,29 @@ def enter(config: ExperimentConfig, given: GivenMap, sequence: Sequence) -> Entr
     Raises:
         MapError: another rig made the map, it is empty, or no frame could be located.
     """
-    saved, settings = given.saved, config.map
-    require_rig(saved, sequence.rig, str(given.path))
-    if not len(saved):
-        raise MapError(f"{given.path}: holds no landmark; make the map anew")
-    if settings.start == "relocalise":
+    start = MapStart(given.saved, config.map, str(given.path))
+    start.require_usable(sequence.rig)
+    arrival, before = start.known(), 0
+    if arrival is None:
         before, found = _locate(config, given, sequence)
-        prior = _around(found.wTc, settings.begin)
-        return Entry(str(given.path), given.identity, before, True, prior)
-    pose = np.eye(4)
-    if settings.start == "last":
-        if not len(saved.trajectory):
-            raise MapError(f"{given.path}: knows no last pose; use map.start relocalise")
-        pose = saved.trajectory.poses[-1]
-    return Entry(str(given.path), given.identity, 0, False, _around(pose, settings.begin))
-
-
-def _around(wTc: FloatArray, settings: MapStartSettings) -> Prediction:
-    """A first pose that is known roughly: what is known better its landmarks will tell."""
-    sigma = np.repeat([np.deg2rad(settings.sigma_deg), settings.sigma_m], 3)
-    return Prediction(wTc, np.diag(sigma**2))
+        arrival = start.at(found.wTc, relocalised=True)
+    return Entry(str(given.path), given.identity, before, arrival.relocalised, arrival.prior)
 
 
 def _locate(
     config: ExperimentConfig, given: GivenMap, sequence: Sequence
 ) -> tuple[int, Relocalisation]:
     """The first frame that the map's landmarks place beyond doubt, and its number."""
-    saved, frontend = given.saved, config.frontend
-    relocaliser = make_relocaliser(sequence.rig, frontend)
-    relocaliser.learn(*trusted(saved, frontend.database.valid_hits))
-    stereo = make_stereo_matcher(sequence.rig, frontend)
+    locate = make_locator(sequence.rig, config.frontend, given.saved, config.seed)
     within, why = min(config.map.begin.within, len(sequence)), "no image could be read"
-    stream = make_stream(sequence, frontend)()
+    stream = make_stream(sequence, config.frontend)()
     try:
         for found in stream:
             if found.i >= within:
                 break
             if found.frame is None:
                 continue
-            rng = np.random.default_rng([config.seed, _STREAM, found.i])
-            located = relocaliser.locate(stereo.match(found.features), rng)
+            located = locate(found)
             if located.found:
                 return found.i, located
             why = located.why
@@ -168,13 +147,6 @@ def _locate(
         f"{given.path}: none of the first {within} frames of {sequence.name} could be located in "
         f"the map ({why}); raise map.begin.within, or tell the place by map.start"
     )
-
-
-def trusted(saved: SavedMap, valid_hits: int) -> tuple[LandmarkMap, LandmarkAppearances]:
-    """Landmarks seen often enough to be there (Se et al. 6.1), with their looks."""
-    sure = saved.permanent | (saved.hits >= valid_hits)
-    landmarks = saved.landmarks.select(sure)
-    return landmarks, saved.appearances.of(landmarks.ids)
 
 
 def arrival_of(run: Path) -> Arrival | None:

@@ -43,6 +43,7 @@ from fgslam.runs.tasks.slam_metrics import (
     write_closures,
 )
 from fgslam.runs.tasks.truth import rendered_landmark_truth
+from fgslam.slam.first_images import stereo_remarks
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.results import STAGES, RunRecorder
 from fgslam.slam.session import Session
@@ -160,7 +161,7 @@ class RunOutputs:
             "odometry": self.config.odometry.kind,
             "landmarks_permanent": int(self.pipeline.tracker.database.permanent.sum()),
             "remark": self.remark or None,
-            "notes": [*self.sequence.notes, *self.notes],
+            "notes": [*self.sequence.notes, *self.notes, *stereo_remarks(self.recorder)],
         }
 
 
@@ -193,7 +194,8 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
 def run_notes(outputs: RunOutputs, metrics: EstimatorMetrics) -> tuple[str, ...]:
     """What was tolerated: notes on the recording, and frames that could not be used."""
     problems = frame_problems(outputs.recorder)
-    lines = [*outputs.sequence.notes, *outputs.notes, *problems[:_PROBLEMS_SHOWN]]
+    lines = [*outputs.sequence.notes, *outputs.notes, *stereo_remarks(outputs.recorder)]
+    lines += problems[:_PROBLEMS_SHOWN]
     if len(problems) > _PROBLEMS_SHOWN:
         lines.append(f"and {len(problems) - _PROBLEMS_SHOWN} more such frames, see metrics.json")
     if not metrics.landmarks:

@@ -1,0 +1,72 @@
+"""Remarks on images that stereo matching cannot use: swapped cameras, darkness, 12-bit values."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.results import RunRecorder
+
+_FRAMES = 10  # judged: what is wrong with cables, drivers or calibration is wrong from the start
+_FEWEST = 3  # frames: one or two may show a blank wall
+_LEAST_MATCHED = 0.02
+"""Of the right image's features, share that finds its partner. Of swapped images only what agrees
+by chance does, under 0.01 on all recordings tried; of sound ones a third and more."""
+_DARK = 15
+"""Largest grey value of a dark image, of 255: 12-bit values reach 4095, of which the upper eight of
+16 bits are 15."""
+
+
+class FirstImages:
+    """What the first images of a session were like."""
+
+    def __init__(self) -> None:
+        """No image yet."""
+        self._left: list[int] = []
+        self._brightest = 0
+        self._uint16 = False
+
+    def add(self, found: FeatureFrame, uint16: bool) -> None:
+        """Counts a frame with images; ``uint16``: they were given so."""
+        if found.frame is None or len(self._left) >= _FRAMES:
+            return
+        self._left.append(len(found.features[1]))
+        self._brightest = max(self._brightest, *(int(image.max()) for image in found.frame.images))
+        self._uint16 |= uint16
+
+    def cause(self) -> str:
+        """What is known beside the numbers of features; empty where it is nothing."""
+        if not self._left:
+            return ""
+        if self._brightest > _DARK:
+            return f" ({np.mean(self._left):.0f} in the left image)"
+        if self._uint16:
+            return (
+                f"; of uint16 the upper eight bits count, and they reach {self._brightest} of 255: "
+                "shift 12-bit values to 16 bits (image << 4)"
+            )
+        return f"; the images are dark, their largest grey value is {self._brightest} of 255"
+
+
+def any_uint16(images: Sequence[npt.ArrayLike]) -> bool:
+    """True if one of the images is an array of 16 bits a value."""
+    return any(getattr(image, "dtype", None) == np.uint16 for image in images)
+
+
+def stereo_remarks(recorder: RunRecorder, seen: FirstImages | None = None) -> tuple[str, ...]:
+    """A remark where the first frames with images have next to no stereo match; else none."""
+    rows = [row for row in recorder.rows if not row.problem][:_FRAMES]
+    features, matched = sum(row.features for row in rows), sum(row.stereo for row in rows)
+    if len(rows) < _FEWEST or matched > _LEAST_MATCHED * features:
+        return ()
+    n, cause = len(rows), "" if seen is None else seen.cause()
+    found = f"no stereo matches in the first {n} frames: {features / n:.0f} features in the right"
+    found += f" image, {matched / n:.0f} of them matched{cause}"
+    if cause.startswith(";"):
+        return (found,)
+    if not features:
+        return (f"{found}; are the images dark, or 12-bit values in 16-bit images?",)
+    return (f"{found}; are left and right swapped, or the images not rectified?",)

@@ -1,0 +1,56 @@
+"""A remark on images that stereo matching cannot use, and none on sound ones."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import fgslam as fg
+from fgslam.core.arrays import Image
+
+FRAMES = 4
+Images = tuple[Image, ...]
+
+
+@pytest.fixture(scope="module")
+def recording() -> fg.Recording:
+    return fg.rendered_recording("lab", frames=FRAMES)
+
+
+def remarks(recording: fg.Recording, change: Callable[[Images], Images]) -> tuple[str, ...]:
+    with fg.Slam(recording.rig, "odometry") as slam:
+        for t, images, odometry in recording:
+            assert images is not None
+            slam.track(t, change(images), odometry)
+    return slam.result().remarks
+
+
+def test_sound_images_give_no_remark(recording: fg.Recording) -> None:
+    assert remarks(recording, lambda images: images) == ()
+    # 16 bits are as good, where they are used.
+    assert remarks(recording, lambda images: tuple(x.astype(np.uint16) << 8 for x in images)) == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda images: (images[1], images[0], *images[2:]), "left and right swapped"),
+        (
+            lambda images: tuple(x.astype(np.uint16) << 4 for x in images),
+            r"reach 1[0-5] of 255: shift 12-bit values to 16 bits \(image << 4\)",
+        ),
+        (lambda images: tuple(x // 32 for x in images), "dark, their largest grey value is 7 of"),
+        (lambda images: tuple(np.full_like(x, 128) for x in images), "dark, or 12-bit values"),
+    ],
+    ids=["swapped", "12 bits", "dark", "blank"],
+)
+def test_images_without_stereo_matches_give_one_line(
+    recording: fg.Recording, change: Callable[[Images], Images], words: str
+) -> None:
+    (remark,) = remarks(recording, change)
+    assert remark.startswith(f"no stereo matches in the first {FRAMES} frames: ")
+    assert "\n" not in remark
+    assert re.search(words, remark), remark
