@@ -3,12 +3,29 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from collections.abc import Sequence as Items
 from pathlib import Path
 from typing import TypeAlias
 
-from fgslam.datasets.checks.findings import Finding, Level, by_severity, share
-from fgslam.datasets.checks.recording import inspect_sequence
+import numpy as np
+
+from fgslam.core.recordings import Sequence
+from fgslam.datasets.checks.motion import (
+    check_clock,
+    check_odometry,
+    check_odometry_against_truth,
+    check_truth,
+)
+from fgslam.datasets.checks.recording import (
+    Finding,
+    Level,
+    by_severity,
+    check_calibration,
+    check_images,
+    check_timing,
+    share,
+)
 from fgslam.datasets.layouts import kitti_drives, recognise_layout
 from fgslam.datasets.settings import KittiSettings, MeasurementDatasetSettings, RenderedLabSettings
 from fgslam.runs.config import ExperimentConfig, load_config, make_config
@@ -18,13 +35,16 @@ from fgslam.runs.opening import open_sequence
 Progress = Callable[[str, int, int], None]
 """Called with what is under way, how much is done, and of how much."""
 
+Facts: TypeAlias = tuple[tuple[str, str], ...]
+"""Labels and values."""
+
 _READ_AT_LEAST = 300  # frames whose images are read; a few seconds
 _YAML = (".yaml", ".yml")
 
 
 def inspect_recording(
     dataset: Path,
-    overrides: Sequence[str] = (),
+    overrides: Items[str] = (),
     frames: int = 12,
     progress: Progress = lambda what, done, total: None,
 ) -> str:
@@ -42,20 +62,17 @@ def inspect_recording(
     config = configure(dataset, overrides)
     sequence = open_sequence(config, lambda done, total: progress("rendering", done, total))
     read = max(frames, _READ_AT_LEAST)
-    general = inspect_sequence(sequence, read, lambda done, total: progress("reading", done, total))
+    general = check_sequence(sequence, read, lambda done, total: progress("reading", done, total))
     looks = look_at_frames(
         sequence, config.frontend, frames, lambda done, total: progress("matching", done, total)
     )
     stereo = config.frontend.stereo
-    findings: tuple[Finding, ...] = (
-        *general.findings,
-        *judge_matches(looks, sequence.rig, stereo),
-    )
+    findings = by_severity((*general, *judge_matches(looks, sequence.rig, stereo)))
     seen: Facts = (
         ("images read", _images_read(min(read, len(sequence)), len(sequence))),
         *match_facts(looks, sequence.rig, stereo),
     )
-    return render_report((*general.facts, *_opening_facts(config)), seen, by_severity(findings))
+    return render_report((*facts_of(sequence), *_opening_facts(config)), seen, findings)
 
 
 def _images_read(read: int, frames: int) -> str:
@@ -63,7 +80,55 @@ def _images_read(read: int, frames: int) -> str:
     return f"{share(read, frames)} frames{all_of_them}"
 
 
-def configure(dataset: Path, overrides: Sequence[str]) -> ExperimentConfig:
+def check_sequence(
+    sequence: Sequence,
+    samples: int = 20,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[Finding, ...]:
+    """Findings of all checks that need no features, the worst first.
+
+    Args:
+        sequence: the recording.
+        samples: how many frames, spread over it, are read.
+        progress: called with how many of these have been read, and how many there are.
+    """
+    return by_severity(
+        (
+            *(Finding(Level.WARNING, "recording", note) for note in sequence.notes),
+            *check_calibration(sequence.rig),
+            *check_timing(sequence.timestamps),
+            *check_images(sequence, samples, progress),
+            *check_odometry(sequence),
+            *check_truth(sequence),
+            *check_odometry_against_truth(sequence),
+            *check_clock(sequence),
+        )
+    )
+
+
+def facts_of(sequence: Sequence) -> Facts:
+    """Label and value of what the recording is."""
+    rig, stamps = sequence.rig, sequence.timestamps
+    duration = float(stamps[-1] - stamps[0])
+    rate = f"{(len(stamps) - 1) / duration:.3g} Hz" if duration > 0.0 else "single frame"
+    view = 2.0 * np.degrees(np.arctan(0.5 * np.array([rig.width / rig.fx, rig.height / rig.fy])))
+    vertical = "" if rig.vertical_baseline is None else f", {rig.vertical_baseline:.4g} m vertical"
+    place = ", ".join(f"{x + 0.0:.3g}" for x in rig.bTc[:3, 3])
+    return (
+        ("recording", sequence.name),
+        ("frames", f"{len(stamps)} over {duration:.4g} s"),
+        ("rate", rate),
+        ("cameras", f"{rig.cameras}, {rig.width}x{rig.height}"),
+        ("focal length", f"{rig.fx:.5g} x {rig.fy:.5g} px, view {view[0]:.0f} x {view[1]:.0f} deg"),
+        ("principal point", f"{rig.cx:.5g}, {rig.cy:.5g} px"),
+        ("baseline", f"{rig.baseline:.4g} m{vertical}"),
+        ("camera's place", f"({place}) m in the robot's body"),
+        ("one pixel of disparity", f"is {rig.fx * rig.baseline:.3g} m away"),
+        ("identity", sequence.identity[:16]),
+    )
+
+
+def configure(dataset: Path, overrides: Items[str]) -> ExperimentConfig:
     """The experiment's configuration, or the default one for a folder in a known layout.
 
     Raises:
@@ -92,9 +157,6 @@ def _opening_facts(config: ExperimentConfig) -> Facts:
         facts.append(("other drives", f"{', '.join(others)}: inspect {folder}/NN"))
     return tuple(facts)
 
-
-Facts: TypeAlias = tuple[tuple[str, str], ...]
-"""Labels and values."""
 
 _WIDTH = 100
 _MOTION = ("ground truth", "odometry", "odometry against truth")

@@ -15,8 +15,6 @@ from fgslam.core.errors import FrameError
 from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.checks.findings import Finding, Level
-from fgslam.datasets.checks.images import spread_over
 from fgslam.datasets.checks.matches import (
     LEFT_RIGHT,
     TOP_RIGHT,
@@ -30,6 +28,7 @@ from fgslam.datasets.checks.matches import (
     check_stereo_counts,
     fit_turn,
 )
+from fgslam.datasets.checks.recording import Finding, Level, spread_over
 from fgslam.frontend.features.matching import mutual_nearest
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.settings import FrontendSettings, StereoSettings

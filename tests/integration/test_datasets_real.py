@@ -10,9 +10,8 @@ import pytest
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
-from fgslam.datasets.checks.findings import Level
 from fgslam.datasets.checks.matches import check_epipolar
-from fgslam.datasets.checks.recording import inspect_sequence
+from fgslam.datasets.checks.recording import Level
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.kitti import open_kitti
 from fgslam.datasets.light_field import open_light_field
@@ -25,6 +24,7 @@ from fgslam.datasets.settings import (
     RecordedOdometrySettings,
     SyntheticOdometrySettings,
 )
+from fgslam.runs.inspection import check_sequence
 
 pytestmark = pytest.mark.data
 
@@ -62,7 +62,7 @@ def test_stereo_recordings(
     for i in (0, frames - 1):
         frame = recording.frame(i)
         assert [image.shape for image in frame.images] == [size[::-1]] * 2
-    problems = [f for f in inspect_sequence(recording, 8).findings if f.level is Level.PROBLEM]
+    problems = [f for f in check_sequence(recording, 8) if f.level is Level.PROBLEM]
     assert problems == []
 
 

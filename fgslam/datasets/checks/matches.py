@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.datasets.checks.findings import Finding, Level, listed
-from fgslam.datasets.checks.images import CAMERA_NAMES
+from fgslam.datasets.checks.recording import CAMERA_NAMES, Finding, Level, listed
 
 _FEWEST_MATCHES = 20
 _SIGNIFICANT_DISPARITY_PX = 0.5

@@ -1,75 +1,191 @@
-"""What is in a recording, and every problem found, in words: the checks behind ``inspect``.
+"""Findings about a recording, and the checks of its images, calibration and time stamps.
 
 The checks look at any Sequence and raise nothing for what is wrong with it: each problem becomes a
-:class:`~fgslam.datasets.checks.findings.Finding`. Feature matches are judged in
-:mod:`fgslam.datasets.checks.matches`.
+:class:`Finding`. Those of odometry and truth are in :mod:`fgslam.datasets.checks.motion`, those of
+feature matches in :mod:`fgslam.datasets.checks.matches`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from enum import Enum
+from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray
-from fgslam.core.recordings import Sequence
+from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.errors import FrameError
+from fgslam.core.recordings import Frame, Sequence
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.checks.clock import check_clock
-from fgslam.datasets.checks.findings import Finding, Level, by_severity
-from fgslam.datasets.checks.images import Progress, check_images
-from fgslam.datasets.checks.motion import check_odometry, check_odometry_against_truth, check_truth
 
-_GAP_FACTOR = 1.8
+_LISTED = 5
+
+
+class Level(str, Enum):
+    """How bad a finding is."""
+
+    INFO = "info"
+    WARNING = "warning"
+    PROBLEM = "problem"
 
 
 @dataclass(frozen=True, slots=True)
-class Inspection:
-    """Facts (label, value) of a recording, and findings, the worst first."""
+class Finding:
+    """One line of an inspection.
 
-    facts: tuple[tuple[str, str], ...]
-    findings: tuple[Finding, ...]
-
-
-def inspect_sequence(
-    sequence: Sequence, samples: int = 20, progress: Progress | None = None
-) -> Inspection:
-    """All checks that need no features; reads ``samples`` frames spread over the recording.
-
-    ``progress`` gets the number of these frames that have been read, and of all of them.
+    Attributes:
+        level: ``problem`` will spoil a run, ``warning`` may, ``info`` informs.
+        subject: what it is about, such as "time" or "odometry".
+        text: one sentence with the numbers, and the remedy where there is one.
     """
-    findings = (
-        *(Finding(Level.WARNING, "recording", note) for note in sequence.notes),
-        *check_calibration(sequence.rig),
-        *check_timing(sequence.timestamps),
-        *check_images(sequence, samples, progress),
-        *check_odometry(sequence),
-        *check_truth(sequence),
-        *check_odometry_against_truth(sequence),
-        *check_clock(sequence),
-    )
-    return Inspection(facts(sequence), by_severity(findings))
+
+    level: Level
+    subject: str
+    text: str
 
 
-def facts(sequence: Sequence) -> tuple[tuple[str, str], ...]:
-    """Label and value of what the recording is."""
-    rig, stamps = sequence.rig, sequence.timestamps
-    duration = float(stamps[-1] - stamps[0])
-    rate = f"{(len(stamps) - 1) / duration:.3g} Hz" if duration > 0.0 else "single frame"
-    view = 2.0 * np.degrees(np.arctan(0.5 * np.array([rig.width / rig.fx, rig.height / rig.fy])))
-    vertical = "" if rig.vertical_baseline is None else f", {rig.vertical_baseline:.4g} m vertical"
-    place = ", ".join(f"{x + 0.0:.3g}" for x in rig.bTc[:3, 3])
-    return (
-        ("recording", sequence.name),
-        ("frames", f"{len(stamps)} over {duration:.4g} s"),
-        ("rate", rate),
-        ("cameras", f"{rig.cameras}, {rig.width}x{rig.height}"),
-        ("focal length", f"{rig.fx:.5g} x {rig.fy:.5g} px, view {view[0]:.0f} x {view[1]:.0f} deg"),
-        ("principal point", f"{rig.cx:.5g}, {rig.cy:.5g} px"),
-        ("baseline", f"{rig.baseline:.4g} m{vertical}"),
-        ("camera's place", f"({place}) m in the robot's body"),
-        ("one pixel of disparity", f"is {rig.fx * rig.baseline:.3g} m away"),
-        ("identity", sequence.identity[:16]),
+def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """The findings, the worst first, otherwise in their order."""
+    order = (Level.PROBLEM, Level.WARNING, Level.INFO)
+    return tuple(sorted(findings, key=lambda f: order.index(f.level)))
+
+
+def share(part: int, whole: int) -> str:
+    """A part of a whole in words: ``3 of 200 (1.5 %)``."""
+    return f"{part} of {whole} ({100.0 * part / max(whole, 1):.3g} %)"
+
+
+def listed(items: list[int]) -> str:
+    """The first few numbers of a list in words."""
+    more = ", ..." if len(items) > _LISTED else ""
+    return ", ".join(str(item) for item in items[:_LISTED]) + more
+
+
+# --------------------------------------------------------------------------------------------
+# Images
+
+Progress: TypeAlias = Callable[[int, int], None]
+"""Called with how much is done, and of how much."""
+
+CAMERA_NAMES = ("right", "left", "top")
+_DARK, _BRIGHT, _FLAT_SIGMA = 8.0, 247.0, 2.0
+_MAX_BRIGHTNESS_RATIO = 1.5
+_KINDS = (("black", "too dark"), ("white", "over-exposed"), ("flat", "without any structure"))
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """What is kept of one frame: per camera its kind, mean grey value, and equality to the right.
+
+    The images are not kept: a long recording would fill the memory.
+    """
+
+    index: int
+    kinds: tuple[str, ...]
+    means: tuple[float, ...]
+    copies: tuple[bool, ...]
+
+
+def spread_over(sequence: Sequence, samples: int) -> IntArray:
+    """Positions (n,) of up to ``samples`` frames, evenly spread, with the first and the last."""
+    count = min(samples, len(sequence))
+    return np.unique(np.linspace(0, len(sequence) - 1, count).astype(np.int64))
+
+
+def check_images(
+    sequence: Sequence, samples: int = 20, progress: Progress | None = None
+) -> tuple[Finding, ...]:
+    """Unreadable, black, white and flat images, cameras of unequal brightness, copies.
+
+    Reads up to ``samples`` frames, evenly spread, with the first and the last.
+    """
+    chosen = spread_over(sequence, samples)
+    looks: list[_Look] = []
+    unreadable: list[str] = []
+    for done, i in enumerate(chosen.tolist(), 1):
+        try:
+            looks.append(_look(sequence.frame(i)))
+        except FrameError as error:
+            unreadable.append(str(error))
+        if progress is not None:
+            progress(done, len(chosen))
+    found: list[Finding] = []
+    if unreadable:
+        text = (
+            f"{share(len(unreadable), len(chosen))} sampled frames cannot be read, the first: "
+            f"{unreadable[0]}"
+        )
+        found.append(Finding(Level.PROBLEM, "images", text))
+    found.extend(_uninformative_images(looks))
+    found.extend(_unequal_cameras(looks))
+    return tuple(found)
+
+
+def _look(frame: Frame) -> _Look:
+    right = frame.images[0]
+    return _Look(
+        index=frame.index,
+        kinds=tuple(_kind(image) for image in frame.images),
+        means=tuple(float(image.mean()) for image in frame.images),
+        copies=tuple(np.array_equal(right, image) for image in frame.images),
     )
+
+
+def _kind(image: Image) -> str:
+    """``black``, ``white``, ``flat`` or ``good``."""
+    low, high = np.percentile(image, [1.0, 99.0])
+    if high < _DARK:
+        return "black"
+    if low > _BRIGHT:
+        return "white"
+    return "flat" if float(image.std()) < _FLAT_SIGMA else "good"
+
+
+def _uninformative_images(looks: list[_Look]) -> list[Finding]:
+    """Images in which nothing can be seen, by kind and camera."""
+    found = []
+    for kind, meaning in _KINDS:
+        for c, camera in enumerate(CAMERA_NAMES):
+            bad = [k.index for k in looks if c < len(k.kinds) and k.kinds[c] == kind]
+            if bad:
+                text = (
+                    f"the {camera} image is all {kind} ({meaning}) in "
+                    f"{share(len(bad), len(looks))} sampled frames: {listed(bad)}; no feature can "
+                    "be found there, so a run relies on odometry alone: leave them out with "
+                    "dataset.start and dataset.stop, or record again"
+                )
+                found.append(Finding(Level.PROBLEM, "images", text))
+    return found
+
+
+def _unequal_cameras(looks: list[_Look]) -> list[Finding]:
+    """Cameras that show the same image, or images of different brightness."""
+    found = []
+    for c, camera in enumerate(CAMERA_NAMES[1:], 1):
+        # Images without content are reported already; they are all equal.
+        both = [k for k in looks if c < len(k.kinds) and k.kinds[0] == k.kinds[c] == "good"]
+        if not both:
+            continue
+        copies = sum(k.copies[c] for k in both)
+        if copies:
+            text = (
+                f"right and {camera} image are identical in {share(copies, len(both))} "
+                f"sampled frames: the recording holds one camera twice; restore the {camera} "
+                "camera's images"
+            )
+            found.append(Finding(Level.PROBLEM, "images", text))
+        ratio = float(np.median([(k.means[0] + 1.0) / (k.means[c] + 1.0) for k in both]))
+        if max(ratio, 1.0 / ratio) > _MAX_BRIGHTNESS_RATIO:
+            text = (
+                f"the right camera is {ratio:.2g} times as bright as the {camera} one; give both "
+                "one exposure time and gain"
+            )
+            found.append(Finding(Level.WARNING, "images", text))
+    return found
+
+
+_GAP_FACTOR = 1.8
 
 
 # --------------------------------------------------------------------------------------------

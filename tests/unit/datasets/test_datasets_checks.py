@@ -13,11 +13,15 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Trajectory
 from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.checks.findings import Finding, Level
-from fgslam.datasets.checks.images import check_images
 from fgslam.datasets.checks.matches import check_epipolar
 from fgslam.datasets.checks.motion import check_odometry, check_odometry_against_truth, check_truth
-from fgslam.datasets.checks.recording import check_calibration, check_timing, inspect_sequence
+from fgslam.datasets.checks.recording import (
+    Finding,
+    Level,
+    check_calibration,
+    check_images,
+    check_timing,
+)
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.odometry import SyntheticOdometry
 from fgslam.datasets.recording import Recording
@@ -26,6 +30,7 @@ from fgslam.datasets.settings import (
     RecordedOdometrySettings,
     SyntheticOdometrySettings,
 )
+from fgslam.runs.inspection import check_sequence, facts_of
 
 
 def opened(root: Path, **settings: object) -> Recording:
@@ -41,15 +46,15 @@ def test_sound_recording_has_facts_and_no_warning(tmp_path: Path) -> None:
     root = image_folder(tmp_path / "sound", 20)
     write_tum(root / "gt_right_cam.txt", 0.1 * np.arange(20), curve(20))
     write_tum(root / "odometry.txt", 0.1 * np.arange(20), body_poses(opened(root), curve(20)))
-    inspection = inspect_sequence(opened(root))
-    assert texts(inspection.findings) == ""
-    facts = dict(inspection.facts)
+    findings = check_sequence(opened(root))
+    assert texts(findings) == ""
+    facts = dict(facts_of(opened(root)))
     assert facts["recording"] == "sound"
     assert facts["frames"] == "20 over 1.9 s"
     assert facts["rate"] == "10 Hz"
     assert facts["cameras"] == "2, 32x24"
     assert facts["baseline"] == "0.2 m"
-    info = texts(inspection.findings, Level.INFO)
+    info = texts(findings, Level.INFO)
     assert "covers 19 of 19 (100 %) steps" in info
     assert "covers 20 of 20 (100 %) frames, path length 9.7" in info
     assert "differs from truth by" in info
@@ -63,7 +68,7 @@ def test_findings_come_worst_first(tmp_path: Path) -> None:
     root = image_folder(tmp_path)
     save(root / "left" / "000002.png", np.zeros((24, 32), np.uint8))
     (root / "right" / "000004.png").unlink()
-    levels = [f.level for f in inspect_sequence(opened(root)).findings]
+    levels = [f.level for f in check_sequence(opened(root))]
     order = [Level.PROBLEM, Level.WARNING, Level.INFO]
     assert levels == sorted(levels, key=order.index)
     assert set(levels) == set(order)
@@ -172,8 +177,8 @@ def test_gap_in_the_odometry(tmp_path: Path) -> None:
 def test_broken_odometry_is_a_problem_not_an_exception(tmp_path: Path) -> None:
     root = with_truth(tmp_path)
     (root / "odom.csv").write_text("0,1,0\n1,nan,0\n")
-    inspection = inspect_sequence(opened(root))
-    assert "odom.csv, line 2: forward speed is nan" in texts(inspection.findings, Level.PROBLEM)
+    findings = check_sequence(opened(root))
+    assert "odom.csv, line 2: forward speed is nan" in texts(findings, Level.PROBLEM)
 
 
 def test_truth_that_jumps(tmp_path: Path) -> None:

@@ -11,8 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from fgslam.core.errors import DatasetError
 from fgslam.core.geometry import pose
-from fgslam.datasets.checks.clock import check_clock
-from fgslam.datasets.checks.findings import Finding, Level
 from fgslam.datasets.checks.matches import (
     LEFT_RIGHT,
     TOP_RIGHT,
@@ -25,6 +23,8 @@ from fgslam.datasets.checks.matches import (
     check_stereo_counts,
     fit_turn,
 )
+from fgslam.datasets.checks.motion import check_clock
+from fgslam.datasets.checks.recording import Finding, Level
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.layouts import kitti_drives, recognise_layout
 from fgslam.datasets.settings import ImageFolderSettings, RecordedOdometrySettings
