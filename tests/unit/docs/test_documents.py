@@ -17,6 +17,7 @@ ids = [str(page.relative_to(ROOT)) for page in EVERY]
 CODES = re.compile(r"\b(E-[GS]\d+|[SG]\d{1,2}|[BD]\d)\b")
 WORDS = re.compile(r"\b(doctors?|strangers?|witness(es)?|rivals?|twins?|amid)\b", re.IGNORECASE)
 FOLDERS = "fgslam|experiments|tests|docs|examples|benchmarks|scripts"
+MODULES = [str(path) for top in FOLDERS.split("|") for path in (ROOT / top).rglob("*.py")]
 NAVIGATION = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
 
 
@@ -77,3 +78,15 @@ def test_every_public_name_is_in_the_reference() -> None:
     page = (ROOT / "docs/reference/api.md").read_text(encoding="utf-8")
     shown = set(re.findall(r"^::: fgslam\.(\w+)$", page, flags=re.MULTILINE))
     assert shown == set(fgslam.__all__) - {"__version__", "errors"}
+
+
+@pytest.mark.parametrize("page", EVERY, ids=ids)
+def test_modules_that_a_page_names_exist(page: Path) -> None:
+    if page.name == "CHANGELOG.md":  # names what has been
+        return
+    text = page.read_text(encoding="utf-8")
+    named = {f"/{name}" for name in re.findall(r"`([A-Za-z0-9_/]+\.py)`", text)}
+    rooms = set(re.findall(r"`(fgslam/[a-z0-9_/]*)`", text))
+    stale = [name for name in named if not any(path.endswith(name) for path in MODULES)]
+    stale += [room for room in rooms if not (ROOT / room).is_dir()]
+    assert not sorted(stale)
