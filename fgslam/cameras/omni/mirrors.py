@@ -327,7 +327,6 @@ def fit_radial_polynomial(
     radii: tuple[float, float],
     samples: tuple[FloatArray, FloatArray],
     degree: int = PAPER_DEGREE,
-    weights: FloatArray | None = None,
 ) -> RadialFit:
     """Least squares of elevation over radius.
 
@@ -336,7 +335,6 @@ def fit_radial_polynomial(
         radii: inner and outer, pixels. The fit is extrapolated where samples do not reach them.
         samples: radii (n,) in pixels and elevations (n,) in radians, n > degree.
         degree: of the polynomial.
-        weights: (n,) inverse standard deviations of the elevations, or None for equal ones.
 
     Raises:
         CalibrationError: too few different radii, values that are not finite, or a polynomial
@@ -352,6 +350,6 @@ def fit_radial_polynomial(
             f"least {degree + 1}"
         )
     x = _scaled(radius, *radii)
-    coefficients = polynomial.polyfit(x, elevation, degree, w=weights)
+    coefficients = polynomial.polyfit(x, elevation, degree)
     camera = RadialPolynomial(frame, *radii, coefficients=tuple(coefficients.tolist()))
     return RadialFit(camera, elevation - polynomial.polyval(x, coefficients))

@@ -307,7 +307,10 @@ PLAIN_MATCHING = OmniMatchingSettings(
 """Lowe's ratio test alone, for :func:`plain_sift`."""
 
 
-def plain_sift(camera: OmniCamera, image: Image, sigma_px: float = 1.2) -> UprightFeatures:
+_PLAIN_SIGMA_PX = 1.2  # of a feature's place
+
+
+def plain_sift(camera: OmniCamera, image: Image) -> UprightFeatures:
     """OpenCV's SIFT with its own parameters, orientations and all, on an image (h, w, 3).
 
     Features that the camera does not see are left out. There is no colour: it is zero.
@@ -319,7 +322,7 @@ def plain_sift(camera: OmniCamera, image: Image, sigma_px: float = 1.2) -> Uprig
     if descriptors is None:
         descriptors = np.zeros((0, 128), np.float32)
     table = np.array([(*k.pt, 0.5 * k.size) for k in keypoints], np.float64).reshape(-1, 3)
-    bearing, elevation, covariance = measure(camera, table[:, :2], sigma_px)
+    bearing, elevation, covariance = measure(camera, table[:, :2], _PLAIN_SIGMA_PX)
     up = np.linalg.norm(up_in_image(camera, table[:, :2]), axis=1)
     seen = np.isfinite(bearing) & np.isfinite(up)
     return UprightFeatures(

@@ -34,6 +34,10 @@ from fgslam.core.planar import wrap
 LEAST_SEPARATION = np.deg2rad(5.0)
 """Bearing difference that two features need in one of the views: less is one vertical line."""
 
+_CLAMP_SIGMAS = 3.0
+"""A negative discriminant within so many of its standard deviations counts as a double root;
+beyond, the sample is refused."""
+
 _EQUALLY_FAR = 1e-12
 """|1 - rho^2| below which a feature counts as equally far from both cameras."""
 
@@ -79,19 +83,16 @@ class TwoPointSolutions:
 
 def solve_two_point(
     samples: TwoPointSamples,
-    clamp_sigmas: float = 3.0,
     least_separation: float = LEAST_SEPARATION,
 ) -> TwoPointSolutions:
     """All solutions with positive distances; degenerate samples have none.
 
     Args:
         samples: as described.
-        clamp_sigmas: a negative discriminant within so many of its standard deviations counts as
-            a double root; beyond, the sample is refused.
         least_separation: of the two bearings in one of the views, radians.
     """
     rho = np.exp(samples.log_ratio)
-    ratios = _distance_ratios(samples, rho, clamp_sigmas)
+    ratios = _distance_ratios(samples, rho)
     ratios[_separation(samples) < least_separation] = np.nan
     z_a, z_b = np.exp(1j * samples.bearing_a), np.exp(1j * samples.bearing_b)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -112,7 +113,7 @@ def solve_two_point(
     )
 
 
-def _distance_ratios(samples: TwoPointSamples, rho: FloatArray, clamp_sigmas: float) -> FloatArray:
+def _distance_ratios(samples: TwoPointSamples, rho: FloatArray) -> FloatArray:
     """(s, 2) roots k of the quadratic A k^2 - 2 B k + C = 0, NaN where there is none."""
     between_a = samples.bearing_a[:, 1] - samples.bearing_a[:, 0]
     between_b = samples.bearing_b[:, 1] - samples.bearing_b[:, 0]
@@ -122,7 +123,7 @@ def _distance_ratios(samples: TwoPointSamples, rho: FloatArray, clamp_sigmas: fl
     b = np.cos(between_a) - product * np.cos(between_b)
     discriminant = b * b - a * c
     spread = _discriminant_sigma(samples, rho, (a, b, c), (between_a, between_b))
-    refused = discriminant < -clamp_sigmas * spread
+    refused = discriminant < -_CLAMP_SIGMAS * spread
     refused |= (np.abs(a) < _EQUALLY_FAR) & (np.abs(c) < _EQUALLY_FAR)
     root = np.sqrt(np.maximum(discriminant, 0.0))
     q = b + np.where(b < 0.0, -root, root)
