@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 from simulated import RIG, Drive, Simulation, observations, play, simulate
 
 from fgslam.backend.protocol import Estimator
@@ -15,6 +16,7 @@ from fgslam.backend.settings import (
     FixedLagSettings,
     Isam2Settings,
 )
+from fgslam.backend.smoothers import admission, fixed_lag, graph_builder, isam2
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.estimates import Estimate, Prediction, UpdateStats
@@ -35,6 +37,20 @@ SMOOTHERS: dict[str, EstimatorSettings] = {
     "fixed_lag": FixedLagSettings(lag_frames=5),
 }
 PIXELS = np.array([0.3, 0.3, 0.2])
+
+
+def admit_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Landmarks enter a graph with their first sighting, without a prior, and never start anew."""
+    monkeypatch.setattr(admission, "LEAST_SIGHTINGS", 1)
+    monkeypatch.setattr(admission, "LEAST_PARALLAX", 0.0)
+    monkeypatch.setattr(admission, "CONTRADICTED_AFTER", 10**9)
+    monkeypatch.setattr(graph_builder, "WEAK_PARALLAX", 0.0)
+
+
+def relinearise_beyond(monkeypatch: pytest.MonkeyPatch, threshold: float) -> None:
+    """The incremental smoothers linearise anew what moves by more than a threshold."""
+    for module in (isam2, fixed_lag):
+        monkeypatch.setattr(module, "_RELINEARISED", threshold)
 
 
 def drawn(seed: int, **drive: object) -> Simulation:

@@ -102,12 +102,6 @@ class PerLandmarkSettings(NamedSettings):
             description="add the pose's covariance to the observation's (6.4 read with IJRR 2002)"
         ),
     ] = True
-    miss_growth_m: Annotated[
-        float,
-        Field(
-            ge=0.0, description="standard deviation in metres added to a landmark on a miss (6.4)"
-        ),
-    ] = 0.0001
     loops: LoopCorrectionSettings = LoopCorrectionSettings()
 
 
@@ -189,34 +183,6 @@ class GraphSettings(NamedSettings):
             "drifted: the kernel deals with them. A range sensor's are all left out. 0: none is",
         ),
     ] = 12.0
-    least_sightings: Annotated[
-        int,
-        Field(ge=1, description="frames in which a landmark is seen before it enters the graph"),
-    ] = 2
-    least_parallax: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="disparity over its standard deviation below which a landmark waits; of a "
-            "range sensor, range over its deviation",
-        ),
-    ] = 3.0
-    weak_parallax: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="below this a landmark in the graph gets a weak prior, so that a far point "
-            "cannot be thrown behind the camera",
-        ),
-    ] = 8.0
-    contradicted_after: Annotated[
-        int,
-        Field(
-            ge=0,
-            description="left out in so many frames in a row, which agree on another place, a "
-            "landmark counts as moved and starts anew; 0: never",
-        ),
-    ] = 3
     loops: LoopCorrectionSettings = LoopCorrectionSettings()
 
 
@@ -232,9 +198,6 @@ class FixedLagSettings(GraphSettings):
     lag_s: Annotated[
         float | None, Field(gt=0.0, description="lag in seconds; used where lag_frames is null")
     ] = None
-    relinearize_threshold: Annotated[
-        float, Field(gt=0.0, description="change (radians, metres) that relinearises a variable")
-    ] = 0.01
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -258,14 +221,6 @@ class Isam2Settings(GraphSettings):
             "choice, all variables of the update",
         ),
     ] = 30
-    relinearize_threshold: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="change (radians, metres) that relinearises a variable; 0.1, GTSAM's own, "
-            "leaves a drive of 50 m twice as far off as 0.01",
-        ),
-    ] = 0.01
     keyframe_every: Annotated[
         int,
         Field(
@@ -274,14 +229,6 @@ class Isam2Settings(GraphSettings):
             "factors of the keyframe. 1: every frame is a variable",
         ),
     ] = 1
-    final_iterations: Annotated[
-        int,
-        Field(
-            ge=0,
-            description="further updates without measurements, relinearising everything that "
-            "moved, before the estimate is reported",
-        ),
-    ] = 5
 
 
 @dataclass(frozen=True, config=STRICT)

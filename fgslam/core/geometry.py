@@ -178,12 +178,11 @@ def se3_log(aTb: FloatArray) -> FloatArray:
 
 
 def adjoint(aTb: FloatArray) -> FloatArray:
-    """Adjoint (6, 6) of ``aTb``: maps a tangent vector in b to the same motion's in a."""
-    rotation = aTb[:3, :3]
-    out = np.zeros((6, 6))
-    out[:3, :3] = rotation
-    out[3:, 3:] = rotation
-    out[3:, :3] = skew(aTb[:3, 3]) @ rotation
+    """Adjoints (..., 6, 6) of ``aTb``: map a tangent vector in b to the same motion's in a."""
+    rotation = aTb[..., :3, :3]
+    out = np.zeros((*aTb.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = rotation
+    out[..., 3:, :3] = skew(aTb[..., :3, 3]) @ rotation
     return out
 
 

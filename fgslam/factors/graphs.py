@@ -71,6 +71,22 @@ def poses_of_frame(values: Any, frame: int) -> FloatArray:
     return np.asarray(values.atPose3(pose_key(frame)).matrix())
 
 
+def isam2_parameters(method: Any, relinearised: float, factorization: str = "CHOLESKY") -> Any:
+    """Parameters of iSAM2; in every update it looks for variables to linearise anew.
+
+    Args:
+        method: GTSAM's parameters of Gauss-Newton or of the dog leg.
+        relinearised: a variable that moves by more, in radians or its lengths, is linearised anew.
+        factorization: ``CHOLESKY``, or ``QR`` for what is known very unevenly.
+    """
+    params = gtsam.ISAM2Params()
+    params.setOptimizationParams(method)
+    params.setFactorization(factorization)
+    params.setRelinearizeThreshold(relinearised)
+    params.relinearizeSkip = 1
+    return params
+
+
 def solver_parameters(max_iterations: int, relative_tolerance: float) -> Any:
     """Parameters of Levenberg-Marquardt that stop by the relative change of the cost alone."""
     params = gtsam.LevenbergMarquardtParams()

@@ -30,6 +30,15 @@ _TRACKING = {
 }
 """A group of omnidirectional tracking, all of which is constant."""
 
+_ADMISSION = {
+    "weak_prior_ranges": 2.0,
+    "least_sightings": 2,
+    "least_parallax": 3.0,
+    "weak_parallax": 8.0,
+    "contradicted_after": 3,
+}
+"""Of landmarks to the graph of any smoother."""
+
 RETIRED: dict[str, dict[str, Any]] = {
     "AvoidanceSettings": {
         "look_ahead_m": 0.6,
@@ -44,7 +53,7 @@ RETIRED: dict[str, dict[str, Any]] = {
         "escape_mps": 0.25,
     },
     "BatchSettings": {
-        "weak_prior_ranges": 2.0,
+        **_ADMISSION,
         "max_iterations": 100,
     },
     "BloggieSettings": {
@@ -85,14 +94,15 @@ RETIRED: dict[str, dict[str, Any]] = {
         "initial_speed": 0.5,
     },
     "FixedLagSettings": {
-        "weak_prior_ranges": 2.0,
+        **_ADMISSION,
+        "relinearize_threshold": 0.01,
     },
     "GraphMotionSettings": {
         "initial_speed": 0.5,
         "initial_turning_deg": 30.0,
     },
     "GraphSettings": {
-        "weak_prior_ranges": 2.0,
+        **_ADMISSION,
     },
     "HomingConfig": {
         "tracking": _TRACKING,
@@ -143,7 +153,9 @@ RETIRED: dict[str, dict[str, Any]] = {
         "period_s": 7.0,
     },
     "Isam2Settings": {
-        "weak_prior_ranges": 2.0,
+        **_ADMISSION,
+        "relinearize_threshold": 0.01,
+        "final_iterations": 5,
         "relinearize_skip": 1,
     },
     "LabDriveSettings": {
@@ -151,6 +163,12 @@ RETIRED: dict[str, dict[str, Any]] = {
     },
     "LightFieldSettings": {
         "metres_per_unit": 0.001,
+    },
+    "LandmarkKalmanGraphSettings": {
+        "miss_growth_m": 0.0001,
+    },
+    "LandmarkKalmanSettings": {
+        "miss_growth_m": 0.0001,
     },
     "LocalisationSettings": {
         "background": 4.0,

@@ -10,17 +10,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from fgslam.backend.filters.filtered import FilteredTrajectory, FirstSights, moved
+from fgslam.backend.filters.filtered import FilteredTrajectory, FirstSights, moved, placed
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.geometry import (
     adjoint,
-    congruence,
     inverse,
     point_pose_jacobian,
     reorthonormalise,
     transform_to_camera,
-    transform_to_world,
 )
 from fgslam.core.measurements import Increment, MeasurementType, Observations, Odometry
 from fgslam.core.sensors import Sensor
@@ -111,14 +109,15 @@ class DeadReckoning:
 
     def _add(self, observed: Observations) -> None:
         """Adds new landmarks (type IV): their own noise and the pose's, at this frame."""
-        first = FirstSights.of(self._sensor, observed)
-        wTc = self._current.wTc
-        by_pose = point_pose_jacobian(first.points)
-        local = first.covariances + congruence(by_pose, self._current.covariance)
-        ids = np.concatenate([self._map.ids, first.observed.ids])
-        positions = np.concatenate([self._map.positions, transform_to_world(wTc, first.points)])
-        covariances = np.concatenate([self._map.covariances, congruence(wTc[:3, :3], local)])
-        frames = np.concatenate([self._first_frame, np.full(len(first.points), len(self._past))])
+        observed = FirstSights.of(self._sensor, observed).observed
+        wTc, covariance = self._current.wTc, self._current.covariance
+        new, around = placed(
+            self._sensor, wTc, observed.measurement, observed.covariance, covariance
+        )
+        ids = np.concatenate([self._map.ids, observed.ids])
+        positions = np.concatenate([self._map.positions, new])
+        covariances = np.concatenate([self._map.covariances, around])
+        frames = np.concatenate([self._first_frame, np.full(len(new), len(self._past))])
         order = np.argsort(ids, kind="stable")
         self._map = LandmarkMap(ids[order], positions[order], covariances[order])
         self._first_frame = frames[order]

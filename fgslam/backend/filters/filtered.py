@@ -1,4 +1,4 @@
-"""What filters share: a trajectory that is never revised, and landmarks placed at first sight."""
+"""What estimators share: checks of a frame, filtered trajectories, places of one observation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,15 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray, StateArrays
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Prediction, Trajectory
-from fgslam.core.geometry import compose_covariance, in_front, triangulate, triangulation_covariance
+from fgslam.core.geometry import (
+    compose_covariance,
+    congruence,
+    in_front,
+    point_pose_jacobian,
+    transform_to_world,
+    triangulate,
+    triangulation_covariance,
+)
 from fgslam.core.measurements import Increment, Observations, Odometry
 from fgslam.core.sensors import CameraRig, Sensor
 
@@ -84,6 +92,29 @@ def moved(current: Prediction, odometry: Odometry | None) -> Prediction:
         current.wTc @ odometry.motion,
         compose_covariance(odometry.motion, current.covariance, odometry.covariance),
     )
+
+
+def placed(
+    sensor: Sensor,
+    wTc: FloatArray,
+    measurement: FloatArray,
+    covariance: FloatArray,
+    pose_covariance: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """World positions (k, 3) of single observations, and covariances (k, 3, 3).
+
+    Args:
+        sensor: that observed.
+        wTc: (4, 4) its pose.
+        measurement: (k, 3).
+        covariance: (k, 3, 3) of the measurements.
+        pose_covariance: (6, 6); None takes the pose as exact.
+    """
+    points = triangulate(sensor, measurement)
+    local = triangulation_covariance(sensor, measurement, covariance)
+    if pose_covariance is not None:
+        local = local + congruence(point_pose_jacobian(points), pose_covariance)
+    return transform_to_world(wTc, points), congruence(wTc[:3, :3], local)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

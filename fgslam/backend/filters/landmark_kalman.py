@@ -16,7 +16,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from fgslam.backend.filters.filtered import FilteredTrajectory, moved
+from fgslam.backend.filters.filtered import FilteredTrajectory, moved, placed
 from fgslam.backend.filters.loop_correction import (
     Chain,
     DriveRecord,
@@ -38,12 +38,11 @@ from fgslam.core.geometry import (
     project,
     projection_jacobian,
     transform_to_camera,
-    transform_to_world,
-    triangulate,
-    triangulation_covariance,
 )
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
 from fgslam.core.sensors import Sensor
+
+_MISS_GROWTH_M = 0.0001  # added to a landmark's deviation on a miss (6.4, which gives no number)
 
 
 class LandmarkRows:
@@ -357,18 +356,15 @@ class LandmarkKalman:
 
     def _observed_positions(self, observed: Observations) -> tuple[FloatArray, FloatArray]:
         """World positions (k, 3) of single observations, and covariances (k, 3, 3)."""
-        wTc = self._current.wTc
-        points = triangulate(self._rig, observed.measurement)
-        local = triangulation_covariance(self._rig, observed.measurement, observed.covariance)
-        if self._settings.pose_covariance:
-            local = local + congruence(point_pose_jacobian(points), self._current.covariance)
-        return transform_to_world(wTc, points), congruence(wTc[:3, :3], local)
+        known = self._current.covariance if self._settings.pose_covariance else None
+        measurement, noise = observed.measurement, observed.covariance
+        return placed(self._rig, self._current.wTc, measurement, noise, known)
 
     def _grow(self, ids: IntArray) -> None:
         """Expands the ellipsoids of missed landmarks (type II, Se et al. 6.4)."""
         if len(ids):
             rows = self._rows.rows(ids)
-            self._rows.covariances[rows] += self._settings.miss_growth_m**2 * np.eye(3)
+            self._rows.covariances[rows] += _MISS_GROWTH_M**2 * np.eye(3)
 
     def _add(self, observed: Observations) -> None:
         """Adds new landmarks (type IV) where this frame sees them."""

@@ -312,7 +312,6 @@ class LandmarkKalmanGraph(LandmarkKalman):
         closed_form = LandmarkKalmanSettings(
             update=settings.update,
             pose_covariance=settings.pose_covariance,
-            miss_growth_m=settings.miss_growth_m,
             loops=settings.loops,
         )
         super().__init__(rig, closed_form, prior)

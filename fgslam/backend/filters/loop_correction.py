@@ -70,19 +70,6 @@ class Constraint:
     doubted: bool = False
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Corrected:
-    """The chain that meets all constraints as well as it can.
-
-    Attributes:
-        poses: (n, 4, 4).
-        cost: squared residuals, each in its own deviations, of all changes together.
-    """
-
-    poses: FloatArray
-    cost: float
-
-
 @dataclass(slots=True, eq=False)
 class Chain:
     """A drive as it was tracked: never revised, so that corrections do not accumulate.
@@ -105,24 +92,24 @@ class Chain:
         self.poses.append(self.poses[-1] @ motion if self.poses else motion)
         self.steps.append(covariance)
 
-    def cost(self, constraints: list[Constraint], every: int) -> float:
-        """What these constraints cost, without the poses."""
-        if not constraints:
+    def cost(self) -> float:
+        """What the constraints cost, without the poses."""
+        if not self.constraints:
             return 0.0
         poses = np.array(self.poses)
         errors = _as_motions_of_the_world(poses, np.array(self.steps))
-        return _minimum(poses, errors, constraints, every)[1]
+        return _minimum(poses, errors, self.constraints, SUBMAP_FRAMES)[1]
 
-    def solve(self, constraints: list[Constraint], every: int) -> Corrected:
-        """The chain under these constraints, with a submap every so many frames."""
-        return corrected(np.array(self.poses), np.array(self.steps), constraints, every)
+    def solve(self, constraints: list[Constraint]) -> tuple[FloatArray, float]:
+        """Poses and cost of the chain under these constraints; see :func:`corrected`."""
+        return corrected(np.array(self.poses), np.array(self.steps), constraints)
 
     def steps_between(self, frames: IntArray) -> FloatArray:
         """(m, 6, 6) covariances of the steps to some frames, ascending, from the one before."""
         poses = np.array(self.poses)
         errors = _as_motions_of_the_world(poses, np.array(self.steps))
         sums = [errors[a + 1 : b + 1].sum(axis=0) for a, b in itertools.pairwise([-1, *frames])]
-        return congruence(_adjoints(_inverses(poses[frames])), np.array(sums))
+        return congruence(adjoint(_inverses(poses[frames])), np.array(sums))
 
     def state(self) -> StateArrays:
         """All of it as plain arrays."""
@@ -153,8 +140,11 @@ class Chain:
 
 
 def corrected(
-    poses: FloatArray, steps: FloatArray, constraints: list[Constraint], every: int
-) -> Corrected:
+    poses: FloatArray,
+    steps: FloatArray,
+    constraints: list[Constraint],
+    every: int = SUBMAP_FRAMES,
+) -> tuple[FloatArray, float]:
     """Least weighted changes to a chain under which it meets its constraints.
 
     Args:
@@ -163,13 +153,17 @@ def corrected(
             first one is not used.
         constraints: between frames of the chain.
         every: frames to a submap; frames with a constraint begin one, too.
+
+    Returns:
+        Poses (n, 4, 4), and the cost: squared residuals, each in its own deviations, of all
+        changes together.
     """
     errors = _as_motions_of_the_world(poses, steps)
     at, cost = _minimum(poses, errors, constraints, every)
     out = poses.copy()
     for a, b in itertools.pairwise(sorted(at)):
         out[a : b + 1] = _between(poses[a : b + 1], errors[a : b + 1], at[a], at[b])
-    return Corrected(out, cost)
+    return out, cost
 
 
 def constraint_factor(known: Constraint) -> Any:
@@ -265,15 +259,7 @@ def _as_motions_of_the_world(poses: FloatArray, steps: FloatArray) -> FloatArray
     The error ``xi`` of the step to pose T moves all that follows by ``Ad(T) xi``: to first order
     these motions add up, and so do their covariances.
     """
-    return congruence(_adjoints(poses), steps + _EXACT_SIGMA**2 * np.eye(6))
-
-
-def _adjoints(poses: FloatArray) -> FloatArray:
-    """Adjoints (n, 6, 6) of poses (n, 4, 4)."""
-    out = np.zeros((len(poses), 6, 6))
-    out[:, :3, :3] = out[:, 3:, 3:] = poses[:, :3, :3]
-    out[:, 3:, :3] = skew(poses[:, :3, 3]) @ poses[:, :3, :3]
-    return out
+    return congruence(adjoint(poses), steps + _EXACT_SIGMA**2 * np.eye(6))
 
 
 def _between(
@@ -408,20 +394,17 @@ class DriveRecord:
             raise EstimatorError(f"{what}, which does not come before it; correct the log")
         covariance = CLOSURE_FACTOR**2 * loop.covariance
         known = Constraint(loop.frame, last, loop.oTc, covariance)
-        every, gate = SUBMAP_FRAMES, self._settings.gate_sigmas
-        before = self._chain.cost(self._chain.constraints, every)
-        found = self._chain.solve([*self._chain.constraints, known], every)
-        rise = found.cost - before
-        refused = refusal(what, rise, gate)
+        poses, cost = self._chain.solve([*self._chain.constraints, known])
+        refused = refusal(what, cost - self._chain.cost(), self._settings.gate_sigmas)
         if refused:
             self.remarks.append(refused)
             return None
         self._chain.constraints.append(dataclasses.replace(known, doubted=True))
-        shift = found.poses[-1, :3, 3] - here[:3, 3]
+        shift = poses[-1, :3, 3] - here[:3, 3]
         self.remarks.append(
             f"{what}: the camera moved by {np.linalg.norm(shift):.2f} m, the drive with it"
         )
-        return found.poses
+        return poses
 
     def state(self) -> StateArrays:
         """All of it as plain arrays."""

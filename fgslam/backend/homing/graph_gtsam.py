@@ -35,6 +35,7 @@ from fgslam.factors.bearing import (
 from fgslam.factors.graphs import (
     height_key,
     is_pose,
+    isam2_parameters,
     landmark_key,
     pose_key,
     target_key,
@@ -191,7 +192,7 @@ class Isam2Solver(GtsamSolver):
     def __init__(self, settings: HomingGraphSettings) -> None:
         """Empty."""
         super().__init__(settings)
-        self._isam = gtsam.ISAM2(isam2_parameters())
+        self._isam = gtsam.ISAM2(_parameters())
 
     def _update(self, graph: Any, values: Any, touched: tuple[set[int], float]) -> None:
         self._isam.update(graph, values, [], _last(touched[0]))
@@ -199,7 +200,7 @@ class Isam2Solver(GtsamSolver):
         self._graph.push_back(graph)
 
     def _restart(self, graph: Any, time: float) -> None:
-        self._graph, self._isam = graph, gtsam.ISAM2(isam2_parameters())
+        self._graph, self._isam = graph, gtsam.ISAM2(_parameters())
         try:
             self._isam.update(graph, self.values)
             self.values = self._isam.calculateEstimate()
@@ -220,7 +221,7 @@ class FixedLagSolver(GtsamSolver):
         self._smoother = self._new()
 
     def _new(self) -> Any:
-        params = isam2_parameters()
+        params = _parameters()
         params.findUnusedFactorSlots = True  # without it the smoother grows
         return gtsam.IncrementalFixedLagSmoother(self._settings.lag_s, params)
 
@@ -265,16 +266,11 @@ class BatchSolver(GtsamSolver):
         return joint_of(marginals, keys)
 
 
-def isam2_parameters() -> Any:
+def _parameters() -> Any:
     """Dog leg, because an undamped step may carry a landmark across a camera's centre."""
     dog_leg = gtsam.ISAM2DoglegParams()
     dog_leg.setInitialDelta(_TRUST_RADIUS)
-    params = gtsam.ISAM2Params()
-    params.setOptimizationParams(dog_leg)
-    params.setFactorization("CHOLESKY")
-    params.setRelinearizeThreshold(_RELINEARISED)
-    params.relinearizeSkip = 1
-    return params
+    return isam2_parameters(dog_leg, _RELINEARISED)
 
 
 def minimised(graph: Any, values: Any) -> Any:

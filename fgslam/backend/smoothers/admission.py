@@ -12,18 +12,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fgslam.backend.filters.filtered import placed
 from fgslam.backend.settings import GraphSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion, LandmarkMap
-from fgslam.core.geometry import (
-    congruence,
-    transform_to_world,
-    triangulate,
-    triangulation_covariance,
-)
 from fgslam.core.measurements import Observations
 from fgslam.core.sensors import CameraRig, Sensor
 
+LEAST_SIGHTINGS = 2  # frames in which a landmark is seen before it enters: one match may be wrong
+LEAST_PARALLAX = 3.0
+"""Range over its deviation below which a landmark waits: its depth is not normally distributed."""
+CONTRADICTED_AFTER = 3
+"""Rejected in so many frames in a row, which agree on another place, a landmark has moved."""
 _SAME_PLACE = 16.3  # 99.9 % quantile of chi-square with three degrees of freedom
 _ASTRAY_PX = 12.0  # where nothing is left out: farther off, a match speaks against its landmark
 
@@ -112,13 +112,11 @@ class LandmarkAdmission:
             rejected: a frame's matched observations that do not fit.
             wTc: (4, 4) the frame's pose.
         """
-        after = self._settings.contradicted_after
-        if after == 0 or not len(rejected):
+        after = CONTRADICTED_AFTER
+        if not len(rejected):
             return rejected.select(np.zeros(len(rejected), np.bool_))
-        local = triangulate(self._sensor, rejected.measurement)
-        spread = triangulation_covariance(self._sensor, rejected.measurement, rejected.covariance)
-        places = transform_to_world(wTc, local)
-        covariances = congruence(wTc[:3, :3], spread)
+        measured = rejected.measurement, rejected.covariance
+        places, covariances = placed(self._sensor, wTc, *measured)
         moved = np.zeros(len(rejected), np.bool_)
         for i, identity in enumerate(rejected.ids.tolist()):
             track = self.tracks.get(identity)
@@ -146,7 +144,7 @@ class LandmarkAdmission:
         """The landmark's track with one sighting more."""
         track = self.tracks.get(identity)
         if track is None:
-            track = self.tracks[identity] = Track(self._settings.least_parallax, sighting)
+            track = self.tracks[identity] = Track(LEAST_PARALLAX, sighting)
         track.last = sighting
         track.sightings += 1
         return track
@@ -160,7 +158,7 @@ class LandmarkAdmission:
         """
         track = self.tracks[identity]
         track.waiting = [s for s in track.waiting if s.frame >= self._first_frame]
-        seldom = len(track.waiting) < self._settings.least_sightings
+        seldom = len(track.waiting) < LEAST_SIGHTINGS
         return identity in self._saved or not (seldom or parallax < track.least_parallax)
 
     def pruned(self, identities: IntArray) -> None:

@@ -53,6 +53,7 @@ from fgslam.core.geometry import (
 from fgslam.core.sensors import Sensor
 from fgslam.factors.graphs import (
     is_pose,
+    isam2_parameters,
     landmark_key,
     number,
     pose_key,
@@ -61,6 +62,7 @@ from fgslam.factors.graphs import (
 )
 from fgslam.factors.motion import pose_prior
 
+_RELINEARISED = 0.01  # radians, metres: a variable that moves by more is linearised anew
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
 
 
@@ -89,7 +91,6 @@ class FixedLagSolver:
         self._in_seconds = settings.lag_frames is None
         self._lag = float(settings.lag_frames or settings.lag_s or 0.0)
         self._loop_gate = settings.loops.gate_sigmas
-        self._relinearize = settings.relinearize_threshold
         self._solver = self._new_solver()
         self._values = gtsam.Values()
         self._oldest = 0
@@ -218,12 +219,8 @@ class FixedLagSolver:
     # ----------------------------------------------------------------------------------------
 
     def _new_solver(self) -> Any:
-        params = gtsam.ISAM2Params()
-        params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams())
-        params.setFactorization("CHOLESKY")
-        params.setRelinearizeThreshold(self._relinearize)
-        params.relinearizeSkip = 1
-        # Without it the list of factors, and the effort, grow with the run .
+        params = isam2_parameters(gtsam.ISAM2GaussNewtonParams(), _RELINEARISED)
+        # Without it the list of factors, and the effort, grow with the run.
         params.findUnusedFactorSlots = True
         return gtsam.IncrementalFixedLagSmoother(self._lag, params)
 

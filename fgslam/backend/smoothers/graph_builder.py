@@ -26,6 +26,7 @@ from fgslam.factors.motion import (
 )
 from fgslam.factors.noise import Whitening
 
+WEAK_PARALLAX = 8.0  # range over its deviation below which a landmark gets a weak prior
 _WEAK_PRIOR_RANGES = 2.0  # keeps a first step before the camera: docs/derivations/smoothers.md
 
 
@@ -255,7 +256,7 @@ class GraphBuilder:
         saved = self.admission.saved(identity)
         if saved is not None:
             self._rows[track.variable].append(self._push(new, point_prior(key, *saved)))
-        elif parallax < self._settings.weak_parallax:
+        elif parallax < WEAK_PARALLAX:
             distance = float(np.linalg.norm(position - wTc[:3, 3]))
             sigma = _WEAK_PRIOR_RANGES * distance
             self._rows[track.variable].append(

@@ -35,6 +35,7 @@ from fgslam.core.geometry import reorthonormalise
 from fgslam.core.sensors import Sensor
 from fgslam.factors.graphs import (
     is_pose,
+    isam2_parameters,
     landmark_key,
     number,
     pose_key,
@@ -43,6 +44,10 @@ from fgslam.factors.graphs import (
 )
 
 _RELATIVE_TOLERANCE = 1e-9  # of the cost
+_RELINEARISED = 0.01
+"""Radians, metres: a variable that moves by more is linearised anew. 0.1, GTSAM's own, leaves a
+drive of 50 m twice as far off."""
+_FINAL_ITERATIONS = 5  # of the estimate's solution: everything that moved is linearised anew
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
 
 
@@ -129,10 +134,7 @@ class Isam2Solver:
     def _refined(self) -> Refined:
         values = gtsam.Values(self._values)
         values.insert(self._new_values)
-        iterations = self._settings.final_iterations
-        if iterations == 0:
-            return Refined(self._builder.kept_factors(), values)
-        params = solver_parameters(iterations, _RELATIVE_TOLERANCE)
+        params = solver_parameters(_FINAL_ITERATIONS, _RELATIVE_TOLERANCE)
         try:
             factor = self._settings.noise_factor
             return refine(
@@ -156,12 +158,11 @@ class Isam2Solver:
     # ----------------------------------------------------------------------------------------
 
     def _new_solver(self) -> Any:
-        params = gtsam.ISAM2Params()
-        params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams())
-        params.setFactorization("QR" if self._with_qr else "CHOLESKY")
-        params.setRelinearizeThreshold(self._settings.relinearize_threshold)
-        params.relinearizeSkip = 1  # looks for variables to relinearise in every update
-        return gtsam.ISAM2(params)
+        method, factorization = (
+            gtsam.ISAM2GaussNewtonParams(),
+            "QR" if self._with_qr else "CHOLESKY",
+        )
+        return gtsam.ISAM2(isam2_parameters(method, _RELINEARISED, factorization))
 
     def _flush(self) -> None:
         """Brings the frames since the last update in."""

@@ -17,7 +17,6 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.filters.loop_correction import (
-    SUBMAP_FRAMES,
     Chain,
     Constraint,
     changes,
@@ -159,7 +158,7 @@ def first_guess(builder: GraphBuilder, values: Any, chain: Chain, loops: list[Co
     ends = [_row(frames, loops[-1].before), _row(frames, loops[-1].after)]
     new = dataclasses.replace(loops[-1], before=ends[0], after=ends[1])
     constraints = [known for known in held if known.before != known.after]
-    found = corrected(poses, chain.steps_between(frames), [*constraints, new], SUBMAP_FRAMES).poses
+    found, _ = corrected(poses, chain.steps_between(frames), [*constraints, new])
     return _moved(builder, values, frames, found, changes(poses, found))
 
 

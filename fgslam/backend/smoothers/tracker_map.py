@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fgslam.backend.filters.filtered import placed
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting
 from fgslam.backend.smoothers.solver import (
@@ -19,12 +20,8 @@ from fgslam.backend.smoothers.solver import (
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.geometry import (
-    congruence,
     inverse,
-    point_pose_jacobian,
     transform_to_world,
-    triangulate,
-    triangulation_covariance,
 )
 from fgslam.core.sensors import Sensor
 from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame
@@ -116,10 +113,8 @@ class TrackerMap:
 
     def _seen_from(self, answer: Solution, sighting: Sighting) -> tuple[FloatArray, FloatArray]:
         """Position and covariance of a landmark from a single sighting."""
-        wTc = answer.poses[sighting.frame]
-        measurement = sighting.measurement[None]
-        point = triangulate(self._sensor, measurement)
-        local = triangulation_covariance(self._sensor, measurement, sighting.covariance[None])
-        by_pose = congruence(point_pose_jacobian(point), answer.pose_covariances[sighting.frame])
-        world = congruence(wTc[:3, :3], local + by_pose)
-        return transform_to_world(wTc, point)[0], world[0]
+        at, measured = sighting.frame, (sighting.measurement[None], sighting.covariance[None])
+        places, covariances = placed(
+            self._sensor, answer.poses[at], *measured, answer.pose_covariances[at]
+        )
+        return places[0], covariances[0]

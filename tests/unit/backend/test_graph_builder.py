@@ -12,6 +12,7 @@ from smoothing import (
     FREE,
     PIXELS,
     SMOOTHERS,
+    admit_at_once,
     answer,
     assert_finite,
     ate,
@@ -24,6 +25,7 @@ from smoothing import (
 )
 
 from fgslam.backend.settings import BatchSettings, GraphSettings
+from fgslam.backend.smoothers import admission
 from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
 from fgslam.core import geometry as g
 from fgslam.core.errors import EstimatorError
@@ -105,9 +107,10 @@ def test_parallax_decides_between_waiting_a_weak_prior_and_none(
     assert (prior in keys) == (expected == "weak")
 
 
-def test_the_weak_prior_holds_two_ranges_about_the_place() -> None:
+def test_the_weak_prior_holds_two_ranges_about_the_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(admission, "LEAST_SIGHTINGS", 1)
     points = {7: [3.0, 0.0, 4.0]}
-    made = builder(least_sightings=1)
+    made = builder()
     new = made.add(frame(0, points, True), known(points, 5.0 / 4))
     rows = [new.graph.at(row) for row in range(new.graph.size())]
     prior = next(f for f in rows if tuple(f.keys()) == (landmark_key(0),))
@@ -115,17 +118,19 @@ def test_the_weak_prior_holds_two_ranges_about_the_place() -> None:
     assert prior.error(new.values) == pytest.approx(0.5)  # one standard deviation: 2 x 5 m
 
 
-def test_waiting_landmarks_hold_no_information_about_poses() -> None:
+def test_waiting_landmarks_hold_no_information_about_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those seen once enter or wait: the rest of the answer is the same."""
     simulation = drawn(8, frames=9, miss_rate=0.4)
     increments = simulation.increments
     counts = np.bincount(np.concatenate([x.observations.ids for x in increments]))
     once = np.flatnonzero(counts == 1)
     assert len(once)
-    settings = BatchSettings(trim=False, weak_parallax=0.0, least_parallax=0.0)
+    settings = BatchSettings(trim=False)
+    admit_at_once(monkeypatch)
+    inside = answer(settings, increments)
+    monkeypatch.setattr(admission, "LEAST_SIGHTINGS", 2)
     waiting = answer(settings, increments)
     without = answer(settings, keep(increments, lambda k, x: ~np.isin(x.observations.ids, once)))
-    inside = answer(dataclasses.replace(settings, least_sightings=1), increments)
     for other in (without, inside):
         np.testing.assert_allclose(
             other.trajectory.poses, waiting.trajectory.poses, rtol=0, atol=1e-6
@@ -246,11 +251,12 @@ def test_wrong_matches_do_not_start_a_landmark_anew(drive: Simulation) -> None:
         assert np.linalg.norm(offset) < 0.05
 
 
-def test_contradictions_count_in_a_row_and_not_at_all_where_switched_off() -> None:
+def test_contradictions_count_in_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     points = {1: [0.2, 0.1, 3.0]}
     elsewhere = {1: [0.6, 0.1, 3.0]}
-    for after, expected in ((0, [False] * 6), (2, [False, True, False, False, False, True])):
-        made = builder(contradicted_after=after)
+    for after, expected in ((7, [False] * 6), (2, [False, True, False, False, False, True])):
+        monkeypatch.setattr(admission, "CONTRADICTED_AFTER", after)
+        made = builder()
         made.add(frame(0, points, True), known(points))
         found = []
         for k in range(1, 7):
@@ -413,7 +419,9 @@ def test_landmarks_behind_a_camera_are_removed(
 
 
 @GRAPHS
-def test_points_at_infinity_admitted_at_once_do_no_harm(name: str) -> None:
+def test_points_at_infinity_admitted_at_once_do_no_harm(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """No waiting, no weak prior: disparities of half a pixel, with as much noise."""
     far = simulate(
         Drive(frames=12, points=40, depth_m=(40.0, 90.0), sigma_px=(0.3, 0.3, 0.3)),
@@ -421,10 +429,8 @@ def test_points_at_infinity_admitted_at_once_do_no_harm(name: str) -> None:
     )
     near = drawn(3, frames=12)
     both = [joined(a, b) for a, b in zip(near.increments, far.increments, strict=True)]
-    careless = dataclasses.replace(
-        SMOOTHERS[name], least_sightings=1, least_parallax=0.0, weak_parallax=0.0
-    )
-    found = answer(careless, both)
+    admit_at_once(monkeypatch)
+    found = answer(SMOOTHERS[name], both)
     assert np.isfinite(found.trajectory.poses).all()
     assert np.isfinite(found.landmarks.positions).all()
     assert ate(found, near) < 0.02

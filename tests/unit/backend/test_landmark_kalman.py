@@ -277,8 +277,11 @@ def test_trace_falls_on_a_hit(
         assert (np.trace(difference, axis1=1, axis2=2) > 0).all()
 
 
-def test_a_miss_grows_the_missed_ones_by_the_stated_amount(rng: np.random.Generator) -> None:
-    estimator, _ = started(6, rng, miss_growth_m=0.02)
+def test_a_miss_grows_the_missed_ones_by_the_stated_amount(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fgslam.backend.filters.landmark_kalman._MISS_GROWTH_M", 0.02)
+    estimator, _ = started(6, rng)
     before = estimator.estimate().landmarks
     missed = frame(1, NO_IDS, np.empty((0, 3)), False, missed=np.array([1, 4]))
     estimator.update(missed, at(np.eye(4), 0))

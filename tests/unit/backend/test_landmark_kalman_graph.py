@@ -167,7 +167,7 @@ def test_the_innovation_is_the_same(rng: np.random.Generator) -> None:
 CASES = {
     "default": (EgoMotionSettings(), {}),
     "world update": (EgoMotionSettings(), {"update": "world"}),
-    "exact pose": (EgoMotionSettings(), {"pose_covariance": False, "miss_growth_m": 0.01}),
+    "exact pose": (EgoMotionSettings(), {"pose_covariance": False}),
     "fixed height": (EgoMotionSettings(dof=5), {}),
     "planar": (EgoMotionSettings(dof=3), {}),
     "by measurement": (EgoMotionSettings(weighting="measurement"), {}),

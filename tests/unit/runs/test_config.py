@@ -409,7 +409,7 @@ def test_every_estimator_has_a_folder_of_its_own(tmp_path: Path) -> None:
         ("dataset.stride", "two", "give a whole number"),
         ("dataset.stride", 1.5, "give a whole number"),
         ("output.pictures", "perhaps", "give true or false"),
-        ("estimator.miss_growth_m", "much", "give a number"),
+        ("frontend.ego_motion.outlier_px", "much", "give a number"),
     ],
 )
 def test_wrong_types_are_reported_in_plain_words(
