@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.estimates import Estimate, Prediction, UpdateStats
 from fgslam.core.measurements import Increment
-from fgslam.evaluation.consistency import Nees, landmark_nees, pose_nees
+from fgslam.evaluation.consistency import Nees, judge, landmark_nees, pose_nees
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.slam.factory import make_estimator
 
@@ -89,6 +90,30 @@ def nees_of(estimate: Estimate, simulation: Simulation) -> tuple[Nees, Nees]:
     poses = estimate.trajectory.poses[1:], estimate.covariances[1:], simulation.poses[1:]
     landmarks = estimate.landmarks.positions, estimate.landmarks.covariances, truth
     return pose_nees(*poses), landmark_nees(*landmarks)
+
+
+def assert_consistent(settings: EstimatorSettings) -> None:
+    """Errors of poses and landmarks over 20 drives are those that the covariances state."""
+    drives = [drawn(100 + seed) for seed in range(20)]
+    found = [nees_of(answer(settings, drive.increments), drive) for drive in drives]
+    for runs in zip(*found, strict=True):
+        verdict = judge(runs)
+        assert verdict is not None
+        assert verdict.verdict == "consistent", verdict
+
+
+class Failing:
+    """A solver that fails with a message when it is next updated, and works otherwise."""
+
+    def __init__(self, solver: Any, message: str) -> None:
+        self._solver = solver
+        self._message = message
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._solver, name)
+
+    def update(self, *arguments: Any) -> None:
+        raise RuntimeError(self._message)
 
 
 def position_sigma(covariance: FloatArray) -> FloatArray:

@@ -211,7 +211,7 @@ def own_values(solver: Isam2Solver) -> Refined:
 def test_isam2_converges_to_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     """By itself: one step a frame, and nothing stays unlinearised."""
     relinearise_beyond(monkeypatch, 1e-9)
-    monkeypatch.setattr(Isam2Solver, "_refined", own_values)
+    monkeypatch.setattr(Isam2Solver, "_refine", own_values)
     for seed in range(10, 14):
         reference = answer(BATCH, last_blind(seed))
         settings = Isam2Settings(update_every=1, **LEAST_SQUARES)
@@ -220,7 +220,7 @@ def test_isam2_converges_to_batch(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_isam2_by_default_is_near_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its own estimate leaves what moves by less than the threshold; the last word is batch's."""
-    monkeypatch.setattr(Isam2Solver, "_refined", own_values)
+    monkeypatch.setattr(Isam2Solver, "_refine", own_values)
     own = Isam2Settings(**LEAST_SQUARES)
     for seed in range(10, 14):
         assert_same(answer(own, last_blind(seed)), answer(BATCH, last_blind(seed)), 0.1, 0.05)

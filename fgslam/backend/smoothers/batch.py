@@ -11,12 +11,10 @@ import numpy as np
 from fgslam.backend.filters.loop_correction import Constraint
 from fgslam.backend.settings import BatchSettings, KernelSettings
 from fgslam.backend.smoothers.graph_builder import NewFactors
-from fgslam.backend.smoothers.loop_closing import GraphLoops, solved
+from fgslam.backend.smoothers.loop_closing import solved
 from fgslam.backend.smoothers.refinement import (
-    Refined,
-    WholeGraphAnswer,
+    WholeGraphSolver,
     graduated,
-    refine,
     trimmed,
     with_kernel,
 )
@@ -25,11 +23,8 @@ from fgslam.backend.smoothers.solver import (
     ClosedLoop,
     Drive,
     Smoothed,
-    Solution,
     allowed_parts,
-    solver_failed,
 )
-from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import reorthonormalise
@@ -51,51 +46,37 @@ def batch_smoother(
     return MapSmoother(problem, BatchSolver(problem, settings))
 
 
-class BatchSolver:
+class BatchSolver(WholeGraphSolver):
     """Solves the whole graph by Levenberg-Marquardt or graduated non-convexity, when asked to."""
 
     kind: ClassVar[str] = "batch"
 
     def __init__(self, problem: GraphProblem, settings: BatchSettings) -> None:
         """Nothing to solve yet."""
-        self._builder, self._floor = problem.builder, problem.floor
+        super().__init__(problem.builder, problem.floor, settings.loops)
         self._settings = settings
-        self._loops = GraphLoops(problem.builder, settings.loops)
-        self._answer = WholeGraphAnswer(problem.builder, problem.floor, self._refined)
-        self._values = gtsam.Values()
-        self.remarks: list[str] = []
 
     def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
         """Takes in a frame's initial values; the builder keeps its factors."""
         self._values.insert(new.values)
-        self._answer.changed()
+        self._answer = None
 
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
         """The minimum after every `solve_every` frames."""
         every = self._settings.solve_every
         if not every or (frame + 1) % every:
             return None
-        answer = self._answer.solution()
-        self._values.update(self._answer.refined().values)
+        answer = self.solution()
+        self._values.update(self._refined().values)
         return Smoothed(self._values, Prediction(answer.poses[-1], answer.pose_covariances[-1]))
 
     def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
         """Tracks on from the solution; where nothing moves, the next one takes the loop in."""
-        try:
-            found = self._loops.judge(
-                loop,
-                drive,
-                self._values,
-                self._factors,
-                lambda graph: solved(graph, self._values),
-                what,
-            )
-        except RuntimeError as error:
-            raise self._failed(error) from None
-        self.remarks.append(found.remark)
-        if not found.closed:
+        found = self._accepted(
+            loop, drive, what, self._factors, lambda graph: solved(graph, self._values)
+        )
+        if found is None:
             return None
-        self._answer.changed()  # it may have been solved in this very frame, without the loop
         if found.values is None:
             return ClosedLoop()
         self._values = found.values
@@ -103,27 +84,12 @@ class BatchSolver:
         here = reorthonormalise(poses_of_frame(self._values, last))
         marginals = gtsam.Marginals(self._factors(), self._values)
         covariance = np.asarray(marginals.marginalCovariance(pose_key(last)))
-        covariance = allowed_parts(self._floor, here[None], covariance[None])[0]
-        return ClosedLoop(Smoothed(self._values, Prediction(here, covariance), by_loop=True))
-
-    def solution(self) -> Solution:
-        """The minimum over all that was measured."""
-        return self._answer.solution()
-
-    def joint(self, variables: list[int]) -> FloatArray:
-        """Joint covariance of the last pose and landmark variables."""
-        return self._answer.joint(variables)
+        return self._after_loop(allowed_parts(self._floor, here[None], covariance[None])[0])
 
     def _factors(self) -> Any:
         """The graph as it is solved when a loop is judged."""
         graph = self._builder.kept_factors()
         return with_kernel(graph) if self._settings.method == "gnc" else graph
-
-    def _refined(self) -> Refined:
-        try:
-            return refine(self._builder, self._values, self._minimise)
-        except RuntimeError as error:
-            raise self._failed(error, "after") from None
 
     def _minimise(self, graph: Any, values: Any) -> tuple[Any, Any]:
         """Values at the minimum, and the factors that count there."""
@@ -133,6 +99,3 @@ class BatchSolver:
         if self._settings.trim:
             return trimmed(graph, values, params, self._settings.noise_factor)
         return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize(), graph
-
-    def _failed(self, error: Exception, when: str = "at") -> Exception:
-        return solver_failed(self.kind, error, self._builder.frames[-1], when)

@@ -11,10 +11,9 @@ from fgslam.backend.filters.loop_correction import Constraint
 from fgslam.backend.settings import Isam2Settings
 from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.backend.smoothers.keyframes import Segments
-from fgslam.backend.smoothers.loop_closing import GraphLoops
 from fgslam.backend.smoothers.refinement import (
     Refined,
-    WholeGraphAnswer,
+    WholeGraphSolver,
     refine,
     trimmed,
 )
@@ -23,15 +22,12 @@ from fgslam.backend.smoothers.solver import (
     ClosedLoop,
     Drive,
     Smoothed,
-    Solution,
     allowed_parts,
-    solver_failed,
     suspect,
 )
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
-from fgslam.core.geometry import reorthonormalise
 from fgslam.core.sensors import Sensor
 from fgslam.factors.graphs import (
     is_pose,
@@ -60,7 +56,7 @@ def isam2_smoother(
     return MapSmoother(problem, Isam2Solver(problem, settings), segments)
 
 
-class Isam2Solver:
+class Isam2Solver(WholeGraphSolver):
     """Updates GTSAM's Bayes tree every few frames; in between the tracker answers.
 
     The last poses are kept at the root of the tree, which is three times faster than GTSAM's own
@@ -71,23 +67,19 @@ class Isam2Solver:
 
     def __init__(self, problem: GraphProblem, settings: Isam2Settings) -> None:
         """An empty tree."""
-        self._builder, self._floor = problem.builder, problem.floor
+        super().__init__(problem.builder, problem.floor, settings.loops)
         self._settings = settings
-        self._loops = GraphLoops(problem.builder, settings.loops)
-        self._answer = WholeGraphAnswer(problem.builder, problem.floor, self._refined)
         self._with_qr = False
         self._isam = self._new_solver()
         self._graph = gtsam.NonlinearFactorGraph()
         self._new_values = gtsam.Values()
-        self._values = gtsam.Values()
         self._updated = 0
-        self.remarks: list[str] = []
 
     def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
         """Keeps a frame's factors for the next update."""
         self._graph.push_back(new.graph)
         self._new_values.insert(new.values)
-        self._answer.changed()
+        self._answer = None
 
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
         """Updates the tree where the last update lies `update_every` frames back."""
@@ -104,44 +96,22 @@ class Isam2Solver:
         """Updates the tree with the loop, or builds it anew where the loop moves the map."""
         self._updated = self._builder.frames[-1]
         self._flush()
-        self._answer.changed()
         values = self._values
-        try:
-            found = self._loops.judge(
-                loop, drive, values, self._builder.kept_factors, lambda graph: values, what
-            )
-        except RuntimeError as error:
-            raise self._failed(error) from None
-        if found.closed:
-            self._join(found.values)
-        self.remarks.append(found.remark)
-        if not found.closed:
+        found = self._accepted(loop, drive, what, self._builder.kept_factors, lambda graph: values)
+        if found is None:
             return None
-        last = self._builder.frames[-1]
-        here = reorthonormalise(poses_of_frame(self._values, last))
-        return ClosedLoop(
-            Smoothed(self._values, Prediction(here, self._covariance(last)), by_loop=True)
-        )
+        self._join(found.values)
+        return self._after_loop(self._covariance(self._builder.frames[-1]))
 
-    def solution(self) -> Solution:
-        """All poses and landmarks of the graph, refined."""
-        return self._answer.solution()
-
-    def joint(self, variables: list[int]) -> FloatArray:
-        """Joint covariance of the graph's last pose and landmark variables."""
-        return self._answer.joint(variables)
-
-    def _refined(self) -> Refined:
+    def _refine(self) -> Refined:
         values = gtsam.Values(self._values)
         values.insert(self._new_values)
+        return refine(self._builder, values, self._minimise)
+
+    def _minimise(self, graph: Any, values: Any) -> tuple[Any, Any]:
+        """Values after a few iterations, and the factors that count there."""
         params = solver_parameters(_FINAL_ITERATIONS, _RELATIVE_TOLERANCE)
-        try:
-            factor = self._settings.noise_factor
-            return refine(
-                self._builder, values, lambda graph, at: trimmed(graph, at, params, factor)
-            )
-        except RuntimeError as error:
-            raise self._failed(error) from None
+        return trimmed(graph, values, params, self._settings.noise_factor)
 
     def _join(self, found: Any | None) -> None:
         """Goes on with the graph that has the loop; from these values where they are given."""
@@ -238,6 +208,3 @@ class Isam2Solver:
         covariance = np.asarray(self._isam.marginalCovariance(pose_key(frame)))
         pose = poses_of_frame(self._values, frame)
         return np.asarray(allowed_parts(self._floor, pose[None], covariance[None])[0])
-
-    def _failed(self, error: Exception) -> Exception:
-        return solver_failed(self.kind, error, self._builder.frames[-1])

@@ -10,23 +10,32 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import gtsam
 import numpy as np
 
+from fgslam.backend.filters.loop_correction import Constraint
+from fgslam.backend.settings import LoopCorrectionSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
+from fgslam.backend.smoothers.loop_closing import Acceptance, GraphLoops
 from fgslam.backend.smoothers.marginals import marginals_of
 from fgslam.backend.smoothers.solver import (
+    ClosedLoop,
+    Drive,
+    Smoothed,
     Solution,
     allowed_joint,
     allowed_parts,
     points_of,
     poses_of,
+    solver_failed,
 )
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
+from fgslam.core.estimates import Prediction
 from fgslam.core.floor import Floor
+from fgslam.core.geometry import reorthonormalise
 from fgslam.core.quantiles import chi_square_quantile
 from fgslam.factors.graphs import (
     is_pose,
@@ -185,29 +194,25 @@ def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
     return Refined(kept, found, tuple(remarks))
 
 
-class WholeGraphAnswer:
-    """Final answers of a graph that keeps every pose, refined once until it changes."""
+class WholeGraphSolver:
+    """What solvers of a graph that keeps every pose share: loops, and the answer for the whole run.
 
-    def __init__(self, builder: GraphBuilder, floor: Floor, refined: Callable[[], Refined]) -> None:
-        """``refined`` gives the graph, solved anew."""
-        self._builder = builder
-        self._floor = floor
-        self._refine = refined
-        self._refined: Refined | None = None
+    The answer is solved for once, until the graph changes.
+    """
 
-    def changed(self) -> None:
-        """Forgets the last answer."""
-        self._refined = None
+    kind: ClassVar[str]
 
-    def refined(self) -> Refined:
-        """The graph's last solution."""
-        if self._refined is None:
-            self._refined = self._refine()
-        return self._refined
+    def __init__(self, builder: GraphBuilder, floor: Floor, loops: LoopCorrectionSettings) -> None:
+        """Nothing to solve yet."""
+        self._builder, self._floor = builder, floor
+        self._loops = GraphLoops(builder, loops)
+        self._values = gtsam.Values()
+        self._answer: Refined | None = None
+        self.remarks: list[str] = []
 
     def solution(self) -> Solution:
-        """All poses and landmarks with their marginals."""
-        return solution(self.refined(), self._builder.frames, self._floor)
+        """All poses and landmarks at the minimum over all that was measured, with marginals."""
+        return solution(self._refined(), self._builder.frames, self._floor)
 
     def joint(self, variables: list[int]) -> FloatArray:
         """Joint covariance of the graph's last pose and landmark variables.
@@ -215,12 +220,53 @@ class WholeGraphAnswer:
         Raises:
             EstimatorError: a landmark was left out of the last solution.
         """
-        refined = self.refined()
+        refined = self._refined()
         lost = set(variables) - set(refined.variables)
         if lost:
             raise EstimatorError(f"{self._builder.describe(min(lost))} was left out of the graph")
         last = self._builder.frames[-1]
         return joint_of(refined.graph, refined.values, self._floor, last, variables)
+
+    def _refined(self) -> Refined:
+        """The graph's last solution."""
+        if self._answer is None:
+            try:
+                self._answer = self._refine()
+            except RuntimeError as error:
+                raise self._failed(error, "after") from None
+        return self._answer
+
+    def _refine(self) -> Refined:
+        return refine(self._builder, self._values, self._minimise)
+
+    def _minimise(self, graph: Any, values: Any) -> tuple[Any, Any]:
+        """Values at the minimum, and the factors that count there."""
+        raise NotImplementedError
+
+    def _accepted(
+        self,
+        loop: Constraint,
+        drive: Drive,
+        what: str,
+        graph: Callable[[], Any],
+        minimum: Callable[[Any], Any],
+    ) -> Acceptance | None:
+        """The loop in the graph; None, and a remark, if it is refused. See GraphLoops.judge."""
+        try:
+            found = self._loops.judge(loop, drive, self._values, graph, minimum, what)
+        except RuntimeError as error:
+            raise self._failed(error) from None
+        self.remarks.append(found.remark)
+        self._answer = None  # it may have been solved in this very frame, without the loop
+        return found if found.closed else None
+
+    def _after_loop(self, covariance: FloatArray) -> ClosedLoop:
+        """The values that a loop has moved, and the covariance (6, 6) of their last pose."""
+        here = reorthonormalise(poses_of_frame(self._values, self._builder.frames[-1]))
+        return ClosedLoop(Smoothed(self._values, Prediction(here, covariance), by_loop=True))
+
+    def _failed(self, error: Exception, when: str = "at") -> Exception:
+        return solver_failed(self.kind, error, self._builder.frames[-1], when)
 
 
 def solution(refined: Refined, frames: list[int], floor: Floor) -> Solution:

@@ -11,13 +11,13 @@ import pytest
 from simulated import assert_same_bits, play
 from smoothing import (
     FREE,
+    Failing,
     answer,
     assert_finite,
     ate,
     blackout,
     build,
     drawn,
-    nees_of,
     position_sigma,
     run,
     unseen,
@@ -27,24 +27,9 @@ from fgslam.backend.settings import FixedLagSettings
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Prediction
-from fgslam.evaluation.consistency import judge
 from fgslam.factors.graphs import is_pose, landmark_key, number, pose_key
 
 LAG = FixedLagSettings(lag_frames=5)
-
-
-class Failing:
-    """A solver that fails when it is next updated."""
-
-    def __init__(self, solver: Any, message: str) -> None:
-        self._solver = solver
-        self._message = message
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._solver, name)
-
-    def update(self, *arguments: Any) -> None:
-        raise RuntimeError(self._message)
 
 
 def spoil(estimator: Any, message: str) -> None:
@@ -139,17 +124,6 @@ def test_landmark_that_left_keeps_its_place_until_it_is_seen_again() -> None:
     offset = places[15][0] - simulation.points_by_id[28]
     assert offset @ np.linalg.solve(places[15][1], offset) < 16.3
     assert (places[-1][0] != places[15][0]).any()
-
-
-def test_pose_and_landmarks_are_consistent_over_20_drives() -> None:
-    found = [
-        nees_of(answer(LAG, simulation.increments), simulation)
-        for simulation in (drawn(100 + seed) for seed in range(20))
-    ]
-    for runs in zip(*found, strict=True):
-        verdict = judge(runs)
-        assert verdict is not None
-        assert verdict.verdict == "consistent", verdict
 
 
 def test_a_blackout_longer_than_the_lag_is_bridged_and_never_forgotten() -> None:
