@@ -20,7 +20,7 @@ from fgslam.backend.filters.ekf_update import (
     correct,
     correct_anew,
 )
-from fgslam.backend.filters.filtered import FilteredTrajectory, FirstSights
+from fgslam.backend.filters.filtered import FilteredTrajectory, FirstSights, require_finite
 from fgslam.backend.filters.growing_covariance import BLOCK, FRONT, GrowingCovariance, rows_of
 from fgslam.backend.settings import EkfSettings
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
@@ -114,7 +114,7 @@ class FullEkf:
             self._past.require_step(increment)
         first = self._first_sights(increment)
         self._require_room(increment, len(first.points))
-        self._require_finite(increment)
+        require_finite(increment)
         seen = increment.observations
         if increment.relocalised:
             wTc, front = self._at_tracked_pose(tracking)
@@ -216,17 +216,6 @@ class FullEkf:
                 f"{where}: no memory for the joint covariance of {count} "
                 "landmarks; lower max_landmarks, prune earlier, or use isam2"
             ) from None
-
-    def _require_finite(self, increment: Increment) -> None:
-        seen, motion = increment.observations, increment.odometry
-        given = [seen.measurement, seen.covariance]
-        if motion is not None:
-            given += [motion.motion, motion.covariance]
-        if not all(np.isfinite(array).all() for array in given):
-            raise EstimatorError(
-                f"frame {increment.index}: a measurement or the odometry is not finite; "
-                "leave it out of the log"
-            )
 
     def _moved(self, motion: Odometry | None) -> tuple[FloatArray, FloatArray]:
         """Predicted pose and the joint covariance's columns (n, 6) of it."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, StateArrays
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import Prediction, Trajectory
+from fgslam.core.estimates import EgoMotion, Prediction, Trajectory
 from fgslam.core.geometry import (
     compose_covariance,
     congruence,
@@ -82,6 +82,30 @@ class FilteredTrajectory:
             list(state["poses"]),
             list(state["pose_covariances"]),
         )
+
+
+def require_finite(increment: Increment, tracking: EgoMotion | None = None) -> None:
+    """Refuses numbers that are not finite: in a solver one of them would spoil all others.
+
+    Args:
+        increment: of a frame.
+        tracking: of the same frame, where the estimator uses it.
+
+    Raises:
+        EstimatorError: which kind of number, and in which frame.
+    """
+    observed, motion = increment.observations, increment.odometry
+    given = {
+        "measurement": [observed.measurement, observed.covariance],
+        "motion": [] if motion is None else [motion.motion, motion.covariance],
+        "tracked pose": [] if tracking is None else [tracking.wTc, tracking.covariance],
+    }
+    for what, arrays in given.items():
+        if not all(np.isfinite(array).all() for array in arrays):
+            raise EstimatorError(
+                f"frame {increment.index}: the {what} or its covariance is not finite; "
+                "look at that frame with fgslam inspect"
+            )
 
 
 def moved(current: Prediction, odometry: Odometry | None) -> Prediction:

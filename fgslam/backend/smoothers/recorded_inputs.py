@@ -13,31 +13,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, StateArrays
-from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Odometry
 from fgslam.core.sensors import Sensor
-
-
-def require_finite(increment: Increment, tracking: EgoMotion) -> None:
-    """Refuses numbers that are not finite: in a solver one of them would spoil all others.
-
-    Raises:
-        EstimatorError: which kind of number, and in which frame.
-    """
-    observed, motion = increment.observations, increment.odometry
-    given = {
-        "measurement": [observed.measurement, observed.covariance],
-        "motion": [] if motion is None else [motion.motion, motion.covariance],
-        "tracked pose": [tracking.wTc, tracking.covariance],
-    }
-    for what, arrays in given.items():
-        if not all(np.isfinite(array).all() for array in arrays):
-            raise EstimatorError(
-                f"frame {increment.index}: the {what} or its covariance is not finite; "
-                "look at that frame with fgslam inspect"
-            )
 
 
 @dataclass(slots=True, eq=False)

@@ -257,8 +257,10 @@ class WholeGraphSolver:
         except RuntimeError as error:
             raise self._failed(error) from None
         self.remarks.append(found.remark)
+        if not found.closed:
+            return None
         self._answer = None  # it may have been solved in this very frame, without the loop
-        return found if found.closed else None
+        return found
 
     def _after_loop(self, covariance: FloatArray) -> ClosedLoop:
         """The values that a loop has moved, and the covariance (6, 6) of their last pose."""

@@ -18,13 +18,14 @@ from typing import ClassVar
 
 import numpy as np
 
+from fgslam.backend.filters.filtered import require_finite
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.loop_correction import CLOSURE_FACTOR, FREE, Constraint
 from fgslam.backend.settings import GraphSettings, LandmarkKalmanSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
 from fgslam.backend.smoothers.keyframes import Segments, fill_between
 from fgslam.backend.smoothers.loop_closing import carried_to
-from fgslam.backend.smoothers.recorded_inputs import RecordedInputs, require_finite
+from fgslam.backend.smoothers.recorded_inputs import RecordedInputs
 from fgslam.backend.smoothers.solver import Drive, GraphSolver, Smoothed, Solution
 from fgslam.backend.smoothers.tracker_map import TrackerMap
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
