@@ -24,6 +24,8 @@ from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import replay_step
+from fgslam.worlds.driving import paths
+from fgslam.worlds.lab_settings import LabDriveSettings
 from fgslam.worlds.simulated.landmarks import IdentityBook
 
 RIG = CameraRig(
@@ -283,3 +285,8 @@ class FeatureWorld:
             orientation=self._orientation[which],
             descriptors=self._descriptors[which],
         )
+
+
+def plan_drive(settings: LabDriveSettings) -> paths.Drive:
+    """Path and time stamps of a drive in the lab. Raises ConfigError where it cannot be driven."""
+    return paths.drive_along(paths.plan_path(settings), settings)

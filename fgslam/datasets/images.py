@@ -50,6 +50,17 @@ def read_grey_image(path: Path) -> Image:
     return _decoded(path, cv2.IMREAD_GRAYSCALE)
 
 
+def read_sized_image(path: Path, width: int, height: int) -> Image:
+    """The image in grey, as :func:`read_grey_image`. Raises FrameError if of another size, too."""
+    image = read_grey_image(path)
+    if image.shape != (height, width):
+        raise FrameError(
+            f"image {path} is {size(image)} but the calibration says {width}x{height}; restore the "
+            "right file"
+        )
+    return image
+
+
 def read_colour_image(path: Path) -> Image:
     """The image (height, width, 3) in red, green, blue, uint8; else as :func:`read_grey_image`."""
     return np.asarray(cv2.cvtColor(_decoded(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), np.uint8)
@@ -120,16 +131,7 @@ class StereoFiles:
 
     def load(self, index: int) -> tuple[Image, ...]:
         """Images of a frame. Raises FrameError when one is missing, damaged or of another size."""
-        images = []
-        for path in self.paths[index]:
-            image = read_grey_image(path)
-            if image.shape != (self.height, self.width):
-                raise FrameError(
-                    f"image {path} is {size(image)} but the calibration says "
-                    f"{self.width}x{self.height}; restore the right file"
-                )
-            images.append(image)
-        return tuple(images)
+        return tuple(read_sized_image(path, self.width, self.height) for path in self.paths[index])
 
     def first_images(self) -> tuple[Image, ...] | None:
         """Images of the first frame that can be read, whatever their size; None without any."""

@@ -22,7 +22,6 @@ from fgslam.datasets.images import (
     list_numbered_images,
     missing_notes,
     require_folder,
-    size,
 )
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
 from fgslam.datasets.settings import KittiSettings
@@ -97,16 +96,8 @@ def _read_rig(path: Path, files: StereoFiles) -> CameraRig:
             f"{path.parent}: not one frame of times.txt has a readable image in image_0/ and in "
             "image_1/; check the unpacked files"
         )
-    _require_same_size(path.parent, size(images[0]), size(images[1]))
     height, width = images[0].shape
     return pair.rig(width, height)
-
-
-def _require_same_size(folder: Path, right: str, left: str) -> None:
-    if right != left:
-        raise DatasetError(
-            f"{folder}: image_0 is {left} but image_1 is {right}; restore the original images"
-        )
 
 
 def _read_poses(path: Path, frames: int) -> FloatArray | None:

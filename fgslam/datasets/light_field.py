@@ -20,12 +20,12 @@ import numpy as np
 
 from fgslam.cameras.calibration import pixels, read_json_object
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.errors import DatasetError, FrameError
+from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.files import read_lines
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.images import read_grey_image, require_folder
+from fgslam.datasets.images import read_sized_image, require_folder
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
 from fgslam.datasets.settings import LightFieldSettings
 
@@ -74,14 +74,8 @@ class Walk:
         return tuple(self._view(view, shift) for view, shift in zip(views, shifts, strict=True))
 
     def _view(self, view: tuple[int, int], shift: FloatArray) -> Image:
-        path = self.grid.files[view]
-        image = read_grey_image(path)
-        if image.shape != (self.grid.height, self.grid.width):
-            raise FrameError(
-                f"image {path} is {image.shape[1]}x{image.shape[0]} but calib.json says "
-                f"{self.grid.width}x{self.grid.height}; restore the right file"
-            )
-        return shift_image(image, shift)
+        grid = self.grid
+        return shift_image(read_sized_image(grid.files[view], grid.width, grid.height), shift)
 
 
 def shift_image(image: Image, shift: FloatArray) -> Image:

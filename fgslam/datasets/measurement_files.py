@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.measurement_log import MeasurementLog
@@ -78,9 +80,22 @@ def make_increments(frames: Iterable[MeasuredFrame]) -> list[Increment]:
     return out
 
 
-def files_identity(files: Iterable[Path], settings: Any) -> str:
-    """SHA-256 of files by their content, and of what the settings make of them."""
-    values = {k: v for k, v in asdict(settings).items() if k not in ("path", "file")}
+def camera_odometry(
+    step: Callable[[int], Odometry], chosen: IntArray, bTc: FloatArray
+) -> Iterator[Odometry | None]:
+    """Motions of the camera (mounted at ``bTc``) into each of the chosen frames; first is None.
+
+    ``step`` gives the body's motion from a frame to the next; those between are composed.
+    """
+    yield None
+    for before, after in pairwise(chosen.tolist()):
+        steps = (step(i) for i in range(before, after))
+        yield g.odometry_of_camera(g.compose_odometry(steps), bTc)
+
+
+def files_identity(files: Iterable[Path], settings: Mapping[str, Any]) -> str:
+    """SHA-256 of files by their content, and of what the settings (as values) make of them."""
+    values = {k: v for k, v in settings.items() if k not in ("path", "file")}
     digest = hashlib.sha256(json.dumps(values, sort_keys=True).encode())
     for path in files:
         digest.update(path.read_bytes())

@@ -235,8 +235,6 @@ class RenderedLabSequence:
         for done, _ in enumerate(self._rendered(missing), start=1):
             if progress is not None:
                 progress(done, len(missing))
-        if len(self._indices) == len(self._drive.timestamps):
-            self._cache.mark_done(len(self._indices))
 
     def _rendered(self, missing: list[int]) -> Iterator[int]:
         """Renders and stores frames on two threads, a few at a time so that Ctrl-C is prompt."""

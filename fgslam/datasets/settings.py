@@ -146,9 +146,6 @@ class UtiasStereoSettings(RecordingSettings):
 
     path: Annotated[str, Field(min_length=1, description="the .mat file of dataset 3")]
     kind: Literal["utias_stereo"] = "utias_stereo"
-    pixel_sigma_scale: Annotated[
-        float, Field(gt=0.0, description="factor on the file's standard deviations of the pixels")
-    ] = 1.0
     left_right_correlation: Annotated[
         tuple[Correlation, Correlation],
         Field(
@@ -156,9 +153,6 @@ class UtiasStereoSettings(RecordingSettings):
             "against the truth); [0, 0]: independent, as the file's variances alone would have it"
         ),
     ] = (0.86, 0.99)
-    rate_sigma_scale: Annotated[
-        float, Field(gt=0.0, description="factor on the file's standard deviations of the rates")
-    ] = 1.0
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
@@ -170,9 +164,6 @@ class UtiasRangeBearingSettings(RecordingSettings):
     max_range_m: Annotated[
         float, Field(gt=0.0, description="readings farther than this are left out, metres")
     ] = 5.0
-    rate_sigma_scale: Annotated[
-        float, Field(gt=0.0, description="factor on the file's standard deviations of the rates")
-    ] = 1.0
     lateral_sigma_mps: Annotated[
         float,
         Field(gt=0.0, description="sideways speed, which the wheels do not measure, m/s"),

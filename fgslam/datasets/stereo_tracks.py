@@ -6,7 +6,7 @@ The files lie inside the installed gtsam wheel; they are read as text, GTSAM is 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -68,7 +68,7 @@ def open_stereo_tracks(
     listed = [path for path in (files.tracks, files.calibration, files.poses) if path.exists()]
     return MeasurementRecording(
         name=f"stereo tracks {files.tracks.stem.removeprefix(_PREFIX).removeprefix('_')}",
-        identity=files_identity(listed, settings),
+        identity=files_identity(listed, asdict(settings)),
         log=make_log(rig, increments, odometry),
         ground_truth=truth,
         landmark_truth=None,

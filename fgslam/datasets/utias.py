@@ -19,7 +19,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,7 @@ from fgslam.core.recordings import LandmarkTruth, MeasurementRecording
 from fgslam.core.sensors import CameraRig, RangeBearingSensor
 from fgslam.datasets.measurement_files import (
     MeasuredFrame,
+    camera_odometry,
     files_identity,
     make_increments,
     make_log,
@@ -49,6 +50,8 @@ from fgslam.datasets.settings import (
 # (column, row, disparity) of the right camera, from left column and row, right column and row.
 _MEASURE: FloatArray = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.5, 0.0, 0.5], [1.0, 0.0, -1.0, 0.0]])
 _NOT_RIGID = 1e-6
+_SCALES = {"pixel_sigma_scale": 1.0, "rate_sigma_scale": 1.0}
+"""Of the file's standard deviations, once settings: part of a recording's identity."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,11 +79,11 @@ def open_starry_night(
     recorded = _read_starry_night(file)
     chosen = select_of(len(recorded.stamps), settings, settings.path)
     covariance = _pixel_covariance(file, settings)
-    increments = make_increments(_stereo_frames(recorded, chosen, settings, covariance))
+    increments = make_increments(_stereo_frames(recorded, chosen, covariance))
     poses = recorded.body[chosen] @ recorded.rig.bTc
     return MeasurementRecording(
         name="UTIAS Starry Night",
-        identity=files_identity([path], settings),
+        identity=files_identity([path], asdict(settings) | _SCALES),
         log=make_log(recorded.rig, increments, odometry),
         ground_truth=Trajectory(recorded.stamps[chosen], poses),
         landmark_truth=LandmarkTruth(
@@ -137,7 +140,7 @@ def _read_rig(file: MatlabFile, pixels: FloatArray) -> CameraRig:
 
 def _pixel_covariance(file: MatlabFile, settings: UtiasStereoSettings) -> FloatArray:
     """Covariance (3, 3) of (column, row, disparity): the file's variances, correlated."""
-    sigma = settings.pixel_sigma_scale * np.sqrt(file.positive("y_var", (4, 1))[:, 0])
+    sigma = np.sqrt(file.positive("y_var", (4, 1))[:, 0])
     columns, rows = settings.left_right_correlation
     correlation = np.eye(4)
     correlation[0, 2] = correlation[2, 0] = columns
@@ -146,14 +149,10 @@ def _pixel_covariance(file: MatlabFile, settings: UtiasStereoSettings) -> FloatA
 
 
 def _stereo_frames(
-    recorded: _StarryNight, chosen: IntArray, settings: UtiasStereoSettings, covariance: FloatArray
+    recorded: _StarryNight, chosen: IntArray, covariance: FloatArray
 ) -> Iterator[MeasuredFrame]:
-    variance = settings.rate_sigma_scale**2 * recorded.rate_variance
-    for k, index in enumerate(chosen.tolist()):
-        odometry = None
-        if k:
-            steps = (_step(recorded, i, variance) for i in range(chosen[k - 1], index))
-            odometry = g.odometry_of_camera(g.compose_odometry(steps), recorded.rig.bTc)
+    motions = camera_odometry(lambda i: _step(recorded, i), chosen, recorded.rig.bTc)
+    for index, odometry in zip(chosen.tolist(), motions, strict=True):
         ids = np.flatnonzero(recorded.seen[index])
         y = recorded.pixels[index, ids]
         pixels = np.full((len(ids), 3, 2), np.nan)
@@ -169,13 +168,13 @@ def _stereo_frames(
         )
 
 
-def _step(recorded: _StarryNight, i: int, variance: FloatArray) -> Odometry:
+def _step(recorded: _StarryNight, i: int) -> Odometry:
     """Motion of the vehicle from frame ``i`` to the next, its rates taken as constant.
 
     Translation is along the axes at the start; its noise is turned to those at the end.
     """
     duration = float(recorded.stamps[i + 1] - recorded.stamps[i])
-    by = duration * recorded.rates[i]
+    by, variance = duration * recorded.rates[i], recorded.rate_variance
     rotation = g.so3_exp(by[:3])
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = duration**2 * np.diag(variance[:3])
@@ -218,7 +217,9 @@ def open_lost_in_the_woods(
     level = np.zeros(len(recorded.landmarks))
     return MeasurementRecording(
         name="UTIAS Lost in the Woods",
-        identity=files_identity([path], settings),
+        identity=files_identity(
+            [path], asdict(settings) | {"rate_sigma_scale": _SCALES["rate_sigma_scale"]}
+        ),
         log=make_log(sensor, increments, odometry),
         ground_truth=_truth(recorded, chosen, bTc),
         landmark_truth=LandmarkTruth(
@@ -279,11 +280,8 @@ def _range_bearing_frames(
     bearing, distance = recorded.variances["b_var"], recorded.variances["r_var"]
     covariance = np.diag([bearing, bearing, distance])
     steps = _steps(recorded, settings)
-    for k, index in enumerate(chosen.tolist()):
-        odometry = None
-        if k:
-            between = g.compose_odometry(steps[chosen[k - 1] : index])
-            odometry = g.odometry_of_camera(between, bTc)
+    motions = camera_odometry(steps.__getitem__, chosen, bTc)
+    for index, odometry in zip(chosen.tolist(), motions, strict=True):
         ranges = recorded.ranges[index]
         ids = np.flatnonzero((ranges > 0.0) & (ranges <= settings.max_range_m))
         azimuth = -recorded.bearings[index, ids]
@@ -305,8 +303,7 @@ def _steps(recorded: _LostInTheWoods, settings: UtiasRangeBearingSettings) -> li
     end. What the wheels do not measure gets the noise of what they do: height that of the way,
     pitch and roll that of the heading; a floor leaves them out.
     """
-    scale = settings.rate_sigma_scale
-    speed, turn = (scale**2 * recorded.variances[name] for name in ("v_var", "om_var"))
+    speed, turn = recorded.variances["v_var"], recorded.variances["om_var"]
     lateral = settings.lateral_sigma_mps**2
     variance = np.array([turn, turn, turn, speed, lateral, speed])
     out = []

@@ -298,6 +298,13 @@ RETIRED: dict[str, dict[str, Any]] = {
         "max_view_width": 2048,
         "sigma_scales": 0.27,
     },
+    "UtiasRangeBearingSettings": {
+        "rate_sigma_scale": 1.0,
+    },
+    "UtiasStereoSettings": {
+        "pixel_sigma_scale": 1.0,
+        "rate_sigma_scale": 1.0,
+    },
     "WheelchairSettings": {
         "max_acceleration_m_s2": 0.5,
         "max_turn_acceleration_deg_s2": 120.0,

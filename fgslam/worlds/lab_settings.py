@@ -64,7 +64,20 @@ class RandomPosesSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
-class LabDriveSettings:
+class DriveLimits:
+    """How fast the robot drives, and how often it takes images."""
+
+    frame_rate_hz: Annotated[float, Field(gt=0.0, le=120.0, description="frames a second")] = 2.0
+    max_speed_m_s: Annotated[float, Field(gt=0.0, le=5.0, description="limit, metres a second")] = (
+        0.40
+    )
+    max_turn_deg_s: Annotated[
+        float, Field(gt=0.0, le=180.0, description="limit, degrees a second")
+    ] = 10.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class LabDriveSettings(DriveLimits):
     """The robot's path and speed."""
 
     path: Annotated[
@@ -83,13 +96,6 @@ class LabDriveSettings:
             "nine tenths of the speed limits; of `random_poses` null makes 200 poses"
         ),
     ] = 249
-    frame_rate_hz: Annotated[float, Field(gt=0.0, le=120.0, description="frames a second")] = 2.0
-    max_speed_m_s: Annotated[float, Field(gt=0.0, le=5.0, description="limit, metres a second")] = (
-        0.40
-    )
-    max_turn_deg_s: Annotated[
-        float, Field(gt=0.0, le=180.0, description="limit, degrees a second")
-    ] = 10.0
     laps: Annotated[
         int,
         Field(ge=1, le=1000, description="times around the room, for `laps`; rounds of a `tour`"),

@@ -5,8 +5,8 @@ from hypothesis import assume, given, reject
 from hypothesis import strategies as st
 
 from fgslam.core.errors import ConfigError
-from fgslam.worlds.driving.paths import plan_drive
 from fgslam.worlds.lab_settings import LabDriveSettings
+from tests.simulated import plan_drive
 
 coordinate = st.floats(-3.5, 3.5, allow_nan=False, width=32)
 points = st.lists(st.tuples(coordinate, coordinate), min_size=3, max_size=6)

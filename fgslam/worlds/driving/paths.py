@@ -318,15 +318,6 @@ def plan_path(settings: LabDriveSettings) -> PlanarPath:
     )
 
 
-def plan_drive(settings: LabDriveSettings) -> Drive:
-    """Path and time stamps of a drive.
-
-    Raises:
-        ConfigError: the path cannot be driven in so few frames, or has too few waypoints.
-    """
-    return drive_along(plan_path(settings), settings)
-
-
 def drive_along(path: PlanarPath, settings: LabDriveSettings) -> Drive:
     """A given path, driven as the settings say; their own ``path`` is not looked at.
 

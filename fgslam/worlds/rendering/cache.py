@@ -89,13 +89,6 @@ class RenderCache:
         except OSError as error:
             raise _cannot_write(self.folder, error) from error
 
-    def mark_done(self, frames: int) -> None:
-        """Leaves a note that all frames of the drive have been rendered."""
-        try:
-            self._replace(self.folder / "complete", f"{frames}\n".encode())
-        except OSError as error:
-            raise _cannot_write(self.folder, error) from error
-
     def _replace(self, path: Path, content: bytes) -> None:
         beside = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
         try:

@@ -9,7 +9,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT, FrameSelection
-from fgslam.worlds.lab_settings import LabRigSettings, WheelOdometrySettings
+from fgslam.worlds.lab_settings import DriveLimits, LabRigSettings, WheelOdometrySettings
 
 Correlation: TypeAlias = Annotated[float, Field(gt=-1.0, lt=1.0)]
 
@@ -34,7 +34,7 @@ class MeasurementWorldSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
-class MeasurementDriveSettings:
+class MeasurementDriveSettings(DriveLimits):
     """The robot's path and speed."""
 
     path: Annotated[
@@ -52,13 +52,6 @@ class MeasurementDriveSettings:
             "repeats its round); null: one way at nine tenths of the speed limits"
         ),
     ] = 249
-    frame_rate_hz: Annotated[float, Field(gt=0.0, le=120.0, description="frames a second")] = 2.0
-    max_speed_m_s: Annotated[float, Field(gt=0.0, le=5.0, description="limit, metres a second")] = (
-        0.40
-    )
-    max_turn_deg_s: Annotated[
-        float, Field(gt=0.0, le=180.0, description="limit, degrees a second")
-    ] = 10.0
     laps: Annotated[int, Field(ge=1, le=1000, description="rounds, for `laps`")] = 1
     length_m: Annotated[
         float, Field(ge=30.0, le=10_000.0, description="least way, metres, for `exploring`")

@@ -86,7 +86,7 @@ def no_calibration(folder: Path) -> None:
 
 BAD = [
     (mono, DatasetError, ["no image_1/", "both grey cameras", "unpack"]),
-    (other_size, DatasetError, ["image_0 is 32x24", "image_1 is 16x12", "restore"]),
+    (other_size, DatasetError, ["differ in size", "right 16x12", "left 32x24"]),
     (no_calibration, CalibrationError, ["calib.txt", "No such file", "restore"]),
     (replaced("calib.txt", "P1:", "P9:"), CalibrationError, ["calib.txt", "no line 'P1'"]),
     (replaced("calib.txt", "-12.0", "nan"), CalibrationError, ["line 2", "P1", "12 finite"]),

@@ -171,7 +171,7 @@ def test_missing_view(grid: Path) -> None:
 def test_view_of_another_size(grid: Path) -> None:
     save(grid / "r04_c06.png", np.zeros((9, 12), np.uint8))
     with pytest.raises(
-        FrameError, match=r"r04_c06\.png is 12x9 but calib.json says 120x90; restore"
+        FrameError, match=r"r04_c06\.png is 12x9 but the calibration says 120x90; restore"
     ):
         opened(grid).frame(2)
 

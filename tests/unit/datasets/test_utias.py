@@ -200,9 +200,9 @@ def test_pixel_covariance_follows_from_the_file_s_variances(
 
     independent = first(left_right_correlation=(0.0, 0.0))
     np.testing.assert_allclose(independent, [[16, 0, -16], [0, 8.5, 0], [-16, 0, 20]])
-    tied = first(left_right_correlation=(0.5, 0.9), pixel_sigma_scale=2.0)
+    tied = first(left_right_correlation=(0.5, 0.9))
     np.testing.assert_allclose(
-        tied, 4.0 * np.array([[16, 0, 4 - 16], [0, 8.5 + 0.5 * 0.9 * 15, 0], [4 - 16, 0, 20 - 8]])
+        tied, np.array([[16, 0, 4 - 16], [0, 8.5 + 0.5 * 0.9 * 15, 0], [4 - 16, 0, 20 - 8]])
     )
 
 
@@ -232,13 +232,13 @@ def test_odometry_covariance_is_that_of_noisy_rates(
 
 def test_wheel_odometry_is_uncertain_sideways(tmp_path: Path, rng: np.random.Generator) -> None:
     """The covariance back in the body: forward x, left y, up z."""
-    recording = opened(tmp_path, woods(rng), lateral_sigma_mps=0.05, rate_sigma_scale=2.0)
+    recording = opened(tmp_path, woods(rng), lateral_sigma_mps=0.05)
     odometry = recording.log.increments[1].odometry
     assert odometry is not None
     body = g.change_tangent_frame(recording.log.rig.bTc, odometry.covariance)
     sigma = np.sqrt(np.diagonal(body)) / 0.1
-    assert sigma[2] == pytest.approx(2.0 * np.sqrt(0.01))
-    assert sigma[3] == pytest.approx(2.0 * np.sqrt(0.004))
+    assert sigma[2] == pytest.approx(np.sqrt(0.01))
+    assert sigma[3] == pytest.approx(np.sqrt(0.004))
     assert sigma[4] == pytest.approx(0.05)
 
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from fgslam.worlds.buildings.lab import HALF_SIDE, HEIGHT, build_lab
-from fgslam.worlds.driving.paths import plan_drive
 from fgslam.worlds.lab import make_rig
 from fgslam.worlds.lab_settings import LabDriveSettings, LabPersonSettings, LabRigSettings
 from fgslam.worlds.people import across_view, person
 from fgslam.worlds.rendering.patches import RayCaster, Thing, stack
 from fgslam.worlds.rendering.texture_library import PHOTOGRAPHS, build_library, photograph
 from fgslam.worlds.rendering.textures import book_row
+from tests.simulated import plan_drive
 
 VISITS = (1, 2, 3)
 

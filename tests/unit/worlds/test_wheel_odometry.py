@@ -5,8 +5,8 @@ import pytest
 
 from fgslam.core import geometry
 from fgslam.worlds.driving import wheel_odometry
-from fgslam.worlds.driving.paths import plan_drive
 from fgslam.worlds.lab_settings import LabDriveSettings, WheelOdometrySettings
+from tests.simulated import plan_drive
 
 QUIET = WheelOdometrySettings(
     distance_scale=0.0,
