@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -21,7 +21,7 @@ from fgslam.core.errors import FgslamError
 from fgslam.runs.named_experiments import experiment_names, find_experiment
 
 if TYPE_CHECKING:
-    from fgslam.runs.baseline import Results
+    from fgslam.runs.baseline import Baseline, Results
     from fgslam.runs.engine import RunResult
     from fgslam.runs.folder import ExistingFolder
 
@@ -168,7 +168,7 @@ def compare(  # noqa: PLR0913 - each option is a parameter
         raise typer.Exit(EXIT_FAULT)
 
 
-def _baselines(results: Results, written: Path | None, expected: dict[str, Any] | None) -> bool:
+def _baselines(results: Results, written: Path | None, expected: Baseline | None) -> bool:
     """Writes and checks baselines where that is asked for; whether something became worse."""
     from fgslam.cli.console import show_parts
     from fgslam.runs.baseline import check_baseline, deviation_lines, write_baseline

@@ -7,7 +7,9 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Annotated, Any, Literal, Self, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from fgslam.core.errors import ConfigError
 from fgslam.core.files import write_text
@@ -48,6 +50,26 @@ _FLOOR = 1e-6  # metres, degrees: less is rounding, whatever the ratio
 _WHERE = dict(RESULT_COLUMNS)
 
 
+class Baseline(BaseModel):
+    """Numbers of estimators by the run's name and their title, and how far each may be off."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
+
+    format: Literal["fgslam baseline"]
+    version: Literal[1]
+    relative_tolerances: dict[str, float]
+    runs: Annotated[
+        dict[str, Annotated[dict[str, dict[str, float]], Field(min_length=1)]], Field(min_length=1)
+    ]
+
+    @model_validator(mode="after")
+    def _all_have_tolerances(self) -> Self:
+        every = (numbers for estimators in self.runs.values() for numbers in estimators.values())
+        if not all(numbers.keys() <= self.relative_tolerances.keys() for numbers in every):
+            raise ValueError("a number without a tolerance")
+        return self
+
+
 @dataclass(frozen=True, slots=True)
 class Deviation:
     """A value outside its tolerance.
@@ -86,34 +108,35 @@ def write_baseline(path: Path, results: Results, command: str) -> None:
     write_text(path, json.dumps(document, indent=2, allow_nan=False) + "\n")
 
 
-def read_baseline(path: Path) -> dict[str, Any]:
+def read_baseline(path: Path) -> Baseline:
     """A baseline's document. Raises ConfigError where the file is missing or is none."""
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        values = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, ValueError, RecursionError) as error:
         raise ConfigError(
             f"{path}: cannot be read as a baseline ({error}); write one with --write-baseline"
         ) from None
-    if not _is_baseline(document):
+    try:
+        return Baseline.model_validate(values)
+    except ValidationError:
         raise ConfigError(
             f"{path}: is no {FORMAT} of version {VERSION}; write one with --write-baseline"
-        )
-    return dict(document)
+        ) from None
 
 
-def check_baseline(document: Mapping[str, Any], results: Results) -> list[Deviation]:
+def check_baseline(expected: Baseline, results: Results) -> list[Deviation]:
     """Compares results with a baseline; runs and estimators that it does not know are ignored."""
-    tolerances: dict[str, float] = document["relative_tolerances"]
     out: list[Deviation] = []
-    for run, estimators in document["runs"].items():
-        for title, expected in estimators.items():
+    for run, estimators in expected.runs.items():
+        for title, numbers in estimators.items():
             metrics = results.get(run, {}).get(title)
             if metrics is None:
                 out.append(Deviation(f"{run}, {title}: not among the results", True))
                 continue
             found = _numbers(metrics)
-            for name, value in expected.items():
-                out += _deviation(f"{run}, {title}: {name}", name, value, found, tolerances)
+            for name, value in numbers.items():
+                tolerance = expected.relative_tolerances[name]
+                out += _deviation(f"{run}, {title}: {name}", name, value, found, tolerance)
     return out
 
 
@@ -135,13 +158,12 @@ def _deviation(
     name: str,
     expected: float,
     found: Mapping[str, float],
-    tolerances: Mapping[str, float],
+    tolerance: float,
 ) -> Iterator[Deviation]:
     value = found.get(name)
     if value is None:
         yield Deviation(f"{what}: {expected:.6g} in the baseline, not known now", True)
         return
-    tolerance = tolerances[name]
     if abs(value - expected) <= max(tolerance * abs(expected), _FLOOR):
         return
     worse = value > expected if name in _SMALLER_IS_BETTER else _off(value) > _off(expected)
@@ -156,26 +178,3 @@ def _deviation(
 def _off(ratio: float) -> float:
     """How far a ratio is from 1, either way."""
     return abs(math.log(ratio)) if ratio > 0.0 else math.inf
-
-
-def _is_baseline(document: Any) -> bool:
-    """Whether all parts are there, with numbers and a tolerance wherever one is needed."""
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        return False
-    tolerances, runs = document.get("relative_tolerances"), document.get("runs")
-    if document.get("version") != VERSION or not isinstance(tolerances, dict):
-        return False
-    if not isinstance(runs, dict) or not runs or not all(map(_is_number, tolerances.values())):
-        return False
-    estimators = [
-        e for run in runs.values() for e in (run.values() if isinstance(run, dict) else [0])
-    ]
-    return bool(estimators) and all(
-        isinstance(values, dict)
-        and all(name in tolerances and _is_number(value) for name, value in values.items())
-        for values in estimators
-    )
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

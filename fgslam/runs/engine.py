@@ -19,7 +19,7 @@ from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.content import Page, TextTable
 from fgslam.report.page import write_html
-from fgslam.report.tables import write_json
+from fgslam.report.tables import read_metrics, write_json
 from fgslam.runs.config import load_experiment
 from fgslam.runs.config_models import Experiment
 from fgslam.runs.folder import (
@@ -29,7 +29,6 @@ from fgslam.runs.folder import (
     STATE_FILE,
     ExistingFolder,
     create_run_folder,
-    read_document,
     versions,
     write_config,
 )
@@ -83,7 +82,7 @@ class RunResult:
     @property
     def metrics(self) -> dict[str, Any]:
         """The document of metrics.json. Raises DatasetError where there is none."""
-        return read_document(self.folder / METRICS_FILE)
+        return read_metrics(self.folder / METRICS_FILE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,7 +191,7 @@ def is_finished(folder: Path) -> bool:
     """Whether a run folder has nothing left to do."""
     path = folder / METRICS_FILE
     begun = (folder / UNITS_FOLDER).is_dir() or (folder / STATE_FILE).is_file()
-    return not begun and path.is_file() and read_document(path).get("status") != "interrupted"
+    return not begun and path.is_file() and read_metrics(path).get("status") != "interrupted"
 
 
 def require_unfinished(folder: Path) -> None:

@@ -6,7 +6,6 @@ Its files are written whole or not at all: :mod:`fgslam.core.files`.
 from __future__ import annotations
 
 import hashlib
-import json
 import platform
 from collections.abc import Iterable
 from importlib import metadata
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from fgslam.core import __version__
-from fgslam.core.errors import DatasetError, OutputError
+from fgslam.core.errors import OutputError
 from fgslam.core.files import (
     clear_output_errors,
     is_unfinished_file,
@@ -176,17 +175,6 @@ def digest_of(files: Iterable[Path]) -> str:
     for file in files:
         digest.update(file.name.encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()
-
-
-def read_document(path: Path) -> dict[str, Any]:
-    """A run's metrics.json. Raises DatasetError where it is none."""
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise DatasetError(f"{path}: cannot be read ({error}); run the experiment again") from None
-    if not isinstance(document, dict):
-        raise DatasetError(f"{path}: holds no metrics; run the experiment again")
-    return document
 
 
 def _version(package: str) -> str | None:
