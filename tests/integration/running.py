@@ -36,6 +36,8 @@ SAME_BYTES = (
     f"{KIND}/map.ply",
 )
 """What the same configuration and seed must give to the byte."""
+HANGS_AFTER_S = 600.0
+"""Longer than any command of these tests takes, on a machine that has other work as well."""
 
 
 @dataclass(frozen=True)
@@ -156,5 +158,5 @@ def start(*arguments: object, **environment: str) -> subprocess.Popen[str]:
 def call(*arguments: object, **environment: str) -> tuple[int, str, str]:
     """Exit status, standard output and standard error of the command."""
     process = start(*arguments, **environment)
-    out, error = process.communicate(timeout=120)
+    out, error = process.communicate(timeout=HANGS_AFTER_S)
     return process.returncode, out, error

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from recordings import experiment
 from running import (
+    HANGS_AFTER_S,
     KIND,
     Finished,
     assert_valid_results,
@@ -195,7 +196,7 @@ def test_a_closed_pipe_is_no_fault() -> None:
     process.stdout.close()
     error = process.stderr.read()
     process.stderr.close()
-    process.wait(timeout=60)
+    process.wait(timeout=HANGS_AFTER_S)
     assert b"Traceback" not in error
 
 

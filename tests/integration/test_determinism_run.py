@@ -7,7 +7,15 @@ from pathlib import Path
 
 import pytest
 from recordings import experiment
-from running import Finished, bytes_of, run_values, start, stop_after, write_config
+from running import (
+    HANGS_AFTER_S,
+    Finished,
+    bytes_of,
+    run_values,
+    start,
+    stop_after,
+    write_config,
+)
 
 
 def test_two_runs_in_one_process(finished: Finished, tmp_path: Path) -> None:
@@ -31,7 +39,7 @@ def test_another_process(
         **dict.fromkeys(names, threads),
     )
     os.sched_setaffinity(process.pid, sorted(os.sched_getaffinity(0))[:cores])
-    _, error = process.communicate(timeout=120)
+    _, error = process.communicate(timeout=HANGS_AFTER_S)
     assert process.returncode == 0, error
     assert bytes_of(folder) == bytes_of(finished.folder)
 

@@ -53,9 +53,9 @@ def digest_with(threads: int) -> tuple[int, str]:
         env=os.environ | {"OPENBLAS_NUM_THREADS": str(threads)},
         capture_output=True,
         text=True,
-        check=True,
-        timeout=120,
+        check=False,
     )
+    assert found.returncode == 0, found.stderr
     allowed, digest = found.stdout.split()
     return int(allowed), digest
 
@@ -82,5 +82,5 @@ def test_nested_thread_limits_end_independently() -> None:
 
 def test_the_same_bytes_whatever_the_environment_says() -> None:
     (one, first), (two, second) = digest_with(1), digest_with(2)
-    assert (one, two) == (1, 2)
+    assert (one, two) == (1, min(2, len(os.sched_getaffinity(0))))
     assert first == second
