@@ -12,7 +12,7 @@ import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeAlias, TypeVar
+from typing import Any, Generic, Literal, Protocol, TypeAlias, TypeVar
 
 from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.core.threads import one_blas_thread
@@ -122,6 +122,25 @@ class Task(Generic[R_co]):
 
     provenance: Mapping[str, Any]
     run: Callable[[Context], R_co]
+
+
+class Identified(Protocol):
+    """A recording of any kind."""
+
+    @property
+    def name(self) -> str:
+        """What users call it."""
+        ...
+
+    @property
+    def identity(self) -> str:
+        """Digest of what it holds."""
+        ...
+
+
+def provenance_of(recording: Identified) -> dict[str, Any]:
+    """What config.yaml says of a recording, from which a changed one is told on resuming."""
+    return {"dataset": {"name": recording.name, "identity": recording.identity}}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,6 +16,7 @@ import numpy as np
 
 from fgslam.core.errors import ConfigError, StoredMapError
 from fgslam.core.homing import OmniFeatures, Refusal, TwoViewVector
+from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.frontend.homing.homing_vector import vector_between
 from fgslam.homing.link_consistency import InlierRows
@@ -28,16 +29,24 @@ from fgslam.report.figures.plan import Links, network_figure, unfolded
 from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.config_models import TopologicalMapConfig
-from fgslam.runs.engine import Context, Opening, RunResult, Task, write_document, write_page
+from fgslam.runs.engine import (
+    Context,
+    Opening,
+    RunResult,
+    Task,
+    provenance_of,
+    write_document,
+    write_page,
+)
 from fgslam.runs.tasks.homing_views import (
     PairAnswer,
     PairSearch,
-    Views,
     answer_pairs,
     draw_pair,
     extract_features,
     inlier_rows,
-    open_views,
+    open_checked,
+    view_names,
 )
 
 MAP_FILE = "map.npz"
@@ -78,15 +87,15 @@ class Route:
 
 def open_topological_map(config: TopologicalMapConfig, opening: Opening) -> Task[RunResult]:
     """Opens the recording. Raises DatasetError, or ConfigError of routes to unknown views."""
-    views = open_views(config.dataset)
-    _require_nodes(config, views.names)
-    return Task({"dataset": views.provenance}, lambda context: _run(config, views, context))
+    views = open_checked(config.dataset)
+    _require_nodes(config, view_names(views))
+    return Task(provenance_of(views), lambda context: _run(config, views, context))
 
 
-def _run(config: TopologicalMapConfig, views: Views, context: Context) -> RunResult:
+def _run(config: TopologicalMapConfig, views: OmniRecording, context: Context) -> RunResult:
     """Features once a view, homings of all candidates both ways, the map of those believed."""
     folder = context.folder
-    features = extract_features(views, config.features, context)
+    features = extract_features(views, config.dataset, config.features, context)
     rng = np.random.default_rng(config.seed)
     half = map_candidates(features, config.map, rng, ordered=config.ordered)
     pairs = tuple(pair for a, b in half for pair in ((a, b), (b, a)))
@@ -95,7 +104,7 @@ def _run(config: TopologicalMapConfig, views: Views, context: Context) -> RunRes
     )
     found, failures = answer_pairs(search, context)
     answers: dict[Pair, Answer] = {(answer.a, answer.b): answer.found for answer in found}
-    names, rows = views.names[: len(features)], inlier_rows(found)
+    names, rows = view_names(views)[: len(features)], inlier_rows(found)
     topology = map_of_answers(features, answers, ordered=config.ordered, names=names, rows=rows)
     kilobytes = topology.save(folder / MAP_FILE)
     routes = [_route(topology, asked) for asked in config.routes]
@@ -110,7 +119,7 @@ def _run(config: TopologicalMapConfig, views: Views, context: Context) -> RunRes
         "finished" if whole else "interrupted",
         _verdict(topology, routes, located),
         (_table(topology, views),),
-        (*views.recording.notes, *failures, *missing),
+        (*views.notes, *failures, *missing),
     )
     write_csv(folder / LINKS_FILE, _LINK_COLUMNS, _link_rows(topology, views))
     write_csv(folder / ROUTES_FILE, ("asked", "found", "reason"), _route_rows(routes))
@@ -120,7 +129,7 @@ def _run(config: TopologicalMapConfig, views: Views, context: Context) -> RunRes
     pictures = _pictures(folder, views, search, topology, answers, config.output.pictures)
     write_page(
         result,
-        f"{len(topology)} views of {views.recording.name}",
+        f"{len(topology)} views of {views.name}",
         figures=(_figure(topology, views),),
         pictures=pictures,
     )
@@ -159,7 +168,7 @@ def _route(topology: TopologicalMap, asked: tuple[str, ...]) -> Route:
 
 
 def _numbers(
-    topology: TopologicalMap, views: Views, answers: dict[Pair, Answer], kilobytes: float
+    topology: TopologicalMap, views: OmniRecording, answers: dict[Pair, Answer], kilobytes: float
 ) -> dict[str, JsonValue]:
     parts = topology.components()
     gaps = [link.b - link.a for link in topology.links]
@@ -179,7 +188,7 @@ def _numbers(
     }
 
 
-def _lengths(topology: TopologicalMap, views: Views) -> np.ndarray | None:
+def _lengths(topology: TopologicalMap, views: OmniRecording) -> np.ndarray | None:
     """(m,) true lengths of the links, metres; None without poses."""
     if views.poses is None:
         return None
@@ -212,7 +221,7 @@ def _verdict(
     return tuple(lines)
 
 
-def _table(topology: TopologicalMap, views: Views) -> TextTable:
+def _table(topology: TopologicalMap, views: OmniRecording) -> TextTable:
     numbers = _numbers(topology, views, {}, 0.0)
     rows = (
         ("nodes", "nodes"),
@@ -239,7 +248,7 @@ def _value(value: JsonValue) -> str:
 # Rows, figures, pictures
 
 
-def _link_rows(topology: TopologicalMap, views: Views) -> Iterator[list[Cell]]:
+def _link_rows(topology: TopologicalMap, views: OmniRecording) -> Iterator[list[Cell]]:
     lengths = _lengths(topology, views)
     for k, link in enumerate(topology.links):
         sigma = np.rad2deg(np.sqrt(np.diagonal(link.covariance)))
@@ -264,7 +273,7 @@ def _route_rows(routes: Sequence[Route]) -> Iterator[list[Cell]]:
         yield ["-".join(route.asked), "-".join(route.found), route.reason]
 
 
-def _figure(topology: TopologicalMap, views: Views) -> Figure:
+def _figure(topology: TopologicalMap, views: OmniRecording) -> Figure:
     pairs = tuple((link.a, link.b) for link in topology.links)
     surveyed = views.poses is not None
     places = (
@@ -299,7 +308,7 @@ def _label(topology: TopologicalMap, link: Link) -> str:
 
 def _pictures(
     folder: Path,
-    views: Views,
+    views: OmniRecording,
     search: PairSearch,
     topology: TopologicalMap,
     answers: dict[Pair, Answer],

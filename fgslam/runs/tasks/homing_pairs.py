@@ -18,6 +18,7 @@ from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.homing import Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
 from fgslam.core.quantiles import chi_square_quantile
+from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.frontend.homing.matching import PLAIN_MATCHING
 from fgslam.frontend.homing.settings import HomingVectorSettings
@@ -27,15 +28,23 @@ from fgslam.report.figures.plan import Links, network_figure
 from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.config_models import HomingPairsConfig
-from fgslam.runs.engine import Context, Opening, RunResult, Task, write_document, write_page
+from fgslam.runs.engine import (
+    Context,
+    Opening,
+    RunResult,
+    Task,
+    provenance_of,
+    write_document,
+    write_page,
+)
 from fgslam.runs.tasks.homing_views import (
     PairAnswer,
     PairSearch,
-    Views,
     answer_pairs,
     draw_pair,
     extract_features,
-    open_views,
+    open_checked,
+    view_names,
 )
 
 PAIRS_FILE = "pairs.csv"
@@ -50,21 +59,21 @@ PLAIN_INLIERS = 25
 
 def open_pairs(config: HomingPairsConfig, opening: Opening) -> Task[RunResult]:
     """Opens the recording. Raises DatasetError."""
-    views = open_views(config.dataset)
-    return Task({"dataset": views.provenance}, lambda context: _run(config, views, context))
+    views = open_checked(config.dataset)
+    return Task(provenance_of(views), lambda context: _run(config, views, context))
 
 
-def _run(config: HomingPairsConfig, views: Views, context: Context) -> RunResult:
+def _run(config: HomingPairsConfig, views: OmniRecording, context: Context) -> RunResult:
     """Features once an image, then every pair; stopped early, the pairs that are done count."""
     folder = context.folder
-    features = extract_features(views, config.features, context)
+    features = extract_features(views, config.dataset, config.features, context)
     every = tuple(pairs_of(len(features), both_ways=config.both_ways))
     search = PairSearch(
         tuple(features), every, config.features.matching, config.homing_vector, config.seed
     )
     answers, failures = answer_pairs(search, context)
     whole = len(features) == len(views) and len(answers) == len(every)
-    write_pairs(folder / PAIRS_FILE, answers, views.names)
+    write_pairs(folder / PAIRS_FILE, answers, view_names(views))
     errors, numbers = _judged(answers, views)
     numbers["images"] = len(features)
     numbers["reference"] = _reference(config, views, context) if whole else None
@@ -75,14 +84,14 @@ def _run(config: HomingPairsConfig, views: Views, context: Context) -> RunResult
         "finished" if whole else "interrupted",
         _verdict(numbers, errors),
         _tables(errors),
-        (*views.recording.notes, *failures),
+        (*views.notes, *failures),
     )
     write_document(result, numbers)
     pictures = draw_pairs(folder, views, search, answers, errors, config.output.pictures)
     figures = tuple(_figures(errors, answers, views))
     write_page(
         result,
-        f"{len(answers)} pairs of {len(features)} views of {views.recording.name}",
+        f"{len(answers)} pairs of {len(features)} views of {views.name}",
         figures=figures,
         pictures=pictures,
         series=("direction", "rotation") if figures else (),
@@ -91,18 +100,18 @@ def _run(config: HomingPairsConfig, views: Views, context: Context) -> RunResult
 
 
 def _reference(
-    config: HomingPairsConfig, views: Views, context: Context
+    config: HomingPairsConfig, views: OmniRecording, context: Context
 ) -> dict[str, JsonValue] | None:
     """The same pairs by plain SIFT and two-point RANSAC, for comparison; None where not asked."""
     if not config.reference:
         return None
-    features = extract_features(views, None, context)
+    features = extract_features(views, config.dataset, None, context)
     every = tuple(pairs_of(len(features), both_ways=config.both_ways))
     vector = never_refusing(config.homing_vector)
     search = PairSearch(tuple(features), every, PLAIN_MATCHING, vector, config.seed)
     answers, _ = answer_pairs(search, context, "plain pairs")
     answers = [with_support(answer, PLAIN_INLIERS) for answer in answers]
-    write_pairs(context.folder / REFERENCE_FILE, answers, views.names)
+    write_pairs(context.folder / REFERENCE_FILE, answers, view_names(views))
     return _judged(answers, views)[1]
 
 
@@ -124,7 +133,7 @@ def pairs_of(count: int, *, both_ways: bool) -> list[tuple[int, int]]:
 
 
 def _judged(
-    answers: Sequence[PairAnswer], views: Views
+    answers: Sequence[PairAnswer], views: OmniRecording
 ) -> tuple[PairErrors | None, dict[str, JsonValue]]:
     """Errors against the true poses, and the numbers; the errors are null where there are none."""
     errors = None if views.poses is None else pair_errors(answers, views.poses, views.rooms)
@@ -183,12 +192,12 @@ def _cell(group: dict[str, JsonValue], key: str, spec: str) -> str:
 
 
 def _figures(
-    errors: PairErrors | None, answers: Sequence[PairAnswer], views: Views
+    errors: PairErrors | None, answers: Sequence[PairAnswer], views: OmniRecording
 ) -> Iterator[Figure]:
     """Where the answered pairs lie, and how good they are; nothing without true poses."""
     if errors is None or views.poses is None:
         return
-    yield _plan(errors, answers, views.poses, views.names)
+    yield _plan(errors, answers, views.poses, view_names(views))
     true = {"direction": errors.direction, "rotation": errors.rotation}
     claimed = {"direction": errors.sigma_direction, "rotation": errors.sigma_rotation}
     yield sorted_errors(true, "degrees", ("errors", "Errors of the answered pairs"))
@@ -383,7 +392,7 @@ def _taken(errors: PairErrors, which: BoolArray) -> PairErrors:
 
 def draw_pairs(
     folder: Path,
-    views: Views,
+    views: OmniRecording,
     search: PairSearch,
     answers: Sequence[PairAnswer],
     errors: PairErrors | None,

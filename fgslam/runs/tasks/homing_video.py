@@ -18,7 +18,16 @@ from fgslam.report.content import Column, Picture, TextTable
 from fgslam.report.figures.homing import Line, curve_figure
 from fgslam.report.tables import write_csv
 from fgslam.runs.config_models import OmniVideoConfig
-from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, write_document, write_page
+from fgslam.runs.engine import (
+    Context,
+    Opening,
+    RunResult,
+    Status,
+    Task,
+    provenance_of,
+    write_document,
+    write_page,
+)
 from fgslam.runs.tasks.homing_views import open_checked
 
 FRAMES_FILE = "frames.csv"
@@ -74,8 +83,7 @@ class _Progress:
 def open_video(config: OmniVideoConfig, opening: Opening) -> Task[RunResult]:
     """Opens the recording and checks its mirror. Raises DatasetError."""
     recording = open_checked(config.dataset)
-    dataset = {"name": recording.name, "identity": recording.identity}
-    return Task({"dataset": dataset}, lambda context: _run(config, recording, context))
+    return Task(provenance_of(recording), lambda context: _run(config, recording, context))
 
 
 def _run(config: OmniVideoConfig, recording: OmniRecording, context: Context) -> RunResult:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -99,42 +98,6 @@ def _circle(image: Image, near: tuple[tuple[float, float], float] | None) -> Mir
 _VIEWS_A_BLOCK = 4
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Views:
-    """A recording of single views.
-
-    Attributes:
-        settings: that it is opened with, in any process.
-        recording: opened.
-    """
-
-    settings: OmniDatasetSettings
-    recording: OmniRecording
-
-    def __len__(self) -> int:
-        return len(self.recording)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """(n) the recording's own numbers, as text."""
-        return tuple(str(number) for number in self.recording.ids.tolist())
-
-    @property
-    def poses(self) -> FloatArray | None:
-        """(n, 3) true planar poses, or None."""
-        return self.recording.poses
-
-    @property
-    def rooms(self) -> tuple[str, ...] | None:
-        """(n) names of the rooms, or None."""
-        return self.recording.rooms
-
-    @property
-    def provenance(self) -> dict[str, Any]:
-        """What the run's configuration says about its data."""
-        return {"name": self.recording.name, "identity": self.recording.identity}
-
-
 @dataclass(frozen=True, slots=True)
 class _Block:
     dataset: OmniDatasetSettings
@@ -142,18 +105,22 @@ class _Block:
     views: tuple[int, ...]
 
 
-def open_views(settings: OmniDatasetSettings) -> Views:
-    """Opens the recording and checks its mirror, if it has one. Raises DatasetError."""
-    return Views(settings, open_checked(settings))
+def view_names(views: OmniRecording) -> tuple[str, ...]:
+    """(n) the recording's own numbers of its views, as text."""
+    return tuple(str(number) for number in views.ids.tolist())
 
 
 def extract_features(
-    views: Views, settings: OmniFeatureSettings | None, context: Context
+    views: OmniRecording,
+    dataset: OmniDatasetSettings,
+    settings: OmniFeatureSettings | None,
+    context: Context,
 ) -> list[OmniFeatures]:
     """Features of all views in their order; stopped early, of the first ones without a gap.
 
     Args:
         views: opened.
+        dataset: that it is opened with, in any process.
         settings: of the features; None for plain SIFT, the baseline.
         context: of the run.
 
@@ -167,13 +134,13 @@ def extract_features(
         label=what,
         count=len(views),
         work=_extract,
-        argument=lambda units: _Block(views.settings, settings, units),
+        argument=lambda units: _Block(dataset, settings, units),
         kind=OmniFeatures,
         blocks=in_blocks(_VIEWS_A_BLOCK),
     )
     done = context.perform(stage)
     if done.ended and not context.stopped():
-        raise OutputError(f"features of {views.recording.name}: {done.ended[0][1]}")
+        raise OutputError(f"features of {views.name}: {done.ended[0][1]}")
     gap = next((k for k in range(len(views)) if k not in done.results), len(views))
     return [done.results[k] for k in range(gap)]
 
@@ -283,19 +250,21 @@ def _perform(search: PairSearch) -> list[PairAnswer]:
 FOLDER = "pictures"
 
 
-def draw_pair(folder: Path, views: Views, search: PairSearch, answer: PairAnswer) -> Picture:
+def draw_pair(
+    folder: Path, views: OmniRecording, search: PairSearch, answer: PairAnswer
+) -> Picture:
     """One pair: its accepted matches on both views."""
     from fgslam.report.pictures.image_overlays import MatchedPixels, draw_view_matches
 
     found, matches = answer_pair(search, answer.a, answer.b)
-    a, b = views.names[answer.a], views.names[answer.b]
+    a, b = view_names(views)[answer.a], view_names(views)[answer.b]
     vector = found.found
     kept = (
         matches.select(vector.inliers)
         if isinstance(vector, TwoViewVector)
         else matches.select(np.zeros(len(matches), np.bool_))
     )
-    camera = views.recording.camera
+    camera = views.camera
     pixels = MatchedPixels(
         _pixels(camera, kept.bearing_a, kept.elevation_a),
         _pixels(camera, kept.bearing_b, kept.elevation_b),
@@ -303,7 +272,7 @@ def draw_pair(folder: Path, views: Views, search: PairSearch, answer: PairAnswer
     )
     caption = _caption(vector, matches) if isinstance(vector, TwoViewVector) else "refused"
     path = make_subfolder(folder, FOLDER) / f"matches_{a}_{b}.png"
-    images = views.recording.image(answer.a), views.recording.image(answer.b)
+    images = views.image(answer.a), views.image(answer.b)
     draw_view_matches(path, images, pixels, (f"view {a}: {caption}", f"view {b}"))
     return Picture(f"Matches of views {a} and {b}: {caption}", path.read_bytes())
 

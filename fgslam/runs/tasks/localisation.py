@@ -28,7 +28,7 @@ from fgslam.runs.config import (
     make_experiment,
 )
 from fgslam.runs.config_models import LocalisationConfig
-from fgslam.runs.engine import Context, Opening, Task
+from fgslam.runs.engine import Context, Opening, Task, provenance_of
 from fgslam.runs.folder import ExistingFolder, create_run_folder, is_run_folder, write_config
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.tasks.localisation_queries import Attempt, ask_all, nothing_asked
@@ -52,7 +52,7 @@ def open_localisation(config: LocalisationConfig, opening: Opening) -> Task[Loca
     sequence = open_queries(config, opening.progress)
     if given is not None:
         require_rig(given.saved, sequence.rig, str(given.path))
-    provenance = provenance_of(given, sequence)
+    provenance = _provenance(given, sequence)
     return Task(provenance, lambda context: _run(config, given, sequence, context))
 
 
@@ -67,7 +67,7 @@ def _run(
             nothing = nothing_asked("the map was not finished")
             return result_of(config, folder, nothing, sequence.notes)
         given = open_map(folder / FIRST_FOLDER / MAP_FILE)
-        write_config(folder, config, provenance_of(given, sequence))
+        write_config(folder, config, _provenance(given, sequence))
     asked = ask_all(config, given, sequence, context)
     result = result_of(config, folder, asked, sequence.notes)
     subtitle = f"{sequence.name}, in a map of {len(asked.landmarks)} landmarks"
@@ -82,12 +82,12 @@ def open_queries(config: LocalisationConfig, progress: Progress) -> Sequence:
     )
 
 
-def provenance_of(given: GivenMap | None, sequence: Sequence) -> dict[str, Any]:
+def _provenance(given: GivenMap | None, sequence: Sequence) -> dict[str, Any]:
     """What it takes to repeat the run, beside its configuration."""
-    provenance: dict[str, Any] = {"dataset": {"name": sequence.name, "identity": sequence.identity}}
+    out = provenance_of(sequence)
     if given is not None:
-        provenance["map"] = {"path": str(given.path), "sha256": given.identity}
-    return provenance
+        out["map"] = {"path": str(given.path), "sha256": given.identity}
+    return out
 
 
 _YAML = (".yaml", ".yml")
@@ -133,7 +133,7 @@ def localize(wanted: Wanted, progress: Progress, stopped: Callable[[], bool]) ->
     require_rig(given.saved, sequence.rig, str(given.path))
     if out is not None:
         create_run_folder(out, wanted.existing)
-        write_config(out, config, provenance_of(given, sequence))
+        write_config(out, config, _provenance(given, sequence))
     context = Context(out or Path(), False, UnitStore(None), 1, progress, stopped)
     asked = ask_all(config, given, sequence, context)
     result = result_of(config, out, asked, sequence.notes)

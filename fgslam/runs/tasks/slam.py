@@ -19,7 +19,7 @@ from fgslam.core.recordings import Sequence
 from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.report.tables import write_comparison_csv
 from fgslam.runs.config import ExperimentConfig
-from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, run_task
+from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, provenance_of, run_task
 from fgslam.runs.folder import COMPARISON_FILE, ExistingFolder, is_run_folder, write_config
 from fgslam.runs.metric_tables import comparison_particulars, comparison_tables
 from fgslam.runs.opening import open_sequence
@@ -69,9 +69,7 @@ class OpenedRun:
     @property
     def provenance(self) -> dict[str, Any]:
         """What it takes to repeat the run, beside its configuration."""
-        out: dict[str, Any] = {
-            "dataset": {"name": self.sequence.name, "identity": self.sequence.identity}
-        }
+        out = provenance_of(self.sequence)
         if self.entry is not None:
             out["map"] = self.entry.as_values()
         elif self.given is not None and (entered := state.entered_by(self.given)):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.point_cloud import read_ply
 from fgslam.report.tables import LANDMARK_TRUTH_FILE, StageTime, write_landmark_truth, write_timing
 from fgslam.runs.config import ExperimentConfig
-from fgslam.runs.engine import Context, Opening, RunResult, Task
+from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of
 from fgslam.runs.estimator_files import FRAMES_FILE, read_frames
 from fgslam.runs.folder import LOG_FILE, write_config
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, replay_apart, write_comparison
@@ -42,7 +41,7 @@ def open_measured(config: ExperimentConfig, seed: int | None = None) -> Measurem
 def open_measurements_task(config: ExperimentConfig, opening: Opening) -> Task[RunResult]:
     """Opens or simulates the recording. Raises FgslamError."""
     recording = open_measured(config)
-    return Task(_provenance(recording), lambda context: _run(config, recording, context))
+    return Task(provenance_of(recording), lambda context: _run(config, recording, context))
 
 
 def _run(config: ExperimentConfig, recording: MeasurementRecording, context: Context) -> RunResult:
@@ -58,15 +57,11 @@ def _run(config: ExperimentConfig, recording: MeasurementRecording, context: Con
     return write_comparison(context, config, len(recording.log), metrics, about, folder)
 
 
-def _provenance(recording: MeasurementRecording) -> dict[str, Any]:
-    return {"dataset": {"name": recording.name, "identity": recording.identity}}
-
-
 def write_recording(
     folder: Path, config: ExperimentConfig, recording: MeasurementRecording
 ) -> None:
     """What every estimator's replay starts from: configuration, log, truth."""
-    write_config(folder, config, _provenance(recording))
+    write_config(folder, config, provenance_of(recording))
     write_log_and_truth(folder, recording)
 
 
