@@ -23,10 +23,6 @@ from fgslam.evaluation.trajectory import (
 from fgslam.report.content import Picture, TextTable
 
 
-def _no_landmarks() -> LandmarkMap:
-    return LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class EstimatorReport:
     """One estimator's result, frame by frame; arrays of (n, ...) share their rows.
@@ -94,23 +90,31 @@ class EstimatorReport:
         return Trajectory(self.timestamps, self.final_poses)
 
     @staticmethod
-    def failed(title: str, kind: str, why: str) -> EstimatorReport:
-        """An estimator that gave no result."""
-        none, poses = np.empty(0), np.empty((0, 4, 4))
+    def unjudged(title: str, kind: str, estimate: Estimate) -> EstimatorReport:
+        """An estimate of which neither errors nor times nor first estimates are known."""
+        final, unknown = estimate.trajectory, np.full(len(estimate.trajectory), np.nan)
         return EstimatorReport(
             title=title,
             kind=kind,
-            timestamps=none,
-            final_poses=poses,
-            online_poses=poses,
-            covariances=np.empty((0, 6, 6)),
-            landmarks=_no_landmarks(),
-            final_error_m=none,
-            online_error_m=none,
-            nees=none,
-            update_ms=none,
-            failure=why,
+            timestamps=final.timestamps,
+            final_poses=final.poses,
+            online_poses=np.full((len(final), 4, 4), np.nan),
+            covariances=estimate.covariances,
+            landmarks=estimate.landmarks,
+            final_error_m=unknown,
+            online_error_m=unknown,
+            nees=unknown,
+            update_ms=unknown,
+            remarks=estimate.remarks,
         )
+
+    @staticmethod
+    def failed(title: str, kind: str, why: str) -> EstimatorReport:
+        """An estimator that gave no result."""
+        path = Trajectory(np.empty(0), np.empty((0, 4, 4)))
+        landmarks = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+        nothing = Estimate(path, np.empty((0, 6, 6)), landmarks)
+        return replace(EstimatorReport.unjudged(title, kind, nothing), failure=why)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,26 +193,12 @@ def judged_report(
         online: each pose as first estimated, where that is known.
         truth: true poses in any world, where there are some.
     """
-    final, covariances = estimate.trajectory, estimate.covariances
-    poses = np.full((len(final), 4, 4), np.nan)
+    final, report = estimate.trajectory, EstimatorReport.unjudged(title, kind, estimate)
     if online is not None:
         rows, of = same_times(final.timestamps, online.timestamps)
+        poses = report.online_poses.copy()
         poses[rows] = online.poses[of]
-    unknown = np.full(len(final), np.nan)
-    report = EstimatorReport(
-        title=title,
-        kind=kind,
-        timestamps=final.timestamps,
-        final_poses=final.poses,
-        online_poses=poses,
-        covariances=covariances,
-        landmarks=estimate.landmarks,
-        final_error_m=unknown,
-        online_error_m=unknown,
-        nees=unknown,
-        update_ms=unknown,
-        remarks=estimate.remarks,
-    )
+        report = replace(report, online_poses=poses)
     found = None if truth is None else to_estimate_world(final, truth)
     return report if found is None else _against_truth(report, *found, truth)
 
