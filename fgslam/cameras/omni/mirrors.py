@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -179,6 +179,38 @@ class MonotoneInverse:
         return np.where(seen, x, np.nan)
 
 
+@dataclass(frozen=True)
+class InvertedCamera(RadialCamera):
+    """A camera whose elevation is a smooth function of the radius, inverted numerically.
+
+    Raises:
+        CalibrationError: the elevation is not monotone over the ring.
+    """
+
+    _inverse: MonotoneInverse = field(init=False, repr=False, compare=False)
+    _turns_back: ClassVar[str]
+    """What to do about an elevation that turns back."""
+
+    def __post_init__(self) -> None:
+        RadialCamera.__post_init__(self)
+        inverse = MonotoneInverse(self._value_and_slope, self.inner_radius, self.outer_radius)
+        if not inverse.monotone:
+            turn = inverse.knots[int(np.argmin(np.abs(inverse.slopes)))]
+            raise CalibrationError(
+                f"mirror image: elevation turns back near radius {turn:.1f} px of the ring "
+                f"{self.inner_radius:.1f} to {self.outer_radius:.1f} px; {self._turns_back}"
+            )
+        object.__setattr__(self, "_inverse", inverse)
+
+    def radius(self, elevation: FloatArray) -> FloatArray:
+        """(n,) radii, exact to rounding; see :class:`RadialCamera`."""
+        return self._inverse(elevation)
+
+    @abstractmethod
+    def _value_and_slope(self, radius: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n,) elevations of radii (n,), and their derivatives."""
+
+
 # --------------------------------------------------------------------------------------------
 # The hyperbolic mirror as a unified sphere, above and below the horizon
 
@@ -259,7 +291,7 @@ PAPER_DEGREE = 5
 
 
 @dataclass(frozen=True)
-class RadialPolynomial(RadialCamera):
+class RadialPolynomial(InvertedCamera):
     """Elevation = sum of ``coefficients[k] x^k``, x = radius scaled to [-1, 1]; rising or falling.
 
     The paper names the degree, five, and a calibration image, not the argument. Here it is the
@@ -271,29 +303,16 @@ class RadialPolynomial(RadialCamera):
     """
 
     coefficients: tuple[float, ...]
-    _inverse: MonotoneInverse = field(init=False, repr=False, compare=False)
+    _turns_back = "fit a lower degree, correct the samples, or take more near the rims"
 
     def __post_init__(self) -> None:
-        RadialCamera.__post_init__(self)
         if not self.coefficients or not np.isfinite(self.coefficients).all():
             raise CalibrationError("radial polynomial: its coefficients must be finite, at least 1")
-        inverse = MonotoneInverse(self._value_and_slope, self.inner_radius, self.outer_radius)
-        if not inverse.monotone:
-            turn = inverse.knots[int(np.argmin(np.abs(inverse.slopes)))]
-            raise CalibrationError(
-                f"radial polynomial: elevation turns back near radius {turn:.1f} px, so a pixel "
-                "would have two radii; fit a lower degree, correct the samples, or take more near "
-                "the rims"
-            )
-        object.__setattr__(self, "_inverse", inverse)
+        InvertedCamera.__post_init__(self)
 
     def elevation(self, radius: FloatArray) -> FloatArray:
         """(n,) elevations; see :class:`RadialCamera`."""
         return np.asarray(polynomial.polyval(self._scaled(radius), np.array(self.coefficients)))
-
-    def radius(self, elevation: FloatArray) -> FloatArray:
-        """(n,) radii; see :class:`RadialCamera`."""
-        return self._inverse(elevation)
 
     def _scaled(self, radius: FloatArray) -> FloatArray:
         return _scaled(radius, self.inner_radius, self.outer_radius)

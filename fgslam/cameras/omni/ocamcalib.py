@@ -8,13 +8,13 @@ by solving f exactly.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.polynomial import polynomial
 
-from fgslam.cameras.omni.mirrors import AHEAD_IS_UP, MirrorFrame, MonotoneInverse, RadialCamera
+from fgslam.cameras.omni.mirrors import AHEAD_IS_UP, InvertedCamera, MirrorFrame
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.files import read_text
@@ -25,7 +25,7 @@ _MAX_DISAGREEMENT_PX = 3.0
 
 
 @dataclass(frozen=True)
-class OCamCamera(RadialCamera):
+class OCamCamera(InvertedCamera):
     """A camera with the direct polynomial ``f(rho) = sum direct[k] rho^k``, rho in pixels.
 
     With the mirror above an upward-looking camera f is negative where the camera sees downward, in
@@ -33,28 +33,12 @@ class OCamCamera(RadialCamera):
     """
 
     direct: tuple[float, ...]
-    _inverse: MonotoneInverse = field(init=False, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        RadialCamera.__post_init__(self)
-        inverse = MonotoneInverse(self._value_and_slope, self.inner_radius, self.outer_radius)
-        if not inverse.monotone:
-            turn = inverse.knots[int(np.argmin(np.abs(inverse.slopes)))]
-            raise CalibrationError(
-                f"OCamCalib polynomial: elevation turns back near radius {turn:.1f} px of the ring "
-                f"{self.inner_radius:.1f} to {self.outer_radius:.1f} px; narrow the ring to what "
-                "the mirror shows"
-            )
-        object.__setattr__(self, "_inverse", inverse)
+    _turns_back = "narrow the ring to what the mirror shows"
 
     def elevation(self, radius: FloatArray) -> FloatArray:
         """(n,) elevations; see :class:`RadialCamera`."""
         radius = np.asarray(radius, dtype=np.float64)
         return np.asarray(np.arctan2(polynomial.polyval(radius, np.array(self.direct)), radius))
-
-    def radius(self, elevation: FloatArray) -> FloatArray:
-        """(n,) radii, exact to rounding; see :class:`RadialCamera`."""
-        return self._inverse(elevation)
 
     def _value_and_slope(self, radius: FloatArray) -> tuple[FloatArray, FloatArray]:
         f = polynomial.polyval(radius, np.array(self.direct))
