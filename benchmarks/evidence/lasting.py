@@ -172,7 +172,7 @@ def visit_twice() -> Visits:
     found = find_features(experiment("lab_loop"))
     pipeline = make_system(experiment("lab_loop", _KEEP_ALL), found.sequence)
     reports = list(_with_places(found, pipeline))
-    lives = Lives(pipeline.tracker.database.new_ids(1)[0])
+    lives = Lives(int(pipeline.tracker.database.state()["next_id"]))
     for report, places in reports:
         lives.follow(report, places)
     saved = _map_of(pipeline, found.sequence)

@@ -37,4 +37,4 @@ def later_time(time: object, last: float | None, what: str, error: type[FgslamEr
 def require_seed(seed: object, where: str) -> None:
     """Raises ConfigError where a random generator cannot begin with it."""
     if not isinstance(seed, Integral) or isinstance(seed, bool) or seed < 0:
-        raise ConfigError(f"{where}: seed is {seed!r}; give a whatle number, 0 or larger")
+        raise ConfigError(f"{where}: seed is {seed!r}; give a whole number, 0 or larger")

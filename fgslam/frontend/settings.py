@@ -263,10 +263,6 @@ class RelocalisationSettings:
             "orientation alone, as features without descriptors would"
         ),
     ] = True
-    samples: Annotated[
-        int,
-        Field(ge=16, description="minimal samples drawn at a time; most fail the rigidity test"),
-    ] = 4096
     view_sigma_px: Annotated[
         float,
         Field(
@@ -342,9 +338,6 @@ class LoopSettings:
             description="frames in a row that must find the same offset between map and estimate",
         ),
     ] = 3
-    max_drift_m: Annotated[
-        float, Field(gt=0.0, description="drift that needs no way to have come about, metres")
-    ] = 0.5
     max_drift_share: Annotated[
         float,
         Field(
@@ -353,12 +346,6 @@ class LoopSettings:
             "wheels with a gyro-less heading reach 0.05",
         ),
     ] = 0.08
-    max_drift_deg: Annotated[
-        float, Field(gt=0.0, description="drift of heading that needs no way, degrees")
-    ] = 10.0
-    max_drift_deg_m: Annotated[
-        float, Field(ge=0.0, description="drift of heading that is believed, degrees a metre")
-    ] = 0.25
     min_matches: Annotated[
         int, Field(ge=3, description="old landmarks that must agree on the closure in the end")
     ] = 12
@@ -373,14 +360,6 @@ class LoopSettings:
     rest: Annotated[
         int, Field(ge=0, description="frames after a closure in which no other is looked for")
     ] = 15
-    fuse_m: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="after a closure, landmarks that look alike and lie this near to each "
-            "other become one; 0 leaves them",
-        ),
-    ] = 0.10
 
 
 @dataclass(frozen=True, config=STRICT)

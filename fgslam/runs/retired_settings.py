@@ -180,6 +180,10 @@ RETIRED: dict[str, dict[str, Any]] = {
         "closure_factor": 3.0,
     },
     "LoopSettings": {
+        "max_drift_m": 0.5,
+        "max_drift_deg": 10.0,
+        "max_drift_deg_m": 0.25,
+        "fuse_m": 0.1,
         "agreement_m": 0.15,
         "agreement_deg": 2.0,
         "least_offset_m": 0.03,
@@ -228,6 +232,7 @@ RETIRED: dict[str, dict[str, Any]] = {
         "rotation_floor_deg": 0.1,
     },
     "RelocalisationSettings": {
+        "samples": 4096,
         "neighbours": 12,
         "max_distance": 400.0,
         "ratio": 0.85,

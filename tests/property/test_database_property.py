@@ -42,7 +42,8 @@ def some_features(count: int, seed: int) -> StereoFeatures:
 
 
 def entry_bits(database: LandmarkDatabase, row: int) -> bytes:
-    columns = (database.size, database.orientation, database.descriptors, database.hits)
+    views = database.appearances()
+    columns = (views.size, views.orientation, views.descriptors, database.hits)
     columns += (database.misses, database.missed, database.colour)
     return b"".join(column[row].tobytes() for column in columns)
 

@@ -23,6 +23,10 @@ from fgslam.frontend.tracking.resection import Resection
 
 _AGREEMENT = 0.15, 2.0  # metres and degrees by which the offsets of two frames may differ
 _WORTH = 0.03, 0.3  # metres and degrees: below both the tracker finds the old landmarks by itself
+_DRIFT_M = 0.5  # drift of position that needs no way to have come about
+_DRIFT_DEG = 10.0  # and of heading
+_DRIFT_DEG_PER_M = 0.25  # of heading, by wheels without a gyro
+_FUSED_M = 0.10  # after a closure, landmarks that look alike and lie this near become one
 
 
 class Confirmation:
@@ -80,8 +84,8 @@ def drift_allows(
     metres, degrees = difference(estimated, recognised)
     worth = metres > _WORTH[0] or degrees > _WORTH[1]
     return worth and (
-        metres <= settings.max_drift_m + settings.max_drift_share * way_m
-        and degrees <= settings.max_drift_deg + settings.max_drift_deg_m * way_m
+        metres <= _DRIFT_M + settings.max_drift_share * way_m
+        and degrees <= _DRIFT_DEG + _DRIFT_DEG_PER_M * way_m
     )
 
 
@@ -148,7 +152,6 @@ def duplicates(
     landmarks: LandmarkMap,
     looks: LandmarkAppearances,
     sides: tuple[IntArray, IntArray],
-    within_m: float,
     appearance: AppearanceSettings,
 ) -> IntArray:
     """Pairs (m, 2) of identities (that ends, that stays) near each other that look alike.
@@ -157,13 +160,12 @@ def duplicates(
         landmarks: the map, corrected: what is one lies in one place.
         looks: stored views of the landmarks on both sides.
         sides: (a,) identities that may end, (b,) identities that may stay; none in both.
-        within_m: largest distance.
         appearance: how alike; each must be the other's closest, clearly.
     """
     (new, new_at), (old, old_at) = (_one_view_each(looks, ids) for ids in sides)
     if not len(new) or not len(old):
         return np.empty((0, 2), np.int64)
-    i, j = _near(_positions(landmarks, new), _positions(landmarks, old), within_m)
+    i, j = _near(_positions(landmarks, new), _positions(landmarks, old), _FUSED_M)
     i, j = choose(i, j, (looks.descriptors[new_at], looks.descriptors[old_at]), appearance)
     return np.column_stack([new[i], old[j]]).astype(np.int64)
 

@@ -212,13 +212,11 @@ class PlaceRecognition:
             return _NOBODY
         ended = self._tracker.merge(self._merging)
         self._merging, self._fuse_since = _NO_PAIRS, -1
-        if loops.fuse_m == 0.0:
-            return ended
         left = landmarks.ids[~np.isin(landmarks.ids, ended)]
         new = self._memory.made_after(since, left)
         looks = self._tracker.database.appearances()
         sides = left[new], left[~new]
-        pairs = duplicates(landmarks, looks, sides, loops.fuse_m, self._parts.appearance)
+        pairs = duplicates(landmarks, looks, sides, self._parts.appearance)
         return np.union1d(ended, self._tracker.merge(pairs))
 
     # -- upkeep ------------------------------------------------------------------------------

@@ -69,10 +69,6 @@ class LandmarkDatabase(LandmarkTable):
             certain=found.certain & known,
         )
 
-    def new_ids(self, count: int) -> IntArray:
-        """The identities that the next ``count`` landmarks will get."""
-        return np.arange(self._next_id, self._next_id + count)
-
     def missing(self, expected: ExpectedLandmarks, hit: BoolArray) -> IntArray:
         """Type II: identities expected well in view and not hit (v,); none in a blocked view."""
         permanence = self._settings.permanence
@@ -97,8 +93,8 @@ class LandmarkDatabase(LandmarkTable):
         """
         rows = self.rows(ids)
         self.missed[rows] = 0
-        self.contradicted[rows] = 0
-        self.seen[rows] = self._frame
+        self._columns["contradicted"][rows] = 0
+        self._columns["seen"][rows] = self._frame
         self.hits[rows] += 1
         self._refresh(rows, Views.of(features, which, directions, self._frame))
         permanence = self._settings.permanence
@@ -137,8 +133,8 @@ class LandmarkDatabase(LandmarkTable):
         against = seen_past(places, seen) | np.isin(ids, rejected)
         ids = ids[against]
         rows = self.rows(ids)
-        self.contradicted[rows] += 1
-        self.demote(ids[self.contradicted[rows] >= permanence.contradicted_after])
+        self._columns["contradicted"][rows] += 1
+        self.demote(ids[self._columns["contradicted"][rows] >= permanence.contradicted_after])
 
     def demote(self, ids: IntArray) -> None:
         """Permanent landmarks become ordinary ones, which go once they have been missed for long.
@@ -147,7 +143,7 @@ class LandmarkDatabase(LandmarkTable):
         """
         rows = self.rows(ids)
         self.permanent[rows] = False
-        self.contradicted[rows] = 0
+        self._columns["contradicted"][rows] = 0
 
     def add(
         self,
@@ -157,7 +153,7 @@ class LandmarkDatabase(LandmarkTable):
         directions: FloatArray | None = None,
     ) -> IntArray:
         """Type IV: starts a track for each chosen feature (4.2); returns their identities."""
-        ids = self.new_ids(len(which))
+        ids = np.arange(self._next_id, self._next_id + len(which))
         self._next_id += len(which)
         views = Views.of(features, which, directions, self._frame)
         self._append(ids, views, colour)
@@ -172,7 +168,7 @@ class LandmarkDatabase(LandmarkTable):
         gone = self.missed >= self._settings.prune_after_misses
         forget_after = self._settings.forget_unconfirmed_after
         if forget_after is not None:
-            gone |= ~self.valid & (self._frame >= self.seen + forget_after)
+            gone |= ~self.valid & (self._frame >= self._columns["seen"] + forget_after)
         gone &= ~self.permanent
         self._frame += 1
         pruned = self.ids[gone]

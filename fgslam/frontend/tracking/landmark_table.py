@@ -67,16 +67,6 @@ class LandmarkTable:
         return self._columns["missed"]
 
     @property
-    def seen(self) -> IntArray:
-        """(n,) frame of the last hit."""
-        return self._columns["seen"]
-
-    @property
-    def contradicted(self) -> IntArray:
-        """(n,) frames since the last hit that contradict a permanent landmark."""
-        return self._columns["contradicted"]
-
-    @property
     def colour(self) -> ByteArray:
         """(n,) grey values."""
         return self._columns["colour"]
@@ -85,36 +75,6 @@ class LandmarkTable:
     def permanent(self) -> BoolArray:
         """(n,) never pruned for being missed (6.2)."""
         return self._columns["permanent"]
-
-    @property
-    def size(self) -> FloatArray:
-        """(n,) physical size, pixels times metres, of the first view."""
-        return self._first_views().size
-
-    @property
-    def orientation(self) -> FloatArray:
-        """(n,) radians, of the first view."""
-        return self._first_views().orientation
-
-    @property
-    def descriptors(self) -> ByteArray:
-        """(n, 128) of the first view."""
-        return self._first_views().descriptors
-
-    @property
-    def view_counts(self) -> IntArray:
-        """(n,) views of each."""
-        return np.asarray((self._places >= 0).sum(axis=1))
-
-    @property
-    def bytes_per_landmark(self) -> int:
-        """Memory of a landmark with one view, without the room kept for growth."""
-        return self._columns.bytes_per_row() + self._pool.bytes_per_view()
-
-    @property
-    def bytes_per_view(self) -> int:
-        """Memory of each further view."""
-        return self._pool.bytes_per_view()
 
     def appearances(
         self, ids: IntArray | None = None, with_words: bool = False
@@ -159,7 +119,8 @@ class LandmarkTable:
         from_rows, to_rows = self.rows(ends), self.rows(stays)
         for name in ("hits", "misses"):
             np.add.at(self._columns[name], to_rows, self._columns[name][from_rows])
-        np.maximum.at(self.seen, to_rows, self.seen[from_rows])
+        seen = self._columns["seen"]
+        np.maximum.at(seen, to_rows, seen[from_rows])
         for name in ("missed", "contradicted"):
             np.minimum.at(self._columns[name], to_rows, self._columns[name][from_rows])
         np.logical_or.at(self.permanent, to_rows, self.permanent[from_rows])
@@ -219,7 +180,7 @@ class LandmarkTable:
         out["next_id"] = np.array(self._next_id)
         out["frame"] = np.array(self._frame)
         if self._pool.several:
-            out["view_counts"] = self.view_counts
+            out["view_counts"] = np.asarray((self._places >= 0).sum(axis=1))
         return out
 
     def restore(self, state: StateArrays) -> None:
@@ -272,9 +233,6 @@ class LandmarkTable:
         places = self._places[rows]
         self._pool.refresh(places, seen)
         self._places[rows] = places
-
-    def _first_views(self) -> Views:
-        return self._pool.at(self._places[:, 0])
 
     def _places_of(
         self, rows: IntArray, by_age: bool = False

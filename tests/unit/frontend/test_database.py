@@ -223,7 +223,7 @@ def test_new_landmarks_count_one_hit_and_get_ascending_ids() -> None:
     points = at_pixels([(80, 60, 8), (100, 110, 12), (150, 150, 20)])
     database = LandmarkDatabase(RIG, NO_BORDER, 40.0)
     features = stereo_features(points)
-    np.testing.assert_array_equal(database.new_ids(2), [0, 1])
+    assert database.state()["next_id"] == 0
     first = database.add(features, np.array([0, 2]), np.array([7, 9], np.uint8))
     second = database.add(features, np.array([1]), np.array([8], np.uint8))
     assert first.tolist() == [0, 1]
@@ -232,7 +232,7 @@ def test_new_landmarks_count_one_hit_and_get_ascending_ids() -> None:
     assert database.hits.tolist() == [1, 1, 1]
     assert database.misses.tolist() == database.missed.tolist() == [0, 0, 0]
     assert database.colour.tolist() == [7, 9, 8]
-    np.testing.assert_allclose(database.size, 3.0 * points[[0, 2, 1], 2])
+    np.testing.assert_allclose(database.appearances().size, 3.0 * points[[0, 2, 1], 2])
 
 
 @pytest.mark.parametrize("limit", [1, 3, 20])
@@ -246,10 +246,10 @@ def test_pruned_exactly_at_the_last_miss_in_a_row(limit: int) -> None:
     database.record_misses(np.array([1]))
     assert database.prune().tolist() == [1]
     assert database.ids.tolist() == [0]
-    assert len(database.descriptors) == len(database.hits) == len(database.colour) == 1
+    assert len(database.appearances()) == len(database.hits) == len(database.colour) == 1
     # Never again: neither the entry nor its name.
     assert len(database.prune()) == 0
-    assert database.new_ids(1).tolist() == [2]
+    assert database.state()["next_id"] == 2
 
 
 def test_an_unconfirmed_landmark_is_forgotten_in_view_or_not() -> None:
@@ -310,9 +310,9 @@ def test_a_hit_refreshes_the_appearance() -> None:
     nearer = at_pixels([(10, 10, 3), (100, 110, 24)])
     seen = stereo_features(nearer, scale=5.0)
     database.record_hits(np.array([1]), seen, np.array([1]))
-    assert database.size[1] == pytest.approx(5.0 * nearer[1, 2])
-    assert database.orientation[1] == seen.orientation[1]
-    np.testing.assert_array_equal(database.descriptors[1], seen.descriptors[1])
+    assert database.appearances().size[1] == pytest.approx(5.0 * nearer[1, 2])
+    assert database.appearances().orientation[1] == seen.orientation[1]
+    np.testing.assert_array_equal(database.appearances().descriptors[1], seen.descriptors[1])
     others = np.array([0, 2])
     for name in before:
         if name not in ("next_id", "frame"):

@@ -111,18 +111,18 @@ def test_merging_adds_counts_and_keeps_the_later_look() -> None:
         hit(database, 2)
     end_frame(database, 3)
     looks = {i: database.appearances(np.array([i])).descriptors[0] for i in (0, 2, 3)}
-    seen = database.seen[[0, 2, 3]].copy()
+    seen = database.state()["seen"][[0, 2, 3]].copy()
     assert seen.tolist() == [1, 1, 0]
     database.merge(np.array([[2, 0], [3, 1]]))
     assert database.ids.tolist() == [0, 1]
     assert database.hits.tolist() == [5, 2]
     assert database.misses.tolist() == [1, 1]
     assert database.missed.tolist() == [0, 0]
-    assert database.seen.tolist() == [1, 0]
+    assert database.state()["seen"].tolist() == [1, 0]
     assert database.permanent.tolist() == [True, False]
     np.testing.assert_array_equal(database.appearances(np.array([0])).descriptors[0], looks[2])
     # What ends is never named again.
-    assert database.new_ids(1).tolist() == [4]
+    assert database.state()["next_id"] == 4
 
 
 def test_several_landmarks_are_merged_into_one() -> None:
@@ -135,7 +135,7 @@ def test_several_landmarks_are_merged_into_one() -> None:
     assert database.hits.tolist() == [8]
     found = database.appearances()
     assert len(found) == 3  # as many as it may have
-    assert database.view_counts.tolist() == [3]
+    assert database.state()["view_counts"].tolist() == [3]
 
 
 @pytest.mark.parametrize(
@@ -239,8 +239,8 @@ def test_a_saved_map_s_database() -> None:
     for name in ("ids", "hits", "misses", "permanent", "colour"):
         np.testing.assert_array_equal(getattr(second, name), getattr(first, name))
     assert_same_bits(second.appearances(), first.appearances())
-    assert second.missed.tolist() == second.contradicted.tolist() == [0, 0, 0]
-    assert second.new_ids(1).tolist() == [4]
+    assert second.missed.tolist() == second.state()["contradicted"].tolist() == [0, 0, 0]
+    assert second.state()["next_id"] == 4
     # Its own columns, not the map's: the map is not touched by the visit.
     kept = copy.deepcopy(given)
     hit(second, 0, directions=towards(130.0))
@@ -280,12 +280,12 @@ def test_an_empty_map() -> None:
     database = seen_around()
     database.load(given)
     assert len(database) == len(database.appearances()) == 0
-    assert database.new_ids(1).tolist() == [0]
+    assert database.state()["next_id"] == 0
 
 
 def test_memory_a_landmark_is_as_documented() -> None:
     """docs/concepts/maps.md tells it."""
-    assert LandmarkDatabase(RIG, DatabaseSettings(), 40.0).bytes_per_landmark == 54 + 166
+    assert LandmarkDatabase(RIG, DatabaseSettings(), 40.0)._columns.bytes_per_row() == 54
     several = LandmarkDatabase(RIG, VIEWS, 40.0)
-    assert several.bytes_per_view == 166
-    assert several.bytes_per_landmark == 54 + 2 * 4 + 166
+    assert several._pool.bytes_per_view() == 166
+    assert several._columns.bytes_per_row() == 54 + 2 * 4

@@ -80,7 +80,9 @@ class Things:
     def entry(self, landmark: int) -> dict[str, int]:
         row = int(self.database.rows(np.array([landmark]))[0])
         names = ("hits", "misses", "missed", "contradicted", "permanent", "view_counts")
-        return {name: int(getattr(self.database, name)[row]) for name in names}
+        state = self.database.state()
+        state.setdefault("view_counts", np.ones(len(self.database), np.int64))
+        return {name: int(state[name][row]) for name in names}
 
 
 def cloud(count: int = 40, spread: float = 0.5) -> FloatArray:
@@ -171,7 +173,7 @@ def test_an_orbit_around_a_pillar(several: bool) -> None:
     assert lost == 0
     assert len(things.map) == len(born)
     # Seen over 120 degrees of their own, a little less of the orbit's (the pillar is thick).
-    views = things.database.view_counts
+    views = things.database.state()["view_counts"]
     assert 4 <= np.median(views) <= views.max() <= 1 + 120 // 20
 
 
@@ -267,7 +269,7 @@ def test_a_thing_behind_a_person_stays() -> None:
         assert not np.isin(ids, association.pruned_ids).any()
     rows = things.database.rows(ids)
     assert (things.database.missed[rows] == 40).all()
-    assert (things.database.contradicted[rows] == 0).all()
+    assert (things.database.state()["contradicted"][rows] == 0).all()
     assert things.database.permanent[rows].all()
 
 

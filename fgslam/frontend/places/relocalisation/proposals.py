@@ -22,7 +22,6 @@ from fgslam.frontend.places.relocalisation.residuals import (
     refine,
     residuals,
 )
-from fgslam.frontend.settings import RelocalisationSettings
 from fgslam.frontend.tracking.resection import align, align_planar, floor_axes, rigid, sample_size
 
 _AT_ONCE = 40_000  # residuals computed together; a few megabytes
@@ -111,14 +110,13 @@ def distinct(found: Proposals, count: int, metres: float, radians: float) -> Pro
 
 
 _HYPOTHESES = 64  # poses scored at a time, from the rigid samples
+_SAMPLES = 4096  # minimal samples drawn at a time; most fail the rigidity test
 _ROUNDS = 6  # times that samples are drawn at most
 _CONFIDENCE = 0.999  # that one sample was free of mistakes, at which the search ends
 _SAMPLED_STEPS = 3  # Newton steps of a sample: from the closed form to the image's metric
 
 
-def propose_by_samples(
-    evidence: Evidence, floor: Floor, settings: RelocalisationSettings, rng: np.random.Generator
-) -> Proposals:
+def propose_by_samples(evidence: Evidence, floor: Floor, rng: np.random.Generator) -> Proposals:
     """Poses, best first; none where too few matches make a sample.
 
     Rounds of samples are drawn until one of them was free of mistakes with the wanted confidence,
@@ -129,7 +127,7 @@ def propose_by_samples(
         return found
     odds = _odds(evidence)
     for _ in range(_ROUNDS):
-        samples = _draw(evidence, odds, size, settings.samples, rng)
+        samples = _draw(evidence, odds, size, _SAMPLES, rng)
         rigid_ones = samples[_rigid(evidence, samples, floor)]
         used = rigid_ones[:_HYPOTHESES]
         share = 1.0 if len(rigid_ones) <= len(used) else len(used) / len(rigid_ones)

@@ -82,7 +82,7 @@ class Relocaliser:
         if self._settings.method == "hough":
             proposals = propose_by_votes(evidence, self._floor)
         else:
-            proposals = propose_by_samples(evidence, self._floor, self._settings, rng)
+            proposals = propose_by_samples(evidence, self._floor, rng)
         refined = self._refine(features, seen, evidence, proposals)
         return accept(tentative, refined, self._known.landmarks, self._settings)
 

@@ -401,8 +401,8 @@ def test_duplicates_are_near_and_look_alike() -> None:
         ids, descriptors, np.ones(8), np.zeros(8), np.full((8, 3), np.nan)
     )
     landmarks = _map(ids, np.concatenate([old, new]))
-    pairs = duplicates(landmarks, appearances, (ids[4:], ids[:4]), 0.1, AppearanceSettings())
+    pairs = duplicates(landmarks, appearances, (ids[4:], ids[:4]), AppearanceSettings())
     # the second is too far away, the fourth looks different
     np.testing.assert_array_equal(pairs, [[4, 0], [6, 2]])
-    none = duplicates(landmarks, appearances, (ids[:0], ids[:4]), 0.1, AppearanceSettings())
+    none = duplicates(landmarks, appearances, (ids[:0], ids[:4]), AppearanceSettings())
     assert none.shape == (0, 2)
