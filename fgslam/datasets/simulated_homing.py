@@ -23,9 +23,6 @@ def open_simulated_homing(
         outliers: part of the matches, and of the bearings tracked at the drive's end, that is
             wrong; replaces the settings' own.
         rng: source of everything random.
-
-    Raises:
-        ConfigError: there is no such room.
     """
     return simulate_homing(with_outliers(settings, outliers), rng)
 

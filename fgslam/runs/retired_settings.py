@@ -264,6 +264,8 @@ RETIRED: dict[str, dict[str, Any]] = {
         "edge_threshold": 10.0,
     },
     "SimulatedBearingsSettings": {
+        "nearest_m": 0.8,
+        "farthest_m": 2.5,
         "lowest_m": 0.2,
         "highest_m": 1.5,
         "direction_deg": 20.0,

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.errors import ConfigError
 from fgslam.core.homing import BearingMatches, FeatureKind, HomingTruth, TrackedBearings
 from fgslam.core.planar import bearings, rotation, wrap
 from fgslam.worlds.simulated.settings import SimulatedBearingsSettings
 
 _CORRELATION_S = 0.5  # of the disturbances of the drive
+_NEAREST_M, _FARTHEST_M = 0.8, 2.5  # of points from the way: a furnished room
 _LOWEST_M, _HIGHEST_M = 0.2, 1.5  # of points above or below the camera: furniture and ceiling
 _DIRECTION_DEG, _ROTATION_DEG = 20.0, 30.0  # the target's, at most, against the start
 _SPEED_MPS = 0.3  # the paper's wheelchair while homing
@@ -64,12 +64,7 @@ class SimulatedHoming:
 def simulate_homing(
     settings: SimulatedBearingsSettings, rng: np.random.Generator
 ) -> SimulatedHoming:
-    """Places points and target, matches the two views, drives and tracks.
-
-    Raises:
-        ConfigError: ranges are upside down, so that there is no such room.
-    """
-    _require_room(settings)
+    """Places points and target, matches the two views, drives and tracks."""
     target = _target(settings, rng)
     wrong = round(settings.features * settings.wrong_matches / (1.0 - settings.wrong_matches))
     n = settings.features + wrong
@@ -80,11 +75,6 @@ def simulate_homing(
     tracks = _Tracks(settings, points, decoys, heights, rng).images(robots)
     landmarks = np.where(correct[:, None], points, np.nan)
     return SimulatedHoming(0.0, matches, correct, tracks, HomingTruth(target, robots, landmarks))
-
-
-def _require_room(settings: SimulatedBearingsSettings) -> None:
-    if not settings.nearest_m < settings.farthest_m:
-        raise ConfigError("simulated bearings: nearest_m must be below farthest_m")
 
 
 def _target(settings: SimulatedBearingsSettings, rng: np.random.Generator) -> FloatArray:
@@ -99,7 +89,7 @@ def _points(
     """(count, 2) points around the middle of the way, none too near to it."""
     drawn = _CANDIDATES * count
     angle = rng.uniform(-np.pi, np.pi, drawn)
-    low, high = settings.nearest_m, settings.farthest_m + 0.5 * settings.leg_m
+    low, high = _NEAREST_M, _FARTHEST_M + 0.5 * settings.leg_m
     distance = rng.uniform(low, high, drawn)
     if settings.surrounding == "anisotropic":
         near = rng.random(drawn) < _NEAR_SIDE

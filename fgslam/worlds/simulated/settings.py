@@ -179,10 +179,6 @@ class SimulatedBearingsSettings:
             "in five on one side, where they are near, the others far, as beside a wall"
         ),
     ] = "isotropic"
-    nearest_m: Annotated[
-        float, Field(gt=0.0, description="distance of the nearest points from the way, metres")
-    ] = 0.8
-    farthest_m: Annotated[float, Field(gt=0.0, description="and of the farthest ones")] = 2.5
     leg_m: Annotated[
         float, Field(gt=0.0, description="from start to target, metres (paper: about 2 m)")
     ] = 2.0

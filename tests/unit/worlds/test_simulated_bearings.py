@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgslam.core.errors import ConfigError
 from fgslam.core.planar import bearings, wrap
 from fgslam.worlds.simulated.bearings import SimulatedHoming, simulate_homing
 from fgslam.worlds.simulated.settings import SimulatedBearingsSettings, with_outliers
@@ -104,8 +103,3 @@ def test_anisotropic_rooms_are_near_on_one_side() -> None:
     distance = np.linalg.norm(homing.truth.landmarks - middle, axis=1)
     assert 0.65 < np.mean(side) < 0.95
     assert np.median(distance[side]) < 0.7 * np.median(distance[~side])
-
-
-def test_impossible_rooms_are_refused() -> None:
-    with pytest.raises(ConfigError, match="nearest_m must be below farthest_m"):
-        simulate(replace(CLEAN, nearest_m=3.0))
