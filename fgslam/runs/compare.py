@@ -140,7 +140,7 @@ def _with(settings: Any, config: Experiment, overrides: tuple[str, ...]) -> Any:
         return settings
     values = config.model_copy(update={"estimator": settings}).as_values() | {"compare": []}
     moved = [f"estimator{override[len(_PREFIX) + len(title) :]}" for override in own]
-    found = make_experiment(values, moved, f"--set {own[0]}").estimators[0]
+    found = make_experiment(values, f"--set {own[0]}", moved).estimators[0]
     if found.kind != settings.kind:
         raise ConfigError(f"--set {own[0]}: the kind is what names it; use --estimators")
     return found

@@ -34,10 +34,6 @@ __all__ = [
     "load_homing",
     "make_config",
     "make_experiment",
-    "parse_config",
-    "parse_experiment",
-    "parse_homing",
-    "parse_localisation",
 ]
 
 _GROUPS_OF_KINDS = ("dataset", "odometry", "estimator")
@@ -50,52 +46,43 @@ def load_experiment(path: Path, overrides: Iterable[str] = ()) -> Experiment:
     Raises:
         ConfigError: the file is missing or no YAML mapping, or a key or value is wrong.
     """
-    return make_experiment(read_mapping(path), overrides, str(path))
+    return make_experiment(read_mapping(path), str(path), overrides)
 
 
-def make_experiment(values: dict[str, Any], overrides: Iterable[str], where: str) -> Experiment:
-    """Plain values with overrides applied, checked; ``where`` names their source in messages."""
+def make_experiment(
+    values: Mapping[str, Any], where: str, overrides: Iterable[str] = ()
+) -> Experiment:
+    """Plain values of any task with overrides applied, checked; ``where`` names their source.
+
+    Raises:
+        ConfigError: an override is malformed, or a key or value is wrong.
+    """
     overrides = tuple(overrides)
     asked = {"task": values["task"]} if "task" in values else {}
     apply_overrides(asked, [o for o in overrides if o.partition("=")[0].strip() == "task"])
-    return _checked(_reader(asked, where).make(values, overrides, where), where)
-
-
-def parse_experiment(values: Mapping[str, Any], where: str) -> Experiment:
-    """Checks plain values of any task; ``where`` names their source in messages."""
-    return _checked(_reader(values, where).parse(values, where), where)
+    config = _reader(asked, where).make(values, overrides, where)
+    problem = config.problem()
+    if problem:
+        raise ConfigError(f"{where}: {problem}")
+    return config
 
 
 def load_config(path: Path, overrides: Iterable[str] = ()) -> ExperimentConfig:
     """Reads an experiment of SLAM. Raises ConfigError, also where it is of another task."""
-    return make_config(read_mapping(path), overrides, str(path))
+    return make_config(read_mapping(path), str(path), overrides)
 
 
-def make_config(values: dict[str, Any], overrides: Iterable[str], where: str) -> ExperimentConfig:
+def make_config(
+    values: Mapping[str, Any], where: str, overrides: Iterable[str] = ()
+) -> ExperimentConfig:
     """As :func:`make_experiment`, of SLAM alone."""
     _require_slam(values, where)
-    return as_task(ExperimentConfig, make_experiment(values, overrides, where), where)
-
-
-def parse_config(values: Mapping[str, Any], where: str) -> ExperimentConfig:
-    """As :func:`parse_experiment`, of SLAM alone."""
-    _require_slam(values, where)
-    return as_task(ExperimentConfig, parse_experiment(values, where), where)
+    return as_task(ExperimentConfig, make_experiment(values, where, overrides), where)
 
 
 def load_homing(path: Path, overrides: Iterable[str] = ()) -> HomingExperiment:
     """Reads a homing experiment. Raises ConfigError, also where it is of another task."""
     return as_task(HomingExperiment, load_experiment(path, overrides), str(path))
-
-
-def parse_homing(values: Mapping[str, Any], where: str) -> HomingExperiment:
-    """As :func:`parse_experiment`, of homing alone."""
-    return as_task(HomingExperiment, parse_experiment(values, where), where)
-
-
-def parse_localisation(values: Mapping[str, Any], where: str) -> LocalisationConfig:
-    """As :func:`parse_experiment`, of the task `localisation` alone."""
-    return as_task(LocalisationConfig, parse_experiment(values, where), where)
 
 
 def is_homing(path: Path) -> bool:
@@ -116,13 +103,6 @@ def _reader(values: Mapping[str, Any], where: str) -> Reader[Experiment]:
         raise ConfigError(f"{where}: task is {task!r}; {hint} (SLAM has no key task)")
     groups = tuple(name for name in _GROUPS_OF_KINDS if name in model.model_fields)
     return Reader(model, groups)
-
-
-def _checked(config: Experiment, where: str) -> Experiment:
-    problem = config.problem()
-    if problem:
-        raise ConfigError(f"{where}: {problem}")
-    return config
 
 
 def _require_slam(values: Mapping[str, Any], where: str) -> None:

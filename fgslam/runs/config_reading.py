@@ -46,21 +46,21 @@ class Reader(Generic[Model]):
     model: type[Model]
     groups: tuple[str, ...]
 
-    def make(self, values: dict[str, Any], overrides: Iterable[str], where: str) -> Model:
+    def make(self, values: Mapping[str, Any], overrides: Iterable[str], where: str) -> Model:
         """Plain values with ``a.b=value`` overrides applied, checked; ``where`` as in parse.
 
         Raises:
             ConfigError: an override is malformed, or a key or value is wrong.
         """
-        values, overrides = copy.deepcopy(values), tuple(overrides)
-        before = {group: _kind(values, group) for group in self.groups}
+        plain, overrides = copy.deepcopy(dict(values)), tuple(overrides)
+        before = {group: _kind(plain, group) for group in self.groups}
         if overrides:
-            apply_overrides(values, overrides, _schema_of(self.model))
+            apply_overrides(plain, overrides, _schema_of(self.model))
         given = {override.partition("=")[0].strip() for override in overrides}
         for group, kind in before.items():
-            if _kind(values, group) != kind:
-                self._drop_unknown(values[group], group, given)
-        return self.parse(values, where)
+            if _kind(plain, group) != kind:
+                self._drop_unknown(plain[group], group, given)
+        return self.parse(plain, where)
 
     def parse(self, values: Mapping[str, Any], where: str) -> Model:
         """Checks plain values against the schema; ``where`` names their source in messages."""

@@ -139,7 +139,7 @@ def configure(dataset: Path, overrides: Items[str]) -> ExperimentConfig:
     # The kind is named so that an override of one of its keys finds it.
     odometry = {"kind": "recorded"}
     values = {"name": "inspect", "dataset": recognise_layout(dataset), "odometry": odometry}
-    return make_config(values, overrides, str(dataset))
+    return make_config(values, str(dataset), overrides)
 
 
 def _opening_facts(config: ExperimentConfig) -> Facts:

@@ -149,7 +149,7 @@ def _recording_config(path: Path, overrides: Overrides) -> ExperimentConfig:
             )
         return slam_config(path, overrides)
     values = {"name": "recording", "dataset": dict(recognise_layout(path))}
-    return make_config(values, override_texts(overrides), str(path))
+    return make_config(values, str(path), override_texts(overrides))
 
 
 def run(

@@ -20,7 +20,7 @@ from fgslam.cli import main as cli
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.trajectories import Trajectory, read_covariances
 from fgslam.report.point_cloud import read_ply
-from fgslam.runs.config import parse_config
+from fgslam.runs.config import make_config
 from fgslam.runs.engine import run_task
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.tasks.slam import SlamResult, open_slam
@@ -55,7 +55,7 @@ def run_values(
     existing: ExistingFolder = "refuse",
     stopped: Callable[[], bool] = lambda: False,
 ) -> Finished:
-    config = parse_config(values, "test")
+    config = make_config(values, "test")
     return Finished(values, folder, run_task(open_slam, config, folder, existing, stopped=stopped))
 
 

@@ -26,7 +26,7 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.trajectories import Trajectory, read_covariances
 from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.report.point_cloud import read_ply
-from fgslam.runs.config import load_config, parse_config
+from fgslam.runs.config import load_config, make_config
 from fgslam.runs.run import run_experiment
 
 CONTRACT = set(EstimatorMetrics().as_json())
@@ -45,7 +45,7 @@ SAME = ("final.tum", "online.tum", "covariance.csv", "map.ply")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run on simulated measurements, two estimators; read only."""
     folder = tmp_path_factory.mktemp("measured") / "run"
-    run_experiment(parse_config(DRIVE, "test"), folder)
+    run_experiment(make_config(DRIVE, "test"), folder)
     return folder
 
 

@@ -14,7 +14,7 @@ from running import main, write_config
 
 from fgslam.core.bearing_log import BearingLog
 from fgslam.core.errors import DatasetError
-from fgslam.runs.config import load_homing, parse_homing
+from fgslam.runs.config import load_homing, make_experiment
 from fgslam.runs.folder import RUN_MARKER
 from fgslam.runs.report import report_from_folder
 from fgslam.runs.run import run_experiment
@@ -54,7 +54,7 @@ def mistake(capfd: Capture, monkeypatch: Patch, *arguments: object) -> str:
 def trials(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("homing") / "run"
     values = TRIALS | {"estimator": {"kind": "homing_ekf"}}
-    run_experiment(parse_homing(values, "test"), folder)
+    run_experiment(make_experiment(values, "test"), folder)
     return folder
 
 
@@ -202,7 +202,7 @@ def test_the_page_of_slam_never_takes_the_place_of_homing_s(trials: Path) -> Non
 
 def test_stopped_at_once_the_files_are_valid(tmp_path: Path) -> None:
     values = TRIALS | {"estimator": {"kind": "homing_ekf"}}
-    result = run_experiment(parse_homing(values, "test"), tmp_path / "run", stopped=lambda: True)
+    result = run_experiment(make_experiment(values, "test"), tmp_path / "run", stopped=lambda: True)
     assert result.status == "interrupted"
     assert values_of(tmp_path / "run")["status"] == "interrupted"
     assert len((tmp_path / "run" / "trials.csv").read_text(encoding="utf-8").splitlines()) == 1

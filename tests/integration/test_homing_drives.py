@@ -20,7 +20,7 @@ from fgslam.homing.drive_record import DriveRecord, cross_track, pass_distances,
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import NoAvoidance, Steering
-from fgslam.runs.config import parse_homing
+from fgslam.runs.config import make_experiment
 from fgslam.runs.config_models import HomingConfig, PathFollowingConfig
 from fgslam.runs.folder import write_config
 from fgslam.runs.homing_comparison import load_bearing_logs, replay_homing
@@ -43,7 +43,7 @@ EKF = {"kind": "homing_ekf"}
 
 def configuration(**more: Any) -> PathFollowingConfig:
     values = {"task": "path_following", "name": "x", "estimator": EKF, "trials": 1, **more}
-    return cast(PathFollowingConfig, parse_homing(values, "test"))
+    return cast(PathFollowingConfig, make_experiment(values, "test"))
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +192,7 @@ def test_slope_of_pass_distances_leaves_the_last_target_out(record: DriveRecord)
 
 def test_one_homing_is_a_path_of_one_leg() -> None:
     values = {"task": "homing", "name": "x", "estimator": EKF}
-    assert cast(HomingConfig, parse_homing(values, "test")).resolved().dataset.path.legs == 1
+    assert cast(HomingConfig, make_experiment(values, "test")).resolved().dataset.path.legs == 1
 
 
 def test_displaced_starts_stay_near_and_free() -> None:

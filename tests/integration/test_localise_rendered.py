@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgslam.runs.config import parse_localisation
+from fgslam.runs.config import make_experiment
 from fgslam.runs.engine import run_task
 from fgslam.runs.tasks.localisation import open_localisation
 
@@ -40,7 +40,7 @@ VALUES: dict[str, Any] = {
 @pytest.mark.usefixtures("open3d")
 def test_poses_between_those_of_the_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FGSLAM_CACHE", str(tmp_path / "cache"))
-    result = run_task(open_localisation, parse_localisation(VALUES, "test"), tmp_path / "run")
+    result = run_task(open_localisation, make_experiment(VALUES, "test"), tmp_path / "run")
     assert result.asked.alignment == "truth in the world of the map's first frame, exactly"
     with (tmp_path / "run" / "localisation.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))

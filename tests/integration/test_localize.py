@@ -15,7 +15,7 @@ from recordings import experiment, write_calibration
 from running import main, run_values
 
 from fgslam.core.errors import ConfigError
-from fgslam.runs.config import load_experiment, parse_localisation
+from fgslam.runs.config import load_experiment, make_experiment
 from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.engine import run_task
 from fgslam.runs.tasks.localisation import open_localisation
@@ -85,7 +85,7 @@ def test_every_frame_with_files_that_repeat_the_run(
 
 def test_a_submap_is_located_at_its_last_frame(recording: Path, map_file: Path) -> None:
     values = values_of(recording, map_file, localisation={"frames": [1, 3], "every": 2})
-    config = parse_localisation(values, "test")
+    config = make_experiment(values, "test")
     result = run_task(open_localisation, config, map_file.parent / "submaps")
     one, three = result.asked.of(1), result.asked.of(3)
     assert [a.frame for a in one] == [a.frame for a in three] == [5, 9]
@@ -180,7 +180,7 @@ def test_a_map_that_is_made_first_and_one_that_is_there_answer_alike(
     made = given | {"map": {"made_from": {"dataset": dataset}}}
     rows = []
     for name, values in (("given", given), ("made", made)):
-        result = run_task(open_localisation, parse_localisation(values, "test"), tmp_path / name)
+        result = run_task(open_localisation, make_experiment(values, "test"), tmp_path / name)
         assert result.status == "finished"
         rows.append(rows_of(tmp_path / name))
     assert (tmp_path / "made" / "first" / "map.fgmap").is_file()
@@ -190,7 +190,7 @@ def test_a_map_that_is_made_first_and_one_that_is_there_answer_alike(
 
 def test_stopping_leaves_valid_files(recording: Path, map_file: Path, tmp_path: Path) -> None:
     asked = iter((False, True))
-    config = parse_localisation(values_of(recording, map_file), "test")
+    config = make_experiment(values_of(recording, map_file), "test")
     result = run_task(open_localisation, config, tmp_path / "run", stopped=lambda: next(asked))
     assert result.status == "interrupted"
     assert len(rows_of(tmp_path / "run")) == 2
@@ -200,4 +200,4 @@ def test_a_map_is_needed_and_only_one(recording: Path, map_file: Path) -> None:
     values = values_of(recording, map_file)
     for wrong in ({}, {"load": "a", "made_from": {"dataset": values["dataset"]}}):
         with pytest.raises(ConfigError, match="map needs either load or made_from"):
-            parse_localisation(values | {"map": wrong}, "test")
+            make_experiment(values | {"map": wrong}, "test")

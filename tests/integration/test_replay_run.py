@@ -13,7 +13,7 @@ from running import KIND, run_values
 from fgslam.core.estimates import Estimate
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.runs.config import ExperimentConfig, parse_config
+from fgslam.runs.config import ExperimentConfig, make_config
 from fgslam.slam import factory
 from fgslam.slam.pipeline import replay_step
 
@@ -45,7 +45,7 @@ def test_replay_to_the_bit(
     live = run.result.outputs.pipeline.estimator.estimate()
     log = MeasurementLog.load(run.folder / "measurements.npz")
     assert log.motion_model["kind"] == kind
-    replayed = replay(parse_config(values, "test"), log)
+    replayed = replay(make_config(values, "test"), log)
     np.testing.assert_array_equal(replayed.trajectory.poses, live.trajectory.poses)
     np.testing.assert_array_equal(replayed.covariances, live.covariances)
     np.testing.assert_array_equal(replayed.landmarks.ids, live.landmarks.ids)
@@ -63,7 +63,7 @@ def test_a_changed_measurement_changes_the_replay(recording: Path, tmp_path: Pat
     run = run_values(values, tmp_path / "run")
     log = MeasurementLog.load(run.folder / "measurements.npz")
     log.increments[5].observations.measurement[0, 0] += 0.25
-    replayed = replay(parse_config(values, "test"), log)
+    replayed = replay(make_config(values, "test"), log)
     live = run.result.outputs.pipeline.estimator.estimate()
     np.testing.assert_array_equal(replayed.trajectory.poses[:5], live.trajectory.poses[:5])
     assert np.abs(replayed.trajectory.poses[5:] - live.trajectory.poses[5:]).max() > 1e-9

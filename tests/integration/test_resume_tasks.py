@@ -31,7 +31,7 @@ from fgslam.core import files
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.report.tables import write_comparison_csv
 from fgslam.runs.compare import Choice, compare_runs
-from fgslam.runs.config import parse_experiment
+from fgslam.runs.config import make_experiment
 from fgslam.runs.engine import RunResult
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.run import run_experiment
@@ -183,7 +183,7 @@ def _small_steps(in_this_process: None, monkeypatch: pytest.MonkeyPatch) -> None
 def run(
     values: dict[str, Any], folder: Path, existing: ExistingFolder = "refuse", **more: Any
 ) -> RunResult:
-    return run_experiment(parse_experiment(values, "test"), folder, existing, **more)
+    return run_experiment(make_experiment(values, "test"), folder, existing, **more)
 
 
 def renames(monkeypatch: pytest.MonkeyPatch, most: float, *, after: bool) -> list[Path]:

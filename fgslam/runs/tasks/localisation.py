@@ -175,7 +175,7 @@ def _config(wanted: Wanted, saved: SavedMap) -> LocalisationConfig:
     kept = {name: value for name, value in values.items() if name in known}
     queries = {**kept.get("localisation", {}), "frames": [wanted.frames], "every": 1}
     kept |= {"task": "localisation", "localisation": queries, "map": {"load": str(wanted.map_file)}}
-    config = as_task(LocalisationConfig, make_experiment(kept, overrides, where), where)
+    config = as_task(LocalisationConfig, make_experiment(kept, where, overrides), where)
     return _of_one_frame(config, wanted)
 
 

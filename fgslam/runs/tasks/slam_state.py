@@ -18,7 +18,7 @@ from fgslam.core.files import require_writable
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap, require_rig, save_map
-from fgslam.runs.config import ExperimentConfig, parse_config
+from fgslam.runs.config import ExperimentConfig, make_config
 from fgslam.runs.folder import LOG_FILE, STATE_FILE
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, entry_of
 from fgslam.runs.tasks.slam_outputs import RunOutputs
@@ -245,7 +245,7 @@ def go_on(given: GivenMap, pipeline: SlamPipeline, recorder: RunRecorder) -> Non
 def _settings_of(drive: dict[str, Any], where: str) -> dict[str, Any]:
     """A drive's settings, with the defaults of keys that are newer than it."""
     try:
-        return parse_config({"name": drive["name"], **drive["settings"]}, where).as_values()
+        return make_config({"name": drive["name"], **drive["settings"]}, where).as_values()
     except ConfigError as error:
         raise MapError(
             f"{where}: its run had settings that this fgslam does not know ({error}); use "

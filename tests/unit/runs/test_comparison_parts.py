@@ -34,7 +34,7 @@ from fgslam.report.tables import (
 )
 from fgslam.runs.baseline import check_baseline, read_baseline, write_baseline
 from fgslam.runs.compare import Choice, all_kinds, choose
-from fgslam.runs.config import ExperimentConfig, parse_config
+from fgslam.runs.config import ExperimentConfig, make_config
 from fgslam.runs.estimator_files import points_from_log
 from fgslam.runs.metric_tables import (
     TRIAL_COLUMNS,
@@ -49,7 +49,7 @@ LAB: dict[str, Any] = {"name": "x", "dataset": {"kind": "rendered_lab"}}
 
 
 def config(**more: Any) -> ExperimentConfig:
-    return parse_config(LAB | more, "test")
+    return make_config(LAB | more, "test")
 
 
 # --------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import yaml
 from fgslam.core.errors import ConfigError
 from fgslam.datasets.settings import ConstantVelocitySettings, ImageFolderSettings
 from fgslam.frontend.settings import LoopSettings
-from fgslam.runs.config import ExperimentConfig, load_config, parse_config
+from fgslam.runs.config import ExperimentConfig, load_config, make_config
 from fgslam.runs.config_models import TASKS
 from fgslam.runs.config_reading import accepted_at, read_mapping, typed_value
 from fgslam.worlds.lab_settings import RenderedLabSettings
@@ -338,15 +338,15 @@ def test_every_experiment_is_valid_and_survives_a_round_trip(path: Path, tmp_pat
 
 
 def test_defaults_are_filled_in() -> None:
-    values = parse_config(LAB, "x").as_values()
+    values = make_config(LAB, "x").as_values()
     assert values["seed"] == 0
     assert values["dataset"]["rig"]["width"] == 320
     assert values["estimator"]["kind"] == "landmark_kalman"
-    assert isinstance(parse_config(values, "x").dataset, RenderedLabSettings)
+    assert isinstance(make_config(values, "x").dataset, RenderedLabSettings)
 
 
 def test_a_configuration_cannot_be_changed() -> None:
-    config = parse_config(LAB, "x")
+    config = make_config(LAB, "x")
     with pytest.raises(ValueError, match="frozen"):
         config.seed = 3  # type: ignore[misc]
 
@@ -397,8 +397,8 @@ def test_every_estimator_has_a_folder_of_its_own(tmp_path: Path) -> None:
     other = {"kind": "landmark_kalman", "update": "world"}
     message = message_of(LAB | {"compare": [other]}, tmp_path)
     assert "two different estimators are called landmark_kalman; give one of them a" in message
-    assert len(parse_config(LAB | {"compare": [other | {"label": "w"}]}, "x").compare) == 1
-    assert len(parse_config(LAB | {"compare": ["landmark_kalman"]}, "x").compare) == 1
+    assert len(make_config(LAB | {"compare": [other | {"label": "w"}]}, "x").compare) == 1
+    assert len(make_config(LAB | {"compare": ["landmark_kalman"]}, "x").compare) == 1
     taken = LAB | {"estimator": {"label": "pictures"}}
     assert "cannot be called pictures, a folder of the run" in message_of(taken, tmp_path)
 
@@ -437,11 +437,11 @@ def test_wrong_types_are_reported_in_plain_words(
 )
 def test_maps_that_contradict_themselves(maps: dict[str, Any], expected: str) -> None:
     with pytest.raises(ConfigError, match=expected):
-        parse_config({**MINIMAL, "map": maps}, "test")
+        make_config({**MINIMAL, "map": maps}, "test")
 
 
 def test_a_map_that_is_not_extended_allows_loops() -> None:
     values = {**MINIMAL, "map": {"load": "a", "extend": False}, "frontend": {"loops": {}}}
-    config = parse_config(values, "test")
+    config = make_config(values, "test")
     assert not config.map.extend
     assert config.frontend.loops == LoopSettings()

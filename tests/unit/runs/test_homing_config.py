@@ -16,7 +16,7 @@ from fgslam.runs.config import (
     load_config,
     load_experiment,
     load_homing,
-    parse_homing,
+    make_experiment,
 )
 from fgslam.runs.config_models import TASKS, Experiment, HomingTrialsConfig
 from fgslam.runs.config_reading import read_mapping
@@ -98,7 +98,7 @@ def test_another_kind_drops_the_keys_of_the_old_one(tmp_path: Path) -> None:
 
 
 def test_the_same_estimator_twice_counts_once() -> None:
-    config = parse_homing(TRIALS | {"compare": ["homing_graph", "alv"]}, "x")
+    config = make_experiment(TRIALS | {"compare": ["homing_graph", "alv"]}, "x")
     assert [settings.title for settings in config.estimators] == ["homing_graph", "alv"]
 
 

@@ -8,7 +8,7 @@ from fgslam.core.errors import ConfigError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
 from fgslam.core.measurements import MeasurementType
 from fgslam.core.sensors import CameraRig
-from fgslam.runs.config import parse_config
+from fgslam.runs.config import make_config
 from fgslam.runs.opening import open_sequence
 from fgslam.slam.factory import make_estimator, require_support
 
@@ -33,4 +33,4 @@ def test_noise_of_recorded_odometry_is_not_silently_idle_in_the_lab() -> None:
     lab = {"kind": "rendered_lab"}
     noisy = {"kind": "recorded", "speed_sigma_mps": 9.0}
     with pytest.raises(ConfigError, match=r"dataset\.odometry"):
-        open_sequence(parse_config({"name": "x", "dataset": lab, "odometry": noisy}, "x"))
+        open_sequence(make_config({"name": "x", "dataset": lab, "odometry": noisy}, "x"))

@@ -33,7 +33,7 @@ from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 def settings(**values: Any) -> SimulatedMeasurementsSettings:
     """Settings as an experiment's file would give them: the short part of a drive."""
     values = {"kind": "simulated_measurements", "stop": 40} | values
-    config = make_config({"name": "x", "dataset": values}, (), "x")
+    config = make_config({"name": "x", "dataset": values}, "x")
     assert isinstance(config.dataset, SimulatedMeasurementsSettings)
     return config.dataset
 
