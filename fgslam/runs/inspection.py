@@ -180,11 +180,11 @@ def render_report(recording: Facts, seen: Facts, findings: tuple[Finding, ...]) 
         if f.level is not Level.INFO
     )
     blocks = [_aligned(facts, width) for facts in (recording, moved, (*seen, *matched))]
-    blocks += [_aligned(bad, len(Level.PROBLEM.value)), _verdict(findings)]
+    blocks += [_aligned(bad, len(Level.PROBLEM.value)), _conclusion(findings)]
     return "\n\n".join(block for block in blocks if block)
 
 
-def _verdict(findings: tuple[Finding, ...]) -> str:
+def _conclusion(findings: tuple[Finding, ...]) -> str:
     problems = sum(f.level is Level.PROBLEM for f in findings)
     warnings = sum(f.level is Level.WARNING for f in findings)
     if problems:

@@ -117,8 +117,8 @@ def _run(config: TopologicalMapConfig, views: OmniRecording, context: Context) -
         config,
         folder,
         "finished" if whole else "interrupted",
-        _verdict(topology, routes, located),
-        (_table(topology, views),),
+        _sentences(topology, routes, located),
+        (_table(numbers),),
         (*views.notes, *failures, *missing),
     )
     write_csv(folder / LINKS_FILE, _LINK_COLUMNS, _link_rows(topology, views))
@@ -203,7 +203,7 @@ def _of_routes(routes: Sequence[Route]) -> dict[str, JsonValue]:
     return {"routes": found, "routes_found": sum(not r.reason for r in routes)}
 
 
-def _verdict(
+def _sentences(
     topology: TopologicalMap, routes: Sequence[Route], located: list[Localised] | None
 ) -> tuple[str, ...]:
     parts = topology.components()
@@ -221,8 +221,7 @@ def _verdict(
     return tuple(lines)
 
 
-def _table(topology: TopologicalMap, views: OmniRecording) -> TextTable:
-    numbers = _numbers(topology, views, {}, 0.0)
+def _table(numbers: Mapping[str, JsonValue]) -> TextTable:
     rows = (
         ("nodes", "nodes"),
         ("links", "links"),

@@ -54,7 +54,7 @@ _ROWS = ("all pairs", "same room", "different rooms")
 
 
 PLAIN_INLIERS = 25
-"""A plain answer counts from here on (issue 4, 5.3)."""
+"""Inliers from which on an answer of the reference, which never refuses, counts."""
 
 
 def open_pairs(config: HomingPairsConfig, opening: Opening) -> Task[RunResult]:
@@ -82,7 +82,7 @@ def _run(config: HomingPairsConfig, views: OmniRecording, context: Context) -> R
         config,
         folder,
         "finished" if whole else "interrupted",
-        _verdict(numbers, errors),
+        _sentences(numbers, errors),
         _tables(errors),
         (*views.notes, *failures),
     )
@@ -141,7 +141,7 @@ def _judged(
     return errors, answer_numbers(answers) | of_errors
 
 
-def _verdict(numbers: dict[str, JsonValue], errors: PairErrors | None) -> tuple[str, ...]:
+def _sentences(numbers: dict[str, JsonValue], errors: PairErrors | None) -> tuple[str, ...]:
     lines = [f"{numbers['answered']} of {numbers['pairs']} pairs are answered."]
     reference = numbers["reference"]
     if isinstance(reference, dict):
@@ -249,7 +249,7 @@ PAIR_COLUMNS = (
     "reason",
 )
 WRONG_DEG = 10.0
-"""An answer whose direction or rotation is off by more is a wrong one (issue 4, 5.3)."""
+"""An answer whose direction or rotation is off by more is a wrong one."""
 
 _JOINT_PROBABILITY = 0.95
 _SIGMAS = 2.0

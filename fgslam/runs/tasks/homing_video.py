@@ -97,7 +97,7 @@ def _run(config: OmniVideoConfig, recording: OmniRecording, context: Context) ->
     write_csv(folder / TRACKS_FILE, ("id", "first_frame", "last_frame"), rows)
     numbers = _numbers(tracks)
     result = RunResult(
-        config, folder, status, _verdict(numbers), (_table(numbers),), recording.notes
+        config, folder, status, _sentences(numbers), (_table(numbers),), recording.notes
     )
     write_document(result, numbers)
     frames = np.arange(len(tracks.frames), dtype=np.float64)
@@ -185,7 +185,7 @@ def _median(values: np.ndarray) -> float | None:
     return float(np.median(values)) if len(values) else None
 
 
-def _verdict(numbers: dict[str, JsonValue]) -> tuple[str, ...]:
+def _sentences(numbers: dict[str, JsonValue]) -> tuple[str, ...]:
     rate, life = numbers["frames_a_second"], numbers["track_life_median_frames"]
     if not isinstance(rate, float):
         return ("No frame was tracked.",)

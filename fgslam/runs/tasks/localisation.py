@@ -38,7 +38,7 @@ from fgslam.runs.tasks.localisation_results import (
     in_frames,
     result_of,
     sigmas_of,
-    verdict_of,
+    status_of,
     write_results,
 )
 from fgslam.runs.tasks.slam import drive_first
@@ -181,7 +181,7 @@ def _config(wanted: Wanted, saved: SavedMap) -> LocalisationConfig:
 
 def _answer_line(attempt: Attempt) -> str:
     """One query in a line, for the terminal."""
-    start = f"frame {attempt.frame:>5}  {verdict_of(attempt):<16}"
+    start = f"frame {attempt.frame:>5}  {status_of(attempt):<16}"
     found = attempt.found
     if found is None:
         return f"{start}{attempt.problem}"
@@ -200,7 +200,7 @@ def _answer_line(attempt: Attempt) -> str:
 def _details(attempt: Attempt) -> Iterator[tuple[str, str]]:
     """One query in full: name and value of what there is to know."""
     yield "frame", f"{attempt.frame}, from {in_frames(attempt.frames)}"
-    yield "verdict", verdict_of(attempt)
+    yield "verdict", status_of(attempt)
     found = attempt.found
     if found is None:
         yield "why", attempt.problem

@@ -208,16 +208,16 @@ def _score_cells(counts: LocalisationScore) -> tuple[str, ...]:
 
 
 def _refusal_table(judged: Sequence[Scored]) -> TextTable:
-    """How the queries ended, by verdict."""
-    counts = [Counter(verdict_of(one) for one in j.attempts) for j in judged]
+    """How many queries ended with which status of relocalisation."""
+    counts = [Counter(status_of(one) for one in j.attempts) for j in judged]
     names = sorted({name for count in counts for name in count})
     columns = tuple(Column(in_frames(j.frames), "queries that ended so") for j in judged)
     rows = tuple((name, tuple(str(count[name]) for count in counts)) for name in names)
     return TextTable("verdicts", "Verdicts", "verdict", columns, rows)
 
 
-def verdict_of(attempt: Attempt) -> str:
-    """The verdict's name; ``no_image`` of a frame that could not be read."""
+def status_of(attempt: Attempt) -> str:
+    """Name of the relocalisation status; ``no_image`` of a frame that could not be read."""
     return "no_image" if attempt.found is None else attempt.found.status.value
 
 
@@ -347,7 +347,7 @@ def _numbers(judged: Scored) -> dict[str, JsonValue]:
         **_score_numbers(judged.counts),
         "familiar_view": _score_numbers(judged.familiar),
         "too_few_in_view": _score_numbers(judged.apart),
-        "verdicts": dict(sorted(Counter(verdict_of(a) for a in judged.attempts).items())),
+        "verdicts": dict(sorted(Counter(status_of(a) for a in judged.attempts).items())),
         "locate_ms": _spread_numbers(Spread.of(milliseconds)),
         "frontend_ms": _spread_numbers(Spread.of(frontend)),
     }
