@@ -67,6 +67,14 @@ class Browser:
         self.driver.get(page.resolve().as_uri())
         self.wait("document.documentElement.dataset.drawn === 'yes'")
 
+    def assert_loads_quietly(self) -> None:
+        """The page loads without an error in the console and asks for nothing outside itself."""
+        self.complaints(), self.requests()  # forget what came before
+        self.driver.refresh()
+        self.wait("document.documentElement.dataset.drawn === 'yes'")
+        assert self.complaints() == []
+        assert self.requests() == []
+
     def reset(self) -> None:
         """All controls of the open report as they were when it was loaded."""
         self.driver.execute_script(

@@ -69,11 +69,7 @@ def figure_switch(figure: str, key: str) -> str:
 
 
 def test_page_loads_offline_without_error_or_request(browser: Browser) -> None:
-    browser.complaints(), browser.requests()  # forget what came before
-    browser.driver.refresh()
-    browser.wait("document.documentElement.dataset.drawn === 'yes'")
-    assert browser.complaints() == []
-    assert browser.requests() == []
+    browser.assert_loads_quietly()
     for figure in FIGURES:
         assert browser.js(f"{DRAWN.format(figure)}.length") >= 2
     assert browser.js("document.querySelectorAll('#plot-map canvas').length") >= 1
