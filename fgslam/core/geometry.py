@@ -168,6 +168,11 @@ def se3_exp(xi: FloatArray) -> FloatArray:
     return pose(so3_exp(xi[:3]), _so3_left_jacobian(xi[:3]) @ xi[3:])
 
 
+def moved_apart(aTb: FloatArray, step: FloatArray) -> FloatArray:
+    """A pose moved by a step (6,), rotation and translation apart: planar motion stays planar."""
+    return pose(aTb[:3, :3] @ so3_exp(step[:3]), aTb[:3, 3] + aTb[:3, :3] @ step[3:])
+
+
 def se3_log(aTb: FloatArray) -> FloatArray:
     """Tangent vector (6,) [rotation, translation] of a rigid motion (4, 4); GTSAM's Logmap."""
     omega = so3_log(aTb[:3, :3])

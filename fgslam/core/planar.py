@@ -21,6 +21,11 @@ def wrap(angle: FloatArray) -> FloatArray:
     return np.asarray(np.where(wrapped >= np.pi, -np.pi, wrapped))
 
 
+def wrapped_pose(pose: FloatArray) -> FloatArray:
+    """(3,) the same pose, its heading within half a turn: steps of a solver may lead beyond."""
+    return np.append(pose[:2], wrap(pose[2:]))
+
+
 def unit(angle: FloatArray) -> FloatArray:
     """(..., 2) unit vectors (cos, sin) of angles (...)."""
     angle = np.asarray(angle, dtype=np.float64)

@@ -31,11 +31,10 @@ from fgslam.core.geometry import (
     adjoint,
     congruence,
     inverse,
+    moved_apart,
     point_pose_jacobian,
-    pose,
     reorthonormalise,
     se3_exp,
-    so3_exp,
     transform_to_world,
 )
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
@@ -313,8 +312,7 @@ class FullEkf:
         """The pose moved by a step (6,), on a hard floor."""
         if self._floor.rigid_dof == 6:
             return wTc @ se3_exp(step)
-        moved = pose(wTc[:3, :3] @ so3_exp(step[:3]), wTc[:3, 3] + wTc[:3, :3] @ step[3:])
-        return self._floor.constrain(moved)
+        return self._floor.constrain(moved_apart(wTc, step))
 
     def _drop(self, increment: Increment) -> None:
         gone = np.flatnonzero(np.isin(self._ids, increment.pruned_ids))

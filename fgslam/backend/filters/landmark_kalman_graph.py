@@ -23,10 +23,9 @@ from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Predi
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     congruence,
-    pose,
+    moved_apart,
     projection_jacobian,
     reorthonormalise,
-    so3_exp,
     transform_to_camera,
     transform_to_world,
     triangulate,
@@ -80,7 +79,7 @@ class FixedMapPose:
             step, covariance = _solved(_pose_columns(graph.linearize(values)), basis)
             if np.abs(step).max() < _CONVERGED:
                 break
-            wTc = pose(wTc[:3, :3] @ so3_exp(step[:3]), wTc[:3, 3] + wTc[:3, :3] @ step[3:])
+            wTc = moved_apart(wTc, step)
             values.update(_POSE, gtsam.Pose3(wTc))
         return Prediction(reorthonormalise(wTc), covariance)
 

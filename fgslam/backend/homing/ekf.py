@@ -16,7 +16,7 @@ from fgslam.backend.homing.settings import FilterMotionSettings, HomingEkfSettin
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings, among
-from fgslam.core.planar import wrap
+from fgslam.core.planar import wrapped_pose
 from fgslam.factors.bearing_residuals import (
     bearing,
     bearing_jacobians,
@@ -303,8 +303,8 @@ class HomingEkf:
         jacobian[3:, 3:] = target_jacobian(target)
         return HomingEstimate(
             time=self._features.time,
-            robot=_wrapped(state.mean[:3]),
-            target=_wrapped(target_pose(target)),
+            robot=wrapped_pose(state.mean[:3]),
+            target=wrapped_pose(target_pose(target)),
             covariance=jacobian @ state.covariance[np.ix_(rows, rows)] @ jacobian.T,
             ids=state.ids,
             landmarks=polar_points(state.polar),
@@ -357,7 +357,3 @@ def _landmark_covariances(state: FilterState, wanted: bool) -> FloatArray:
     by_polar, every = polar_jacobians(state.polar), np.arange(n)
     blocks = state.covariance[7:, 7:].reshape(n, 2, n, 2)[every, :, every, :]
     return np.asarray(by_polar @ blocks @ np.swapaxes(by_polar, 1, 2))
-
-
-def _wrapped(pose: FloatArray) -> FloatArray:
-    return np.append(pose[:2], wrap(pose[2]))

@@ -16,7 +16,7 @@ from fgslam.backend.homing.schur_model import STATE, Look, NormalEquations, Schu
 from fgslam.backend.homing.settings import HomingGraphSettings
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.planar import wrap
+from fgslam.core.planar import wrapped_pose
 
 _ROWS, _COLUMNS = np.indices((STATE, STATE))
 _LOWER = np.tril_indices(STATE)
@@ -138,7 +138,7 @@ class SchurSolver:
 
     def pose(self, image: int) -> FloatArray:
         """See :class:`Solver`."""
-        return _wrapped(self._state.chain[image, :3])
+        return wrapped_pose(self._state.chain[image, :3])
 
     def velocity(self, image: int) -> FloatArray:
         """See :class:`Solver`."""
@@ -146,7 +146,7 @@ class SchurSolver:
 
     def target(self) -> FloatArray:
         """See :class:`Solver`."""
-        return _wrapped(self._state.target)
+        return wrapped_pose(self._state.target)
 
     def points(self, rows: list[int]) -> FloatArray:
         """See :class:`Solver`."""
@@ -207,8 +207,3 @@ class SchurSolver:
                     return ahead, factored, damping
             damping = max(_MORE * damping, _FIRST_DAMPING)
         return None
-
-
-def _wrapped(pose: FloatArray) -> FloatArray:
-    """(3,) the same pose, its heading within half a turn: steps may lead beyond."""
-    return np.append(pose[:2], wrap(pose[2:]))

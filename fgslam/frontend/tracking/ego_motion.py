@@ -22,15 +22,14 @@ from fgslam.core.geometry import (
     inverse,
     inverse_spd3,
     measurement_difference,
+    moved_apart,
     point_pose_jacobian,
-    pose,
     project,
     projection_jacobian,
     reorthonormalise,
     se3_exp,
     se3_log,
     se3_log_jacobian,
-    so3_exp,
     transform_to_camera,
 )
 from fgslam.core.measurements import Observations
@@ -154,7 +153,7 @@ class EgoMotionSolver:
                 return _Minimum(start, hessian, False, iteration)
             if np.abs(step).max() < tolerance:
                 break
-            wTc = _retract(best, step)
+            wTc = moved_apart(best, step)
         return _Minimum(best, hessian, self._determined(best, hessian), iteration)
 
     def _determined(self, wTc: FloatArray, hessian: FloatArray) -> bool:
@@ -333,11 +332,6 @@ def _prior_information(covariance: FloatArray) -> FloatArray:
 def _inverse_spd(matrix: FloatArray) -> FloatArray:
     inverted = np.linalg.inv(matrix)
     return np.asarray(0.5 * (inverted + inverted.T))
-
-
-def _retract(wTc: FloatArray, step: FloatArray) -> FloatArray:
-    """Move by a tangent vector, rotation and translation apart: planar motion stays planar."""
-    return pose(wTc[:3, :3] @ so3_exp(step[:3]), wTc[:3, 3] + wTc[:3, :3] @ step[3:])
 
 
 def _add_prior(
