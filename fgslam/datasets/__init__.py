@@ -1,1 +1,1 @@
-"""Readers of recordings, one a module, all behind the Sequence protocol."""
+"""Readers of recordings, a module for each layout; those of images give the Sequence protocol."""
