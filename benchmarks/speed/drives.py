@@ -22,8 +22,7 @@ from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.runs.config import load_config
 from fgslam.slam.factory import make_estimator
-from fgslam.slam.pipeline import replay_frame
-from fgslam.slam.replay import replay_motion
+from fgslam.slam.replay import replay_frame, replay_motion
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,7 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.factors.graphs import solver_parameters
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.factory import make_estimator
-from fgslam.slam.pipeline import replay_frame
-from fgslam.slam.replay import replay_motion
+from fgslam.slam.replay import replay_frame, replay_motion
 
 LIMITS = {
     "isam2_windowed_over_own_ordering": 0.5,

@@ -1,15 +1,10 @@
-"""The SLAM loop (Se et al. 4): predict, match, ego-motion, update, database maintenance.
-
-The same ego-motion serves a live run and the replay of its log, against each estimator's own map.
-"""
+"""The SLAM loop (Se et al. 4): predict, match, ego-motion, update, database maintenance."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,10 +13,9 @@ from fgslam.backend.protocol import Estimator
 from fgslam.core.arrays import IntArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.features import StereoFeatures
-from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
+from fgslam.core.measurements import Increment, LoopClosure, Odometry
 from fgslam.frontend.stereo import StereoMatcher
-from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
-from fgslam.frontend.tracking.resection import Resection
+from fgslam.frontend.tracking.ego_motion import unmeasured
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import MotionModel
@@ -37,15 +31,6 @@ class FrameReport:
     found: FeatureFrame
     stereo: StereoFeatures
     increment: Increment
-    tracking: EgoMotion
-    stats: UpdateStats
-    stage_ms: dict[str, float]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ReplayedFrame:
-    """What one frame of a log gave, and how long `predict`, `track` and `update` took."""
-
     tracking: EgoMotion
     stats: UpdateStats
     stage_ms: dict[str, float]
@@ -107,7 +92,7 @@ class SlamPipeline:
         watch.lap("places")
         increment = _increment(index, timestamp, odometry, seen)
         stats = self.estimator.update(increment, seen.tracking)
-        _observe(self.motion, increment, seen.tracking, stats)
+        observe(self.motion, increment, seen.tracking, stats)
         self._remember(increment, seen, stats)
         watch.lap("update")
         return FrameReport(found, stereo, increment, seen.tracking, stats, watch.ms)
@@ -176,75 +161,7 @@ class _Seen:
     relocalised: bool = False
 
 
-def replay_step(
-    increment: Increment,
-    estimator: Estimator,
-    ego_motion: EgoMotionSolver,
-    motion: MotionModel,
-    k: int,
-) -> UpdateStats:
-    """Gives frame ``k`` of a log to an estimator: the live loop without its matching."""
-    return replay_frame(increment, estimator, ego_motion, motion, k).stats
-
-
-def replay_frame(
-    increment: Increment,
-    estimator: Estimator,
-    ego_motion: EgoMotionSolver,
-    motion: MotionModel,
-    k: int,
-) -> ReplayedFrame:
-    """As :func:`replay_step`, with the frame's tracking and times."""
-    watch = Stopwatch()
-    if increment.odometry is None:
-        stand_in = motion.between(increment.timestamp, None)
-        increment = dataclasses.replace(increment, odometry=stand_in)
-    prediction = estimator.predict(increment.odometry)
-    watch.lap("predict")
-    matched = increment.observations.select(~increment.observations.is_new)
-    if k == 0 and not len(estimator.landmarks()):
-        tracking = unmeasured(prediction, EgoMotionStatus.FIRST)
-    elif increment.relocalised:
-        tracking = _relocated(estimator, ego_motion, prediction, matched)
-    else:
-        tracking = _solve(estimator, partial(ego_motion.solve, prediction), matched)
-    watch.lap("track")
-    stats = estimator.update(increment, tracking)
-    _observe(motion, increment, tracking, stats)
-    watch.lap("update")
-    return ReplayedFrame(tracking, stats, watch.ms)
-
-
-def _solve(
-    estimator: Estimator, solve: Callable[[PoseProblem], EgoMotion], matched: Observations
-) -> EgoMotion:
-    """Against the landmarks that the estimator holds; the others are no inliers."""
-    landmarks = estimator.landmarks()
-    held = np.isin(matched.ids, landmarks.ids)
-    if held.all():
-        return solve(PoseProblem.of(landmarks, matched))
-    solved = solve(PoseProblem.of(landmarks, matched.select(held)))
-    inliers = np.zeros(len(matched), np.bool_)
-    residuals = np.full(len(matched), np.inf)
-    inliers[held], residuals[held] = solved.inliers, solved.residuals
-    return dataclasses.replace(solved, inliers=inliers, residuals=residuals)
-
-
-def _relocated(
-    estimator: Estimator,
-    ego_motion: EgoMotionSolver,
-    prediction: Prediction,
-    matched: Observations,
-) -> EgoMotion:
-    """Without the prediction, which it contradicts; with it where the landmarks are too few."""
-    resection = Resection(ego_motion)
-    found = _solve(estimator, resection.solve, matched)
-    if found.status.measured:
-        return found
-    return _solve(estimator, partial(ego_motion.solve, prediction), matched)
-
-
-def _observe(
+def observe(
     motion: MotionModel, increment: Increment, tracking: EgoMotion, stats: UpdateStats
 ) -> None:
     """Hands the pose to the motion model; a jump by loop or relocalisation is no motion."""

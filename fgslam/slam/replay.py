@@ -1,13 +1,18 @@
-"""Replays a measurement log through one estimator, as the live loop would have driven it."""
+"""Replays a measurement log through one estimator, as the live loop would have driven it.
+
+The ego-motion of the live loop, against each estimator's own map; without its matching.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import resource
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,18 +23,27 @@ from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.arrays import Brief, FloatArray
 from fgslam.core.errors import ConfigError, MeasurementLogError
-from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
+from fgslam.core.estimates import (
+    EgoMotion,
+    EgoMotionStatus,
+    Estimate,
+    LandmarkMap,
+    Prediction,
+    Trajectory,
+    UpdateStats,
+)
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Increment, MeasurementType
+from fgslam.core.measurements import Increment, MeasurementType, Observations
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
-from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
+from fgslam.frontend.tracking.resection import Resection
 from fgslam.slam.arrival import Arrival, take_over
 from fgslam.slam.factory import made_or_given
-from fgslam.slam.motion import ConstantVelocityMotion
-from fgslam.slam.pipeline import ReplayedFrame, replay_frame
+from fgslam.slam.motion import ConstantVelocityMotion, MotionModel
+from fgslam.slam.pipeline import Stopwatch, observe
 from fgslam.slam.results import ESTIMATOR_FAULTS, estimate_of_failed, reason
 
 _PROC_STATUS = Path("/proc/self/status")
@@ -87,6 +101,15 @@ class Replay(Brief):
         return np.array([getattr(row, name) for row in self.rows])
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ReplayedFrame:
+    """What one frame of a log gave, and how long `predict`, `track` and `update` took."""
+
+    tracking: EgoMotion
+    stats: UpdateStats
+    stage_ms: dict[str, float]
+
+
 @one_blas_thread()
 def replay(
     log: MeasurementLog,
@@ -125,6 +148,74 @@ def replay(
             return run.result(estimator, before_mb, where + why.removeprefix(where))
         progress(k + 1, len(log))
     return run.result(estimator, before_mb, "")
+
+
+def replay_step(
+    increment: Increment,
+    estimator: Estimator,
+    ego_motion: EgoMotionSolver,
+    motion: MotionModel,
+    k: int,
+) -> UpdateStats:
+    """Gives frame ``k`` of a log to an estimator: the live loop without its matching."""
+    return replay_frame(increment, estimator, ego_motion, motion, k).stats
+
+
+def replay_frame(
+    increment: Increment,
+    estimator: Estimator,
+    ego_motion: EgoMotionSolver,
+    motion: MotionModel,
+    k: int,
+) -> ReplayedFrame:
+    """As :func:`replay_step`, with the frame's tracking and times."""
+    watch = Stopwatch()
+    if increment.odometry is None:
+        stand_in = motion.between(increment.timestamp, None)
+        increment = dataclasses.replace(increment, odometry=stand_in)
+    prediction = estimator.predict(increment.odometry)
+    watch.lap("predict")
+    matched = increment.observations.select(~increment.observations.is_new)
+    if k == 0 and not len(estimator.landmarks()):
+        tracking = unmeasured(prediction, EgoMotionStatus.FIRST)
+    elif increment.relocalised:
+        tracking = _relocated(estimator, ego_motion, prediction, matched)
+    else:
+        tracking = _solve(estimator, partial(ego_motion.solve, prediction), matched)
+    watch.lap("track")
+    stats = estimator.update(increment, tracking)
+    observe(motion, increment, tracking, stats)
+    watch.lap("update")
+    return ReplayedFrame(tracking, stats, watch.ms)
+
+
+def _solve(
+    estimator: Estimator, solve: Callable[[PoseProblem], EgoMotion], matched: Observations
+) -> EgoMotion:
+    """Against the landmarks that the estimator holds; the others are no inliers."""
+    landmarks = estimator.landmarks()
+    held = np.isin(matched.ids, landmarks.ids)
+    if held.all():
+        return solve(PoseProblem.of(landmarks, matched))
+    solved = solve(PoseProblem.of(landmarks, matched.select(held)))
+    inliers = np.zeros(len(matched), np.bool_)
+    residuals = np.full(len(matched), np.inf)
+    inliers[held], residuals[held] = solved.inliers, solved.residuals
+    return dataclasses.replace(solved, inliers=inliers, residuals=residuals)
+
+
+def _relocated(
+    estimator: Estimator,
+    ego_motion: EgoMotionSolver,
+    prediction: Prediction,
+    matched: Observations,
+) -> EgoMotion:
+    """Without the prediction, which it contradicts; with it where the landmarks are too few."""
+    resection = Resection(ego_motion)
+    found = _solve(estimator, resection.solve, matched)
+    if found.status.measured:
+        return found
+    return _solve(estimator, partial(ego_motion.solve, prediction), matched)
 
 
 def replay_motion(log: MeasurementLog) -> ConstantVelocityMotion:

@@ -34,7 +34,7 @@ from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.motion import ConstantVelocityMotion
-from fgslam.slam.pipeline import replay_step
+from fgslam.slam.replay import replay_step
 
 DEFAULTS: dict[str, EstimatorSettings] = {
     settings.kind: settings() for settings in get_args(get_args(EstimatorSettings)[0])

@@ -37,7 +37,8 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.factory import make_estimator, make_tracker
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import ConstantVelocityMotion, OdometryMotion
-from fgslam.slam.pipeline import FrameReport, SlamPipeline, replay_step
+from fgslam.slam.pipeline import FrameReport, SlamPipeline
+from fgslam.slam.replay import replay_step
 
 DRIVE = Drive(frames=10)
 SIXDOF = EgoMotionSettings(dof=6)

@@ -15,7 +15,7 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.runs.config import ExperimentConfig, make_config
 from fgslam.slam import factory
-from fgslam.slam.pipeline import replay_step
+from fgslam.slam.replay import replay_step
 
 
 def replay(config: ExperimentConfig, log: MeasurementLog) -> Estimate:

@@ -37,7 +37,8 @@ from fgslam.frontend.places.closures import difference
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.arrival import Arrival, take_over
 from fgslam.slam.factory import make_estimator
-from fgslam.slam.pipeline import FrameReport, SlamPipeline, replay_step
+from fgslam.slam.pipeline import FrameReport, SlamPipeline
+from fgslam.slam.replay import replay_step
 
 MAPPED = ROUND // 2  # frames of the drive that makes the map
 BEGIN = 22  # of it, where the second drive begins

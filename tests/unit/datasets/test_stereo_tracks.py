@@ -25,7 +25,7 @@ from fgslam.evaluation.trajectory import evaluate_trajectory
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.motion import ConstantVelocityMotion
-from fgslam.slam.pipeline import replay_step
+from fgslam.slam.replay import replay_step
 
 FX, FY, CX, CY, B = 700.0, 710.0, 600.0, 180.0, 0.5
 POINTS = np.array([[1.0, 0.5, 10.0], [-2.0, -1.0, 8.0], [0.3, 0.2, 25.0], [3.0, -0.4, 14.0]])

@@ -28,7 +28,7 @@ from fgslam.evaluation.trajectory import evaluate_trajectory
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.motion import ConstantVelocityMotion
-from fgslam.slam.pipeline import replay_step
+from fgslam.slam.replay import replay_step
 
 N = 12
 STEREO_FILE = "utias_starry_night_dataset3.mat"

@@ -25,7 +25,7 @@ from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.runs.config import ExperimentConfig, load_experiment, make_config
 from fgslam.slam.motion import ConstantVelocityMotion
-from fgslam.slam.pipeline import replay_step
+from fgslam.slam.replay import replay_step
 from fgslam.worlds.simulated.landmarks import IdentityBook
 from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 

@@ -33,7 +33,8 @@ from fgslam.frontend.settings import LostSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.motion import ConstantVelocityMotion
-from fgslam.slam.pipeline import FrameReport, SlamPipeline, _observe, replay_step
+from fgslam.slam.pipeline import FrameReport, SlamPipeline, observe
+from fgslam.slam.replay import replay_step
 
 # -- the return ------------------------------------------------------------------------------
 
@@ -301,7 +302,7 @@ def test_a_correction_is_no_motion() -> None:
         for found in seen(path, dark):
             report = pipeline.process(found, found.i, float(found.i))
             expected = steady.between(float(found.i))
-            _observe(steady, report.increment, report.tracking, report.stats)
+            observe(steady, report.increment, report.tracking, report.stats)
             after = steady.between(found.i + 1.0)
             if report.increment.loops or report.increment.relocalised:
                 assert expected is not None
