@@ -80,7 +80,10 @@ class Trajectory(Brief):
         path = Path(path)
         expected = "timestamp tx ty tz qx qy qz qw on each line"
         values, lines = _parse_rows(
-            path, read_text(path, remedy=f"give {expected}"), _TUM_COLUMNS, expected
+            path,
+            read_text(path, remedy=f"check the path; it has {expected}"),
+            _TUM_COLUMNS,
+            expected,
         )
         _refuse(path, lines, np.asarray(~np.isfinite(values).all(axis=1)), _NOT_FINITE)
         norms = np.linalg.norm(values[:, 4:], axis=1)
