@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
@@ -98,21 +98,27 @@ def run_apart(
 
 
 def _start(index: int, function: Callable[[Argument], Result], argument: Argument) -> _Worker:
+    """The work is sent once the process runs: one that ends before it has read it breaks the pipe.
+
+    Handed over as arguments of the process, work larger than the pipe's buffer would be waited for
+    without end: multiprocessing keeps the reading end open while it writes.
+    """
     context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(theirs, function, argument), daemon=True)
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_work, args=(theirs,), daemon=True)
     process.start()
     theirs.close()  # so that the end of the process is the end of the pipe
+    with suppress(BrokenPipeError, ConnectionResetError):  # _collect says how it ended
+        ours.send((function, argument))
     return _Worker(index, process, ours)
 
 
-def _work(
-    connection: Connection, function: Callable[[Argument], Result], argument: Argument
-) -> None:
+def _work(connection: Connection) -> None:
     """In the worker: Ctrl-C is the parent's to answer; asked to end, it clears up first."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    function, argument = connection.recv()
     try:
         connection.send(function(argument))
     except FgslamError as error:
@@ -141,7 +147,7 @@ def _see_off(process: SpawnProcess) -> None:
 def _collect(worker: _Worker, argument: Argument) -> Result | WorkerEnded[Argument]:
     try:
         result: Result | FgslamError = worker.connection.recv()
-    except EOFError:
+    except (EOFError, ConnectionResetError):
         worker.process.join()
         return WorkerEnded(argument, _ending(worker.process.exitcode))
     worker.process.join()

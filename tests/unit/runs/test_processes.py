@@ -6,11 +6,13 @@ import multiprocessing
 import os
 import signal
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
 
 from fgslam.core.errors import ConfigError
+from fgslam.runs import processes
 from fgslam.runs.processes import WorkerEnded, run_apart
 
 
@@ -50,6 +52,21 @@ def test_a_crash_takes_nothing_else_along() -> None:
     assert isinstance(second, WorkerEnded)
     assert "status 3" in second.why
     assert str(found[2]).startswith("fine")
+
+
+def end_at_once(connection: Connection) -> None:
+    """In place of what a process does: it ends before it has read its work."""
+    del connection
+    os._exit(5)
+
+
+def test_a_process_that_ends_before_it_reads_its_work_is_not_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(processes, "_work", end_at_once)
+    ((_, ended),) = run_apart(work, ["x" * 10_000_000])  # more than any pipe holds
+    assert isinstance(ended, WorkerEnded)
+    assert "status 5" in ended.why
 
 
 def test_a_users_mistake_is_raised_here() -> None:
