@@ -11,7 +11,7 @@ from recordings import experiment, write_recording
 from running import Finished, run_values, units_in_this_process
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)  # of a session it would last into other folders
 def _coarse_pictures() -> Iterator[None]:
     """What pictures look like is tested elsewhere; here coarse ones, which are drawn faster."""
     with pytest.MonkeyPatch.context() as patch:

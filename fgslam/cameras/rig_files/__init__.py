@@ -1,1 +1,0 @@
-"""Calibration files of stereo rigs: one reader a format, found by content."""
