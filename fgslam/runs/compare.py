@@ -27,7 +27,14 @@ from fgslam.report.content import TextTable
 from fgslam.report.tables import write_comparison_csv
 from fgslam.runs.config import is_homing, load_config, load_homing, make_experiment
 from fgslam.runs.config_models import Experiment, ExperimentConfig, HomingExperiment
-from fgslam.runs.engine import RunResult, Task, is_finished, run_task
+from fgslam.runs.engine import (
+    RunResult,
+    Task,
+    is_finished,
+    require_same,
+    require_same_ground,
+    run_task,
+)
 from fgslam.runs.folder import COMPARISON_FILE, RUN_MARKER, ExistingFolder, is_run_folder
 from fgslam.runs.homing_comparison import open_homing_comparison
 from fgslam.runs.metric_tables import ate_table
@@ -167,14 +174,15 @@ def compare_runs(
         out: folder of the results; of several runs each gets one below it, by its folder's name.
             None: `compare` inside each run.
         existing: what to do where results are already. `resume` goes on with what an interrupted
-            comparison left: of several runs those that had finished are left as they are, and
-            those that were not begun are.
+            comparison left: of several runs those that had finished with these estimators on these
+            logs are left as they are, and those that were not begun are.
         jobs: processes at a time; more than one disturbs the times.
         progress: called after each estimator that is done.
         stopped: True ends the replays; what was finished is kept.
 
     Raises:
-        FgslamError: a run cannot be read, a name is unknown, or the results cannot be written.
+        FgslamError: a run cannot be read, a name is unknown, what was begun is of other estimators
+            or of another log, or the results cannot be written.
     """
     configs = [load_run(run) for run in runs]
     _require_one_kind(runs, configs)
@@ -182,14 +190,18 @@ def compare_runs(
     opened = [_open(*run, choice) for run in zip(runs, configs, strict=True)]
     for run, folder in zip(runs, folders, strict=True):
         require_room(folder, run, existing)
+    several_resumed = existing == "resume" and len(runs) > 1
+    if several_resumed:
+        for (config, task), folder in zip(opened, folders, strict=True):
+            _require_same_where_begun(config, task, folder)
     results = []
     for (config, task), folder in zip(opened, folders, strict=True):
         begun = existing
-        if existing == "resume" and len(runs) > 1:
-            if is_finished(folder):
-                results.append(RunResult(config, folder, "finished", (f"{folder}: had finished",)))
-                continue
+        if several_resumed:
             begun = "resume" if is_run_folder(folder) else "refuse"
+            if begun == "resume" and is_finished(folder):
+                results.append(_had_finished(config, folder))
+                continue
         results.append(
             run_task(partial(_opened, task), config, folder, begun, progress, stopped, jobs)
         )
@@ -246,6 +258,20 @@ def _open(
     first, *others = estimators
     chosen = config.model_copy(update={"estimator": first, "compare": tuple(others)})
     return chosen, open_homing_comparison(config, run, estimators)
+
+
+def _require_same_where_begun(config: Experiment, task: Task[RunResult], folder: Path) -> None:
+    """Raises before anything is done where a table would mix estimators, logs or versions."""
+    if is_run_folder(folder):
+        require_same(config.resolved(), folder)
+        require_same_ground(task.provenance, folder)
+
+
+def _had_finished(config: Experiment, folder: Path) -> RunResult:
+    """What an earlier session has finished, as it stands."""
+    result = RunResult(config, folder, "finished", (f"{folder}: had finished",))
+    found = result.metrics["estimators"].values()
+    return dataclasses.replace(result, failed=all(one.get("failure") for one in found))
 
 
 def _opened(task: Task[RunResult], *_: object) -> Task[RunResult]:

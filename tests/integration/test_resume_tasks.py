@@ -453,9 +453,46 @@ def test_of_several_comparisons_those_that_had_finished_stay_as_they_are(
     first = (out / "a" / "metrics.json").read_bytes()
     assert not (out / "c").exists()
     results = compare_runs(runs, out=out, existing="resume")
-    assert [one.status for one in results] == ["finished"] * 3
+    assert [(one.status, one.failed) for one in results] == [("finished", False)] * 3
     assert (out / "a" / "metrics.json").read_bytes() == first
     rows = list(csv.DictReader((out / "comparison.csv").read_text().splitlines()))
     assert len(rows) == 6
     with pytest.raises(OutputError, match="nothing to resume"):
         compare_runs(runs[:1], out=out / "a", existing="resume")
+
+
+def test_of_several_comparisons_one_that_finished_otherwise_is_refused(
+    values_of: Callable[[str], dict[str, Any]], tmp_path: Path
+) -> None:
+    """Other estimators or another log would make a table of two different comparisons."""
+    values = values_of("measurements") | {"compare": []}
+    runs, out = [tmp_path / name for name in ("a", "b")], tmp_path / "out"
+    for seed, folder in enumerate(runs):
+        run(values | {"seed": seed}, folder)
+    odometry = Choice(("odometry",))
+    compare_runs(runs[:1], odometry, out / "a")
+    with pytest.raises(ConfigError, match="a/config.yaml: differs from the configuration given"):
+        compare_runs(runs, Choice(("ekf",)), out, "resume")
+    kept = (runs[0] / "measurements.npz").read_bytes()
+    shutil.copy(runs[1] / "measurements.npz", runs[0])
+    with pytest.raises(ConfigError, match="a/config.yaml: was begun with log "):
+        compare_runs(runs, odometry, out, "resume")
+    assert not (out / "b").exists()
+    (runs[0] / "measurements.npz").write_bytes(kept)
+    compare_runs(runs, odometry, out, "resume")
+    rows = list(csv.DictReader((out / "comparison.csv").read_text().splitlines()))
+    assert [row["estimator"] for row in rows] == ["odometry", "odometry"]
+
+
+def test_of_several_comparisons_a_finished_failure_stays_one_when_resumed(
+    values_of: Callable[[str], dict[str, Any]], tmp_path: Path
+) -> None:
+    values = values_of("measurements") | {"compare": []}
+    runs, out = [tmp_path / name for name in ("a", "b")], tmp_path / "out"
+    for folder in runs:
+        run(values, folder)
+    choice = Choice(("ekf",), ("estimators.ekf.max_landmarks=5",))
+    compare_runs(runs[:1], choice, out / "a")
+    results = compare_runs(runs, choice, out, "resume")
+    assert [one.failed for one in results] == [True, True]
+    assert [one.failed for one in compare_runs(runs, choice, out, "resume")] == [True, True]
