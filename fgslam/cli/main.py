@@ -160,12 +160,18 @@ def compare(  # noqa: PLR0913 - each option is a parameter
             seeds = Seeds(trials, seed)
             tried = run_trials(runs[0], seeds, choice, out, existing, jobs, progress, stopped)
             results = [tried]
-    _show(results, shlex.join(["fgslam", *sys.argv[1:], *([] if resume else ["--resume"])]))
+    _show(results, _same_with_resume())
     show_parts((), ate_tables(results))
     regression = _baselines(metrics_of(results), write_baseline, expected)
     _exit_as(results)
     if regression:
         raise typer.Exit(EXIT_FAULT)
+
+
+def _same_with_resume() -> str:
+    """This command once more, to go on with what it left."""
+    given = [word for word in sys.argv[1:] if word not in ("--overwrite", "--resume")]
+    return shlex.join(["fgslam", *given, "--resume"])
 
 
 def _baselines(results: Results, written: Path | None, expected: Baseline | None) -> bool:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import shlex
 import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -210,6 +213,32 @@ def test_two_runs_are_compared_side_by_side(
     assert [row["estimator"] for row in rows] == ["odometry", "odometry"]
     assert "final ATE, cm, SE3 aligned" in capsys.readouterr().out
     assert (out / plain.name / "odometry" / "final.tum").is_file()
+
+
+@pytest.mark.parametrize("existing", [(), ("--overwrite",), ("--resume",)])
+def test_the_command_that_an_interrupted_comparison_shows_goes_on_with_it(
+    plain: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+    existing: tuple[str, ...],
+) -> None:
+    given = ("compare", plain, "--out", tmp_path / "out", "--estimators", "odometry")
+
+    @contextmanager
+    def ctrl_c_at_once() -> Iterator[Callable[[], bool]]:
+        yield lambda: True
+
+    with monkeypatch.context() as patch:
+        patch.setattr("fgslam.cli.main.stop_flag", ctrl_c_at_once)
+        if existing:
+            assert main(monkeypatch, *given) == 130
+        assert main(monkeypatch, *given, *existing) == 130
+    shown = capsys.readouterr().out.splitlines()[-1].partition("go on: fgslam ")[2]
+    assert shlex.split(shown) == [*map(str, given), "--resume"]
+    with units_in_this_process():
+        assert main(monkeypatch, *shlex.split(shown)) == 0
+    assert metrics_of(tmp_path / "out")["status"] == "finished"
 
 
 @pytest.mark.parametrize(
