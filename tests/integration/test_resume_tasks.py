@@ -471,11 +471,11 @@ def test_of_several_comparisons_one_that_finished_otherwise_is_refused(
         run(values | {"seed": seed}, folder)
     odometry = Choice(("odometry",))
     compare_runs(runs[:1], odometry, out / "a")
-    with pytest.raises(ConfigError, match="a/config.yaml: differs from the configuration given"):
+    with pytest.raises(ConfigError, match=r"a/config\.yaml: differs from the configuration given"):
         compare_runs(runs, Choice(("ekf",)), out, "resume")
     kept = (runs[0] / "measurements.npz").read_bytes()
     shutil.copy(runs[1] / "measurements.npz", runs[0])
-    with pytest.raises(ConfigError, match="a/config.yaml: was begun with log "):
+    with pytest.raises(ConfigError, match=r"a/config\.yaml: was begun with log "):
         compare_runs(runs, odometry, out, "resume")
     assert not (out / "b").exists()
     (runs[0] / "measurements.npz").write_bytes(kept)
