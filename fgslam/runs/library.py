@@ -199,12 +199,17 @@ def replay(
 
     Raises:
         ConfigError: no such estimator.
-        MeasurementLogError: ``log`` is none.
+        MeasurementLogError: ``log`` is none, or begins in a saved map, which it does not hold.
     """
     if not isinstance(log, MeasurementLog):
         raise MeasurementLogError(
             f"replay: the log is a {type(log).__name__}; give that of a session, slam.log, or load "
             "one by fgslam.MeasurementLog.load(file)"
+        )
+    if len(log) and not log.increments[0].observations.is_new.all():
+        raise MeasurementLogError(
+            "replay: this log begins in a saved map, which it does not hold; compare estimators on "
+            "it by a run: fgslam run with map.load, then fgslam compare RUN"
         )
     return replay_log(log, _unused(chosen_estimator(estimator)), ego_motion or EgoMotionSettings())
 

@@ -13,7 +13,7 @@ import yaml
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core import __version__
-from fgslam.core.errors import ConfigError
+from fgslam.core.errors import ConfigError, MapError
 from fgslam.core.saved_map import load_map
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.settings import OdometrySettings
@@ -110,6 +110,13 @@ class Slam(Session):
         """
         if isinstance(start_map, Map):
             start_map = MapStart(start_map.saved, MapSettings(extend=extend_map))
+        elif start_map is None and not extend_map:
+            raise ConfigError("extend_map: without a start_map there is none to leave as it is")
+        elif start_map is not None and not isinstance(start_map, MapStart):
+            raise MapError(
+                f"start_map is a {type(start_map).__name__}; give fgslam.Map.load(file), or the "
+                "map of a result"
+            )
         self._before = None if start_map is None else start_map.saved
         super().__init__(
             rig,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,12 @@ from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.report.point_cloud import MapPoints, write_map
-from fgslam.slam.factory import make_extractor, make_relocaliser, make_stereo_matcher
+from fgslam.slam.factory import (
+    chosen_frontend,
+    make_extractor,
+    make_relocaliser,
+    make_stereo_matcher,
+)
 from fgslam.slam.inputs import checked_images
 
 _VALID_HITS = 3  # where the map does not say how many its run asked for (Se et al. 6.1)
@@ -83,7 +88,7 @@ class Map:
         self,
         rig: CameraRig,
         images: Sequence[npt.ArrayLike],
-        frontend: FrontendSettings | None = None,
+        frontend: FrontendSettings | Mapping[str, Any] | None = None,
         seed: int = 0,
     ) -> Relocalisation:
         """Pose of a frame in the map without a prior, or why there is none to be believed.
@@ -94,7 +99,8 @@ class Map:
         Args:
             rig: the cameras that made the map.
             images: (left, right[, top]), as for :meth:`fgslam.Slam.track`.
-            frontend: settings of features, matching and relocalisation; None for the defaults.
+            frontend: settings of features, matching and relocalisation, or a mapping for what
+                differs from the defaults.
             seed: of RANSAC's samples.
 
         Returns:
@@ -111,7 +117,7 @@ class Map:
         require_rig_of_map(self.saved, rig, "the map")
         if not len(self.saved):
             raise MapError("the map holds no landmark; make it anew")
-        frontend = frontend or FrontendSettings()
+        frontend = chosen_frontend(frontend)
         checked = checked_images(images, rig)
         extract = make_extractor(frontend)
         with one_blas_thread():

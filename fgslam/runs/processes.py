@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import types
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -106,11 +107,31 @@ def _start(index: int, function: Callable[[Argument], Result], argument: Argumen
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(theirs,), daemon=True)
-    process.start()
+    with _without_main():
+        process.start()
     theirs.close()  # so that the end of the process is the end of the pipe
-    with suppress(BrokenPipeError, ConnectionResetError):  # _collect says how it ended
-        ours.send((function, argument))
+    try:
+        with suppress(BrokenPipeError, ConnectionResetError):  # _collect says how it ended
+            ours.send((function, argument))
+    except BaseException:  # what cannot be handed over is the caller's mistake
+        process.kill()
+        process.join()
+        raise
     return _Worker(index, process, ours)
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """A worker runs functions of this package only: the caller's script is not run again in it.
+
+    multiprocessing would, and a script without a guard on its name would begin its run anew there.
+    """
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def _work(connection: Connection) -> None:

@@ -324,6 +324,18 @@ def chosen_frontend(given: FrontendSettings | Mapping[str, Any] | None) -> Front
         ) from None
 
 
+def chosen_odometry(given: OdometrySettings | None) -> OdometrySettings:
+    """Settings of the odometry as given; None: the defaults. Raises ConfigError for others."""
+    if given is None:
+        return RecordedOdometrySettings()
+    if not isinstance(given, get_args(get_args(OdometrySettings)[0])):
+        raise ConfigError(
+            f"odometry is a {type(given).__name__}; give settings, e.g. "
+            "fgslam.datasets.settings.ConstantVelocitySettings()"
+        )
+    return given
+
+
 def _dotted(location: tuple[int | str, ...]) -> str:
     return ".".join(map(str, location))
 

@@ -21,12 +21,13 @@ from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
-from fgslam.datasets.settings import OdometrySettings, RecordedOdometrySettings
+from fgslam.datasets.settings import OdometrySettings
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.slam.arrival import Arrival, MapStart
 from fgslam.slam.factory import (
     chosen_estimator,
     chosen_frontend,
+    chosen_odometry,
     is_settings,
     make_extractor,
     make_locator,
@@ -106,7 +107,7 @@ class Session:
         require_rig(rig)
         require_seed(seed, "session")
         frontend = chosen_frontend(frontend)
-        odometry = odometry or RecordedOdometrySettings()
+        odometry = chosen_odometry(odometry)
         self.rig = rig
         self.frontend = frontend
         self.numbering = (0, 1)
@@ -241,6 +242,11 @@ class Session:
     # -- results -----------------------------------------------------------------------------
 
     @property
+    def failed(self) -> bool:
+        """True if a frame failed half-way: the parts may know more than the record does."""
+        return self._failed
+
+    @property
     def log(self) -> MeasurementLog:
         """Measurements of all frames so far, which any estimator can replay."""
         return self.recorder.log
@@ -253,12 +259,7 @@ class Session:
         """
         left_out = self._left_out
         if not len(self.recorder):
-            if left_out.count:
-                raise SessionError(
-                    f"none of {left_out.count} frames could be located in {self._map}: "
-                    f"{left_out.why}"
-                )
-            raise SessionError("no frame has been tracked yet; call track first")
+            raise SessionError(self._why_empty())
         notes = stereo_remarks(self.recorder, self._seen)
         if left_out.count:
             notes = (*notes, f"the first {left_out.count} frames could not be located: left out")
@@ -277,6 +278,18 @@ class Session:
         self.close()
 
     # ----------------------------------------------------------------------------------------
+
+    def _why_empty(self) -> str:
+        if self._failed:
+            return f"the session has no result: {self._ended}"
+        left_out = self._left_out
+        if left_out.count:
+            cause = self._seen.cause()
+            return (
+                f"none of {left_out.count} frames could be located in {self._map}: {left_out.why}"
+                f"{cause if cause.startswith(';') else ''}"
+            )
+        return "no frame has been tracked yet; call track first"
 
     def _require_open(self) -> None:
         if self._ended:

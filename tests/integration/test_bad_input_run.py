@@ -23,7 +23,9 @@ from running import (
     write_config,
 )
 
-from fgslam.core.errors import OutputError
+from fgslam.core.errors import DatasetError, OutputError
+from fgslam.core.features import StereoFeatures
+from fgslam.core.recordings import Sequence
 from fgslam.core.trajectories import Trajectory
 
 Refusal = Callable[..., str]
@@ -180,6 +182,25 @@ def test_resumed_over_bad_frames(own_recording: Path, tmp_path: Path) -> None:
     problems = metrics_of(tmp_path / "run")["frame_problems"]
     assert problems == metrics_of(straight.folder)["frame_problems"]
     assert len(problems) == 2
+
+
+def test_a_depth_image_that_cannot_be_read_ends_the_run_which_goes_on_later(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = experiment(recording)
+    straight = run_values(values, tmp_path / "straight")
+
+    def unreadable(sequence: Sequence, i: int, stereo: StereoFeatures) -> float:
+        if i == 6:
+            raise DatasetError("depth/000006.png: cannot be read")
+        return float("nan")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("fgslam.runs.tasks.slam.stereo_precision", unreadable)
+        with pytest.raises(DatasetError, match="cannot be read"):
+            run_values(values, tmp_path / "run")
+    run_values(values, tmp_path / "run", "resume")
+    assert bytes_of(tmp_path / "run") == bytes_of(straight.folder)
 
 
 # --------------------------------------------------------------------------------------------

@@ -11,7 +11,14 @@ import numpy as np
 import pytest
 
 import fgslam as fg
-from fgslam.errors import ConfigError, FrameError, MapError, OutputError, SessionError
+from fgslam.errors import (
+    ConfigError,
+    FrameError,
+    MapError,
+    MeasurementLogError,
+    OutputError,
+    SessionError,
+)
 from fgslam.runs.live import slam_config
 
 QUIET = {"output.pictures": False, "output.report": False, "output.checkpoint_seconds": 3600}
@@ -121,6 +128,8 @@ def test_frames_that_cannot_be_located_have_no_pose_and_are_left_out(tmp_path: P
     assert [drive["name"] for drive in result.map.saved.about["drives"]] == ["session"] * 2
     np.testing.assert_array_equal(place.saved.hits, hits)
     np.testing.assert_array_equal(place.positions, positions)
+    with pytest.raises(MeasurementLogError, match="begins in a saved map, which it does not hold"):
+        fg.replay(back.log, "ekf")
 
 
 def test_a_map_of_other_cameras_or_an_own_estimator_is_refused_before_the_first_frame() -> None:
@@ -136,6 +145,12 @@ def test_a_map_of_other_cameras_or_an_own_estimator_is_refused_before_the_first_
         fg.Slam(recording.rig, "isam2", start_map=place, extend_map=False)
     with pytest.raises(ConfigError, match="give a kind or its settings"):
         fg.Slam(recording.rig, slam.pipeline.estimator, start_map=place)
+    with pytest.raises(MapError, match=r"start_map is a str; give fgslam\.Map\.load"):
+        fg.Slam(recording.rig, start_map="place.fgmap")  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="without a start_map"):
+        fg.Slam(recording.rig, extend_map=False)
+    with pytest.raises(ConfigError, match=r"frontend: nonsense"):
+        place.locate(recording.rig, recording[0][1], {"nonsense": 1})
     with pytest.raises(ConfigError, match="or Slam"):
         fg.Slam.from_config("return_to_map", rig=recording.rig)
 

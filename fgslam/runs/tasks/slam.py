@@ -250,8 +250,8 @@ def _loop(
                 saved = time.perf_counter()
             waiting = time.perf_counter()
     except DatasetError:
-        # The recording failed before its frame touched any state: all up to it can be kept.
-        if len(recorder):
+        # All frames up to this one can be kept, unless it has touched the estimator already.
+        if len(recorder) and not outputs.session.failed:
             save_progress(outputs)
         raise
     finally:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
+import subprocess
+import sys
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -67,6 +70,35 @@ def test_a_process_that_ends_before_it_reads_its_work_is_not_waited_for(
     ((_, ended),) = run_apart(work, ["x" * 10_000_000])  # more than any pipe holds
     assert isinstance(ended, WorkerEnded)
     assert "status 5" in ended.why
+
+
+def test_what_cannot_be_handed_over_is_an_error_here() -> None:
+    with pytest.raises((TypeError, pickle.PicklingError, AttributeError)):
+        list(run_apart(work, [lambda: None]))  # type: ignore[list-item]
+    assert not multiprocessing.active_children()
+
+
+UNGUARDED = """
+from test_processes import work
+from fgslam.runs.processes import run_apart
+print("script starts")
+print(dict(run_apart(work, ["a"])))
+"""
+
+
+def test_a_script_without_a_guard_is_not_run_again_in_its_workers(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(UNGUARDED)
+    paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    found = subprocess.run(  # noqa: S603 - a script of this test
+        [sys.executable, str(script)],
+        env=os.environ | {"PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert found.stdout.count("script starts") == 1
+    assert "'a " in found.stdout
 
 
 def test_a_users_mistake_is_raised_here() -> None:

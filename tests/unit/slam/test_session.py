@@ -292,6 +292,23 @@ def test_after_a_failure_of_the_estimator_the_results_before_it_remain(views: Vi
     assert len(result.trajectory) == len(slam.log) == 3
 
 
+def test_a_failure_in_the_first_frame_is_why_there_is_no_result(views: Views) -> None:
+    def unreadable(report: FrameReport) -> float:
+        raise DatasetError("the depth image is missing")
+
+    slam = session(views)
+    found = slam._describer.describe(0, Frame(0, 0.0, views.images(0)))
+    with pytest.raises(DatasetError):
+        slam.advance(found, 0.0, precision_of=unreadable)
+    with pytest.raises(SessionError, match=r"no result: it failed .*depth image is missing"):
+        slam.result()
+
+
+def test_what_are_no_odometry_settings_is_refused(views: Views) -> None:
+    with pytest.raises(ConfigError, match="odometry is a str; give settings"):
+        session(views, odometry="constant_velocity")
+
+
 class FailingAfterUpdate(LandmarkKalman):
     """Takes the fourth frame in, and fails when asked what came of it."""
 
