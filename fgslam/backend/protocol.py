@@ -29,7 +29,10 @@ from __future__ import annotations
 
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.measurements import Increment, MeasurementType, Odometry
 
@@ -150,3 +153,34 @@ class MapUser(Protocol):
 
 class FullEstimator(Estimator, JointCovariances, Resumable, Protocol):
     """What the estimators of this package offer: everything but, in some, :class:`MapUser`."""
+
+
+def predicted(estimator: Estimator, odometry: Odometry | None) -> Prediction:
+    """What the estimator predicts. Raises EstimatorError where that is no pose with covariance."""
+    prediction = estimator.predict(odometry)
+    _require_pose(estimator, "predict", prediction, Prediction)
+    return prediction
+
+
+def updated(estimator: Estimator, increment: Increment, tracking: EgoMotion) -> UpdateStats:
+    """What an update did. Raises EstimatorError where the estimator does not say it."""
+    stats = estimator.update(increment, tracking)
+    _require_pose(estimator, "update", stats, UpdateStats)
+    return stats
+
+
+def _require_pose(
+    estimator: Estimator, asked: str, given: Prediction | UpdateStats, wanted: type
+) -> None:
+    """Estimators may be a user's own: a slip in one is named where it happens."""
+    if not isinstance(given, wanted):
+        raise EstimatorError(
+            f"estimator {estimator.kind}: {asked} returned {type(given).__name__}; "
+            f"return {wanted.__name__}"
+        )
+    shapes = np.shape(given.wTc), np.shape(given.covariance)
+    if shapes != ((4, 4), (6, 6)):
+        raise EstimatorError(
+            f"estimator {estimator.kind}: {asked} returned a pose of shape {shapes[0]} with a "
+            f"covariance of shape {shapes[1]}; return (4, 4) and (6, 6)"
+        )

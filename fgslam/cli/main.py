@@ -295,7 +295,7 @@ def inspect(
         int, typer.Option(min=1, help="in how many frames, evenly spread, features are matched")
     ] = 12,
 ) -> None:
-    """Say what is in a recording, and every problem found, in words.
+    """Say what is in a recording, and what is wrong with it, in words.
 
     Exits with 0 whatever the report says, with 2 where the recording cannot be opened at all.
     """

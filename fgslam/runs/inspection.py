@@ -1,4 +1,4 @@
-"""What is in a recording, and every problem found, in words (docs/howto/inspect.md)."""
+"""What is in a recording, and what is wrong with it, in words (docs/howto/inspect.md)."""
 
 from __future__ import annotations
 

@@ -91,6 +91,8 @@ class RecordedFrames:
             IndexError: there is no such frame.
             OdometryError: the recording's odometry is malformed.
         """
+        if not -len(self) <= i < len(self):
+            raise IndexError(f"frame {i}: the recording has {len(self)} frames")
         i = range(len(self))[i]
         images: tuple[Image, ...] | None
         try:
@@ -137,6 +139,8 @@ def rendered_recording(world: str = "lab", frames: int | None = None) -> Recorde
     """
     if world not in _WORLDS:
         raise ConfigError(f"no rendered world {world!r}; known: {', '.join(_WORLDS)}")
+    if frames is not None and frames < 1:
+        raise ConfigError(f"frames is {frames}; give at least 1, or None for all")
     overrides = {} if frames is None else {"dataset.stop": frames}
     return open_recording(_WORLDS[world], overrides)
 

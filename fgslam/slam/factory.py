@@ -36,6 +36,7 @@ from fgslam.datasets.settings import (
     ConstantVelocitySettings,
     OdometrySettings,
     RecordedOdometrySettings,
+    SyntheticOdometrySettings,
 )
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
@@ -254,7 +255,8 @@ def require_support(estimator: Estimator, measured_odometry: bool, loops: bool =
     if lacking:
         raise ConfigError(
             f"estimator.kind {estimator.kind} cannot use {' and '.join(lacking)} measurements; "
-            "choose another estimator"
+            "choose another estimator; one of your own names in `supports` all that it is handed, "
+            "used or not"
         )
 
 
@@ -328,7 +330,8 @@ def chosen_odometry(given: OdometrySettings | None) -> OdometrySettings:
     """Settings of the odometry as given; None: the defaults. Raises ConfigError for others."""
     if given is None:
         return RecordedOdometrySettings()
-    if not isinstance(given, get_args(get_args(OdometrySettings)[0])):
+    kinds = (RecordedOdometrySettings, ConstantVelocitySettings, SyntheticOdometrySettings)
+    if not isinstance(given, kinds):
         raise ConfigError(
             f"odometry is a {type(given).__name__}; give settings, e.g. "
             "fgslam.datasets.settings.ConstantVelocitySettings()"

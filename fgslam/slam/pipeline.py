@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fgslam.backend.protocol import Estimator
+from fgslam.backend.protocol import Estimator, predicted, updated
 from fgslam.core.arrays import IntArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.features import StereoFeatures
@@ -81,7 +81,7 @@ class SlamPipeline:
         """
         watch = Stopwatch()
         odometry = self.motion.between(timestamp, body)
-        prediction = self.estimator.predict(odometry)
+        prediction = predicted(self.estimator, odometry)
         watch.lap("predict")
         stereo = self._match_stereo(found)
         watch.lap("stereo")
@@ -91,7 +91,7 @@ class SlamPipeline:
         seen = self._recognise(seen, stereo, landmarks, ended)
         watch.lap("places")
         increment = _increment(index, timestamp, odometry, seen)
-        stats = self.estimator.update(increment, seen.tracking)
+        stats = updated(self.estimator, increment, seen.tracking)
         observe(self.motion, increment, seen.tracking, stats)
         self._remember(increment, seen, stats)
         watch.lap("update")

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.backend.protocol import Estimator
+from fgslam.backend.protocol import Estimator, predicted, updated
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.arrays import Brief, FloatArray
 from fgslam.core.errors import ConfigError, MeasurementLogError
@@ -173,7 +173,7 @@ def replay_frame(
     if increment.odometry is None:
         stand_in = motion.between(increment.timestamp, None)
         increment = dataclasses.replace(increment, odometry=stand_in)
-    prediction = estimator.predict(increment.odometry)
+    prediction = predicted(estimator, increment.odometry)
     watch.lap("predict")
     matched = increment.observations.select(~increment.observations.is_new)
     if k == 0 and not len(estimator.landmarks()):
@@ -183,7 +183,7 @@ def replay_frame(
     else:
         tracking = _solve(estimator, partial(ego_motion.solve, prediction), matched)
     watch.lap("track")
-    stats = estimator.update(increment, tracking)
+    stats = updated(estimator, increment, tracking)
     observe(motion, increment, tracking, stats)
     watch.lap("update")
     return ReplayedFrame(tracking, stats, watch.ms)

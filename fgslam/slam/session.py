@@ -169,7 +169,8 @@ class Session:
             OdometryError: the odometry is not finite, of another shape, or no rigid motion.
             SessionError: the session is closed, or its estimator failed before.
             EstimatorError: the estimator failed in this frame; the session is then at its end,
-                with :meth:`result` of the frames before.
+                with :meth:`result` of the frames before. So it is after any other exception that
+                an estimator of your own raises.
         """
         self._require_open()
         i = self._left_out.count if self._start is not None else len(self.recorder)

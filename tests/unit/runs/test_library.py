@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +12,13 @@ import pytest
 from recordings import write_recording
 
 import fgslam as fg
+from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.settings import LandmarkKalmanSettings
+from fgslam.core.estimates import Prediction
 from fgslam.errors import (
     ConfigError,
     DatasetError,
+    EstimatorError,
     FgslamError,
     MapError,
     MeasurementLogError,
@@ -103,6 +109,46 @@ def test_live_and_replayed_results_stand_in_one_table(
     assert (table["ms"] > 0.0).all()
     figure = fg.plot(answers)
     assert {"live", "isam2"} <= {trace.name for trace in figure.data}
+
+
+class Silent(LandmarkKalman):
+    """Forgets to say what its update did."""
+
+    def update(self, increment, tracking):  # type: ignore[no-untyped-def]
+        super().update(increment, tracking)
+
+
+class Flat(LandmarkKalman):
+    """Predicts a pose in the plane."""
+
+    def predict(self, odometry):  # type: ignore[no-untyped-def]
+        return dataclasses.replace(super().predict(odometry), wTc=np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        (Silent, "update returned NoneType; return UpdateStats"),
+        (Flat, r"predict returned a pose of shape \(3, 3\) .*return \(4, 4\) and \(6, 6\)"),
+    ],
+)
+def test_a_slip_in_an_own_estimator_is_named(
+    kind: type[LandmarkKalman], words: str, driven: tuple[fg.Slam, fg.Result]
+) -> None:
+    slam, _ = driven
+    start = Prediction(np.eye(4), np.zeros((6, 6)))
+    replayed = fg.replay(slam.log, kind(slam.rig, LandmarkKalmanSettings(), start))
+    assert re.search(words, replayed.failure)
+    own = fg.Slam(slam.rig, kind(slam.rig, LandmarkKalmanSettings(), start))
+    with pytest.raises(EstimatorError, match=words):
+        own.track(0.0, (np.zeros((slam.rig.height, slam.rig.width), np.uint8),) * slam.rig.cameras)
+
+
+def test_frames_that_a_recording_does_not_have_are_named(folder: Path) -> None:
+    with pytest.raises(IndexError, match=f"frame 99: the recording has {FRAMES} frames"):
+        fg.open_recording(folder)[99]
+    with pytest.raises(ConfigError, match="frames is 0; give at least 1"):
+        fg.rendered_recording("lab", frames=0)
 
 
 def test_an_estimator_brought_along_is_replayed_and_named(
