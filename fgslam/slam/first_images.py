@@ -14,7 +14,8 @@ _FRAMES = 10  # judged: what is wrong with cables, drivers or calibration is wro
 _FEWEST = 3  # frames: one or two may show a blank wall
 _LEAST_MATCHED = 0.02
 """Of the right image's features, share that finds its partner. Of swapped images only what agrees
-by chance does, under 0.01 on all recordings tried; of sound ones a third and more."""
+by chance does, under 0.01 (rendered lab, kitti06); of sound ones a third and more (those two, the
+light field, the flight, the suburb): the limit lies far from both."""
 _DARK = 15
 """Largest grey value of a dark image, of 255: 12-bit values reach 4095, of which the upper eight of
 16 bits are 15."""
