@@ -33,7 +33,7 @@ from fgslam.report.tables import write_comparison_csv
 from fgslam.runs.compare import Choice, compare_runs
 from fgslam.runs.config import make_experiment
 from fgslam.runs.engine import RunResult
-from fgslam.runs.folder import ExistingFolder
+from fgslam.runs.folder import ExistingFolder, create_run_folder
 from fgslam.runs.run import run_experiment
 from fgslam.runs.trials import Seeds, run_trials
 
@@ -314,6 +314,19 @@ def test_killed_once_a_run_resumes_to_the_same_bytes(
     tmp_path: Path,
 ) -> None:
     killed_and_resumed(task, 1, straight, doing, tmp_path)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_overwriting_deletes_every_file_of_a_run(
+    task: str, straight: Straight, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    names, _ = straight.of(task, folder)
+    for path in map(folder.joinpath, names):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    create_run_folder(folder, "overwrite")
+    assert list(folder.rglob("*")) == []
 
 
 @pytest.mark.slow
