@@ -73,7 +73,7 @@ class Experiment(BaseModel):
         allow_inf_nan=False,
         defer_build=True,  # of eight models a command needs one
     )
-    taken_folders: ClassVar[tuple[str, ...]] = ("pictures", "compare", "trials", "first")
+    taken_folders: ClassVar[tuple[str, ...]] = ("pictures", "compare", "trials", "first", "units")
     """Folders of a run that no estimator may be called."""
 
     name: Annotated[
@@ -243,7 +243,7 @@ _TASK = Field(description="which kind of homing experiment; SLAM has no such key
 class HomingExperiment(Experiment):
     """What the experiments of all homing tasks have."""
 
-    taken_folders: ClassVar[tuple[str, ...]] = ("pictures", "compare", "logs", "runs")
+    taken_folders: ClassVar[tuple[str, ...]] = ("pictures", "compare", "logs", "runs", "units")
 
     task: Annotated[str, Field(description="which kind of homing experiment")]
     output: HomingOutputSettings = HomingOutputSettings()

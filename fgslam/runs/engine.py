@@ -33,7 +33,6 @@ from fgslam.runs.folder import (
     write_config,
 )
 from fgslam.runs.units import (
-    UNITS_FOLDER,
     Argument,
     Done,
     Progress,
@@ -41,6 +40,7 @@ from fgslam.runs.units import (
     Stage,
     Stopped,
     UnitStore,
+    holds_units,
     perform,
 )
 
@@ -209,7 +209,7 @@ def run_task(
 def is_finished(folder: Path) -> bool:
     """Whether a run folder has nothing left to do."""
     path = folder / METRICS_FILE
-    begun = (folder / UNITS_FOLDER).is_dir() or (folder / STATE_FILE).is_file()
+    begun = holds_units(folder) or (folder / STATE_FILE).is_file()
     return not begun and path.is_file() and read_metrics(path).get("status") != "interrupted"
 
 

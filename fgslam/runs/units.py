@@ -24,7 +24,7 @@ import numpy as np
 from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import MeasurementLogError, OutputError
-from fgslam.core.files import clear_output_errors, make_subfolder
+from fgslam.core.files import clear_output_errors, is_unfinished_file, make_subfolder
 from fgslam.runs.processes import WorkerEnded, run_apart
 
 Argument = TypeVar("Argument")
@@ -35,6 +35,7 @@ Stopped: TypeAlias = Callable[[], bool]
 """Asked every moment; True ends a run early, with all files valid and resumable."""
 
 UNITS_FOLDER = "units"
+_UNIT_FILE = re.compile(r"\w+_\d{6,}\.npz")
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,13 +140,25 @@ class UnitStore:
         return found
 
     def remove(self) -> None:
-        """Drops everything once the run has finished."""
+        """Drops all units once the run has finished; files of others and their folder stay."""
         folder = None if self._run is None else self._run / UNITS_FOLDER
         if folder is not None and folder.is_dir():
             with clear_output_errors(folder):
-                for path in folder.iterdir():
+                for path in filter(_is_own, folder.iterdir()):
                     path.unlink()
-                folder.rmdir()
+                if not any(folder.iterdir()):
+                    folder.rmdir()
+
+
+def holds_units(run: Path) -> bool:
+    """Whether a run has left units, or was killed just before it removed their empty folder."""
+    folder = run / UNITS_FOLDER
+    inside = list(folder.iterdir()) if folder.is_dir() else None
+    return inside is not None and (not inside or any(map(_is_own, inside)))
+
+
+def _is_own(path: Path) -> bool:
+    return path.is_file() and bool(_UNIT_FILE.fullmatch(path.name) or is_unfinished_file(path))
 
 
 def perform(

@@ -393,14 +393,18 @@ def test_items_of_compare_are_named_by_their_place(
     assert words in message_of(LAB | {"compare": compare}, tmp_path)
 
 
+@pytest.mark.parametrize("folder", ["pictures", "compare", "trials", "first", "units"])
+def test_no_estimator_is_called_as_a_folder_of_the_run(folder: str, tmp_path: Path) -> None:
+    taken = LAB | {"estimator": {"label": folder}}
+    assert f"cannot be called {folder}, a folder of the run" in message_of(taken, tmp_path)
+
+
 def test_every_estimator_has_a_folder_of_its_own(tmp_path: Path) -> None:
     other = {"kind": "landmark_kalman", "update": "world"}
     message = message_of(LAB | {"compare": [other]}, tmp_path)
     assert "two different estimators are called landmark_kalman; give one of them a" in message
     assert len(make_config(LAB | {"compare": [other | {"label": "w"}]}, "x").compare) == 1
     assert len(make_config(LAB | {"compare": ["landmark_kalman"]}, "x").compare) == 1
-    taken = LAB | {"estimator": {"label": "pictures"}}
-    assert "cannot be called pictures, a folder of the run" in message_of(taken, tmp_path)
 
 
 @pytest.mark.parametrize(

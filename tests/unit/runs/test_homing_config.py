@@ -68,6 +68,7 @@ def test_configuration_class_follows_from_the_task(tmp_path: Path) -> None:
         (TRIALS, ("outliers=[0.1, 1.0]",), "outliers[1] = 1.0 is not usable"),
         (TRIALS, ("trials=0",), "trials = 0 is not usable"),
         (TRIALS, ("estimator.label=logs",), "cannot be called logs, a folder of the run"),
+        (TRIALS, ("estimator.label=units",), "cannot be called units, a folder of the run"),
         (
             TRIALS,
             ("compare=[{kind: homing_graph, solver: batch}]",),

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import os
+import pkgutil
 import resource
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import fgslam.report
+import fgslam.runs
 from fgslam.core import files as whole_files
 from fgslam.core.errors import OutputError
 from fgslam.core.files import make_subfolder, replacing, write_bytes, write_text
+from fgslam.runs.engine import is_finished
 from fgslam.runs.folder import create_run_folder, is_run_folder
+from fgslam.runs.units import UnitStore
 
 
 def leftovers(folder: Path) -> list[Path]:
@@ -148,6 +154,26 @@ def test_overwriting_deletes_the_run_and_nothing_else(tmp_path: Path) -> None:
     assert not (folder / "pictures").exists()
 
 
+def names_of_files() -> list[str]:
+    """Every name of a file that a module states which writes run folders."""
+    modules = [
+        importlib.import_module(found.name)
+        for package in (fgslam.runs, fgslam.report)
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+    ]
+    stated = [item for module in modules for item in vars(module).items()]
+    return sorted({v for k, v in stated if k.endswith(("_FILE", "_MARKER")) and isinstance(v, str)})
+
+
+def test_overwriting_deletes_every_file_that_a_task_writes(tmp_path: Path) -> None:
+    names = names_of_files()
+    assert {"config.yaml", "loops.csv", "legs.csv", "map.fgmap"} <= set(names)
+    for name in names:
+        write_text(tmp_path / name, "")
+    create_run_folder(tmp_path, "overwrite")
+    assert [path.name for path in tmp_path.iterdir()] == []
+
+
 def test_resume_keeps_everything(tmp_path: Path) -> None:
     folder = a_run(tmp_path / "run")
     before = sorted(folder.rglob("*"))
@@ -199,3 +225,27 @@ def test_a_run_killed_before_its_first_file_leaves_room_for_another(
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match="something else than a run"):
         create_run_folder(tmp_path)
+
+
+# --------------------------------------------------------------------------------------------
+# Units of a run
+
+
+def test_removing_units_leaves_files_of_others(tmp_path: Path) -> None:
+    write_text(tmp_path / "metrics.json", '{"estimators": {}}')
+    store = UnitStore(tmp_path)
+    store.add("replays", {0: 1.5, 1: 2.5}, float)
+    units = tmp_path / "units"
+    write_text(units / ".replays_000002.npz.partial.npz", "left by a killed run")
+    write_text(units / "final.tum", "mine")
+    assert not is_finished(tmp_path)
+    store.remove()
+    assert [path.name for path in units.iterdir()] == ["final.tum"]
+    assert is_finished(tmp_path)
+
+
+def test_removing_units_removes_their_folder(tmp_path: Path) -> None:
+    store = UnitStore(tmp_path)
+    store.add("replays", {0: 1.5}, float)
+    store.remove()
+    assert list(tmp_path.iterdir()) == []
