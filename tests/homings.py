@@ -11,7 +11,7 @@ from fgslam.core.homing import HomingStart, HomingTruth, TrackedBearings, TwoVie
 from fgslam.frontend.homing.homing_vector import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view_geometry import make_local_map
-from fgslam.worlds.simulated.bearings import simulate_homing
+from fgslam.worlds.simulated.bearings import NO_OUTLIERS, HomingOutliers, simulate_homing
 from fgslam.worlds.simulated.settings import SimulatedBearingsSettings
 
 LEVEL = HomingVectorSettings(tilt_sigma_deg=0.0, height_sigma=0.0, max_direction_sigma_deg=15.0)
@@ -28,10 +28,14 @@ class Trial:
     correct: BoolArray
 
 
-def trial(seed: int, settings: SimulatedBearingsSettings | None = None) -> Trial:
+def trial(
+    seed: int,
+    settings: SimulatedBearingsSettings | None = None,
+    outliers: HomingOutliers = NO_OUTLIERS,
+) -> Trial:
     """One homing of a seed."""
     simulated = simulate_homing(
-        settings or SimulatedBearingsSettings(), np.random.default_rng([seed, 1])
+        settings or SimulatedBearingsSettings(), np.random.default_rng([seed, 1]), outliers
     )
     vector = estimate_homing_vector(simulated.matches, LEVEL, np.random.default_rng([seed, 2]))
     assert isinstance(vector, TwoViewVector), vector

@@ -15,7 +15,7 @@ To add an estimator:
    refuses an estimator without, in one line.
 3. To choose it in configurations, too: a frozen dataclass in :mod:`fgslam.backend.settings`,
    derived from ``NamedSettings``, with its own ``kind`` and, for the paired tests of many trials,
-   its ``family``; add it to the union there, and one ``case`` to ``make_estimator`` in
+   its family; add it to the union there, and one ``case`` to ``make_estimator`` in
    :mod:`fgslam.slam.factory`.
 
 ``tests/contract/test_estimators.py`` then holds it to the protocol without further ado: predicting

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, TypeAlias, get_args
+from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -14,6 +14,14 @@ Family: TypeAlias = Literal["filter", "smoother", "other"]
 
 An `other` corrects nothing by landmarks seen again: dead reckoning.
 """
+_FAMILIES: dict[str, Family] = {
+    "landmark_kalman": "filter",
+    "landmark_kalman_graph": "filter",
+    "ekf": "filter",
+    "fixed_lag": "smoother",
+    "isam2": "smoother",
+    "batch": "smoother",
+}
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -54,8 +62,6 @@ class KernelSettings:
 class NamedSettings:
     """What every estimator has."""
 
-    family: ClassVar[Family] = "other"
-
     label: Annotated[
         str | None,
         Field(
@@ -71,20 +77,6 @@ class NamedSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
-class LoopCorrectionSettings:
-    """Which loop closures an estimator accepts (docs/derivations/submaps.md)."""
-
-    gate_sigmas: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="a loop closure is refused where it raises the cost by more than the "
-            "square of this (ekf: its innovation squared beyond what is expected); 0: none is",
-        ),
-    ] = 10.0
-
-
-@dataclass(frozen=True, config=STRICT)
 class DeadReckoningSettings(NamedSettings):
     """Odometry alone: poses are never corrected, landmarks stay where they were first seen."""
 
@@ -95,14 +87,12 @@ class DeadReckoningSettings(NamedSettings):
 class PerLandmarkSettings(NamedSettings):
     """What the paper's filter and the same filter as factor graphs share."""
 
-    family: ClassVar[Family] = "filter"
     pose_covariance: Annotated[
         bool,
         Field(
             description="add the pose's covariance to the observation's (6.4 read with IJRR 2002)"
         ),
     ] = True
-    loops: LoopCorrectionSettings = LoopCorrectionSettings()
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -135,7 +125,6 @@ class LandmarkKalmanGraphSettings(PerLandmarkSettings):
 class EkfSettings(NamedSettings):
     """Full stochastic mapping: one joint covariance of pose and landmarks, no relinearisation."""
 
-    family: ClassVar[Family] = "filter"
     kind: Literal["ekf"] = "ekf"
     floor: FloorSettings = FloorSettings()
     gate_sigmas: Annotated[
@@ -146,7 +135,6 @@ class EkfSettings(NamedSettings):
             "deviations (Mahalanobis distance); 0: no gate",
         ),
     ] = 5.0
-    loops: LoopCorrectionSettings = LoopCorrectionSettings()
     max_landmarks: Annotated[
         int,
         Field(
@@ -161,7 +149,6 @@ class EkfSettings(NamedSettings):
 class GraphSettings(NamedSettings):
     """What all smoothers share: how measurements become a graph that can be solved."""
 
-    family: ClassVar[Family] = "smoother"
     floor: FloorSettings = FloorSettings()
     kernel: KernelSettings = KernelSettings()
     noise_factor: Annotated[
@@ -183,7 +170,6 @@ class GraphSettings(NamedSettings):
             "drifted: the kernel deals with them. A range sensor's are all left out. 0: none is",
         ),
     ] = 12.0
-    loops: LoopCorrectionSettings = LoopCorrectionSettings()
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -279,7 +265,4 @@ EstimatorSettings: TypeAlias = Annotated[
 
 def family_of(kind: str) -> Family:
     """Whether estimators of a kind are filters, smoothers or neither."""
-    families: dict[str, Family] = {
-        settings.kind: settings.family for settings in get_args(get_args(EstimatorSettings)[0])
-    }
-    return families.get(kind, "other")
+    return _FAMILIES.get(kind, "other")

@@ -22,6 +22,7 @@ from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
 from fgslam.worlds.driving import wheel_odometry
+from fgslam.worlds.driving.floor_space import BURST_STEP_M
 from fgslam.worlds.driving.paths import MAX_ACCELERATION_M_S2, PosesInTime
 from fgslam.worlds.driving.wheel_odometry import CONSTANTS as WHEEL_CONSTANTS
 from fgslam.worlds.lab import (
@@ -34,9 +35,9 @@ from fgslam.worlds.lab import (
     plan_in_place,
 )
 from fgslam.worlds.lab_settings import LabSettings, RenderedLabSettings
-from fgslam.worlds.people import Stance, make_walk
+from fgslam.worlds.people import ACROSS_M, Stance, make_walk
 from fgslam.worlds.rendering.cache import RenderCache, content_hash
-from fgslam.worlds.rendering.image_effects import apply_effects, is_blocked
+from fgslam.worlds.rendering.image_effects import JUMP_FRAME, WAVE_FRAMES, apply_effects, is_blocked
 from fgslam.worlds.rendering.scene import Body
 
 RENDER_VERSION = 7
@@ -46,6 +47,7 @@ _SHAPING_KEYS = ("rig", "drive", "room_seed", "visit", "place", "posters")
 _SELECTION = ("start", "stop", "stride")
 _THREADS = 2
 _CLEARANCE_M = 0.12
+_BLUR_RENDERS = 5  # a frame with motion blur: more look the same at 8 bits
 Progress = Callable[[int, int], None]
 
 
@@ -278,7 +280,7 @@ class RenderedLabSequence:
         blur = self._settings.effects.motion_blur
         if blur is None:
             return np.array([stamp])
-        spread = (np.arange(blur.samples) + 0.5) / blur.samples - 0.5
+        spread = (np.arange(_BLUR_RENDERS) + 0.5) / _BLUR_RENDERS - 0.5
         return np.asarray(stamp + blur.exposure_s * spread)
 
 
@@ -330,6 +332,15 @@ def _without_later_keys(settings: LabSettings) -> dict[str, Any]:
     out = asdict(settings)
     out["odometry"] |= WHEEL_CONSTANTS
     out["drive"]["max_acceleration_m_s2"] = MAX_ACCELERATION_M_S2
+    out["drive"]["random_poses"]["step_m"] = BURST_STEP_M
+    effects = {
+        "exposure": {"wave_period_frames": WAVE_FRAMES, "jump_frame": JUMP_FRAME},
+        "motion_blur": {"samples": _BLUR_RENDERS},
+        "person": {"distance_m": ACROSS_M},
+    }
+    for name, constants in effects.items():
+        if out["effects"][name] is not None:
+            out["effects"][name] |= constants
     del out["drive"]["world_from"]
     if settings.drive.path != "random_poses":
         del out["drive"]["random_poses"]

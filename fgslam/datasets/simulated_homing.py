@@ -6,11 +6,8 @@ import numpy as np
 
 from fgslam.worlds.house import OmniWorld
 from fgslam.worlds.house_settings import OmniHouseSettings
-from fgslam.worlds.simulated.bearings import SimulatedHoming, simulate_homing
-from fgslam.worlds.simulated.settings import (
-    SimulatedBearingsSettings,
-    with_outliers,
-)
+from fgslam.worlds.simulated.bearings import HomingOutliers, SimulatedHoming, simulate_homing
+from fgslam.worlds.simulated.settings import SimulatedBearingsSettings
 
 
 def open_simulated_homing(
@@ -21,10 +18,10 @@ def open_simulated_homing(
     Args:
         settings: the room, the drive and the noise.
         outliers: part of the matches, and of the bearings tracked at the drive's end, that is
-            wrong; replaces the settings' own.
+            wrong.
         rng: source of everything random.
     """
-    return simulate_homing(with_outliers(settings, outliers), rng)
+    return simulate_homing(settings, rng, HomingOutliers.of_all(outliers))
 
 
 def open_house(settings: OmniHouseSettings, seed: int) -> OmniWorld:

@@ -39,7 +39,37 @@ _ADMISSION = {
 }
 """Of landmarks to the graph of any smoother."""
 
+_LOOPS = {
+    "gate_sigmas": 10.0,
+    "submap_frames": 10,
+    "drift_factor": 1.0,
+    "closure_factor": 3.0,
+}
+"""Of every estimator that corrects: which loop closures it accepts."""
+
 RETIRED: dict[str, dict[str, Any]] = {
+    "DetectionSettings": {
+        "min_range_m": 0.4,
+        "oblique_deg": 75.0,
+        "prune_after_misses": 20,
+    },
+    "LabPersonSettings": {
+        "distance_m": 1.8,
+    },
+    "RandomPosesSettings": {
+        "step_m": 0.1,
+    },
+    "LabBlurSettings": {
+        "samples": 5,
+    },
+    "LabExposureSettings": {
+        "wave_period_frames": 60.0,
+        "jump_frame": 125,
+    },
+    "HouseLightSettings": {
+        "warmth": 0.0,
+        "evening": 0.0,
+    },
     "AvoidanceSettings": {
         "look_ahead_m": 0.6,
         "look_ahead_s": 1.5,
@@ -53,6 +83,7 @@ RETIRED: dict[str, dict[str, Any]] = {
         "escape_mps": 0.25,
     },
     "BatchSettings": {
+        "loops": _LOOPS,
         **_ADMISSION,
         "max_iterations": 100,
     },
@@ -85,6 +116,7 @@ RETIRED: dict[str, dict[str, Any]] = {
         "kernel_width": 2.0,
     },
     "EkfSettings": {
+        "loops": _LOOPS,
         "loop_gate_sigmas": 10.0,
     },
     "EurocSettings": {
@@ -94,6 +126,7 @@ RETIRED: dict[str, dict[str, Any]] = {
         "initial_speed": 0.5,
     },
     "FixedLagSettings": {
+        "loops": _LOOPS,
         **_ADMISSION,
         "relinearize_threshold": 0.01,
     },
@@ -137,6 +170,7 @@ RETIRED: dict[str, dict[str, Any]] = {
         "least_parallax_deg": 3.0,
     },
     "HouseExposureSettings": {
+        "gain": 1.25,
         "period_s": 20.0,
         "offset": 0.0,
         "gamma": 1.0,
@@ -153,6 +187,7 @@ RETIRED: dict[str, dict[str, Any]] = {
         "period_s": 7.0,
     },
     "Isam2Settings": {
+        "loops": _LOOPS,
         **_ADMISSION,
         "relinearize_threshold": 0.01,
         "final_iterations": 5,
@@ -165,19 +200,16 @@ RETIRED: dict[str, dict[str, Any]] = {
         "metres_per_unit": 0.001,
     },
     "LandmarkKalmanGraphSettings": {
+        "loops": _LOOPS,
         "miss_growth_m": 0.0001,
     },
     "LandmarkKalmanSettings": {
+        "loops": _LOOPS,
         "miss_growth_m": 0.0001,
     },
     "LocalisationSettings": {
         "background": 4.0,
         "stay": 0.5,
-    },
-    "LoopCorrectionSettings": {
-        "submap_frames": 10,
-        "drift_factor": 1.0,
-        "closure_factor": 3.0,
     },
     "LoopSettings": {
         "max_drift_m": 0.5,
@@ -194,6 +226,19 @@ RETIRED: dict[str, dict[str, Any]] = {
         "scale_ratio": 1.5,
     },
     "OmniHouseSettings": {
+        "wheelchair": {
+            "latency_s": 0.1,
+            "slip_m_sqrt_m": 0.02,
+            "slip_deg_sqrt_m": 1.0,
+            "max_acceleration_m_s2": 0.5,
+            "max_turn_acceleration_deg_s2": 120.0,
+            "max_speed_m_s": 0.5,
+            "max_turn_deg_s": 45.0,
+            "speed_scale": 0.03,
+            "turn_scale": 0.03,
+            "pull_deg_m": 1.0,
+            "radius_m": 0.35,
+        },
         "camera_height_m": 1.2,
         "door_width_m": 1.6,
         "range_sensor": {
@@ -264,6 +309,9 @@ RETIRED: dict[str, dict[str, Any]] = {
         "edge_threshold": 10.0,
     },
     "SimulatedBearingsSettings": {
+        "wrong_matches": 0.0,
+        "jumping_tracks": 0.0,
+        "gross_bearings": 0.0,
         "nearest_m": 0.8,
         "farthest_m": 2.5,
         "lowest_m": 0.2,
@@ -311,16 +359,6 @@ RETIRED: dict[str, dict[str, Any]] = {
     "UtiasStereoSettings": {
         "pixel_sigma_scale": 1.0,
         "rate_sigma_scale": 1.0,
-    },
-    "WheelchairSettings": {
-        "max_acceleration_m_s2": 0.5,
-        "max_turn_acceleration_deg_s2": 120.0,
-        "max_speed_m_s": 0.5,
-        "max_turn_deg_s": 45.0,
-        "speed_scale": 0.03,
-        "turn_scale": 0.03,
-        "pull_deg_m": 1.0,
-        "radius_m": 0.35,
     },
     "WheelOdometrySettings": {
         "height_m_sqrt_m": 0.002,

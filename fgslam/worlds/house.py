@@ -22,8 +22,6 @@ from fgslam.worlds.driving.reference_paths import PathPlanner
 from fgslam.worlds.driving.wheelchair import RADIUS_M, RangeSensor, Wheelchair
 from fgslam.worlds.house_settings import (
     HouseCameraSettings,
-    HouseExposureSettings,
-    HouseLightSettings,
     HousePanoramaSettings,
     HouseTiltSettings,
     OmniHouseSettings,
@@ -58,8 +56,11 @@ _MIRROR_ELEVATIONS_DEG = (-65.0, 15.0)
 # Between the mirror's rim and the nearest border of the image.
 _MARGIN_PX = 0.5
 # The target images are taken at another time of day.
-_TARGET_LIGHT = HouseLightSettings(level=0.9, warmth=0.04, evening=0.3)
-_TARGET_EXPOSURE = HouseExposureSettings()
+_TARGET_LEVEL = 0.9  # a little darker
+_TARGET_BALANCE = np.array([[1.04], [1.0], [1.0 - 0.04]], dtype=np.float32)
+"""(3, 1) of red, green, blue: warmer."""
+_EVENING_PART = 0.3  # in the evening's light every other lamp is off, and shadows fall otherwise
+_GAIN = 1.25  # of the camera: brings the house's baked light to mid-grey
 _WAVE_PERIOD_S = 20.0  # automatic exposure follows the scene slowly
 _SWAY_PERIOD_S = 7.0  # of a wheelchair on a soft floor
 
@@ -140,14 +141,14 @@ class OmniWorld:
         )
         self._tilt = CameraTilt(settings.tilt, self._rng(2))
         self._sensor = RangeSensor(self.model.layer.caster)
-        self._scene = lit(self.model.layer, self.model.evening, settings.light)
+        self._scene = lit(self.model.layer, self.model.layer.light, settings.light.level)
         self.put(self.reference_poses[0])
 
     # ---------------------------------------------------------------------------- acting
 
     def put(self, pose: FloatArray) -> None:
         """Puts the wheelchair elsewhere (3,), standing still: all begins anew at time 0."""
-        self.wheelchair = Wheelchair(self.settings.wheelchair, pose, self._rng(3), self._touches)
+        self.wheelchair = Wheelchair(pose, self._rng(3), self._touches)
         self._scan_rng = self._rng(4)
         self._people.restart()
 
@@ -183,7 +184,7 @@ class OmniWorld:
         s = self.settings
         pose = camera_pose(self.wheelchair.pose, CAMERA_HEIGHT_M, self._tilt.angles(time))
         levels = self._renderer.levels(self._scene, pose, self._people.bodies())
-        seen = exposed(levels * white_balance(s.light), s.exposure, time)
+        seen = exposed(levels, s.exposure.wave, time)
         return self._with_noise(seen, 1, round(abs(time) * 1e6))
 
     def scan(self) -> tuple[FloatArray, FloatArray]:
@@ -209,11 +210,13 @@ class OmniWorld:
 
     def picture(self, pose: FloatArray, number: int, tilt: FloatArray | None = None) -> Image:
         """(h, w, 3) as target images are taken, from any planar pose (3,); ``number`` seeds it."""
-        scene = lit(self.model.layer, self.model.evening, _TARGET_LIGHT)
+        day = (1.0 - _EVENING_PART) * self.model.layer.light
+        light = day + _EVENING_PART * self.model.evening
+        scene = lit(self.model.layer, light, _TARGET_LEVEL)
         upright = np.zeros(2) if tilt is None else tilt
         seen_from = camera_pose(pose, CAMERA_HEIGHT_M, upright)
         levels = self._renderer.levels(scene, seen_from)
-        seen = exposed(levels * white_balance(_TARGET_LIGHT), _TARGET_EXPOSURE, 0.0)
+        seen = exposed(levels * _TARGET_BALANCE, 0.0, 0.0)
         return self._with_noise(seen, 2, number)
 
     def _with_noise(self, levels: Float32, stream: int, number: int) -> Image:
@@ -280,21 +283,15 @@ class OmniWorld:
 # Disturbances
 
 
-def lit(layer: Layer, evening: Float32, settings: HouseLightSettings) -> Layer:
-    """The same layer in another light: a mix of its own with the evening's, at some level."""
-    mixed = (1.0 - settings.evening) * layer.light + settings.evening * evening
-    return layer.lit(np.asarray(settings.level * mixed, dtype=np.float32))
+def lit(layer: Layer, light: Float32, level: float) -> Layer:
+    """The same layer in another light, at some level."""
+    return layer.lit(np.asarray(level * light, dtype=np.float32))
 
 
-def white_balance(settings: HouseLightSettings) -> Float32:
-    """(3, 1) factors of red, green, blue."""
-    return np.array([[1.0 + settings.warmth], [1.0], [1.0 - settings.warmth]], dtype=np.float32)
-
-
-def exposed(levels: Float32, settings: HouseExposureSettings, time: float) -> Float32:
-    """(3, n) levels as the camera's exposure makes them at a time in seconds."""
-    wave = 1.0 + settings.wave * np.sin(2.0 * np.pi * time / _WAVE_PERIOD_S)
-    return np.asarray(levels * np.float32(settings.gain * wave))
+def exposed(levels: Float32, amplitude: float, time: float) -> Float32:
+    """(3, n) levels as the camera's exposure, a wave of the gain, makes them at a time in s."""
+    wave = 1.0 + amplitude * np.sin(2.0 * np.pi * time / _WAVE_PERIOD_S)
+    return np.asarray(levels * np.float32(_GAIN * wave))
 
 
 class CameraTilt:

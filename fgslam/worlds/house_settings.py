@@ -1,8 +1,7 @@
-"""Settings of the rendered house: camera, wheelchair, range sensor, disturbances, reference path.
+"""Settings of the rendered house: camera, disturbances, reference path.
 
-Defaults: the camera is that of Goedemé et al. 2005 (section I: hyperbolic mirror, 320 x 240); the
-wheelchair's limits are those of an indoor electric wheelchair driven slowly; slip and tilt are the
-issue's (2 degrees at most). What the paper leaves open is said to be so in each description.
+The default camera is that of Goedemé et al. 2005 (section I: hyperbolic mirror, 320 x 240). What
+the paper leaves open is said to be so in each description.
 """
 
 from __future__ import annotations
@@ -39,42 +38,19 @@ HouseCameraSettings: TypeAlias = Annotated[
 
 
 @dataclass(frozen=True, config=STRICT)
-class WheelchairSettings:
-    """The simulated wheelchair: how late it obeys and how much it slips."""
-
-    latency_s: Annotated[
-        float, Field(ge=0.0, le=2.0, description="from a command to its effect, seconds")
-    ] = 0.1
-    slip_m_sqrt_m: Annotated[
-        float, Field(ge=0.0, le=0.5, description="noise along the way, metres per root metre")
-    ] = 0.02
-    slip_deg_sqrt_m: Annotated[
-        float, Field(ge=0.0, le=45.0, description="noise of heading, degrees per root metre")
-    ] = 1.0
-
-
-@dataclass(frozen=True, config=STRICT)
 class HouseExposureSettings:
     """A camera's automatic exposure, over time."""
 
-    gain: Annotated[float, Field(gt=0.05, lt=10.0, description="mean factor of all levels")] = 1.25
     wave: Annotated[float, Field(ge=0.0, lt=0.9, description="amplitude of the gain's wave")] = 0.0
 
 
 @dataclass(frozen=True, config=STRICT)
 class HouseLightSettings:
-    """The lamps: how bright, how warm, and which."""
+    """The lamps."""
 
     level: Annotated[
         float, Field(gt=0.0, le=3.0, description="brightness; 0.05 is a dark house")
     ] = 1.0
-    warmth: Annotated[
-        float, Field(ge=-0.5, le=0.5, description="red up and blue down by this fraction")
-    ] = 0.0
-    evening: Annotated[
-        float,
-        Field(ge=0.0, le=1.0, description="1: every other lamp is off, and shadows fall otherwise"),
-    ] = 0.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -121,7 +97,6 @@ class OmniHouseSettings:
     ] = 2.0
     people: Annotated[int, Field(ge=0, le=8, description="who walk about in the house")] = 0
     path: HousePathSettings = HousePathSettings()
-    wheelchair: WheelchairSettings = WheelchairSettings()
     exposure: HouseExposureSettings = HouseExposureSettings()
     light: HouseLightSettings = HouseLightSettings()
     tilt: HouseTiltSettings = HouseTiltSettings()

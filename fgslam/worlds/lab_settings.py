@@ -54,9 +54,6 @@ class RandomPosesSettings:
     burst: Annotated[
         int, Field(ge=1, le=100, description="consecutive frames from each pose on, straight ahead")
     ] = 1
-    step_m: Annotated[
-        float, Field(gt=0.0, le=0.5, description="way between the frames of a burst, metres")
-    ] = 0.1
     clearance_m: Annotated[
         float,
         Field(ge=0.15, le=2.0, description="of robot and camera from walls and furniture, metres"),
@@ -153,11 +150,9 @@ class LabExposureSettings:
     """A camera's automatic exposure: a slow wave of the gain and one sudden jump."""
 
     wave: Annotated[float, Field(ge=0.0, lt=0.9, description="amplitude of the gain's wave")] = 0.15
-    wave_period_frames: Annotated[float, Field(gt=1.0, description="its period, frames")] = 60.0
     jump: Annotated[
         float, Field(gt=0.1, lt=5.0, description="factor of the gain after the jump")
     ] = 0.7
-    jump_frame: Annotated[int, Field(ge=0, description="first frame after the jump")] = 125
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -165,7 +160,6 @@ class LabBlurSettings:
     """Motion blur: the mean of several renders while the shutter is open."""
 
     exposure_s: Annotated[float, Field(gt=0.0, le=0.5, description="shutter time, seconds")] = 0.03
-    samples: Annotated[int, Field(ge=2, le=32, description="renders a frame")] = 5
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -174,10 +168,6 @@ class LabPersonSettings:
 
     first_frame: Annotated[int, Field(ge=0, description="frame at which the person enters")] = 20
     frames: Annotated[int, Field(ge=2, description="frames until the person has left")] = 12
-    distance_m: Annotated[
-        float,
-        Field(gt=0.7, le=4.0, description="from the camera at the middle of the walk, metres"),
-    ] = 1.8
 
 
 @dataclass(frozen=True, config=STRICT)

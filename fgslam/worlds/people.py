@@ -36,6 +36,7 @@ _THIGH, _SHIN, _UPPER_ARM, _FOREARM = 0.43, 0.42, 0.29, 0.27
 _HIP, _SHOULDER = 0.90, 1.42
 # Beyond the edge of the view at which the walk begins and ends, metres.
 _MARGIN_M = 0.45
+ACROSS_M = 1.8  # before the camera, at the middle of the walk: nearer than most of the lab
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +95,8 @@ def across_view(
     ends = (settings.first_frame + settings.frames - 1) / frame_rate
     camera = (drive.body_poses(np.array([0.5 * (begins + ends)]))[0] @ rig.bTc)[:3]
     right, ahead = camera[:2, 0], camera[:2, 2] / np.linalg.norm(camera[:2, 2])
-    middle = camera[:2, 3] + settings.distance_m * ahead
-    half = settings.distance_m * rig.width / 2.0 / rig.fx + _MARGIN_M
+    middle = camera[:2, 3] + ACROSS_M * ahead
+    half = ACROSS_M * rig.width / 2.0 / rig.fx + _MARGIN_M
     return Walk(middle + half * right, middle - half * right, begins, ends)
 
 

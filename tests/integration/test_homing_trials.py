@@ -19,7 +19,7 @@ from fgslam.backend.homing.settings import (
     HomingGraphSettings,
 )
 from fgslam.evaluation.homing import HomingErrors, homing_errors, summarise_homings
-from fgslam.worlds.simulated.settings import SimulatedBearingsSettings, with_outliers
+from fgslam.worlds.simulated.bearings import HomingOutliers
 
 GRAPH = HomingGraphSettings()
 
@@ -33,8 +33,8 @@ def homed(case: Trial, settings: HomingEstimatorSettings) -> HomingErrors:
 
 
 def cases(count: int, outliers: float) -> list[Trial]:
-    settings = with_outliers(SimulatedBearingsSettings(), outliers)
-    return [trial(seed, settings) for seed in range(count)]
+    some = HomingOutliers.of_all(outliers)
+    return [trial(seed, outliers=some) for seed in range(count)]
 
 
 def test_graph_beats_the_filters_at_twenty_percent_outliers() -> None:

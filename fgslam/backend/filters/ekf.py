@@ -22,6 +22,7 @@ from fgslam.backend.filters.ekf_update import (
 )
 from fgslam.backend.filters.filtered import FilteredTrajectory, FirstSights, require_finite
 from fgslam.backend.filters.growing_covariance import BLOCK, FRONT, GrowingCovariance, rows_of
+from fgslam.backend.filters.loop_correction import within_gate
 from fgslam.backend.settings import EkfSettings
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError
@@ -269,9 +270,8 @@ class FullEkf:
         except DivergedError as cause:
             self._remarks.append(f"{what} left out: {cause}")
             return False
-        excess, gate = found.nis - found.nis_dof, self._settings.loops.gate_sigmas
         said = f"(innovation squared {found.nis:.0f}, {found.nis_dof} expected)"
-        if gate > 0.0 and not excess <= gate**2:
+        if not within_gate(found.nis - found.nis_dof):
             self._remarks.append(f"{what} refused: the covariance does not admit it {said}")
             return False
         admitted = found.nis <= chi_square_quantile(_ADMITTED, found.nis_dof)

@@ -150,7 +150,7 @@ class LandmarkKalman:
         self._current = prior
         self._past = FilteredTrajectory()
         self._rows = LandmarkRows()
-        self._drive = DriveRecord(settings.loops)
+        self._drive = DriveRecord()
         self._fixed = False
 
     @property

@@ -311,7 +311,6 @@ class LandmarkKalmanGraph(LandmarkKalman):
         closed_form = LandmarkKalmanSettings(
             update=settings.update,
             pose_covariance=settings.pose_covariance,
-            loops=settings.loops,
         )
         super().__init__(rig, closed_form, prior)
         self._pose_graph = FixedMapPose(rig, ego_motion)

@@ -17,7 +17,6 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.backend.settings import LoopCorrectionSettings
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, Prediction
@@ -34,6 +33,11 @@ a submap's frames measured hardly bends within it."""
 CLOSURE_FACTOR = 3.0
 """By which deviations of a loop closure are multiplied: its own covariance takes the map around
 both frames as rigid, whose landmarks are as uncertain as the poses that saw them."""
+GATE_SIGMAS = 10.0
+"""A loop closure is refused where it raises the cost by more than the square of this (ekf: its
+innovation squared beyond what is expected). Wide: true ones measured 0.7 to 6.1 in the rendered
+rooms, and a lost closure costs more than covariances a few times too small
+(docs/derivations/submaps.md)."""
 _ITERATIONS = 100
 _TOLERANCE = 1e-12  # of the cost
 _EXACT_SIGMA = 1e-6  # radians and metres: a step's least deviation, for what a floor excludes
@@ -287,18 +291,22 @@ def home_changes(homes: IntArray, moved: FloatArray) -> FloatArray:
     return np.asarray(np.concatenate([moved, np.eye(4)[None]])[homes])
 
 
-def refusal(what: str, squared: float, gate_sigmas: float) -> str:
+def within_gate(squared: float) -> bool:
+    """Whether a loop closure is accepted by the rise of the cost by it, or innovation squared."""
+    return bool(squared <= GATE_SIGMAS**2)
+
+
+def refusal(what: str, squared: float) -> str:
     """Why a loop closure is refused, beginning with ``what``; empty where it is accepted.
 
     Args:
         what: names the closure.
         squared: the rise of the cost by it, or its innovation squared.
-        gate_sigmas: the root of the largest that is accepted; 0: any.
     """
-    if gate_sigmas == 0.0 or squared <= gate_sigmas**2:
+    if within_gate(squared):
         return ""
     off = np.sqrt(max(squared, 0.0))
-    return f"{what} refused: {off:.1f} standard deviations off, {gate_sigmas:g} allowed"
+    return f"{what} refused: {off:.1f} standard deviations off, {GATE_SIGMAS:g} allowed"
 
 
 class DriveRecord:
@@ -310,9 +318,8 @@ class DriveRecord:
     was carried off, unknown.
     """
 
-    def __init__(self, settings: LoopCorrectionSettings) -> None:
+    def __init__(self) -> None:
         """An empty drive."""
-        self._settings = settings
         self._chain = Chain()
         self._tied = -1
         self._coherent = True
@@ -395,7 +402,7 @@ class DriveRecord:
         covariance = CLOSURE_FACTOR**2 * loop.covariance
         known = Constraint(loop.frame, last, loop.oTc, covariance)
         poses, cost = self._chain.solve([*self._chain.constraints, known])
-        refused = refusal(what, cost - self._chain.cost(), self._settings.gate_sigmas)
+        refused = refusal(what, cost - self._chain.cost())
         if refused:
             self.remarks.append(refused)
             return None

@@ -53,7 +53,7 @@ class BatchSolver(WholeGraphSolver):
 
     def __init__(self, problem: GraphProblem, settings: BatchSettings) -> None:
         """Nothing to solve yet."""
-        super().__init__(problem.builder, problem.floor, settings.loops)
+        super().__init__(problem.builder, problem.floor)
         self._settings = settings
 
     def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:

@@ -90,7 +90,6 @@ class FixedLagSolver:
         self._builder, self._floor = problem.builder, problem.floor
         self._in_seconds = settings.lag_frames is None
         self._lag = float(settings.lag_frames or settings.lag_s or 0.0)
-        self._loop_gate = settings.loops.gate_sigmas
         self._solver = self._new_solver()
         self._values = gtsam.Values()
         self._oldest = 0
@@ -143,7 +142,7 @@ class FixedLagSolver:
     def _taken_in(self, known: Constraint, what: str) -> bool:
         """Adds a loop within the lag, where hardly anything drifts, as a factor; or refuses it."""
         factor = constraint_factor(known)
-        refused = refusal(what, misfit(factor, self._values), self._loop_gate)
+        refused = refusal(what, misfit(factor, self._values))
         if refused:
             self.remarks.append(refused)
             return False
@@ -164,7 +163,7 @@ class FixedLagSolver:
         drift = basis.T @ drift @ basis
         innovation = drift + basis.T @ known.covariance @ basis
         gain = np.linalg.solve(innovation, drift).T
-        refused = refusal(what, float(off @ np.linalg.solve(innovation, off)), self._loop_gate)
+        refused = refusal(what, float(off @ np.linalg.solve(innovation, off)))
         if refused:
             self.remarks.append(refused)
             return None

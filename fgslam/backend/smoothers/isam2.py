@@ -67,7 +67,7 @@ class Isam2Solver(WholeGraphSolver):
 
     def __init__(self, problem: GraphProblem, settings: Isam2Settings) -> None:
         """An empty tree."""
-        super().__init__(problem.builder, problem.floor, settings.loops)
+        super().__init__(problem.builder, problem.floor)
         self._settings = settings
         self._with_qr = False
         self._isam = self._new_solver()

@@ -24,7 +24,6 @@ from fgslam.backend.filters.loop_correction import (
     corrected,
     refusal,
 )
-from fgslam.backend.settings import LoopCorrectionSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.solver import Drive
 from fgslam.core.arrays import FloatArray, IntArray
@@ -58,10 +57,9 @@ class Acceptance:
 class GraphLoops:
     """The loops of a graph that keeps every pose: which were accepted, and at what cost."""
 
-    def __init__(self, builder: GraphBuilder, settings: LoopCorrectionSettings) -> None:
+    def __init__(self, builder: GraphBuilder) -> None:
         """No loop yet."""
         self._builder = builder
-        self._settings = settings
         self._accepted: list[Constraint] = []
 
     def judge(
@@ -100,7 +98,7 @@ class GraphLoops:
         factors.add(constraint_factor(known))
         found = solved(factors, guess)
         rise = 2.0 * (float(factors.error(found)) - cost)
-        refused = refusal(what, rise, self._settings.gate_sigmas)
+        refused = refusal(what, rise)
         if refused:
             return Acceptance(False, None, refused)
         self._accept(known)

@@ -16,7 +16,6 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.filters.loop_correction import Constraint
-from fgslam.backend.settings import LoopCorrectionSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.loop_closing import Acceptance, GraphLoops
 from fgslam.backend.smoothers.marginals import marginals_of
@@ -202,10 +201,10 @@ class WholeGraphSolver:
 
     kind: ClassVar[str]
 
-    def __init__(self, builder: GraphBuilder, floor: Floor, loops: LoopCorrectionSettings) -> None:
+    def __init__(self, builder: GraphBuilder, floor: Floor) -> None:
         """Nothing to solve yet."""
         self._builder, self._floor = builder, floor
-        self._loops = GraphLoops(builder, loops)
+        self._loops = GraphLoops(builder)
         self._values = gtsam.Values()
         self._answer: Refined | None = None
         self.remarks: list[str] = []

@@ -78,7 +78,7 @@ class GraphProblem:
         remember: bool = True,
     ) -> GraphProblem:
         """A tracker and a builder at the prior, both empty; ``remember`` as GraphBuilder's."""
-        tracker = LandmarkKalman(sensor, LandmarkKalmanSettings(loops=settings.loops), prior)
+        tracker = LandmarkKalman(sensor, LandmarkKalmanSettings(), prior)
         builder = GraphBuilder(sensor, settings, floor, prior, remember)
         return GraphProblem(sensor, settings, floor, prior, tracker, builder)
 

@@ -135,6 +135,7 @@ def _segments(patches: PatchArrays) -> tuple[FloatArray, FloatArray]:
 _STREAM = 31  # of random numbers, apart from the world's
 _BLOCK, _BLOCKS = 64, 200
 _POSES = 200
+BURST_STEP_M = 0.1  # between the frames of a burst: about that of the lab's drives
 
 
 class RandomPoses:
@@ -179,7 +180,7 @@ def draw_poses(
             "make it one"
         )
     free = _Free(space, start, wanted.clearance_m)
-    ahead = wanted.step_m * np.arange(wanted.burst)
+    ahead = BURST_STEP_M * np.arange(wanted.burst)
     robot = np.column_stack([ahead, np.zeros(wanted.burst)])
     offsets = np.vstack([robot, robot + camera])
     poses = [

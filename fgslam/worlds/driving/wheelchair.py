@@ -9,7 +9,6 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import unit, wrap
-from fgslam.worlds.house_settings import WheelchairSettings
 from fgslam.worlds.rendering.patches import RayCaster
 
 _STEP_S = 0.01
@@ -21,6 +20,10 @@ MAX_SPEED_M_S, MAX_TURN_DEG_S = 0.5, 45.0  # one that is driven slowly
 # Deviations of what is drawn once a drive: relative errors of speed and of turns, and the turn a
 # metre that nobody asked for.
 SPEED_SCALE, TURN_SCALE, PULL_DEG_M = 0.03, 0.03, 1.0
+SLIP_M_SQRT_M, SLIP_DEG_SQRT_M = 0.02, 1.0
+"""Noise along the way, metres, and of the heading, degrees, per root metre."""
+LATENCY_S = 0.1
+"""From a command to its effect."""
 RADIUS_M = 0.35
 """Of the disc that must not touch anything; a door is twice as wide and a half."""
 
@@ -39,14 +42,10 @@ class Wheelchair:
     """
 
     def __init__(
-        self,
-        settings: WheelchairSettings,
-        pose: FloatArray,
-        rng: np.random.Generator,
-        blocked: Blocked | None = None,
+        self, pose: FloatArray, rng: np.random.Generator, blocked: Blocked | None = None
     ) -> None:
         """Stands still at ``pose``; the errors of this drive are drawn from ``rng``."""
-        self._settings, self._rng = settings, rng
+        self._rng = rng
         self._blocked: Blocked = blocked or (lambda _place: False)
         self.pose = np.array(pose, dtype=np.float64)
         self.speed, self.turn_rate, self.time = 0.0, 0.0, 0.0
@@ -70,7 +69,7 @@ class Wheelchair:
         top = np.deg2rad(MAX_TURN_DEG_S)
         limited = float(np.clip(speed, -MAX_SPEED_M_S, MAX_SPEED_M_S))
         turn = float(np.clip(turn_rate, -top, top))
-        self._pending.append((self.time + self._settings.latency_s, limited, turn))
+        self._pending.append((self.time + LATENCY_S, limited, turn))
 
     def advance(self, seconds: float) -> None:
         """Moves on, in steps of a hundredth of a second; what is left over is made up for later.
@@ -107,10 +106,10 @@ class Wheelchair:
 
     def _slipped(self, way: float, turn: float) -> tuple[float, float]:
         """What the floor makes of a small motion of the wheels."""
-        s, noise = self._settings, self._rng.standard_normal(2)
+        noise = self._rng.standard_normal(2)
         root = np.sqrt(abs(way))
-        true_way = way * self._speed_scale + s.slip_m_sqrt_m * root * noise[0]
-        drift = self._pull * abs(way) + np.deg2rad(s.slip_deg_sqrt_m) * root * noise[1]
+        true_way = way * self._speed_scale + SLIP_M_SQRT_M * root * noise[0]
+        drift = self._pull * abs(way) + np.deg2rad(SLIP_DEG_SQRT_M) * root * noise[1]
         return float(true_way), float(turn * self._turn_scale + drift)
 
 

@@ -14,6 +14,8 @@ from fgslam.worlds.lab_settings import LabEffectsSettings, LabExposureSettings
 Float32 = npt.NDArray[np.float32]
 
 _COVER_SEED = 7
+WAVE_FRAMES = 60.0  # half a minute at two frames a second: automatic exposure follows slowly
+JUMP_FRAME = 125  # half way through the paper's drive
 
 
 def noisy(levels: Float32, sigma: float, seed: tuple[int, ...]) -> Float32:
@@ -31,8 +33,8 @@ def exposure_gain(settings: LabExposureSettings | None, index: int) -> float:
     """Gain of frame ``index``: a slow wave, and a factor from the jump on."""
     if settings is None:
         return 1.0
-    wave = 1.0 + settings.wave * np.sin(2.0 * np.pi * index / settings.wave_period_frames)
-    return float(wave * (settings.jump if index >= settings.jump_frame else 1.0))
+    wave = 1.0 + settings.wave * np.sin(2.0 * np.pi * index / WAVE_FRAMES)
+    return float(wave * (settings.jump if index >= JUMP_FRAME else 1.0))
 
 
 def is_blocked(settings: LabEffectsSettings, index: int) -> bool:

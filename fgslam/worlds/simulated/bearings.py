@@ -31,6 +31,34 @@ _CANDIDATES = 40  # points drawn for one that is used
 _LONGEST = 10.0  # drives end after so many times the straight one
 
 
+@dataclass(frozen=True, slots=True)
+class HomingOutliers:
+    """What is wrong in a trial, as parts of one.
+
+    Attributes:
+        wrong_matches: of all matches between start and target; the target's end belongs to another
+            point.
+        jumping_tracks: of the tracks; they jump to another point of the room once, at any time, and
+            follow that one from then on.
+        gross_bearings: of the tracked bearings, each for itself, that point anywhere.
+    """
+
+    wrong_matches: float = 0.0
+    jumping_tracks: float = 0.0
+    gross_bearings: float = 0.0
+
+    @classmethod
+    def of_all(cls, part: float) -> HomingOutliers:
+        """So many of the matches, and of the bearings tracked at the drive's end.
+
+        Half of the latter come from tracks that jumped, half are single gross errors.
+        """
+        return cls(part, 0.5 * part, 0.5 * part)
+
+
+NO_OUTLIERS = HomingOutliers()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedHoming:
     """One trial. Identities of tracks are rows of the matches.
@@ -62,17 +90,19 @@ class SimulatedHoming:
 
 
 def simulate_homing(
-    settings: SimulatedBearingsSettings, rng: np.random.Generator
+    settings: SimulatedBearingsSettings,
+    rng: np.random.Generator,
+    outliers: HomingOutliers = NO_OUTLIERS,
 ) -> SimulatedHoming:
     """Places points and target, matches the two views, drives and tracks."""
     target = _target(settings, rng)
-    wrong = round(settings.features * settings.wrong_matches / (1.0 - settings.wrong_matches))
+    wrong = round(settings.features * outliers.wrong_matches / (1.0 - outliers.wrong_matches))
     n = settings.features + wrong
     points, decoys = np.split(_points(settings, target, 2 * n, rng), 2)
     heights = rng.uniform(_LOWEST_M, _HIGHEST_M, n) * rng.choice([-1.0, 1.0], n)
     matches, correct = _matches(settings, target, (points, heights), wrong, rng)
     robots = _drive(settings, target, rng)
-    tracks = _Tracks(settings, points, decoys, heights, rng).images(robots)
+    tracks = _Tracks(settings, outliers, (points, decoys), heights, rng).images(robots)
     landmarks = np.where(correct[:, None], points, np.nan)
     return SimulatedHoming(0.0, matches, correct, tracks, HomingTruth(target, robots, landmarks))
 
@@ -185,13 +215,13 @@ class _Tracks:
     def __init__(
         self,
         settings: SimulatedBearingsSettings,
-        points: FloatArray,
-        decoys: FloatArray,
+        outliers: HomingOutliers,
+        points_and_decoys: tuple[FloatArray, FloatArray],
         heights: FloatArray,
         rng: np.random.Generator,
     ) -> None:
-        self._settings = settings
-        self._places = np.stack([points, decoys])
+        self._settings, self._outliers = settings, outliers
+        self._places = np.stack(points_and_decoys)
         self._heights = heights
         self._rng = rng
 
@@ -199,7 +229,7 @@ class _Tracks:
         """One a pose (k, 3)."""
         settings, rng = self._settings, self._rng
         n, images = len(self._heights), len(robots)
-        jumps = rng.random(n) < settings.jumping_tracks
+        jumps = rng.random(n) < self._outliers.jumping_tracks
         jump_at = np.where(jumps, rng.integers(0, images, n), images)
         with np.errstate(divide="ignore"):
             seconds = rng.standard_exponential(n) / settings.lost_per_s
@@ -216,7 +246,7 @@ class _Tracks:
         every = np.arange(len(alive))
         points = self._places[jumped, every]
         bearing, elevation = _seen(settings, robot, points, self._heights, rng)
-        gross = rng.random(len(alive)) < settings.gross_bearings
+        gross = rng.random(len(alive)) < self._outliers.gross_bearings
         bearing = np.where(gross, rng.uniform(-np.pi, np.pi, len(alive)), bearing)
         if not settings.tracked_elevations:
             elevation = np.full(len(alive), np.nan)

@@ -30,6 +30,9 @@ _MOVED = 5
 _BORDER_PX = 8.0  # nearer to the edge a landmark may be seen, but is not missed
 _STRENGTH_JITTER = 0.1
 _LEAST_DISPARITY_PX = 0.5  # a fainter one cannot be triangulated
+LEAST_RANGE_M = 0.4  # nearer ones are in one image only, or out of focus
+OBLIQUE_DEG = 75.0  # off its surface's normal a landmark is foreshortened beyond recognition
+PRUNE_AFTER = 20  # consecutive misses in view until an identity is dropped, as in Se et al. 4.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,10 +117,10 @@ def _require_effect(settings: SimulatedMeasurementsSettings, frames: int) -> Non
                 "choose an earlier one"
             )
     detection = settings.detection
-    if detection.min_range_m >= detection.max_range_m:
+    if detection.max_range_m <= LEAST_RANGE_M:
         raise ConfigError(
-            f"dataset.detection.min_range_m is {detection.min_range_m:g} and max_range_m "
-            f"{detection.max_range_m:g}, which leaves no landmark; raise the latter"
+            f"dataset.detection.max_range_m is {detection.max_range_m:g}, which leaves no "
+            f"landmark; raise it above {LEAST_RANGE_M:g}"
         )
 
 
@@ -138,7 +141,7 @@ class _Camera:
         self._pixel_noise = np.random.default_rng([seed, _PIXELS])
         self._wrong = np.random.default_rng([seed, _WRONG])
         self._after = _moved_points(settings, world)
-        self._book = IdentityBook(len(world), settings.detection.prune_after_misses)
+        self._book = IdentityBook(len(world), PRUNE_AFTER)
         self._index_of_birth: list[int] = []
         ratio = vertical_to_horizontal(rig)
         self._model = pixel_model(rig.cameras, ratio)
@@ -216,9 +219,9 @@ class _Camera:
         distance = np.linalg.norm(seen_from, axis=1)
         ray = seen_from @ wTc[:3, :3].T
         facing = -np.einsum("ni,ni->n", ray, self._world.normals[view])
-        ok = (distance >= detection.min_range_m) & (distance <= detection.max_range_m)
-        ok &= facing >= np.cos(np.deg2rad(detection.oblique_deg)) * distance
-        view = view[ok & g.in_front(rig, seen_from, detection.min_range_m)]
+        ok = (distance >= LEAST_RANGE_M) & (distance <= detection.max_range_m)
+        ok &= facing >= np.cos(np.deg2rad(OBLIQUE_DEG)) * distance
+        view = view[ok & g.in_front(rig, seen_from, LEAST_RANGE_M)]
         pixels = g.project(rig, local[view]) @ self._model.T
         margin = np.min(
             [pixels, np.tile([rig.width - 1.0, rig.height - 1.0], rig.cameras) - pixels], axis=0
@@ -257,7 +260,7 @@ class _Camera:
         rig, detection = self._rig, self._settings.detection
         size = np.array([rig.width - 1.0, rig.height - 1.0])
         least = rig.fx * rig.baseline / detection.max_range_m
-        most = min(rig.fx * rig.baseline / detection.min_range_m, rig.width / 2)
+        most = min(rig.fx * rig.baseline / LEAST_RANGE_M, rig.width / 2)
         uniform = self._wrong.uniform(size=(count, 3))
         measurement = np.column_stack(
             [uniform[:, :2] * size, least + uniform[:, 2] * (most - least)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field
@@ -82,16 +81,6 @@ class DetectionSettings:
     max_range_m: Annotated[
         float, Field(gt=0.1, description="landmarks farther than this are not in view, metres")
     ] = 8.0
-    min_range_m: Annotated[
-        float, Field(ge=0.05, description="nor those nearer than this, metres")
-    ] = 0.4
-    oblique_deg: Annotated[
-        float,
-        Field(gt=0.0, le=180.0, description="seen up to this angle off its surface's normal"),
-    ] = 75.0
-    prune_after_misses: Annotated[
-        int, Field(ge=1, description="consecutive misses in view until an identity is dropped")
-    ] = 20
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -197,42 +186,6 @@ class SimulatedBearingsSettings:
     tracked_elevations: Annotated[
         bool, Field(description="images on the way state elevations, too")
     ] = False
-    wrong_matches: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            lt=1.0,
-            description="part of all matches between start and target that is wrong: the target "
-            "end belongs to another point",
-        ),
-    ] = 0.0
-    jumping_tracks: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            lt=1.0,
-            description="part of the tracks that jump to another point of the room once, at any "
-            "time, and follow that one from then on",
-        ),
-    ] = 0.0
-    gross_bearings: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            lt=1.0,
-            description="part of the tracked bearings, each for itself, that point anywhere",
-        ),
-    ] = 0.0
     lost_per_s: Annotated[
         float, Field(ge=0.0, description="part of the tracks that get lost in a second")
     ] = 0.02
-
-
-def with_outliers(settings: SimulatedBearingsSettings, part: float) -> SimulatedBearingsSettings:
-    """The same with so many outliers: of matches, and of the bearings tracked at the drive's end.
-
-    Half of the latter come from tracks that jumped, half are single gross errors.
-    """
-    return dataclasses.replace(
-        settings, wrong_matches=part, jumping_tracks=0.5 * part, gross_bearings=0.5 * part
-    )

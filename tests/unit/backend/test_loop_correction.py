@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from fgslam.backend.filters.loop_correction import DriveRecord
-from fgslam.backend.settings import LoopCorrectionSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus
 from fgslam.core.geometry import pose
@@ -53,7 +52,7 @@ def _closure(frame: int, oTc: FloatArray) -> LoopClosure:
 
 def test_a_frame_most_of_whose_matches_contradict_it_measured_no_step() -> None:
     """Nor is the step back from it one: both are the odometry's."""
-    record = DriveRecord(LoopCorrectionSettings())
+    record = DriveRecord()
     for metres, used in ((0.0, 80), (0.1, 80), (0.9, 49), (-0.7, 80), (0.1, 50)):
         _add_frame(record, metres, used)
     chain = record.chain
@@ -66,7 +65,7 @@ def test_a_frame_most_of_whose_matches_contradict_it_measured_no_step() -> None:
 
 def test_without_odometry_the_tracked_step_is_all_there_is() -> None:
     """A chain needs its steps."""
-    record = DriveRecord(LoopCorrectionSettings())
+    record = DriveRecord()
     record.step(np.eye(4), _tracking(np.eye(4), 80, 100), None, free=False)
     record.step(_forward(0.9), _tracking(_forward(0.9), 10, 100), None, free=False)
     assert record.chain.poses[-1][2, 3] == 0.9
@@ -75,7 +74,7 @@ def test_without_odometry_the_tracked_step_is_all_there_is() -> None:
 def test_a_jump_of_the_tracking_does_not_make_a_true_closure_impossible() -> None:
     """0.8 m in one frame are 800 deviations of a tracked step; the closure knows better."""
     for used, taken in ((80, False), (30, True)):
-        record = DriveRecord(LoopCorrectionSettings())
+        record = DriveRecord()
         _add_frame(record, 0.0)
         for k in range(1, 40):
             _add_frame(record, 0.9 if k == 20 else 0.1, used if k == 20 else 80)
@@ -85,7 +84,7 @@ def test_a_jump_of_the_tracking_does_not_make_a_true_closure_impossible() -> Non
 
 def test_a_few_old_landmarks_among_many_new_ones_tie_a_frame_to_nothing() -> None:
     """They are far away as a rule, and do not say where the frame is."""
-    record = DriveRecord(LoopCorrectionSettings())
+    record = DriveRecord()
     poses = []
     for k in range(120):
         _add_frame(record, 0.1 if k else 0.0)
@@ -101,7 +100,7 @@ def test_a_few_old_landmarks_among_many_new_ones_tie_a_frame_to_nothing() -> Non
 
 def test_incoherent_frame_is_not_tied_to_old_landmarks() -> None:
     """Wherever its landmarks come from."""
-    record = DriveRecord(LoopCorrectionSettings())
+    record = DriveRecord()
     poses = []
     for k in range(120):
         _add_frame(record, 0.1 if k else 0.0, 80 if k < 119 else 40)
@@ -112,7 +111,7 @@ def test_incoherent_frame_is_not_tied_to_old_landmarks() -> None:
 
 def test_restored_record_continues_after_an_incoherent_frame() -> None:
     """The step back is the odometry's, also after a restart."""
-    one, other = (DriveRecord(LoopCorrectionSettings()) for _ in range(2))
+    one, other = (DriveRecord() for _ in range(2))
     for metres, used in ((0.0, 80), (0.1, 80), (0.9, 20)):
         _add_frame(one, metres, used)
     other.restore(one.state())
@@ -125,7 +124,7 @@ def test_restored_record_continues_after_an_incoherent_frame() -> None:
 @pytest.mark.parametrize("matched", [0, 1, 5])
 def test_the_step_from_a_frame_without_a_pose_of_its_own_was_measured(matched: int) -> None:
     """It began the landmarks that the next one was tracked by; stray matches change nothing."""
-    record = DriveRecord(LoopCorrectionSettings())
+    record = DriveRecord()
     _add_frame(record, 0.0)
     odometry, here = Odometry(_forward(0.1), _WHEELS), _forward(0.1)
     failed = replace(_tracking(here, 0, matched), status=EgoMotionStatus.TOO_FEW_MATCHES)

@@ -11,6 +11,7 @@ from loops import CLOSED, ROUND, Returned, Rounds, drive_rounds
 from simulated import Drive, assert_same_bits, play, play_directly, simulate
 from smoothing import FREE, PIXELS, build
 
+from fgslam.backend.filters import loop_correction
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import (
     BatchSettings,
@@ -21,7 +22,6 @@ from fgslam.backend.settings import (
     Isam2Settings,
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
-    LoopCorrectionSettings,
 )
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
@@ -118,12 +118,14 @@ def test_a_wrong_loop_is_refused_and_changes_nothing(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["landmark_kalman", "isam2", "ekf"])
-def test_without_the_gate_the_wrong_loop_is_taken(name: str) -> None:
+def test_without_the_gate_the_wrong_loop_is_taken(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """So it is the gate that refuses it."""
-    settings = dataclasses.replace(CLOSING[name], loops=LoopCorrectionSettings(gate_sigmas=0.0))
+    monkeypatch.setattr(loop_correction, "GATE_SIGMAS", np.inf)
     drive = returned(lies=True)
     increments = drive.increments[: CLOSED + 1]
-    estimator = build(settings)
+    estimator = build(CLOSING[name])
     stats = play(estimator, increments, FREE)
     loop = increments[CLOSED].loops[0]
     claimed = drive.poses[loop.frame] @ loop.oTc

@@ -14,21 +14,17 @@ from fgslam.worlds.driving.reference_paths import PathPlanner
 from fgslam.worlds.driving.wheelchair import RangeSensor, Wheelchair
 from fgslam.worlds.house import CameraTilt, camera_pose, exposed, make_house_camera
 from fgslam.worlds.house_settings import (
-    HouseExposureSettings,
     HouseMirrorSettings,
     HouseTiltSettings,
-    WheelchairSettings,
 )
 from fgslam.worlds.people import Walker
 from fgslam.worlds.rendering.image_effects import noisy
 from fgslam.worlds.rendering.patches import PatchArrays, RayCaster, Surface, Thing, box, stack
 
-EXACT = WheelchairSettings(slip_m_sqrt_m=0.0, slip_deg_sqrt_m=0.0)
-
 
 @pytest.fixture
 def exact_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("SPEED_SCALE", "TURN_SCALE", "PULL_DEG_M"):
+    for name in ("SPEED_SCALE", "TURN_SCALE", "PULL_DEG_M", "SLIP_M_SQRT_M", "SLIP_DEG_SQRT_M"):
         monkeypatch.setattr(wheelchair, name, 0.0)
 
 
@@ -41,14 +37,14 @@ def rng(seed: int = 0) -> np.random.Generator:
 
 
 def test_speed_follows_command_after_the_latency_and_within_limits() -> None:
-    chair = Wheelchair(EXACT, np.zeros(3), rng())
+    chair = Wheelchair(np.zeros(3), rng())
     chair.command(9.0, -9.0)
     speeds, turns = [], []
     for _ in range(200):
         chair.advance(0.01)
         speeds.append(chair.speed)
         turns.append(chair.turn_rate)
-    waiting = round(EXACT.latency_s / 0.01)
+    waiting = round(wheelchair.LATENCY_S / 0.01)
     assert np.array_equal(speeds[:waiting], np.zeros(waiting))
     assert speeds[waiting] == pytest.approx(wheelchair.MAX_ACCELERATION_M_S2 * 0.01)
     assert np.diff(speeds).max() <= wheelchair.MAX_ACCELERATION_M_S2 * 0.01 + 1e-12
@@ -60,7 +56,7 @@ def test_speed_follows_command_after_the_latency_and_within_limits() -> None:
 
 @pytest.mark.usefixtures("exact_drive")
 def test_without_slip_it_drives_the_circle_of_its_command() -> None:
-    chair = Wheelchair(EXACT, np.array([1.0, 2.0, 0.4]), rng())
+    chair = Wheelchair(np.array([1.0, 2.0, 0.4]), rng())
     chair.command(0.3, 0.2)
     chair.advance(5.0)
     first = chair.pose.copy()
@@ -72,12 +68,12 @@ def test_without_slip_it_drives_the_circle_of_its_command() -> None:
 
 
 def test_slip_has_the_stated_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    """End points of 200 drives of 2 m scatter as the settings say."""
-    settings = WheelchairSettings(slip_m_sqrt_m=0.02, slip_deg_sqrt_m=1.0, latency_s=0.0)
+    """End points of 200 drives of 2 m scatter as the constants say."""
+    monkeypatch.setattr(wheelchair, "LATENCY_S", 0.0)
     monkeypatch.setattr(wheelchair, "MAX_ACCELERATION_M_S2", 10.0)
     ends = []
     for seed in range(200):
-        chair = Wheelchair(settings, np.zeros(3), rng(seed))
+        chair = Wheelchair(np.zeros(3), rng(seed))
         chair.command(0.5, 0.0)
         chair.advance(4.0)
         ends.append(chair.pose)
@@ -92,7 +88,7 @@ def test_slip_has_the_stated_size(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("exact_drive")
 def test_a_wall_stops_it_but_lets_it_turn_and_back_out() -> None:
-    chair = Wheelchair(EXACT, np.zeros(3), rng(), lambda place: bool(place[0] > 0.5))
+    chair = Wheelchair(np.zeros(3), rng(), lambda place: bool(place[0] > 0.5))
     chair.command(0.5, 0.0)
     chair.advance(4.0)
     assert chair.collided
@@ -108,7 +104,7 @@ def test_a_wall_stops_it_but_lets_it_turn_and_back_out() -> None:
 
 def test_steps_of_any_length_add_up() -> None:
     """Fifteen frames a second are no whole number of the integration's steps."""
-    chair = Wheelchair(EXACT, np.zeros(3), rng())
+    chair = Wheelchair(np.zeros(3), rng())
     for _ in range(150):
         chair.advance(1.0 / 15.0)
     assert chair.time == pytest.approx(10.0, abs=0.0051)
@@ -116,7 +112,7 @@ def test_steps_of_any_length_add_up() -> None:
 
 @pytest.mark.parametrize("speed", [np.nan, np.inf])
 def test_commands_are_finite_and_time_goes_forwards(speed: float) -> None:
-    chair = Wheelchair(EXACT, np.zeros(3), rng())
+    chair = Wheelchair(np.zeros(3), rng())
     with pytest.raises(ValueError, match="not finite"):
         chair.command(speed, 0.0)
     with pytest.raises(ValueError, match="forwards"):
@@ -316,9 +312,8 @@ def test_tilt_is_bounded_and_leans_the_camera() -> None:
 
 def test_exposure_and_noise() -> None:
     levels = np.full((3, 20_000), 100.0, np.float32)
-    settings = HouseExposureSettings(gain=1.2, wave=0.25)
-    # A quarter of the wave's 20 s: its crest.
-    np.testing.assert_allclose(exposed(levels, settings, 5.0), 100 * 1.2 * 1.25, rtol=1e-5)
+    # The gain is 1.25; at a quarter of the wave's 20 s is its crest.
+    np.testing.assert_allclose(exposed(levels, 0.2, 5.0), 100 * 1.25 * 1.2, rtol=1e-5)
     seen = noisy(levels, 2.0, (1, 2, 3))
     assert seen.std() == pytest.approx(2.0, rel=0.03)
     np.testing.assert_array_equal(seen, noisy(levels, 2.0, (1, 2, 3)))

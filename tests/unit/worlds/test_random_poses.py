@@ -61,11 +61,11 @@ def test_without_frames_there_are_two_hundred_poses() -> None:
 
 
 def test_bursts_go_straight_ahead() -> None:
-    poses = body(drive(30, burst=3, step_m=0.08))
+    poses = body(drive(30, burst=3))
     steps = geometry.inverse(poses[:-1]) @ poses[1:]
     within = np.arange(1, 30) % 3 != 0
     ahead = np.tile(np.eye(4), (int(within.sum()), 1, 1))
-    ahead[:, 0, 3] = 0.08
+    ahead[:, 0, 3] = 0.1
     np.testing.assert_allclose(steps[within], ahead, atol=1e-12)
     assert (np.linalg.norm(steps[~within, :3, 3], axis=1) > 0.2).all()
 

@@ -9,19 +9,26 @@ import numpy as np
 import pytest
 
 from fgslam.core.planar import bearings, wrap
-from fgslam.worlds.simulated.bearings import SimulatedHoming, simulate_homing
-from fgslam.worlds.simulated.settings import SimulatedBearingsSettings, with_outliers
+from fgslam.worlds.simulated.bearings import (
+    NO_OUTLIERS,
+    HomingOutliers,
+    SimulatedHoming,
+    simulate_homing,
+)
+from fgslam.worlds.simulated.settings import SimulatedBearingsSettings
 
 CLEAN = SimulatedBearingsSettings(features=200, lost_per_s=0.0)
 
 
-def simulate(settings: SimulatedBearingsSettings, seed: int = 0) -> SimulatedHoming:
-    return simulate_homing(settings, np.random.default_rng(seed))
+def simulate(
+    settings: SimulatedBearingsSettings, seed: int = 0, outliers: HomingOutliers = NO_OUTLIERS
+) -> SimulatedHoming:
+    return simulate_homing(settings, np.random.default_rng(seed), outliers)
 
 
 def test_same_seed_same_bytes() -> None:
-    settings = with_outliers(SimulatedBearingsSettings(), 0.2)
-    one, other = simulate(settings, 4), simulate(settings, 4)
+    settings, some = SimulatedBearingsSettings(), HomingOutliers.of_all(0.2)
+    one, other = simulate(settings, 4, some), simulate(settings, 4, some)
     assert one.matches.bearing_b.tobytes() == other.matches.bearing_b.tobytes()
     assert one.truth.robots.tobytes() == other.truth.robots.tobytes()
     for a, b in zip(one.tracks, other.tracks, strict=True):
@@ -51,8 +58,7 @@ def test_drive_ends_after_its_part_of_the_way(part: float) -> None:
 
 
 def test_outliers_have_the_configured_share() -> None:
-    settings = replace(CLEAN, wrong_matches=0.2, jumping_tracks=0.3, gross_bearings=0.0)
-    homing = simulate(settings)
+    homing = simulate(CLEAN, outliers=HomingOutliers(wrong_matches=0.2, jumping_tracks=0.3))
     assert len(homing.matches) == 250
     assert np.count_nonzero(~homing.correct) == 50
     assert np.isnan(homing.truth.landmarks[~homing.correct]).all()
@@ -67,7 +73,7 @@ def test_outliers_have_the_configured_share() -> None:
 
 
 def test_gross_bearings_last_one_image() -> None:
-    homing = simulate(replace(CLEAN, gross_bearings=0.3))
+    homing = simulate(CLEAN, outliers=HomingOutliers(gross_bearings=0.3))
     off = [
         np.abs(wrap(image.bearing - bearings(robot, homing.truth.landmarks))) > np.deg2rad(5.0)
         for image, robot in zip(homing.tracks, homing.truth.robots, strict=True)

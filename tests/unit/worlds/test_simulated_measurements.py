@@ -205,9 +205,10 @@ def test_an_identity_is_kept_through_misses_and_new_after_pruning() -> None:
     assert book.point_of_id.tolist() == [0, 2, 1, 0]
 
 
-def test_every_observation_is_new_matched_or_missed() -> None:
+def test_every_observation_is_new_matched_or_missed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every observation is of a landmark known and not pruned, or new under the next number."""
-    recording = recorded(stop=None, detection={"probability": 0.5, "prune_after_misses": 3})
+    monkeypatch.setattr("fgslam.worlds.simulated.measurements.PRUNE_AFTER", 3)
+    recording = recorded(stop=None, detection={"probability": 0.5})
     alive: set[int] = set()
     count = pruned = 0
     for increment in recording.log:
@@ -246,8 +247,9 @@ def test_detection_probability_is_respected() -> None:
     assert all(len(increment.missed_ids) == 0 for increment in full.log)
 
 
-def test_range_limits_hold() -> None:
-    limits = {"max_range_m": 3.0, "min_range_m": 1.0, "noise_scale": 0.0}
+def test_range_limits_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fgslam.worlds.simulated.measurements.LEAST_RANGE_M", 1.0)
+    limits = {"max_range_m": 3.0, "noise_scale": 0.0}
     near = recorded(stop=None, detection=limits)
     distance = np.concatenate(
         [
@@ -366,7 +368,7 @@ def test_the_motion_model_is_what_the_settings_ask_for() -> None:
         ({"blackout": {"start": 249}}, "blackout.start is 249, but the drive has the frames"),
         ({"moved": {"frame": 300}}, "moved.frame is 300"),
         ({"odometry_fault": {"start": 999}}, "odometry_fault.start is 999"),
-        ({"detection": {"min_range_m": 8.0}}, "leaves no landmark; raise the latter"),
+        ({"detection": {"max_range_m": 0.4}}, "leaves no landmark; raise it above 0.4"),
         ({"start": 5, "stop": 5}, "leave none of the drive's 249 frames"),
     ],
 )

@@ -18,6 +18,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import HomingEstimate
 from fgslam.core.planar import wrap
+from fgslam.worlds.simulated.bearings import HomingOutliers
 from fgslam.worlds.simulated.settings import SimulatedBearingsSettings
 
 NONE, CAUCHY, HUBER = (
@@ -128,8 +129,8 @@ def test_wrong_matches_are_found_by_what_contradicts_them(
     exact: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A wrong match that RANSAC let pass, and that no kernel tells from the others."""
-    settings = SimulatedBearingsSettings(images_per_s=5.0, part=0.6, wrong_matches=0.3)
-    given = trial(3, settings)
+    settings = SimulatedBearingsSettings(images_per_s=5.0, part=0.6)
+    given = trial(3, settings, HomingOutliers(wrong_matches=0.3))
     wrong = np.flatnonzero(~given.correct)
     assert len(wrong) == 1
     assert without_target(solver_of(given, EXACT)) == []

@@ -21,7 +21,8 @@ from rings import (
 )
 from simulated import RIG, assert_same_bits
 
-from fgslam.backend.settings import LandmarkKalmanSettings, LoopCorrectionSettings
+from fgslam.backend.filters import loop_correction
+from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotionStatus
@@ -40,19 +41,24 @@ from fgslam.slam.replay import replay_step
 
 RING = [on_ring(k) for k in range(ROUND + 16)]
 DARK = range(30, 42)  # in the dark the heading drifts by what no search window bridges
-REFUSING = LandmarkKalmanSettings(loops=LoopCorrectionSettings(gate_sigmas=1e-6))
 
 
-def round_the_ring(refusing: bool = False) -> SlamPipeline:
-    settings = dataclasses.replace(SETTINGS, lost=None)
-    return pipeline_of(RING, 0.9, settings, REFUSING if refusing else LandmarkKalmanSettings())
+def round_the_ring() -> SlamPipeline:
+    return pipeline_of(RING, 0.9, dataclasses.replace(SETTINGS, lost=None))
+
+
+def refuse_closures(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(loop_correction, "GATE_SIGMAS", 1e-6)
 
 
 @lru_cache(maxsize=2)
 def ring(refusing: bool = False) -> tuple[SlamPipeline, list[FrameReport]]:
     """Once round and past the start, a stretch of it in the dark."""
-    pipeline = round_the_ring(refusing)
-    return pipeline, drive(pipeline, seen(RING, DARK))
+    pipeline = round_the_ring()
+    with pytest.MonkeyPatch.context() as patch:
+        if refusing:
+            refuse_closures(patch)
+        return pipeline, drive(pipeline, seen(RING, DARK))
 
 
 def test_return_is_recognised_and_the_drift_corrected() -> None:
@@ -150,20 +156,23 @@ def test_a_refused_closure_changes_nothing_but_that_a_rest_follows() -> None:
     assert_same_bits(pipeline.tracker.database.state(), without.tracker.database.state())
 
 
-def test_a_refused_closure_is_offered_again_after_the_rest() -> None:
+def test_a_refused_closure_is_offered_again_after_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     """The place was not seen, as far as the map is concerned; so it can be recognised again."""
     first = closings(ring(refusing=True)[1])[0]
     longer = [on_ring(k) for k in range(ROUND + 16 + SETTINGS.loops.rest)]
-    again = pipeline_of(longer, 0.9, dataclasses.replace(SETTINGS, lost=None), REFUSING)
+    again = pipeline_of(longer, 0.9, dataclasses.replace(SETTINGS, lost=None))
+    refuse_closures(monkeypatch)
     offered = closings(drive(again, seen(longer, DARK)))
     assert offered[0] == first
     assert len(offered) >= 2
 
 
-def test_only_a_closure_that_was_taken_bounds_later_drift() -> None:
+def test_only_a_closure_that_was_taken_bounds_later_drift(monkeypatch: pytest.MonkeyPatch) -> None:
     way = {}
     for refusing in (False, True):
-        pipeline = round_the_ring(refusing)
+        pipeline = round_the_ring()
+        if refusing:
+            refuse_closures(monkeypatch)
         frames = list(seen(RING, DARK))[: closings(ring()[1])[0] + 1]
         loop = drive(pipeline, frames)[-1].increment.loops[0]
         way[refusing] = pipeline.places._memory.way_since(loop.frame)
@@ -191,10 +200,13 @@ def test_each_estimator_of_a_comparison_accepts_or_refuses_a_closure_itself() ->
 
 
 @pytest.mark.parametrize("refusing", [False, True])
-def test_a_replay_closes_the_same_loops_to_the_bit(refusing: bool) -> None:
+def test_a_replay_closes_the_same_loops_to_the_bit(
+    refusing: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pipeline, reports = ring(refusing)
-    settings = REFUSING if refusing else LandmarkKalmanSettings()
-    estimator = make_estimator(RIG, settings, SETTINGS.ego_motion)
+    if refusing:
+        refuse_closures(monkeypatch)
+    estimator = make_estimator(RIG, LandmarkKalmanSettings(), SETTINGS.ego_motion)
     solver = EgoMotionSolver(RIG, SETTINGS.ego_motion)
     motion = RingMotion(RING, 0.9)
     for k, report in enumerate(reports):
@@ -210,15 +222,19 @@ def test_a_replay_closes_the_same_loops_to_the_bit(refusing: bool) -> None:
 @pytest.mark.parametrize(
     ("refusing", "after_closing"), [(False, -20), (False, 1), (False, 2), (True, 1), (True, 4)]
 )
-def test_continued_from_its_state_it_goes_on_to_the_bit(refusing: bool, after_closing: int) -> None:
+def test_continued_from_its_state_it_goes_on_to_the_bit(
+    refusing: bool, after_closing: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     _, reports = ring(refusing)
+    if refusing:
+        refuse_closures(monkeypatch)
     stop = closings(reports)[0] + after_closing
-    whole = round_the_ring(refusing)
+    whole = round_the_ring()
     frames = list(seen(RING, DARK))
     log = MeasurementLog(RIG, {})
     for report in drive(whole, frames[:stop]):
         log.append(report.increment)
-    again = round_the_ring(refusing)
+    again = round_the_ring()
     again.tracker.database.restore(whole.tracker.database.state())
     again.estimator.restore(whole.estimator.state())
     again.places.restore(whole.places.state(), log)
