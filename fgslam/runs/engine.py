@@ -32,6 +32,7 @@ from fgslam.runs.folder import (
     versions,
     write_config,
 )
+from fgslam.runs.processes import Workers
 from fgslam.runs.units import (
     Argument,
     Done,
@@ -95,6 +96,7 @@ class Context:
         store: of finished units.
         jobs: processes at a time.
         progress, stopped: as of :func:`run_task`.
+        workers: processes that small units share, whichever their stage; None: there are none.
     """
 
     folder: Path
@@ -103,10 +105,12 @@ class Context:
     jobs: int
     progress: Progress
     stopped: Stopped
+    workers: Workers | None = None
 
     def perform(self, stage: Stage[Argument, Result], single_threaded: bool = True) -> Done[Result]:
         """Does what is missing of a stage; as :func:`fgslam.runs.units.perform`."""
-        return perform(stage, self.store, self.jobs, self.progress, self.stopped, single_threaded)
+        loop = (self.jobs, self.progress, self.stopped)
+        return perform(stage, self.store, *loop, single_threaded, self.workers)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,7 +204,9 @@ def run_task(
         write_config(folder, config, dict(task.provenance))
     store = UnitStore(folder)
     jobs = jobs or getattr(config, "jobs", 1) or os.cpu_count() or 1
-    result = task.run(Context(folder, existing == "resume", store, jobs, progress, stopped))
+    resumed = existing == "resume"
+    with Workers() as workers:
+        result = task.run(Context(folder, resumed, store, jobs, progress, stopped, workers))
     if result.status == "finished":
         store.remove()
     return result

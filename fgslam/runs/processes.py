@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from fgslam.core.errors import FgslamError
 
@@ -46,9 +46,49 @@ class WorkerEnded(Generic[Argument]):
 
 @dataclass(slots=True)
 class _Worker:
-    index: int
     process: SpawnProcess
     connection: Connection
+    single_threaded: bool
+    index: int = -1  # of its argument
+
+
+class Workers:
+    """Processes that wait for more work once theirs is done, until they are closed.
+
+    Starting one takes a second of imports, as long as dozens of small units. One that crashes takes
+    nothing along but its own work: the next piece gets a new process.
+    """
+
+    def __init__(self) -> None:
+        """None yet."""
+        self._idle: list[_Worker] = []
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends those that wait."""
+        idle, self._idle = self._idle, []
+        for worker in idle:
+            worker.connection.close()
+        for worker in idle:
+            _see_off(worker.process)
+
+    def take(self, single_threaded: bool) -> _Worker:
+        """One that waits with as many threads, else a new one."""
+        for worker in self._idle:
+            if worker.single_threaded == single_threaded and worker.process.is_alive():
+                self._idle.remove(worker)
+                return worker
+        with _threads_limited(single_threaded):
+            return _new_worker(single_threaded)
+
+    def keep(self, worker: _Worker) -> None:
+        """Takes one back whose result has been collected."""
+        self._idle.append(worker)
 
 
 def run_apart(
@@ -57,15 +97,17 @@ def run_apart(
     jobs: int = 1,
     stopped: Callable[[], bool] = lambda: False,
     single_threaded: bool = False,
+    workers: Workers | None = None,
 ) -> Iterator[tuple[int, Result | WorkerEnded[Argument]]]:
-    """Calls a function on each argument, each time in a new process.
+    """Calls a function on each argument in another process.
 
     Args:
         function: of a module's top level; result and argument are handed over by multiprocessing.
-        arguments: one a process.
+        arguments: one at a time for a process.
         jobs: how many at a time.
         stopped: asked every moment; True ends the processes that run and starts no more.
         single_threaded: linear algebra on one thread a process.
+        workers: processes to use and to leave behind; None: a new one for each argument.
 
     Yields:
         Index of the argument and its result, as they come.
@@ -74,19 +116,21 @@ def run_apart(
         FgslamError: what the function raised in its process.
     """
     waiting = list(enumerate(arguments))[::-1]
+    source = workers or Workers()
     running: list[_Worker] = []
     try:
         while waiting or running:
             if stopped():
                 break
             while waiting and len(running) < jobs:
-                index, argument = waiting.pop()
-                with _threads_limited(single_threaded):
-                    running.append(_start(index, function, argument))
+                worker = source.take(single_threaded)
+                running.append(worker)
+                worker.index, argument = waiting.pop()
+                _send(worker, function, argument)
             ready = wait([worker.connection for worker in running], _POLL_S)
             for worker in [w for w in running if w.connection in ready]:
                 running.remove(worker)
-                yield worker.index, _collect(worker, arguments[worker.index])
+                yield worker.index, _collect(worker, arguments[worker.index], workers)
     finally:
         for worker in running:
             worker.process.terminate()
@@ -98,26 +142,24 @@ def run_apart(
         yield index, WorkerEnded(argument, "interrupted before it began")
 
 
-def _start(index: int, function: Callable[[Argument], Result], argument: Argument) -> _Worker:
-    """The work is sent once the process runs: one that ends before it has read it breaks the pipe.
-
-    Handed over as arguments of the process, work larger than the pipe's buffer would be waited for
-    without end: multiprocessing keeps the reading end open while it writes.
-    """
+def _new_worker(single_threaded: bool) -> _Worker:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(theirs,), daemon=True)
     with _without_main():
         process.start()
     theirs.close()  # so that the end of the process is the end of the pipe
-    try:
-        with suppress(BrokenPipeError, ConnectionResetError):  # _collect says how it ended
-            ours.send((function, argument))
-    except BaseException:  # what cannot be handed over is the caller's mistake
-        process.kill()
-        process.join()
-        raise
-    return _Worker(index, process, ours)
+    return _Worker(process, ours, single_threaded)
+
+
+def _send(worker: _Worker, function: Callable[[Argument], Result], argument: Argument) -> None:
+    """The work is sent once the process runs: one that ends before it has read it breaks the pipe.
+
+    Handed over as arguments of the process, work larger than the pipe's buffer would be waited for
+    without end: multiprocessing keeps the reading end open while it writes.
+    """
+    with suppress(BrokenPipeError, ConnectionResetError):  # _collect says how it ended
+        worker.connection.send((function, argument))
 
 
 @contextmanager
@@ -139,11 +181,21 @@ def _work(connection: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    function, argument = connection.recv()
+    while (work := _received(connection)) is not None:
+        function, argument = work
+        try:
+            connection.send(function(argument))
+        except FgslamError as error:
+            connection.send(error)
+
+
+def _received(connection: Connection) -> tuple[Callable[[Any], Any], Any] | None:
+    """The next piece of work; None where there will be none."""
     try:
-        connection.send(function(argument))
-    except FgslamError as error:
-        connection.send(error)
+        work: tuple[Callable[[Any], Any], Any] = connection.recv()
+    except (EOFError, ConnectionResetError):
+        return None
+    return work
 
 
 def _end_with_parent() -> None:
@@ -165,13 +217,19 @@ def _see_off(process: SpawnProcess) -> None:
         process.join()
 
 
-def _collect(worker: _Worker, argument: Argument) -> Result | WorkerEnded[Argument]:
+def _collect(
+    worker: _Worker, argument: Argument, workers: Workers | None
+) -> Result | WorkerEnded[Argument]:
     try:
         result: Result | FgslamError = worker.connection.recv()
     except (EOFError, ConnectionResetError):
         worker.process.join()
         return WorkerEnded(argument, _ending(worker.process.exitcode))
-    worker.process.join()
+    if workers is not None:
+        workers.keep(worker)
+    else:
+        worker.connection.close()
+        worker.process.join()
     if isinstance(result, FgslamError):
         raise result
     return result

@@ -25,7 +25,7 @@ from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import MeasurementLogError, OutputError
 from fgslam.core.files import clear_output_errors, is_unfinished_file, make_subfolder
-from fgslam.runs.processes import WorkerEnded, run_apart
+from fgslam.runs.processes import WorkerEnded, Workers, run_apart
 
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
@@ -50,6 +50,8 @@ class Stage(Generic[Argument, Result]):
         argument: what a process is given for a block of units.
         kind: type of one unit's result.
         blocks: divides the units that are missing into blocks.
+        small: a process does several blocks, one after the other: starting one takes as long as
+            some units. Not where a process's own memory is measured.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Stage(Generic[Argument, Result]):
     argument: Callable[[tuple[int, ...]], Argument]
     kind: Any
     blocks: Callable[[Sequence[int]], Sequence[Sequence[int]]]
+    small: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,6 +171,7 @@ def perform(
     progress: Progress,
     stopped: Stopped,
     single_threaded: bool = True,
+    workers: Workers | None = None,
 ) -> Done[Result]:
     """Does what is missing of a stage, in processes.
 
@@ -178,6 +182,7 @@ def perform(
         progress: called after each block that is done.
         stopped: True ends it; what was done until then is kept.
         single_threaded: linear algebra on one thread a process.
+        workers: processes for the blocks of small units; None: each block has one of its own.
 
     Raises:
         FgslamError: what a unit raised, or a unit's file cannot be written or read.
@@ -188,7 +193,8 @@ def perform(
     ended: list[tuple[tuple[int, ...], str]] = []
     progress(stage.label, len(found), stage.count)
     arguments = [stage.argument(block) for block in blocks]
-    for index, result in run_apart(stage.work, arguments, jobs, stopped, single_threaded):
+    kept = workers if stage.small else None
+    for index, result in run_apart(stage.work, arguments, jobs, stopped, single_threaded, kept):
         block = blocks[index]
         if isinstance(result, WorkerEnded):
             ended.append((block, result.why))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -137,6 +138,7 @@ def extract_features(
         argument=lambda units: _Block(dataset, settings, units),
         kind=OmniFeatures,
         blocks=in_blocks(_VIEWS_A_BLOCK),
+        small=True,
     )
     done = context.perform(stage)
     if done.ended and not context.stopped():
@@ -152,8 +154,14 @@ def _extract(block: _Block) -> list[OmniFeatures]:
             OmniFeatures(plain_sift(recording.camera, recording.image(i)), empty_segments())
             for i in block.views
         ]
-    extractor = OmniFeatureExtractor(recording.camera, block.features)
+    extractor = _extractor(block.dataset, block.features)
     return [extractor.extract(recording.image(i)) for i in block.views]
+
+
+@lru_cache(maxsize=1)
+def _extractor(dataset: OmniDatasetSettings, settings: OmniFeatureSettings) -> OmniFeatureExtractor:
+    """Its maps take as long as an image's features; a process does several blocks of views."""
+    return OmniFeatureExtractor(open_omni(dataset).camera, settings)
 
 
 _BLOCKS_A_JOB = 4  # so that progress moves, and no process waits long for the last one
@@ -225,6 +233,7 @@ def answer_pairs(
         argument=lambda units: replace(search, pairs=tuple(search.pairs[k] for k in units)),
         kind=PairAnswer,
         blocks=interleaved(_BLOCKS_A_JOB * context.jobs),
+        small=True,
     )
     done = context.perform(stage)
     failures = [f"{len(units)} pairs: {why}" for units, why in done.ended]

@@ -16,7 +16,7 @@ import pytest
 
 from fgslam.core.errors import ConfigError
 from fgslam.runs import processes
-from fgslam.runs.processes import WorkerEnded, run_apart
+from fgslam.runs.processes import WorkerEnded, Workers, run_apart
 
 
 def work(what: str) -> str:
@@ -55,6 +55,46 @@ def test_a_crash_takes_nothing_else_along() -> None:
     assert isinstance(second, WorkerEnded)
     assert "status 3" in second.why
     assert str(found[2]).startswith("fine")
+
+
+def own_number(what: str) -> int:
+    """Of the process; some end or fail."""
+    work(what)
+    return os.getpid()
+
+
+def test_workers_are_used_again_until_they_are_closed() -> None:
+    with Workers() as workers:
+        first = dict(run_apart(own_number, ["a", "b"], workers=workers))
+        second = dict(run_apart(own_number, ["c"], workers=workers))
+        alone = dict(run_apart(own_number, ["d"]))
+        assert first[0] == first[1] == second[0] != alone[0]
+        assert len(multiprocessing.active_children()) == 1
+    assert not multiprocessing.active_children()
+
+
+def test_other_threads_need_another_worker(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    with Workers() as workers:
+        assert dict(run_apart(work, ["a"], single_threaded=True, workers=workers)) == {0: "a 1"}
+        assert dict(run_apart(work, ["a"], workers=workers)) == {0: "a 2"}
+
+
+def test_a_worker_that_crashed_is_replaced() -> None:
+    with Workers() as workers:
+        found = dict(run_apart(own_number, ["fine", "killed", "fine"], workers=workers))
+    assert isinstance(found[1], WorkerEnded)
+    assert isinstance(found[0], int)
+    assert isinstance(found[2], int)
+    assert found[0] != found[2]
+
+
+def test_a_worker_serves_on_after_a_users_mistake() -> None:
+    with Workers() as workers:
+        before = dict(run_apart(own_number, ["fine"], workers=workers))
+        with pytest.raises(ConfigError):
+            list(run_apart(own_number, ["error"], workers=workers))
+        assert dict(run_apart(own_number, ["fine"], workers=workers)) == before
 
 
 def end_at_once(connection: Connection) -> None:
