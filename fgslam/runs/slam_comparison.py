@@ -114,13 +114,14 @@ def write_comparison(
         config: of the run.
         frames: in its log.
         metrics: by title.
-        about: what metrics.json says beside them; its `status` is set here.
+        about: what metrics.json says beside them, after the run's name and status.
         run: folder of the run.
     """
     out = context.folder
     status: Status = "interrupted" if context.stopped() else "finished"
     values = {title: one.as_json() for title, one in metrics.items()}
-    write_metrics(out / METRICS_FILE, frames, metrics, {**about, "status": status})
+    own: dict[str, JsonValue] = {"name": config.name, "status": status, **about}
+    write_metrics(out / METRICS_FILE, frames, metrics, own)
     write_comparison_csv(out / COMPARISON_FILE, [(config.name, values)])
     if config.output.report:
         report_from_folder(out, run)
@@ -144,8 +145,6 @@ def _compare(
     """One run's log through the estimators."""
     metrics = replay_apart(config, run, estimators, context)
     about: dict[str, JsonValue] = {
-        "name": config.name,
-        "status": None,
         "run": str(run),
         "odometry": config.odometry.kind,
         "remark": config.remark or None,

@@ -1,4 +1,4 @@
-"""What every homing estimator promises (fgslam/backend/homing/protocol.py)."""
+"""What every homing estimator promises (fgslam/backend/homing/estimator.py)."""
 
 from __future__ import annotations
 

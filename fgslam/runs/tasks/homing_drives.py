@@ -209,7 +209,7 @@ _TRAIL = 15  # images
 
 @runtime_checkable
 class Unwrapping(Protocol):
-    """FrontEnd that can show what they see; those of landmark worlds cannot."""
+    """A front-end that can show its view; those of landmark worlds cannot."""
 
     def unwrapped(self, image: ByteArray) -> ByteArray:
         """(h, w) grey view of an image."""

@@ -95,8 +95,6 @@ def _about(
     config: ExperimentConfig, recording: MeasurementRecording, rows: list[ReplayRow]
 ) -> dict[str, JsonValue]:
     return {
-        "name": config.name,
-        "status": None,
         "frames_in_recording": len(recording.log),
         "odometry": config.odometry.kind,
         "remark": config.remark or None,
