@@ -10,4 +10,4 @@ Values are frozen dataclasses of plain NumPy arrays. Frames and units, everywher
   tangent space at the estimate: ``T = T_estimate * Exp(xi)``, as in GTSAM.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"

@@ -41,6 +41,15 @@ def test_words_are_those_of_the_field(page: Path) -> None:
     assert not [found.group() for found in WORDS.finditer(text)]
 
 
+def test_changelog_names_the_version_that_is_made_and_no_release_of_that_version() -> None:
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    released = re.findall(r"^## \[(\d[^]]*)\] - \d{4}-\d{2}-\d{2}$", text, flags=re.MULTILINE)
+    towards = re.findall(r"^Towards (\d[\w.]*\d): ", text, flags=re.MULTILINE)
+    assert towards == [fgslam.__version__.partition(".dev")[0]]
+    assert "0.1.0" in released
+    assert fgslam.__version__ not in released
+
+
 @pytest.mark.parametrize("page", PAGES, ids=ids[: len(PAGES)])
 def test_page_is_in_the_navigation(page: Path) -> None:
     assert str(page.relative_to(ROOT / "docs")) in NAVIGATION
