@@ -28,6 +28,13 @@ class SiftSettings:
         float,
         Field(ge=0.0, description="OpenCV's contrast threshold, divided by octave_layers inside"),
     ] = 0.03
+    contrast: Annotated[
+        Literal["relative", "absolute"],
+        Field(
+            description="`relative`: the threshold is that of a well exposed image and falls with "
+            "the contrast of a dark or pale one, down to its noise; `absolute`: it never does"
+        ),
+    ] = "relative"
     base_sigma_px: Annotated[
         float, Field(gt=0.5, le=3.0, description="Gaussian of the first level, doubled image")
     ] = 1.6

@@ -10,9 +10,17 @@ import numpy as np
 
 from fgslam.core.arrays import ByteArray, Image, IntArray
 from fgslam.core.features import Features
+from fgslam.frontend.features.exposure import contrast_share, noise_sigma
 from fgslam.frontend.features.settings import Appearance, SiftSettings
 
 EDGE_THRESHOLD = 10.0  # ratio of principal curvatures above which edges go: OpenCV's own
+_NOISE_ANSWER = 0.4
+"""Contrast that 1 of 100 features of white noise exceed at the first level, in the noise's sigmas.
+
+Found on noise, base sigma 1.6 and two levels an octave; it is smaller for others, and falls with
+the scale."""
+
+_WHITE = 255.0
 
 
 class SiftExtractor:
@@ -25,38 +33,56 @@ class SiftExtractor:
     def __init__(self, settings: SiftSettings, appearance: Appearance) -> None:
         """Makes the detector; OpenCV's own threads are switched off, images run in parallel."""
         cv2.setNumThreads(1)
+        self._settings = settings
         self._describe = appearance == "descriptor"
-        self._levels = settings.scale_levels
-        self._layers = settings.octave_layers
-        self._sift = cv2.SIFT.create(
-            settings.max_features,
-            settings.octave_layers,
-            settings.contrast_threshold,
-            EDGE_THRESHOLD,
-            settings.base_sigma_px,
-            cv2.CV_8U,
-            True,
-        )
+        self._sift = self._detector(settings.contrast_threshold)
 
     def extract(self, image: Image) -> Features:
-        """Features of one grey image (height, width), in OpenCV's order, which is repeatable."""
-        # One call for both: two calls would build the pyramid twice.
-        if self._describe:
-            keypoints, computed = self._sift.detectAndCompute(image, None)
-        else:
-            keypoints, computed = self._sift.detect(image, None), None
-        if computed is None:
-            computed = np.zeros((len(keypoints), 128), np.uint8)
-        return self._select(keypoints, np.asarray(computed, np.uint8))
+        """Features of one grey image (height, width), in OpenCV's order, which is repeatable.
+
+        With ``contrast: relative`` those that the image would have if it were well exposed, without
+        what is likely to be noise. An image that is well exposed is taken as it is.
+        """
+        share = 1.0 if self._settings.contrast == "absolute" else contrast_share(image)
+        if share == 1.0:
+            return self._select(*self._found(self._sift, image), noise=0.0)
+        dim = self._detector(share * self._settings.contrast_threshold)
+        return self._select(*self._found(dim, image), noise_sigma(image))
 
     def extract_all(self, images: Many[Image], pool: Executor) -> tuple[Features, ...]:
         """Features of several images, one task each."""
         return tuple(pool.map(self.extract, images))
 
-    def _select(self, keypoints: Many[cv2.KeyPoint], descriptors: ByteArray) -> Features:
-        rows = [(*kp.pt, kp.size, kp.angle, kp.octave) for kp in keypoints]
-        table = np.array(rows, dtype=np.float64).reshape(-1, 5)
-        keep = self._levels_of(table[:, 4].astype(np.int64)) < self._levels
+    def _detector(self, contrast_threshold: float) -> cv2.SIFT:
+        return cv2.SIFT.create(
+            self._settings.max_features,
+            self._settings.octave_layers,
+            contrast_threshold,
+            EDGE_THRESHOLD,
+            self._settings.base_sigma_px,
+            cv2.CV_8U,
+            True,
+        )
+
+    def _found(self, sift: cv2.SIFT, image: Image) -> tuple[Many[cv2.KeyPoint], ByteArray]:
+        # One call for both: two calls would build the pyramid twice.
+        if self._describe:
+            keypoints, computed = sift.detectAndCompute(image, None)
+        else:
+            keypoints, computed = sift.detect(image, None), None
+        if computed is None:
+            computed = np.zeros((len(keypoints), 128), np.uint8)
+        return keypoints, np.asarray(computed, np.uint8)
+
+    def _select(
+        self, keypoints: Many[cv2.KeyPoint], descriptors: ByteArray, noise: float
+    ) -> Features:
+        """Features of the levels searched that answer more than noise of that sigma would."""
+        rows = [(*kp.pt, kp.size, kp.angle, kp.octave, kp.response) for kp in keypoints]
+        table = np.array(rows, dtype=np.float64).reshape(-1, 6)
+        level = self._levels_of(table[:, 4].astype(np.int64))
+        by_noise = _NOISE_ANSWER * noise * 2.0 ** (-level / self._settings.octave_layers)
+        keep = (level < self._settings.scale_levels) & (_WHITE * table[:, 5] >= by_noise)
         return Features(
             xy=table[keep, :2],
             scale=0.5 * table[keep, 2],
@@ -68,4 +94,4 @@ class SiftExtractor:
         """Levels counted from the finest, 0-based, of OpenCV's packed octave and layer."""
         octave = packed & 255
         octave = np.where(octave >= 128, octave - 256, octave)
-        return (octave + 1) * self._layers + ((packed >> 8) & 255) - 1
+        return (octave + 1) * self._settings.octave_layers + ((packed >> 8) & 255) - 1

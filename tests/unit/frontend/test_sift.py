@@ -187,6 +187,62 @@ def test_at_most_the_strongest_are_kept() -> None:
 
 
 # --------------------------------------------------------------------------------------------
+# Exposure
+
+
+def lit(gain: float, sigma: float = 0.3, seed: int = 0) -> Image:
+    """The texture in other light, with the noise of reading and the rounding of a camera."""
+    rng = np.random.default_rng([seed, 9])
+    grey = gain * texture(seed=seed)
+    return as_image(np.clip(grey + sigma * rng.standard_normal(grey.shape), 0, 255))
+
+
+@pytest.mark.parametrize("gain", [1 / 4, 1 / 8, 1 / 20])
+def test_a_dark_image_has_the_features_of_the_bright_one(gain: float) -> None:
+    bright, dark = extract(lit(1.0)), extract(lit(gain))
+    assert 0.75 * len(bright) < len(dark) < 1.5 * len(bright)
+    _, distance = nearest(bright.xy, dark.xy)
+    assert (distance < 1.0).mean() > 0.65  # at 1/20 the last levels are those of rounding
+    assert len(extract(lit(gain), contrast="absolute")) < 0.5 * len(bright)
+
+
+def test_a_pale_image_has_the_features_of_the_clear_one() -> None:
+    """Fog, or a dirty window: an eighth of the contrast, on bright grey."""
+    clear = lit(1.0)
+    pale = as_image(180 + clear / 8.0)
+    assert len(extract(pale)) > 0.75 * len(extract(clear))
+
+
+def test_a_well_exposed_image_is_taken_as_it_is() -> None:
+    image = as_image(texture())
+    assert_same_bits(extract(image), extract(image, contrast="absolute"))
+
+
+def test_dark_images_give_the_same_bits_in_any_thread() -> None:
+    images = [lit(1 / 8, seed=seed) for seed in range(3)]
+    extractor = SiftExtractor(SETTINGS, "descriptor")
+    with ThreadPoolExecutor(3) as pool:
+        together = extractor.extract_all(images * 2, pool)
+    for k, found in enumerate(together):
+        assert_same_bits(found, extract(images[k % 3]))
+
+
+@pytest.mark.parametrize("sigma", [0.3, 1.5, 4.0])
+@pytest.mark.parametrize("grey", [0.0, 20.0, 200.0])
+def test_noise_alone_is_hardly_ever_a_feature(grey: float, sigma: float) -> None:
+    """Under a lens cap, or before a white wall: 1 in 100 of what the noise alone would give."""
+    noise = sigma * np.random.default_rng(3).standard_normal((240, 320))
+    image = as_image(np.clip(grey + noise, 0, 255))
+    assert len(extract(image)) <= 8
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_black_image_is_taken_without_a_warning() -> None:
+    assert len(extract(np.zeros((240, 320), np.uint8))) == 0
+    assert len(extract(np.zeros((2, 2), np.uint8))) == 0
+
+
+# --------------------------------------------------------------------------------------------
 # Equivariance: the features move, grow and turn with the texture
 
 
