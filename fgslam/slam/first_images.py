@@ -45,11 +45,18 @@ class FirstImages:
         if self._brightest > _DARK:
             return f" ({np.mean(self._left):.0f} in the left image)"
         if self._uint16:
-            return (
-                f"; of uint16 the upper eight bits count, and they reach {self._brightest} of 255: "
-                "shift 12-bit values to 16 bits (image << 4)"
-            )
+            return f"; {self._lost_bits()}"
         return f"; the images are dark, their largest grey value is {self._brightest} of 255"
+
+    def remarks(self) -> tuple[str, ...]:
+        """What is worth a remark although the images are matched: bits given that are not used."""
+        return (self._lost_bits(),) if self._uint16 and self._brightest <= _DARK else ()
+
+    def _lost_bits(self) -> str:
+        return (
+            f"of uint16 the upper eight bits count, and they reach {self._brightest} of 255: "
+            "shift 12-bit values to 16 bits (image << 4)"
+        )
 
 
 def any_uint16(images: Sequence[npt.ArrayLike]) -> bool:
@@ -58,11 +65,13 @@ def any_uint16(images: Sequence[npt.ArrayLike]) -> bool:
 
 
 def stereo_remarks(recorder: RunRecorder, seen: FirstImages | None = None) -> tuple[str, ...]:
-    """A remark where the first frames with images have next to no stereo match; else none."""
+    """A remark where the first frames with images have next to no stereo match, or lost bits."""
     rows = [row for row in recorder.rows if not row.problem][:_FRAMES]
     features, matched = sum(row.features for row in rows), sum(row.stereo for row in rows)
-    if len(rows) < _FEWEST or matched > _LEAST_MATCHED * features:
+    if len(rows) < _FEWEST:
         return ()
+    if matched > _LEAST_MATCHED * features:
+        return () if seen is None else seen.remarks()
     n, cause = len(rows), "" if seen is None else seen.cause()
     found = f"no stereo matches in the first {n} frames: {features / n:.0f} features in the right"
     found += f" image, {matched / n:.0f} of them matched{cause}"
