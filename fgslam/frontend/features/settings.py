@@ -31,8 +31,8 @@ class SiftSettings:
     contrast: Annotated[
         Literal["relative", "absolute"],
         Field(
-            description="`relative`: the threshold is that of a well exposed image and falls with "
-            "the contrast of a dark or pale one, down to its noise; `absolute`: it never does"
+            description="`relative`: the threshold is a well exposed image's and falls with the "
+            "contrast of a dark or pale one, down to its noise; `absolute`: always the same"
         ),
     ] = "relative"
     base_sigma_px: Annotated[
