@@ -164,10 +164,6 @@ class UtiasRangeBearingSettings(RecordingSettings):
     max_range_m: Annotated[
         float, Field(gt=0.0, description="readings farther than this are left out, metres")
     ] = 5.0
-    lateral_sigma_mps: Annotated[
-        float,
-        Field(gt=0.0, description="sideways speed, which the wheels do not measure, m/s"),
-    ] = 0.03
 
 
 # --------------------------------------------------------------------------------------------

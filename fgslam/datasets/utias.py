@@ -49,6 +49,8 @@ from fgslam.datasets.settings import (
 
 # (column, row, disparity) of the right camera, from left column and row, right column and row.
 _MEASURE: FloatArray = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.5, 0.0, 0.5], [1.0, 0.0, -1.0, 0.0]])
+_LATERAL_SIGMA_MPS = 0.03
+"""Of sideways speed, which wheels do not measure; 0.016 in truth (docs/datasets/utias.md)."""
 _NOT_RIGID = 1e-6
 _SCALES = {"pixel_sigma_scale": 1.0, "rate_sigma_scale": 1.0}
 """Of the file's standard deviations, once settings: part of a recording's identity."""
@@ -304,7 +306,7 @@ def _steps(recorded: _LostInTheWoods, settings: UtiasRangeBearingSettings) -> li
     pitch and roll that of the heading; a floor leaves them out.
     """
     speed, turn = recorded.variances["v_var"], recorded.variances["om_var"]
-    lateral = settings.lateral_sigma_mps**2
+    lateral = _LATERAL_SIGMA_MPS**2
     variance = np.array([turn, turn, turn, speed, lateral, speed])
     out = []
     for rates, duration in zip(recorded.rates, np.diff(recorded.stamps), strict=False):

@@ -51,13 +51,6 @@ class StereoSettings:
 class MapMatchingSettings:
     """Matching of features to predicted landmarks (Se et al. 3.1)."""
 
-    window_px: Annotated[
-        float,
-        Field(gt=0.0, description="side of the search window in the image; 5 in the paper"),
-    ] = 5.0
-    disparity_px: Annotated[
-        float, Field(gt=0.0, description="largest difference from the predicted disparity")
-    ] = 2.0
     widen_sigmas: Annotated[
         float,
         Field(
@@ -66,10 +59,6 @@ class MapMatchingSettings:
             "predicted measurement; 0 keeps the paper's fixed window",
         ),
     ] = 3.0
-    max_window_px: Annotated[
-        float,
-        Field(gt=0.0, description="side that widening may not exceed, also of the disparity gate"),
-    ] = 80.0
     refine: Annotated[
         bool,
         Field(
@@ -79,7 +68,7 @@ class MapMatchingSettings:
     rescue: Annotated[
         bool,
         Field(
-            description="where too few match, search the largest window (max_window_px) by "
+            description="where too few match, search the largest window by "
             "descriptor before falling back to the odometry; needs appearance.mode descriptor"
         ),
     ] = False
@@ -133,10 +122,6 @@ class PermanenceSettings:
 class ViewpointSettings:
     """Several views of a landmark, from different directions (Se et al. 6.3)."""
 
-    view_angle_deg: Annotated[
-        float,
-        Field(gt=0.0, lt=180.0, description="farther than this from every view: a view of its own"),
-    ] = 20.0
     max_views: Annotated[
         int,
         Field(
@@ -263,13 +248,6 @@ class RelocalisationSettings:
             "orientation alone, as features without descriptors would"
         ),
     ] = True
-    view_sigma_px: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="added to a feature's noise: from elsewhere it is found elsewhere, pixels",
-        ),
-    ] = 0.3
     map_sigma_m: Annotated[
         float,
         Field(
@@ -277,14 +255,6 @@ class RelocalisationSettings:
             description="added to a landmark's: what the map's drift hides from its covariances",
         ),
     ] = 0.01
-    min_inliers: Annotated[
-        int,
-        Field(
-            ge=3,
-            description="fewer independent inliers are no pose; at most four count of one piece "
-            "of the map, which may be one object",
-        ),
-    ] = 8
     max_sigma_m: Annotated[
         float, Field(gt=0.0, description="largest standard deviation of an accepted position")
     ] = 0.05

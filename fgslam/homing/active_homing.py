@@ -43,6 +43,7 @@ bearings)."""
 EstimatorMaker: TypeAlias = Callable[[HomingStart], HomingEstimator]
 
 _FARTHEST = 3.0  # legs; an estimate farther away has diverged
+_FASTEST_TURN = np.deg2rad(120.0)  # a second between two images: no wheelchair turns faster
 _TURN_MARGIN = np.deg2rad(20.0)  # what near features and noise make of a common turn
 _KEPT_SHARE = 0.7  # of the tracks; fewer count as weak even where there were few to begin with
 _SIGMAS = 4.0  # between two homing vectors of which one must be wrong
@@ -128,12 +129,11 @@ class ActiveHoming:
 
     def _unusable(self, tracked: TrackedBearings) -> Fault | None:
         """The fault of an image with too few tracks, or turned faster than a robot can turn."""
-        s = self._settings
         if len(tracked) < _FEWEST_TRACKS:
             return Fault(f"{len(tracked)} tracks left", False)
         step = tracked.time - self.tracked.time
         turn = common_turn(self.tracked, tracked)
-        limit = np.deg2rad(s.max_turn_deg_s) * step + _TURN_MARGIN
+        limit = _FASTEST_TURN * step + _TURN_MARGIN
         if abs(turn) > limit:
             degrees = np.rad2deg(turn)
             return Fault(f"image turned by {degrees:.0f} deg within {step:.2f} s", False)

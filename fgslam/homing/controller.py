@@ -23,6 +23,9 @@ from fgslam.homing.front_end import HomingFrontEnd, Sighting
 from fgslam.homing.settings import HomingControlSettings
 
 _BLIND_S = 1.0  # longest drive straight on, at reduced speed, without tracks
+_GIVE_UP_S = 3.0  # of refusals, standing: the robot looks from farther on, or ends the homing
+_WAIT_S = 60.0  # on one leg, on top of the time without progress, for a blocked way to clear
+_FARTHER_TRIES = 3  # drives farther on for one target
 _STALL_S = 15.0  # without progress for so long, the target is matched anew
 _FARTHER_S = 2.5
 """Drive straight on, at reduced speed, to look for a refused target from elsewhere; 0.4 m with the
@@ -68,7 +71,7 @@ class HomingController:
         self._ended: Command | None = None
         self._heading = 0.0
         self._was_ahead = False
-        self._progress, self._patience = _Progress(_STALL_S), settings.wait_s
+        self._progress, self._patience = _Progress(_STALL_S), _WAIT_S
         self._next_try = -np.inf
         self._blind_until = -np.inf
         self._search_until, self._searches = -np.inf, 0
@@ -283,9 +286,9 @@ class HomingController:
         self._obstacle = refusal.details
         command = self._hold(time, refusal.details)
         since = self._standing_since
-        if since is None or time - since < self._settings.give_up_s:
+        if since is None or time - since < _GIVE_UP_S:
             return command
-        if self._searches < self._settings.farther_tries:
+        if self._searches < _FARTHER_TRIES:
             return self._search(time, refusal.details)
         if self.initialisations:
             refusal = Refusal(RefusalReason.LOST, f"lost, then: {refusal.details}")

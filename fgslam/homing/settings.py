@@ -28,34 +28,9 @@ class HomingControlSettings:
             description="part of the leg that may be left when the target counts as reached",
         ),
     ] = 0.07
-    max_turn_deg_s: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="an image turned faster than this against the last one is rejected",
-        ),
-    ] = 120.0
     retry_s: Annotated[
         float, Field(ge=0.0, description="between two attempts to match the target anew")
     ] = 0.5
-    give_up_s: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="after refusals for so long, standing, the robot looks from farther on, or "
-            "ends the homing",
-        ),
-    ] = 3.0
-    farther_tries: Annotated[
-        int, Field(ge=0, description="such drives for one target; 0: refused is refused")
-    ] = 3
-    wait_s: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="on one leg the robot waits so long, on top, for a blocked way to clear",
-        ),
-    ] = 60.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -64,10 +39,6 @@ class SteeringSettings:
 
     max_speed_mps: Annotated[float, Field(gt=0.0, description="on the open way")] = 0.4
     max_turn_deg_s: Annotated[float, Field(gt=0.0, description="largest turning rate")] = 40.0
-    acceleration_mps2: Annotated[float, Field(gt=0.0, description="largest change of speed")] = 0.5
-    turn_acceleration_deg_s2: Annotated[
-        float, Field(gt=0.0, description="largest change of the turning rate")
-    ] = 120.0
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -11,6 +11,9 @@ from fgslam.core.planar import wrap
 from fgslam.homing.command import Command, Drive, HomingState
 from fgslam.homing.settings import AvoidanceSettings, SteeringSettings
 
+ACCELERATION_MPS2, TURN_ACCELERATION_DEG_S2 = 0.5, 120.0
+"""Largest changes of speed and of the turning rate: what a passenger takes without holding on."""
+
 _TURN_IN_PLACE_DEG = 60.0
 """Home farther off than this: turn without driving, until it is within half of it."""
 
@@ -41,15 +44,14 @@ class Steering:
 
     def step(self, command: Command, dt: float) -> Drive:
         """Speed and turning rate for the next ``dt`` seconds."""
-        s = self._settings
         if command.stop:
             wanted_speed, wanted_rate = 0.0, 0.0
             self._turning = False
         else:
             wanted_rate = self._turn(command.heading)
             wanted_speed = self._forward(command)
-        self._speed = _towards(self._speed, wanted_speed, s.acceleration_mps2 * dt)
-        most = np.deg2rad(s.turn_acceleration_deg_s2) * dt
+        self._speed = _towards(self._speed, wanted_speed, ACCELERATION_MPS2 * dt)
+        most = np.deg2rad(TURN_ACCELERATION_DEG_S2) * dt
         self._turn_rate = _towards(self._turn_rate, wanted_rate, most)
         return Drive(self._speed, self._turn_rate)
 

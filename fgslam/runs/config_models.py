@@ -262,9 +262,6 @@ class HomingPairsConfig(HomingExperiment):
     dataset: OmniDatasetSettings
     features: OmniFeatureSettings = OmniFeatureSettings()
     homing_vector: HomingVectorSettings = HomingVectorSettings()
-    both_ways: Annotated[
-        bool, Field(description="each pair in both directions; else from the earlier view only")
-    ] = False
     reference: Annotated[
         bool, Field(description="plain SIFT and two-point RANSAC beside it, for comparison")
     ] = True

@@ -47,7 +47,37 @@ _LOOPS = {
 }
 """Of every estimator that corrects: which loop closures it accepts."""
 
+_COLUMNS = {
+    "sigma_px": 1.8,
+    "max_width": 2048,
+    "max_tangent": 1.0,
+    "smoothing_px": 1.2,
+    "min_length_px": 8.0,
+    "min_length_tangent": 0.05,
+    "min_contrast": 4.0,
+    "min_run_px": 2,
+    "max_run_deg": 8.0,
+    "run_step_px": 1.5,
+    "sigma_run": 0.15,
+    "min_gradient": 4.0,
+}
+"""Of the invariant column segments, all of which are constant."""
+
 RETIRED: dict[str, dict[str, Any]] = {
+    "HomingPairsConfig": {
+        "both_ways": False,
+    },
+    "QuerySettings": {
+        "least_visible": 20,
+        "wrong_m": 0.3,
+        "wrong_deg": 5.0,
+    },
+    "OmniFeatureSettings": {
+        "columns": _COLUMNS,
+    },
+    "ViewpointSettings": {
+        "view_angle_deg": 20.0,
+    },
     "DetectionSettings": {
         "min_range_m": 0.4,
         "oblique_deg": 75.0,
@@ -95,19 +125,6 @@ RETIRED: dict[str, dict[str, Any]] = {
         "mean_floor": 8.0,
         "patch_sigmas": 6.0,
     },
-    "ColumnSegmentSettings": {
-        "max_width": 2048,
-        "max_tangent": 1.0,
-        "smoothing_px": 1.2,
-        "min_length_px": 8.0,
-        "min_length_tangent": 0.05,
-        "min_contrast": 4.0,
-        "min_run_px": 2,
-        "max_run_deg": 8.0,
-        "run_step_px": 1.5,
-        "sigma_run": 0.15,
-        "min_gradient": 4.0,
-    },
     "DatabaseSettings": {
         "cone_deg": 30.0,
     },
@@ -144,6 +161,10 @@ RETIRED: dict[str, dict[str, Any]] = {
         "path": {"skip_unmatched": True, "max_skips": 1},
     },
     "HomingControlSettings": {
+        "give_up_s": 3.0,
+        "farther_tries": 3,
+        "wait_s": 60.0,
+        "max_turn_deg_s": 120.0,
         "blind_s": 1.0,
         "stall_s": 15.0,
         "pass_fraction": 0.25,
@@ -158,6 +179,7 @@ RETIRED: dict[str, dict[str, Any]] = {
         "min_tracks": 10,
     },
     "HomingGraphSettings": {
+        "lag_s": 1.0,
         "prior_distances": 2.0,
         "relinearize_threshold": 0.01,
         "trust_radius": 1.0,
@@ -222,6 +244,9 @@ RETIRED: dict[str, dict[str, Any]] = {
         "least_offset_deg": 0.3,
     },
     "MapMatchingSettings": {
+        "window_px": 5.0,
+        "disparity_px": 2.0,
+        "max_window_px": 80.0,
         "orientation_deg": 20.0,
         "scale_ratio": 1.5,
     },
@@ -277,6 +302,8 @@ RETIRED: dict[str, dict[str, Any]] = {
         "rotation_floor_deg": 0.1,
     },
     "RelocalisationSettings": {
+        "view_sigma_px": 0.3,
+        "min_inliers": 8,
         "samples": 4096,
         "neighbours": 12,
         "max_distance": 400.0,
@@ -323,6 +350,8 @@ RETIRED: dict[str, dict[str, Any]] = {
         "slip": 0.05,
     },
     "SteeringSettings": {
+        "acceleration_mps2": 0.5,
+        "turn_acceleration_deg_s2": 120.0,
         "turn_in_place_deg": 60.0,
         "slow_fraction": 0.3,
         "least_share": 0.25,
@@ -347,6 +376,7 @@ RETIRED: dict[str, dict[str, Any]] = {
         "min_support": 12,
     },
     "UprightSiftSettings": {
+        "sigma_px": 1.2,
         "octave_layers": 3,
         "edge_threshold": 10.0,
         "base_sigma_px": 1.6,
@@ -354,6 +384,7 @@ RETIRED: dict[str, dict[str, Any]] = {
         "sigma_scales": 0.27,
     },
     "UtiasRangeBearingSettings": {
+        "lateral_sigma_mps": 0.03,
         "rate_sigma_scale": 1.0,
     },
     "UtiasStereoSettings": {

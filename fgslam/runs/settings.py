@@ -77,25 +77,9 @@ class QuerySettings:
             description="queries lie so many frames apart; of bursts of random poses their length",
         ),
     ] = 1
-    least_visible: Annotated[
-        int,
-        Field(
-            ge=0,
-            description="a pose from which fewer of the map's landmarks are visible is counted "
-            "apart; where depth is not known all count",
-        ),
-    ] = 20
     within_m: Annotated[
         float, Field(gt=0.0, description="largest error of a right position, metres")
     ] = 0.05
     within_deg: Annotated[
         float, Field(gt=0.0, le=180.0, description="largest error of a right rotation, degrees")
     ] = 1.0
-    wrong_m: Annotated[
-        float,
-        Field(gt=0.0, description="an accepted pose farther off than this is false, metres"),
-    ] = 0.30
-    wrong_deg: Annotated[
-        float,
-        Field(gt=0.0, le=180.0, description="the same of its rotation, degrees"),
-    ] = 5.0

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fgslam.frontend.places.relocalisation import relocaliser
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 from fgslam.frontend.settings import RelocalisationSettings
 from tests.known_places import RIG, error, floor, planar, room, seen
 
-SETTINGS = RelocalisationSettings(map_sigma_m=0.001, view_sigma_px=0.0)
+SETTINGS = RelocalisationSettings(map_sigma_m=0.001)
+
+
+@pytest.fixture(autouse=True)
+def _exact_features(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Simulated features are where their landmarks are, from wherever they are seen."""
+    monkeypatch.setattr(relocaliser, "_VIEW_SIGMA_PX", 0.0)
 
 
 @settings(max_examples=12, deadline=None)
@@ -29,7 +37,7 @@ def test_never_confident_and_wrong(
     rng = np.random.default_rng(seed)
     place, truth = room(rng, count), planar(x, z, yaw)
     method = "hough" if hough else "ransac"
-    chosen = RelocalisationSettings(map_sigma_m=0.001, view_sigma_px=0.0, method=method)
+    chosen = RelocalisationSettings(map_sigma_m=0.001, method=method)
     made = Relocaliser(RIG, floor(3), chosen)
     made.learn(*place.map())
     view = seen(place, truth, rng, clutter)

@@ -45,6 +45,7 @@ from fgslam.factors.graphs import (
 
 _TRUST_RADIUS = 1.0  # legs, radians: the first of Powell's dog leg
 _RELINEARISED = 0.01  # legs, radians: a variable that moves by more is linearised anew
+_LAG_S = 1.0  # of `fixed_lag`: ten images; older poses hardly change
 _MAX_ITERATIONS = 50  # of Levenberg-Marquardt; from the last solution it takes three to ten
 _RELATIVE_TOLERANCE = 1e-5  # of the cost: the estimate then moves by far less than its deviation
 
@@ -223,7 +224,7 @@ class FixedLagSolver(GtsamSolver):
     def _new(self) -> Any:
         params = _parameters()
         params.findUnusedFactorSlots = True  # without it the smoother grows
-        return gtsam.IncrementalFixedLagSmoother(self._settings.lag_s, params)
+        return gtsam.IncrementalFixedLagSmoother(_LAG_S, params)
 
     def _factors(self) -> Any:
         return self._smoother.getFactors()
@@ -232,7 +233,7 @@ class FixedLagSolver(GtsamSolver):
         time = touched[1]
         stamps = self._stamps | dict.fromkeys(list(values.keys()), time)
         stamps |= {key: time for key in stamps if not is_passing(key)}
-        oldest = time - self._settings.lag_s
+        oldest = time - _LAG_S
         self._stamps = {key: stamp for key, stamp in stamps.items() if stamp >= oldest}
         self._smoother.update(graph, values, stamps)  # those before the oldest leave with it
         self.values = self._smoother.calculateEstimate()

@@ -161,9 +161,6 @@ class HomingGraphSettings(NamedSettings):
             "most of them, all enter. 0: all do, and the kernel alone deals with wrong ones",
         ),
     ] = 4.0
-    lag_s: Annotated[
-        float, Field(gt=0.0, description="fixed_lag: how long poses stay variables, seconds")
-    ] = 1.0
     motion: GraphMotionSettings = GraphMotionSettings()
 
 

@@ -24,8 +24,9 @@ from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows
 from fgslam.core.homing import ColumnSegments
 from fgslam.frontend.features.colour_moments import colour_from_means, moment_images
 from fgslam.frontend.features.colour_sift import inner_part, wrapping_period
-from fgslam.frontend.features.settings import ColourMomentSettings, ColumnSegmentSettings
+from fgslam.frontend.features.settings import ColourMomentSettings
 
+_SIGMA_PX = 1.8  # of an end, and of a run of one column (docs/derivations/omni_features.md)
 _SIGMA_RUN = 0.15  # part of a run's width added to the bearing's deviation
 _RUN_STEP_PX = 1.5  # ends of one run shift less than this between columns
 _MAX_RUN_DEG = 8.0
@@ -68,7 +69,6 @@ class ColumnSegmentFinder:
     def __init__(
         self,
         view: OmniCamera,
-        settings: ColumnSegmentSettings,
         colour: ColourMomentSettings,
         seen: BoolArray | None = None,
     ) -> None:
@@ -76,7 +76,7 @@ class ColumnSegmentFinder:
 
         ``seen`` (height, width) tells where the view has a picture; None for everywhere.
         """
-        self._settings, self._colour = settings, colour
+        self._colour = colour
         self._width, self._height = view.width, view.height
         self._period = wrapping_period(view) or view.width
         self._bearings, (self._tangent_0, self._tangent_step) = _axes(view)
@@ -187,12 +187,11 @@ class ColumnSegmentFinder:
         deviation = np.sqrt(np.mean(profile**2, axis=1, keepdims=True))
         intensity = profile / np.maximum(deviation, 1e-6) @ self._dct.T
         colour = colour_from_means(means, self._colour)
-        settings = self._settings
         pixel = 2.0 * np.pi / self._period
-        sigma_end = settings.sigma_px * abs(self._tangent_step)
+        sigma_end = _SIGMA_PX * abs(self._tangent_step)
         return ColumnSegments(
             bearing=self._bearings[raw.column],
-            sigma_bearing=pixel * np.hypot(settings.sigma_px, _SIGMA_RUN * width),
+            sigma_bearing=pixel * np.hypot(_SIGMA_PX, _SIGMA_RUN * width),
             tangents=np.column_stack([low, high]),
             sigma_tangents=np.full((len(raw), 2), sigma_end),
             descriptors=np.column_stack([-low / (high - low), colour, intensity]),

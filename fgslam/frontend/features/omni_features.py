@@ -52,12 +52,11 @@ class OmniFeatureExtractor:
         described = self._sift_view.camera if self._sift_view else camera
         seen = self._sift_view.seen if self._sift_view else None
         self._sift = UprightSift(described, settings.sift, settings.colour, seen)
-        columns = settings.columns
         width = min(_MAX_CYLINDER_WIDTH, round(2.0 * np.pi * resolution))
         height = round(2.0 * _MAX_TANGENT * width / (2.0 * np.pi)) + 1
         cylinder = Cylinder(width, height, -_MAX_TANGENT, _MAX_TANGENT)
         self._cylinder = _View(camera, cylinder)
-        self._columns = ColumnSegmentFinder(cylinder, columns, settings.colour, self._cylinder.seen)
+        self._columns = ColumnSegmentFinder(cylinder, settings.colour, self._cylinder.seen)
 
     def extract(self, image: Image) -> OmniFeatures:
         """Features of an image (height, width, 3) in R, G, B.

@@ -108,18 +108,6 @@ class UprightSiftSettings:
             "radius where they are, `unwrapped` works on the panorama; panoramas are as they are"
         ),
     ] = "unwrapped"
-    sigma_px: Annotated[
-        float, Field(gt=0.0, description="position of a feature: this, in pixels of its view")
-    ] = 1.2
-
-
-@dataclass(frozen=True, config=STRICT)
-class ColumnSegmentSettings:
-    """Invariant column segments (III-A2)."""
-
-    sigma_px: Annotated[
-        float, Field(gt=0.0, description="position of an end, and of a run of one column")
-    ] = 1.8
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -158,7 +146,6 @@ class OmniFeatureSettings:
 
     sift: UprightSiftSettings = UprightSiftSettings()
     colour: ColourMomentSettings = ColourMomentSettings()
-    columns: ColumnSegmentSettings = ColumnSegmentSettings()
     matching: OmniMatchingSettings = OmniMatchingSettings()
     kinds: Annotated[
         Literal["both", "sift", "columns"],

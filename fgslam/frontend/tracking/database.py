@@ -25,6 +25,10 @@ from fgslam.frontend.tracking.map_matching import (
 )
 from fgslam.frontend.tracking.views import Views
 
+_VIEW_ANGLE_DEG = 20.0
+"""A direction farther than this from every view becomes a view of its own: SIFT descriptors match
+up to about this angle (docs/concepts/maps.md)."""
+
 
 class LandmarkDatabase(LandmarkTable):
     """Landmark table updated frame by frame: hits n, misses m, consecutive misses l."""
@@ -35,7 +39,7 @@ class LandmarkDatabase(LandmarkTable):
         if viewpoints is None:
             super().__init__(max_views=1, view_angle=0.0)
         else:
-            super().__init__(viewpoints.max_views, float(np.deg2rad(viewpoints.view_angle_deg)))
+            super().__init__(viewpoints.max_views, float(np.deg2rad(_VIEW_ANGLE_DEG)))
         self._settings = settings
         self._field_of_view = FieldOfView(rig, settings, max_disparity_px)
 

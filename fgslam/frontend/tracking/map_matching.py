@@ -177,6 +177,11 @@ def directions_to(wTc: FloatArray, points: FloatArray) -> FloatArray:
 _SCALE_RATIO = 1.5
 """Largest ratio to the predicted scale: one level of the scale space (Se et al., IJRR 2002)."""
 
+_WINDOW_PX = 5.0  # side of the search window in the image, as in Se et al. 3.1
+_DISPARITY_PX = 2.0  # largest difference from the predicted disparity, likewise before widening
+_MAX_WINDOW_PX = 80.0
+"""Side that widening may not exceed, also of the disparity gate: a quarter of 320 px, beyond
+which most candidates are of other landmarks."""
 _ORIENTATION_DEG = 20.0  # largest difference to the predicted orientation, as between images
 
 
@@ -203,7 +208,7 @@ class MapMatcher:
         """Takes the gates and the use of descriptors."""
         self._settings = settings
         self._appearance = appearance
-        self._limit = 0.5 * settings.max_window_px
+        self._limit = 0.5 * _MAX_WINDOW_PX
 
     @property
     def widens(self) -> bool:
@@ -265,10 +270,9 @@ class MapMatcher:
 
     def _reach(self, count: int, uncertainty: FloatArray | None) -> FloatArray:
         """Half widths (v, 3) of the gates in column, row and disparity."""
-        s = self._settings
-        half = 0.5 * s.window_px
-        base = np.array([half, half, s.disparity_px])
+        half = 0.5 * _WINDOW_PX
+        base = np.array([half, half, _DISPARITY_PX])
         if uncertainty is None:
             return np.tile(base, (count, 1))
-        widened = base + s.widen_sigmas * uncertainty
+        widened = base + self._settings.widen_sigmas * uncertainty
         return np.asarray(np.minimum(widened, np.maximum(self._limit, base)))

@@ -67,7 +67,7 @@ def _run(config: HomingPairsConfig, views: OmniRecording, context: Context) -> R
     """Features once an image, then every pair; stopped early, the pairs that are done count."""
     folder = context.folder
     features = extract_features(views, config.dataset, config.features, context)
-    every = tuple(pairs_of(len(features), both_ways=config.both_ways))
+    every = tuple(pairs_of(len(features)))
     search = PairSearch(
         tuple(features), every, config.features.matching, config.homing_vector, config.seed
     )
@@ -106,7 +106,7 @@ def _reference(
     if not config.reference:
         return None
     features = extract_features(views, config.dataset, None, context)
-    every = tuple(pairs_of(len(features), both_ways=config.both_ways))
+    every = tuple(pairs_of(len(features)))
     vector = never_refusing(config.homing_vector)
     search = PairSearch(tuple(features), every, PLAIN_MATCHING, vector, config.seed)
     answers, _ = answer_pairs(search, context, "plain pairs")
@@ -127,9 +127,9 @@ def never_refusing(settings: HomingVectorSettings) -> HomingVectorSettings:
     )
 
 
-def pairs_of(count: int, *, both_ways: bool) -> list[tuple[int, int]]:
+def pairs_of(count: int) -> list[tuple[int, int]]:
     """Pairs (a, b) of views, a before b; both ways also (b, a)."""
-    return [(a, b) for a in range(count) for b in range(count) if a < b or (both_ways and a != b)]
+    return [(a, b) for a in range(count) for b in range(count) if a < b]
 
 
 def _judged(

@@ -36,6 +36,10 @@ from fgslam.runs.tasks.slam_map_entry import GivenMap
 
 LOCALISATION_FILE = "localisation.csv"
 _UNKNOWN = "-"
+_WRONG_M, _WRONG_DEG = 0.30, 5.0  # an accepted pose farther off than this is false
+_LEAST_VISIBLE = 20
+"""A pose from which fewer of the map's landmarks are visible is counted apart; where depth is not
+known all count."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,8 +76,8 @@ class Scored:
 def bounds_of(config: LocalisationConfig) -> Bounds:
     """What the configuration calls right and false."""
     wanted = config.localisation
-    within, wrong = np.deg2rad([wanted.within_deg, wanted.wrong_deg]).tolist()
-    return Bounds(wanted.within_m, within, wanted.wrong_m, wrong, wanted.least_visible)
+    within, wrong = np.deg2rad([wanted.within_deg, _WRONG_DEG]).tolist()
+    return Bounds(wanted.within_m, within, _WRONG_M, wrong, _LEAST_VISIBLE)
 
 
 def scored(config: LocalisationConfig, asked: Asked) -> tuple[Scored, ...]:
@@ -153,7 +157,7 @@ def _sentence(config: LocalisationConfig, judged: Scored) -> str:
     if judged.apart.queries:
         apart = (
             f"; counted apart: {judged.apart.queries} poses from which fewer than "
-            f"{wanted.least_visible} landmarks are visible, {judged.apart.accepted} of them found, "
+            f"{_LEAST_VISIBLE} landmarks are visible, {judged.apart.accepted} of them found, "
             f"{judged.apart.false} false"
         )
     return (
@@ -170,9 +174,7 @@ def _score_table(config: LocalisationConfig, judged: Sequence[Scored]) -> TextTa
         Column("queries", "asked; those with too few landmarks in view are counted apart"),
         Column("right", right),
         Column("less exact", "accepted, neither right nor false"),
-        Column(
-            "false", f"accepted, off by more than {wanted.wrong_m:g} m or {wanted.wrong_deg:g} deg"
-        ),
+        Column("false", f"accepted, off by more than {_WRONG_M:g} m or {_WRONG_DEG:g} deg"),
         Column("refused", "no pose was to be believed"),
         Column("cm: 50, 95, 100 %", "errors of accepted positions: median, 95 %, largest"),
         Column("deg: 50, 95, 100 %", "the same of rotations"),
@@ -186,7 +188,7 @@ def _score_table(config: LocalisationConfig, judged: Sequence[Scored]) -> TextTa
         times = f"{_number(ms.median, 0)}, {_number(ms.p95, 0)}"
         rows.append((in_frames(one.frames), (*_score_cells(one.counts), times)))
         if one.apart.queries or one.familiar.queries != one.counts.queries:
-            least, name = wanted.least_visible, in_frames(one.frames)
+            least, name = _LEAST_VISIBLE, in_frames(one.frames)
             familiar = f"{name}, {least} in view from familiar sides"
             rows.append((familiar, (*_score_cells(one.familiar), _UNKNOWN)))
             few = f"{name}, fewer than {least} in view"

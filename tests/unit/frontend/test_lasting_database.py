@@ -25,7 +25,7 @@ PLACES = at_pixels([(80, 60, 8), (100, 110, 12), (120, 90, 10), (150, 100, 9)])
 LASTING = DatabaseSettings(
     prune_after_misses=3, permanence=PermanenceSettings(ratio=0.5, hits=3, contradicted_after=4)
 )
-VIEWS = DatabaseSettings(viewpoints=ViewpointSettings(view_angle_deg=20.0, max_views=3))
+VIEWS = DatabaseSettings(viewpoints=ViewpointSettings(max_views=3))
 
 
 def hit(database: LandmarkDatabase, *ids: int, directions: FloatArray | None = None) -> None:

@@ -11,17 +11,18 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.features import StereoFeatures
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import MapMatchingSettings
+from fgslam.frontend.tracking import map_matching
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks, MapMatcher, MapMatches
 
 PAPER = AppearanceSettings(mode="paper")
 DESCRIPTOR = AppearanceSettings(mode="descriptor", max_distance=250.0, ratio=0.85)
-FIXED = MapMatchingSettings(
-    window_px=5.0,
-    disparity_px=2.0,
-    widen_sigmas=0.0,
-    max_window_px=30.0,
-)
+FIXED = MapMatchingSettings(widen_sigmas=0.0)
 AT = (100.0, 80.0, 10.0)
+
+
+@pytest.fixture(autouse=True)
+def _limited_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(map_matching, "_MAX_WINDOW_PX", 30.0)
 
 
 def _columns(rows: object, scale: float, orientation_deg: float, descriptors: FloatArray | None):
@@ -151,15 +152,16 @@ def test_widening_is_per_landmark() -> None:
     assert found.landmarks.tolist() == [0]
 
 
-def test_widening_has_a_limit_but_never_narrows() -> None:
+def test_widening_has_a_limit_but_never_narrows(monkeypatch: pytest.MonkeyPatch) -> None:
     vast = np.full((1, 3), 1e3)
     for offset, count in ((14.9, 1), (15.1, 0)):
         row = (100.0 + offset, 80.0, 10.0)
         found = match(landmarks(), features(row), widen_sigmas=3.0, uncertainty=vast)
         assert len(found.features) == count
     # A limit below the paper's window leaves that as it is.
+    monkeypatch.setattr(map_matching, "_MAX_WINDOW_PX", 2.0)
     row = (102.4, 80.0, 10.0)
-    found = match(landmarks(), features(row), widen_sigmas=3.0, uncertainty=vast, max_window_px=2.0)
+    found = match(landmarks(), features(row), widen_sigmas=3.0, uncertainty=vast)
     assert len(found.features) == 1
 
 

@@ -21,6 +21,7 @@ from fgslam.frontend.settings import (
     StereoSettings,
 )
 from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.tracking import map_matching
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
 from fgslam.slam.factory import make_tracker
 
@@ -30,9 +31,7 @@ CERTAIN = np.diag([0.002] * 3 + [0.005] * 3) ** 2
 SETTINGS = FrontendSettings(
     stereo=StereoSettings(),
     appearance=AppearanceSettings(mode="descriptor"),
-    matching=MapMatchingSettings(
-        window_px=5.0, disparity_px=2.0, widen_sigmas=0.0, refine=False, rescue=False
-    ),
+    matching=MapMatchingSettings(widen_sigmas=0.0, refine=False, rescue=False),
     database=DatabaseSettings(prune_after_misses=3, field_of_view="image", border_px=8.0),
     ego_motion=EgoMotionSettings(min_matches=6),
 )
@@ -190,16 +189,14 @@ def test_landmarks_out_of_view_are_left_alone() -> None:
     assert_same_bits(after, before)
 
 
-def test_outliers_count_as_misses_and_are_marked() -> None:
+def test_outliers_count_as_misses_and_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene()
     scene.step(np.eye(4))
     # One landmark of the map is not where it was seen: 4 px off, but inside the window.
     scene.settings = SETTINGS
-    wide = dataclasses.replace(
-        SETTINGS, matching=dataclasses.replace(SETTINGS.matching, window_px=20.0)
-    )
+    monkeypatch.setattr(map_matching, "_WINDOW_PX", 20.0)
     state = scene.tracker.database.state()
-    scene.tracker = make_tracker(RIG, wide)
+    scene.tracker = make_tracker(RIG, SETTINGS)
     scene.tracker.database.restore(state)
     expected = scene.tracker.database.expected(scene.map, np.eye(4))
     wrong = int(expected.ids[len(expected) // 2])
@@ -236,9 +233,10 @@ def test_beyond_the_window_all_is_lost() -> None:
 
 
 @pytest.mark.parametrize("how", ["rescue", "widen"])
-def test_wider_search_finds_it_again(how: str) -> None:
+def test_wider_search_finds_it_again(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(map_matching, "_MAX_WINDOW_PX", 60.0)
     changes = {"rescue": True} if how == "rescue" else {"widen_sigmas": 3.0}
-    matching = dataclasses.replace(SETTINGS.matching, max_window_px=60.0, **changes)
+    matching = dataclasses.replace(SETTINGS.matching, **changes)
     scene = Scene(dataclasses.replace(SETTINGS, matching=matching))
     scene.step(np.eye(4))
     stereo = scene._stereo.match(scene.world.features(np.eye(4)))

@@ -106,7 +106,7 @@ BRANCHES = {
 def test_the_four_branches(branch: str) -> None:
     """The procedure of 6.3, and 6.3's last sentence: a match measures the position either way."""
     angle, matched, views, misses = BRANCHES[branch]
-    things = Things(cloud(), settings(viewpoints=ViewpointSettings(view_angle_deg=20.0)))
+    things = Things(cloud(), settings(viewpoints=ViewpointSettings()))
     things.step(from_angle(HERE))
     landmark = things.id_of(7)
     before = things.database.appearances(np.array([landmark]))
@@ -157,7 +157,7 @@ def test_an_orbit_around_a_pillar(several: bool) -> None:
     At the end of what is seen of it a landmark is still near to its last view for five frames.
     """
     pillar = Pillar()
-    viewpoints = ViewpointSettings(view_angle_deg=20.0, max_views=8) if several else None
+    viewpoints = ViewpointSettings(max_views=8) if several else None
     things = Things(pillar.points, settings(prune_after=20, viewpoints=viewpoints))
     born: set[int] = set()
     lost = 0

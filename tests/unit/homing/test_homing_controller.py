@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -34,6 +34,8 @@ from fgslam.homing.command import Command, HomingState
 from fgslam.homing.controller import (
     _BLIND_S,
     _FARTHER_S,
+    _FARTHER_TRIES,
+    _GIVE_UP_S,
     _MAX_STALLS,
     _NEAR_FRACTION,
     HomingController,
@@ -161,9 +163,15 @@ class Bench:
         return self.controller.step(DARK, self.time)
 
 
-def bench(*answers: TwoViewVector | Refusal, **changes: float) -> Bench:
+def bench(*answers: TwoViewVector | Refusal) -> Bench:
     """With these answers to ``begin``."""
-    return Bench(ScriptedFrontEnd(list(answers)), replace(SETTINGS, **changes))  # type: ignore[arg-type]
+    return Bench(ScriptedFrontEnd(list(answers)))
+
+
+@pytest.fixture
+def _never_farther(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A refused target is not looked for from farther on."""
+    monkeypatch.setattr("fgslam.homing.controller._FARTHER_TRIES", 0)
 
 
 FEW = Refusal(RefusalReason.TOO_FEW_MATCHES, "2 matches, of 8 needed")
@@ -222,9 +230,10 @@ def test_one_place_is_arrival() -> None:
     assert command.refusal is None
 
 
+@pytest.mark.usefixtures("_never_farther")
 def test_refused_target_is_tried_for_a_while_and_then_given_up() -> None:
     """Standing all the time, one attempt a retry period, the refusal handed on."""
-    b = bench(FEW, farther_tries=0)
+    b = bench(FEW)
     commands = [b.step() for _ in range(40)]
     assert {c.state for c in commands[:30]} == {HomingState.INITIALISE}
     assert all(c.stop for c in commands)
@@ -356,9 +365,10 @@ def test_all_tracks_lost_in_one_frame_heals_in_the_same() -> None:
     assert command.remaining == pytest.approx(0.7)
 
 
+@pytest.mark.usefixtures("_never_farther")
 def test_blind_is_short_then_stands_then_refuses() -> None:
     """Lost and not healing: straight on for a second at most, then standing, then the end."""
-    b = bench(vector_to(0.0), FEW, farther_tries=0)
+    b = bench(vector_to(0.0), FEW)
     b.step()
     b.step()
     b.front_end.tracks = 0
@@ -439,10 +449,11 @@ def test_contradicting_vector_is_confirmed_before_it_is_driven_by() -> None:
     assert confirmed.heading == pytest.approx(2.1)
 
 
+@pytest.mark.usefixtures("_never_farther")
 def test_vectors_that_keep_contradicting_end_the_homing() -> None:
     """Never a confident wrong vector: no two images agree, so there is no answer."""
     answers = [vector_to(0.0)] + [vector_to(2.0 * (-1.0) ** k) for k in range(60)]
-    b = bench(*answers, farther_tries=0)
+    b = bench(*answers)
     b.step()
     b.step()
     b.front_end.tracks = 9
@@ -464,7 +475,7 @@ def test_no_progress_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_refused_target_is_looked_for_from_farther_on() -> None:
     """Standing did not help: slowly straight on, and the first answer is driven by."""
-    standing = int(SETTINGS.give_up_s / SETTINGS.retry_s) + 1
+    standing = int(_GIVE_UP_S / SETTINGS.retry_s) + 1
     b = bench(*[FEW] * (standing + 2), vector_to(0.1))
     commands = [b.step() for _ in range(60)]
     states = [c.state for c in commands]
@@ -482,9 +493,9 @@ def test_search_for_a_refused_target_ends_after_the_stated_tries() -> None:
     states = [b.step().state for _ in range(400)]
     assert states[-1] is HomingState.REFUSED
     driven = 0.1 * states.count(HomingState.SEARCH)
-    assert driven == pytest.approx(SETTINGS.farther_tries * _FARTHER_S, abs=0.5)
+    assert driven == pytest.approx(_FARTHER_TRIES * _FARTHER_S, abs=0.5)
     begun = [now for was, now in itertools.pairwise(states) if now is not was]
-    assert begun.count(HomingState.SEARCH) == SETTINGS.farther_tries
+    assert begun.count(HomingState.SEARCH) == _FARTHER_TRIES
 
 
 def test_answer_after_an_ambiguous_one_needs_another_image() -> None:
@@ -618,7 +629,8 @@ def test_blocked_way_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Held up by obstacles is no lack of progress, for so long; then it is."""
     monkeypatch.setattr("fgslam.homing.controller._MAX_STALLS", 1)
     monkeypatch.setattr("fgslam.homing.controller._STALL_S", 1.0)
-    b = bench(vector_to(0.0), wait_s=2.0)
+    monkeypatch.setattr("fgslam.homing.controller._WAIT_S", 2.0)
+    b = bench(vector_to(0.0))
     ended = []
     for _ in range(60):
         b.controller.held_up(0.1)

@@ -108,18 +108,27 @@ def test_graph_drives_as_well() -> None:
     assert pass_distances(record).max() < 0.2
 
 
+@pytest.fixture
+def _refuses_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fgslam.homing.controller._GIVE_UP_S", 0.5)
+    monkeypatch.setattr("fgslam.homing.controller._FARTHER_TRIES", 0)
+
+
 def follower_with_unknown(count: int) -> HomingChain:
     """Two targets on a path, the first ``count`` replaced by images from elsewhere."""
     setting = winding_path(9, count + 1, 1.0)
     elsewhere = setting.front_end.features_at(np.array([80.0, 80.0, 0.0]))
     images = [elsewhere] * count + setting.path()[count:]
     kind = HomingEkfSettings()
-    control = replace(HomingControlSettings(), give_up_s=0.5, farther_tries=0)
     return HomingChain(
-        setting.front_end, images, lambda start: make_homing_estimator(start, kind), control
+        setting.front_end,
+        images,
+        lambda start: make_homing_estimator(start, kind),
+        HomingControlSettings(),
     )
 
 
+@pytest.mark.usefixtures("_refuses_soon")
 def test_target_that_cannot_be_matched_is_skipped() -> None:
     """The next one can: the path goes on, and the record says so."""
     follower = follower_with_unknown(1)
@@ -160,12 +169,12 @@ def test_way_that_is_blocked_for_a_while_is_driven_on(
     """What avoidance takes does not count as lack of progress, as long as one may wait."""
     monkeypatch.setattr("fgslam.homing.controller._MAX_STALLS", 1)
     monkeypatch.setattr("fgslam.homing.controller._STALL_S", 2.0)
-    control = replace(HomingControlSettings(), wait_s=wait_s)
-    behaviour = replace(HomingBehaviourSettings(), control=control)
-    record = drive_path(winding_path(7, 1, 2.0), behaviour, avoider=Doorkeeper(20, 70))
+    monkeypatch.setattr("fgslam.homing.controller._WAIT_S", wait_s)
+    record = drive_path(winding_path(7, 1, 2.0), avoider=Doorkeeper(20, 70))
     assert [leg.result for leg in record.legs] == [result]
 
 
+@pytest.mark.usefixtures("_refuses_soon")
 def test_two_targets_one_after_another_are_not_skipped() -> None:
     """The path ends with the refusal, standing."""
     follower = follower_with_unknown(2)

@@ -16,6 +16,8 @@ from fgslam.homing.steering import (
     _PASSING_SHARE,
     _SLOW_FRACTION,
     _TURN_IN_PLACE_DEG,
+    ACCELERATION_MPS2,
+    TURN_ACCELERATION_DEG_S2,
     CorridorAvoidance,
     NoAvoidance,
     RangeScan,
@@ -50,9 +52,9 @@ def test_limits_hold_whatever_is_asked() -> None:
         drive = steering.step(command(rng.uniform(-np.pi, np.pi), rng.uniform(0, 1)), DT)
         assert 0.0 <= drive.speed <= SETTINGS.max_speed_mps + 1e-12
         assert abs(drive.turn_rate) <= np.deg2rad(SETTINGS.max_turn_deg_s) + 1e-12
-        assert abs(drive.speed - before.speed) <= SETTINGS.acceleration_mps2 * DT + 1e-12
+        assert abs(drive.speed - before.speed) <= ACCELERATION_MPS2 * DT + 1e-12
         change = np.rad2deg(abs(drive.turn_rate - before.turn_rate))
-        assert change <= SETTINGS.turn_acceleration_deg_s2 * DT + 1e-9
+        assert change <= TURN_ACCELERATION_DEG_S2 * DT + 1e-9
         before = drive
 
 

@@ -32,6 +32,7 @@ _NEIGHBOURS = 12  # stored views asked of the index for each feature
 _REFINED = 4  # distinct best poses that are refined and compared
 _ELSEWHERE_M = 0.5  # poses farther apart than this are different places
 _ELSEWHERE_RAD = float(np.deg2rad(15.0))  # and so are poses turned by more than this
+_VIEW_SIGMA_PX = 0.3  # added to a feature's noise: from elsewhere it is found elsewhere
 _MAX_DISPARITY_PX = 40.0  # of mistakes, spread evenly; the scores hardly depend on it
 
 
@@ -77,7 +78,7 @@ class Relocaliser:
             rng: draws the samples.
         """
         tentative = self.tentative(features)
-        seen = SeenPoints.of(features, self._rig, self._settings.view_sigma_px)
+        seen = SeenPoints.of(features, self._rig, _VIEW_SIGMA_PX)
         evidence = self._evidence(seen, tentative)
         if self._settings.method == "hough":
             proposals = propose_by_votes(evidence, self._floor)
@@ -126,6 +127,9 @@ class Relocaliser:
         return first
 
 
+LEAST_INLIERS = 8
+"""Fewer independent inliers are no pose; at most four count of one piece of the map, which may be
+one object."""
 ENOUGH_INLIERS = 36  # independent inliers that only another hypothesis can call in question
 MAX_MISFIT = 1.2  # mean squared normalised residual of fewer inliers; 1 where as modelled
 _LEAST_AGREEMENT = 0.57  # of frame and map, with fewer inliers
@@ -149,11 +153,11 @@ def accept(
         settings: what it takes.
     """
     matched = len(np.unique(tentative.features))
-    if matched < settings.min_inliers:
+    if matched < LEAST_INLIERS:
         return _nothing(
             RelocalisationStatus.TOO_FEW_MATCHES,
             len(tentative),
-            f"only {matched} features look like a landmark; {settings.min_inliers} are needed",
+            f"only {matched} features look like a landmark; {LEAST_INLIERS} are needed",
         )
     if not refined:
         return _nothing(
@@ -200,8 +204,8 @@ def _status(
         f"{best.covered:.0%} of their places seen; known in {best.explained:.0%} of the "
         f"directions; misfit {best.misfit:.2f}; sigma {sigma_m:.3f} m {sigma_deg:.2f} deg"
     )
-    if best.independent < settings.min_inliers:
-        needed = f"{settings.min_inliers} independent inliers are needed"
+    if best.independent < LEAST_INLIERS:
+        needed = f"{LEAST_INLIERS} independent inliers are needed"
         return RelocalisationStatus.TOO_FEW_INLIERS, f"{said}; {needed}"
     if competing >= _AMBIGUOUS_SHARE * best.independent:
         return (

@@ -15,7 +15,12 @@ from fgslam.core.arrays import Image
 from fgslam.core.errors import FrameError
 from fgslam.core.homing import FeatureKind, OmniFeatures, UprightFeatures
 from fgslam.core.planar import wrap
-from fgslam.frontend.features.colour_sift import _SIGMA_SCALES, up_in_image, wrapping_period
+from fgslam.frontend.features.colour_sift import (
+    _SIGMA_PX,
+    _SIGMA_SCALES,
+    up_in_image,
+    wrapping_period,
+)
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor, _View
 from fgslam.frontend.features.settings import (
     OmniFeatureSettings,
@@ -106,10 +111,9 @@ def test_elevations_are_limited() -> None:
 
 
 def test_sigmas_grow_with_scale() -> None:
-    settings = UprightSiftSettings()
     found = extractor().extract(picture()).sift
     pixel = np.pi / 256
-    expected = pixel * np.hypot(settings.sigma_px, _SIGMA_SCALES * found.scale / pixel)
+    expected = pixel * np.hypot(_SIGMA_PX, _SIGMA_SCALES * found.scale / pixel)
     np.testing.assert_allclose(np.sqrt(found.covariance[:, 1, 1]), expected, rtol=1e-3)
 
 

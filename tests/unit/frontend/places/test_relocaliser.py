@@ -12,12 +12,19 @@ from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Relocalisation, RelocalisationStatus
 from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import pose, so3_exp
-from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
+from fgslam.frontend.places.relocalisation import relocaliser
+from fgslam.frontend.places.relocalisation.relocaliser import LEAST_INLIERS, Relocaliser
 from fgslam.frontend.settings import RelocalisationSettings
 from tests.known_places import RIG, Place, error, floor, planar, room, seen, things
 
-DEFAULTS = RelocalisationSettings(map_sigma_m=0.001, view_sigma_px=0.0)
+DEFAULTS = RelocalisationSettings(map_sigma_m=0.001)
 HOUGH = replace(DEFAULTS, method="hough")
+
+
+@pytest.fixture(autouse=True)
+def _exact_features(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Simulated features are where their landmarks are, from wherever they are seen."""
+    monkeypatch.setattr(relocaliser, "_VIEW_SIGMA_PX", 0.0)
 
 
 def _relocaliser(
@@ -150,7 +157,7 @@ def test_few_features_are_too_few(
         RelocalisationStatus.TOO_FEW_MATCHES,
         RelocalisationStatus.TOO_FEW_INLIERS,
     )
-    assert str(DEFAULTS.min_inliers) in found.why
+    assert str(LEAST_INLIERS) in found.why
 
 
 def test_an_empty_map_finds_nothing(rng: np.random.Generator) -> None:
