@@ -92,12 +92,19 @@ def write_baseline(path: Path, results: Results, command: str) -> None:
         command: what gave them, for whoever wants to repeat it.
 
     Raises:
+        ConfigError: no number of a run is among those that a baseline holds.
         OutputError: the file cannot be written.
     """
     runs = {
         run: {title: _numbers(metrics) for title, metrics in estimators.items()}
         for run, estimators in results.items()
     }
+    empty = [run for run, numbers in runs.items() if not any(numbers.values())]
+    if empty:
+        raise ConfigError(
+            f"{path}: not written: a baseline holds numbers of replayed estimators, and {empty[0]} "
+            "has none (no ground truth, or trials of homing); leave out --write-baseline"
+        )
     document = {
         "format": FORMAT,
         "version": VERSION,

@@ -314,7 +314,16 @@ def _finish(
     with_truth = sum(log.truth is not None for log in logs.values())
     heading = f"{len(logs)} homings replayed, {with_truth} with ground truth"
     tables = (TextTable("compared", heading, "estimator", ESTIMATOR_COLUMNS, tuple(rows)),)
-    result = RunResult(config, folder, status, (f"{heading}.",), tables, tuple(_failures(replays)))
+    answers = [one for by_log in replays.values() for one in by_log.values()]
+    result = RunResult(
+        config,
+        folder,
+        status,
+        (f"{heading}.",),
+        tables,
+        tuple(_failures(replays)),
+        failed=all(one.failure for one in answers),
+    )
     errors = {
         title: {name: one.judged(logs[name].truth).errors for name, one in by_log.items()}
         for title, by_log in replays.items()

@@ -400,6 +400,13 @@ def checked(path: Path, **changes: Any) -> list[tuple[bool, str]]:
     return [(d.regression, d.text) for d in check_baseline(read_baseline(path), results)]
 
 
+def test_a_baseline_without_a_number_is_not_written(tmp_path: Path) -> None:
+    path = tmp_path / "baseline.json"
+    with pytest.raises(ConfigError, match=r"not written: .* home has none .*leave out"):
+        write_baseline(path, {"home": {"homing_ekf": {"kind": "homing_ekf"}}}, "fgslam compare")
+    assert not path.exists()
+
+
 def test_a_baseline_tells_worse_from_better(tmp_path: Path) -> None:
     path = tmp_path / "baseline.json"
     write_baseline(path, {"run": {"isam2": SOUND.as_json()}}, "fgslam compare")
