@@ -215,6 +215,7 @@ def _heading(figure: Figure, title: str) -> None:
 _PAIR_WIDTH_IN = 9.0
 _SHOWN_PX = 1100  # columns of a picture; more would not show
 _PAIR_DIMMED = 0.6
+_EDGE_PART = 0.04  # of a picture: a mark with its number is no wider, nor as high
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -273,14 +274,23 @@ def _show(axes: Axes, image: Image, title: str) -> None:
 def _mark(axes: Axes, points: FloatArray, columns: BoolArray, colours: FloatArray) -> None:
     # Lists of tuples: the drawing library takes arrays, its types do not.
     tints = [tuple(colour) for colour in colours.tolist()]
+    outer = _near_edge(axes, points).tolist()
     for number, (point, tint) in enumerate(zip(points.tolist(), tints, strict=True)):
+        common: dict[str, Any] = {"color": tint, "in_layout": outer[number]}
         if columns[number]:
-            axes.plot(*point, marker="|", markersize=9, markeredgewidth=1.6, color=tint)
+            axes.plot(*point, marker="|", markersize=9, markeredgewidth=1.6, **common)
         else:
-            axes.plot(*point, marker="o", markersize=5, fillstyle="none", color=tint)
+            axes.plot(*point, marker="o", markersize=5, fillstyle="none", **common)
         axes.annotate(
-            str(number), point, (3.0, 3.0), textcoords="offset points", color=tint, fontsize=5.5
+            str(number), point, (3.0, 3.0), textcoords="offset points", fontsize=5.5, **common
         )
+
+
+def _near_edge(axes: Axes, points: FloatArray) -> BoolArray:
+    """(n,) which marks may reach beyond the picture (n, 2); the layout need not measure others."""
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    part = np.abs((points - [left, bottom]) / [right - left, top - bottom] - 0.5)
+    return np.asarray((part > 0.5 - _EDGE_PART).any(axis=1))
 
 
 _VIEW_WIDTH_IN = 11.0
