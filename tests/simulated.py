@@ -23,7 +23,7 @@ from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.slam.motion import ConstantVelocityMotion
-from fgslam.slam.replay import replay_step
+from fgslam.slam.replay import replay_frame
 from fgslam.worlds.driving import paths
 from fgslam.worlds.lab_settings import LabDriveSettings
 from fgslam.worlds.simulated.landmarks import IdentityBook
@@ -186,7 +186,7 @@ def play(
     solver = EgoMotionSolver(rig, settings or EgoMotionSettings())
     motion = ConstantVelocityMotion(ConstantVelocitySettings())
     return [
-        replay_step(increment, estimator, solver, motion, increment.index // 2)
+        replay_frame(increment, estimator, solver, motion, increment.index // 2).stats
         for increment in increments
     ]
 

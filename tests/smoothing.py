@@ -17,12 +17,13 @@ from fgslam.backend.settings import (
     FixedLagSettings,
     Isam2Settings,
 )
-from fgslam.backend.smoothers import admission, fixed_lag, graph_builder, isam2
+from fgslam.backend.smoothers import admission, graph_builder
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.estimates import Estimate, Prediction, UpdateStats
 from fgslam.core.measurements import Increment
 from fgslam.evaluation.consistency import Nees, judge, landmark_nees, pose_nees
+from fgslam.factors import graphs
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.slam.factory import make_estimator
 
@@ -50,8 +51,7 @@ def admit_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def relinearise_beyond(monkeypatch: pytest.MonkeyPatch, threshold: float) -> None:
     """The incremental smoothers linearise anew what moves by more than a threshold."""
-    for module in (isam2, fixed_lag):
-        monkeypatch.setattr(module, "_RELINEARISED", threshold)
+    monkeypatch.setattr(graphs, "_RELINEARISED", threshold)
 
 
 def drawn(seed: int, **drive: object) -> Simulation:

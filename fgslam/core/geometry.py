@@ -436,8 +436,3 @@ def right_from_left_camera(wTl: FloatArray, baseline: float) -> FloatArray:
     out = np.array(wTl, dtype=np.float64)
     out[..., :3, 3] += baseline * wTl[..., :3, 0]
     return out
-
-
-def left_from_right_camera(wTr: FloatArray, baseline: float) -> FloatArray:
-    """Poses (..., 4, 4) of the left camera (GTSAM's stereo reference) from the right one's."""
-    return right_from_left_camera(wTr, -baseline)

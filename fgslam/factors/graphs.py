@@ -71,18 +71,22 @@ def poses_of_frame(values: Any, frame: int) -> FloatArray:
     return np.asarray(values.atPose3(pose_key(frame)).matrix())
 
 
-def isam2_parameters(method: Any, relinearised: float, factorization: str = "CHOLESKY") -> Any:
+_RELINEARISED = 0.01
+"""Radians, and metres or legs: a variable that moves by more is linearised anew. 0.1, GTSAM's own,
+leaves a drive of 50 m twice as far off."""
+
+
+def isam2_parameters(method: Any, factorization: str = "CHOLESKY") -> Any:
     """Parameters of iSAM2; in every update it looks for variables to linearise anew.
 
     Args:
         method: GTSAM's parameters of Gauss-Newton or of the dog leg.
-        relinearised: a variable that moves by more, in radians or its lengths, is linearised anew.
         factorization: ``CHOLESKY``, or ``QR`` for what is known very unevenly.
     """
     params = gtsam.ISAM2Params()
     params.setOptimizationParams(method)
     params.setFactorization(factorization)
-    params.setRelinearizeThreshold(relinearised)
+    params.setRelinearizeThreshold(_RELINEARISED)
     params.relinearizeSkip = 1
     return params
 

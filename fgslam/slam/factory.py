@@ -36,7 +36,6 @@ from fgslam.datasets.settings import (
     ConstantVelocitySettings,
     OdometrySettings,
     RecordedOdometrySettings,
-    SyntheticOdometrySettings,
 )
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
@@ -275,7 +274,12 @@ def is_settings(value: object) -> TypeGuard[EstimatorSettings]:
 
 
 def _classes() -> tuple[type[Any], ...]:
-    union, _ = get_args(EstimatorSettings)
+    return _members(EstimatorSettings)
+
+
+def _members(tagged: Any) -> tuple[type[Any], ...]:
+    """Settings classes of a tagged union."""
+    union, _ = get_args(tagged)
     return get_args(union)
 
 
@@ -330,8 +334,7 @@ def chosen_odometry(given: OdometrySettings | None) -> OdometrySettings:
     """Settings of the odometry as given; None: the defaults. Raises ConfigError for others."""
     if given is None:
         return RecordedOdometrySettings()
-    kinds = (RecordedOdometrySettings, ConstantVelocitySettings, SyntheticOdometrySettings)
-    if not isinstance(given, kinds):
+    if not any(isinstance(given, kind) for kind in _members(OdometrySettings)):
         raise ConfigError(
             f"odometry is a {type(given).__name__}; give settings, e.g. "
             "fgslam.datasets.settings.ConstantVelocitySettings()"

@@ -38,25 +38,25 @@ class FirstImages:
         self._brightest = max(self._brightest, *(int(image.max()) for image in found.frame.images))
         self._uint16 |= uint16
 
-    def cause(self) -> str:
-        """What is known beside the numbers of features; empty where it is nothing."""
-        if not self._left:
+    def left(self) -> str:
+        """How many features the left images have; empty where there was no image."""
+        return f"{np.mean(self._left):.0f} in the left image" if self._left else ""
+
+    def lost_bits(self) -> str:
+        """That bits were given which are not used; empty where none were."""
+        if not self._left or self._brightest > _DARK or not self._uint16:
             return ""
-        if self._brightest > _DARK:
-            return f" ({np.mean(self._left):.0f} in the left image)"
-        if self._uint16:
-            return f"; {self._lost_bits()}"
-        return f"; the images are dark, their largest grey value is {self._brightest} of 255"
-
-    def remarks(self) -> tuple[str, ...]:
-        """What is worth a remark although the images are matched: bits given that are not used."""
-        return (self._lost_bits(),) if self._uint16 and self._brightest <= _DARK else ()
-
-    def _lost_bits(self) -> str:
         return (
             f"of uint16 the upper eight bits count, and they reach {self._brightest} of 255: "
             "shift 12-bit values to 16 bits (image << 4)"
         )
+
+    def fault(self) -> str:
+        """What is wrong with the grey values: bits lost, or darkness; empty where nothing is."""
+        if not self._left or self._brightest > _DARK:
+            return ""
+        dark = f"the images are dark, their largest grey value is {self._brightest} of 255"
+        return self.lost_bits() or dark
 
 
 def any_uint16(images: Sequence[npt.ArrayLike]) -> bool:
@@ -70,13 +70,16 @@ def stereo_remarks(recorder: RunRecorder, seen: FirstImages | None = None) -> tu
     features, matched = sum(row.features for row in rows), sum(row.stereo for row in rows)
     if len(rows) < _FEWEST:
         return ()
+    seen = seen or FirstImages()
     if matched > _LEAST_MATCHED * features:
-        return () if seen is None else seen.remarks()
-    n, cause = len(rows), "" if seen is None else seen.cause()
+        return (seen.lost_bits(),) if seen.lost_bits() else ()
+    n = len(rows)
     found = f"no stereo matches in the first {n} frames: {features / n:.0f} features in the right"
-    found += f" image, {matched / n:.0f} of them matched{cause}"
-    if cause.startswith(";"):
-        return (found,)
+    found += f" image, {matched / n:.0f} of them matched"
+    if seen.fault():
+        return (f"{found}; {seen.fault()}",)
+    if seen.left():
+        found += f" ({seen.left()})"
     if not features:
         return (f"{found}; are the images dark, or 12-bit values in 16-bit images?",)
     return (f"{found}; are left and right swapped, or the images not rectified?",)

@@ -150,17 +150,6 @@ def replay(
     return run.result(estimator, before_mb, "")
 
 
-def replay_step(
-    increment: Increment,
-    estimator: Estimator,
-    ego_motion: EgoMotionSolver,
-    motion: MotionModel,
-    k: int,
-) -> UpdateStats:
-    """Gives frame ``k`` of a log to an estimator: the live loop without its matching."""
-    return replay_frame(increment, estimator, ego_motion, motion, k).stats
-
-
 def replay_frame(
     increment: Increment,
     estimator: Estimator,
@@ -168,7 +157,7 @@ def replay_frame(
     motion: MotionModel,
     k: int,
 ) -> ReplayedFrame:
-    """As :func:`replay_step`, with the frame's tracking and times."""
+    """Gives frame ``k`` of a log to an estimator: the live loop without its matching."""
     watch = Stopwatch()
     if increment.odometry is None:
         stand_in = motion.between(increment.timestamp, None)

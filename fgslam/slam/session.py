@@ -285,11 +285,8 @@ class Session:
             return f"the session has no result: {self._ended}"
         left_out = self._left_out
         if left_out.count:
-            cause = self._seen.cause()
-            return (
-                f"none of {left_out.count} frames could be located in {self._map}: {left_out.why}"
-                f"{cause if cause.startswith(';') else ''}"
-            )
+            why = "; ".join(filter(None, (left_out.why, self._seen.fault())))
+            return f"none of {left_out.count} frames could be located in {self._map}: {why}"
         return "no frame has been tracked yet; call track first"
 
     def _require_open(self) -> None:

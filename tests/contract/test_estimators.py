@@ -34,7 +34,7 @@ from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.motion import ConstantVelocityMotion
-from fgslam.slam.replay import replay_step
+from fgslam.slam.replay import replay_frame
 
 DEFAULTS: dict[str, EstimatorSettings] = {
     settings.kind: settings() for settings in get_args(get_args(EstimatorSettings)[0])
@@ -138,7 +138,7 @@ def play(estimator: Estimator, increments: list[Increment]) -> list[UpdateStats]
     motion = ConstantVelocityMotion(ConstantVelocitySettings())
     for increment in increments:
         k = round(increment.timestamp / 0.5)
-        stats.append(replay_step(increment, estimator, solver, motion, k))
+        stats.append(replay_frame(increment, estimator, solver, motion, k).stats)
     return stats
 
 

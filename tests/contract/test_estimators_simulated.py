@@ -38,7 +38,7 @@ from fgslam.slam.factory import make_estimator, make_tracker
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import ConstantVelocityMotion, OdometryMotion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
-from fgslam.slam.replay import replay_step
+from fgslam.slam.replay import replay_frame
 
 DRIVE = Drive(frames=10)
 SIXDOF = EgoMotionSettings(dof=6)
@@ -205,7 +205,7 @@ def test_a_replay_repeats_the_live_run(settings: EstimatorSettings, dof: int, re
     solver = EgoMotionSolver(RIG, frontend.ego_motion)
     motion = ConstantVelocityMotion(ConstantVelocitySettings())
     stats = [
-        replay_step(report.increment, replayed, solver, motion, k)
+        replay_frame(report.increment, replayed, solver, motion, k).stats
         for k, report in enumerate(reports)
     ]
     assert_same_bits([s.wTc for s in stats], [r.stats.wTc for r in reports])

@@ -15,7 +15,7 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.runs.config import ExperimentConfig, make_config
 from fgslam.slam import factory
-from fgslam.slam.replay import replay_step
+from fgslam.slam.replay import replay_frame
 
 
 def replay(config: ExperimentConfig, log: MeasurementLog) -> Estimate:
@@ -23,7 +23,7 @@ def replay(config: ExperimentConfig, log: MeasurementLog) -> Estimate:
     motion = factory.make_motion(log.rig, config.odometry)
     solver = EgoMotionSolver(log.rig, config.frontend.ego_motion)
     for k, increment in enumerate(log):
-        replay_step(increment, estimator, solver, motion, k)
+        replay_frame(increment, estimator, solver, motion, k)
     return estimator.estimate()
 
 

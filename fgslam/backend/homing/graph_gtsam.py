@@ -44,7 +44,6 @@ from fgslam.factors.graphs import (
 )
 
 _TRUST_RADIUS = 1.0  # legs, radians: the first of Powell's dog leg
-_RELINEARISED = 0.01  # legs, radians: a variable that moves by more is linearised anew
 _LAG_S = 1.0  # of `fixed_lag`: ten images; older poses hardly change
 _MAX_ITERATIONS = 50  # of Levenberg-Marquardt; from the last solution it takes three to ten
 _RELATIVE_TOLERANCE = 1e-5  # of the cost: the estimate then moves by far less than its deviation
@@ -271,7 +270,7 @@ def _parameters() -> Any:
     """Dog leg, because an undamped step may carry a landmark across a camera's centre."""
     dog_leg = gtsam.ISAM2DoglegParams()
     dog_leg.setInitialDelta(_TRUST_RADIUS)
-    return isam2_parameters(dog_leg, _RELINEARISED)
+    return isam2_parameters(dog_leg)
 
 
 def minimised(graph: Any, values: Any) -> Any:

@@ -62,7 +62,6 @@ from fgslam.factors.graphs import (
 )
 from fgslam.factors.motion import pose_prior
 
-_RELINEARISED = 0.01  # radians, metres: a variable that moves by more is linearised anew
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
 
 
@@ -218,7 +217,7 @@ class FixedLagSolver:
     # ----------------------------------------------------------------------------------------
 
     def _new_solver(self) -> Any:
-        params = isam2_parameters(gtsam.ISAM2GaussNewtonParams(), _RELINEARISED)
+        params = isam2_parameters(gtsam.ISAM2GaussNewtonParams())
         # Without it the list of factors, and the effort, grow with the run.
         params.findUnusedFactorSlots = True
         return gtsam.IncrementalFixedLagSmoother(self._lag, params)

@@ -40,9 +40,6 @@ from fgslam.factors.graphs import (
 )
 
 _RELATIVE_TOLERANCE = 1e-9  # of the cost
-_RELINEARISED = 0.01
-"""Radians, metres: a variable that moves by more is linearised anew. 0.1, GTSAM's own, leaves a
-drive of 50 m twice as far off."""
 _FINAL_ITERATIONS = 5  # of the estimate's solution: everything that moved is linearised anew
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
 
@@ -132,7 +129,7 @@ class Isam2Solver(WholeGraphSolver):
             gtsam.ISAM2GaussNewtonParams(),
             "QR" if self._with_qr else "CHOLESKY",
         )
-        return gtsam.ISAM2(isam2_parameters(method, _RELINEARISED, factorization))
+        return gtsam.ISAM2(isam2_parameters(method, factorization))
 
     def _flush(self) -> None:
         """Brings the frames since the last update in."""

@@ -38,7 +38,7 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.arrival import Arrival, take_over
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
-from fgslam.slam.replay import replay_step
+from fgslam.slam.replay import replay_frame
 
 MAPPED = ROUND // 2  # frames of the drive that makes the map
 BEGIN = 22  # of it, where the second drive begins
@@ -197,7 +197,7 @@ def test_every_estimator_returns_to_the_map(settings: EstimatorSettings, extends
     solver, motion = EgoMotionSolver(RIG, SETTINGS.ego_motion), RingMotion(PATH, drift_deg(extends))
     first = closings(reports)[0]
     for k, report in enumerate(reports[: first + 3]):
-        stats = replay_step(report.increment, estimator, solver, motion, k)
+        stats = replay_frame(report.increment, estimator, solver, motion, k).stats
         if report.increment.loops:
             assert stats.closed == (True,)
         if k >= first:

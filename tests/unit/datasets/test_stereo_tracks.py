@@ -25,7 +25,7 @@ from fgslam.evaluation.trajectory import evaluate_trajectory
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.motion import ConstantVelocityMotion
-from fgslam.slam.replay import replay_step
+from fgslam.slam.replay import replay_frame
 
 FX, FY, CX, CY, B = 700.0, 710.0, 600.0, 180.0, 0.5
 POINTS = np.array([[1.0, 0.5, 10.0], [-2.0, -1.0, 8.0], [0.3, 0.2, 25.0], [3.0, -0.4, 14.0]])
@@ -252,7 +252,7 @@ def test_the_filter_follows_the_reference(rng: np.random.Generator) -> None:
     limits = EgoMotionSettings(max_correction_m=3.0, max_correction_deg=10.0)
     solver = EgoMotionSolver(log.rig, limits)
     motion = ConstantVelocityMotion(ConstantVelocitySettings())
-    stats = [replay_step(step, estimator, solver, motion, k) for k, step in enumerate(log)]
+    stats = [replay_frame(step, estimator, solver, motion, k).stats for k, step in enumerate(log)]
     error = evaluate_trajectory(estimator.estimate().trajectory, recording.ground_truth)
     assert error.ate_rmse_m is not None
     assert error.ate_rmse_m < 0.03

@@ -28,7 +28,7 @@ from fgslam.evaluation.trajectory import evaluate_trajectory
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.motion import ConstantVelocityMotion
-from fgslam.slam.replay import replay_step
+from fgslam.slam.replay import replay_frame
 
 N = 12
 STEREO_FILE = "utias_starry_night_dataset3.mat"
@@ -337,7 +337,7 @@ def filtered(recording: MeasurementRecording, settings: EgoMotionSettings) -> Tr
     solver = EgoMotionSolver(log.rig, settings)
     motion = ConstantVelocityMotion(ConstantVelocitySettings())
     for k, increment in enumerate(log):
-        replay_step(increment, estimator, solver, motion, k)
+        replay_frame(increment, estimator, solver, motion, k)
     return estimator.estimate().trajectory
 
 

@@ -96,7 +96,7 @@ def test_the_pose_is_the_right_cameras() -> None:
     assert_near(factor.unwhitenedError(values_of(wTc, point)), np.zeros(3), 1e-12)
     # GTSAM's own stereo camera is the left one: given its pose, without the bridge, it agrees.
     bare = gtsam.StereoCamera(
-        gtsam.Pose3(g.left_from_right_camera(wTc, 0.1)),
+        gtsam.Pose3(g.right_from_left_camera(wTc, -0.1)),
         gtsam.Cal3_S2Stereo(277.0, 277.0, 0.0, 159.5, 119.5, 0.1),
     ).project(point)
     assert_near(np.array([bare.uL(), bare.uR(), bare.v()]), FROM_MEASUREMENT @ seen, 1e-12)

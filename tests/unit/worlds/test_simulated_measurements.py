@@ -25,7 +25,7 @@ from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.runs.config import ExperimentConfig, load_experiment, make_config
 from fgslam.slam.motion import ConstantVelocityMotion
-from fgslam.slam.replay import replay_step
+from fgslam.slam.replay import replay_frame
 from fgslam.worlds.simulated.landmarks import IdentityBook
 from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 
@@ -402,7 +402,7 @@ def filtered(recording: MeasurementRecording) -> tuple[Trajectory, float]:
     solver = EgoMotionSolver(rig, EgoMotionSettings(dof=3))
     motion = ConstantVelocityMotion(ConstantVelocitySettings())
     for k, increment in enumerate(recording.log):
-        replay_step(increment, estimator, solver, motion, k)
+        replay_frame(increment, estimator, solver, motion, k)
     found = estimator.estimate().trajectory
     error = evaluate_trajectory(found, recording.ground_truth, Alignment.FIRST_POSE)
     assert error.ate_rmse_m is not None

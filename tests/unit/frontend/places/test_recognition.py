@@ -35,7 +35,7 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline, observe
-from fgslam.slam.replay import replay_step
+from fgslam.slam.replay import replay_frame
 
 # -- the return ------------------------------------------------------------------------------
 
@@ -187,7 +187,7 @@ def test_each_estimator_of_a_comparison_accepts_or_refuses_a_closure_itself() ->
     solver, motion = EgoMotionSolver(RIG, SETTINGS.ego_motion), RingMotion(RING, 0.9)
     first = closings(reports)[0]
     for k, report in enumerate(reports):
-        stats = replay_step(report.increment, estimator, solver, motion, k)
+        stats = replay_frame(report.increment, estimator, solver, motion, k).stats
         if k >= first:
             assert difference(RING[k], stats.wTc)[0] < 0.15
         assert stats.closed == (() if not report.increment.loops else (True,))
@@ -210,7 +210,7 @@ def test_a_replay_closes_the_same_loops_to_the_bit(
     solver = EgoMotionSolver(RIG, SETTINGS.ego_motion)
     motion = RingMotion(RING, 0.9)
     for k, report in enumerate(reports):
-        replay_step(report.increment, estimator, solver, motion, k)
+        replay_frame(report.increment, estimator, solver, motion, k)
     np.testing.assert_array_equal(
         estimator.estimate().trajectory.poses, pipeline.estimator.estimate().trajectory.poses
     )
@@ -279,7 +279,7 @@ def test_a_relocalised_frame_is_replayed_to_the_bit() -> None:
     estimator = make_estimator(RIG, LandmarkKalmanSettings(), SETTINGS.ego_motion)
     solver, motion = EgoMotionSolver(RIG, SETTINGS.ego_motion), RingMotion(poses, 0.1)
     for k, report in enumerate(reports):
-        stats = replay_step(report.increment, estimator, solver, motion, k)
+        stats = replay_frame(report.increment, estimator, solver, motion, k).stats
         np.testing.assert_array_equal(stats.wTc, report.stats.wTc)
 
 
