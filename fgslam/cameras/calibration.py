@@ -33,7 +33,7 @@ def read_calibration(path: Path, three_cameras: bool) -> CameraRig:
     if values.get("rectified") is False:
         raise CalibrationError(
             f"{path} says that the images are not rectified; rectify them first (rows of the left "
-            "and right image must agree)"
+            "and right image must agree), or give the raw cameras' calibration by --camera FILE"
         )
     return CameraRig(
         width=pixels(path, values, "width"),
@@ -50,7 +50,8 @@ def read_calibration(path: Path, three_cameras: bool) -> CameraRig:
 
 def read_json_object(path: Path) -> Mapping[str, Any]:
     """A JSON file's outermost object. Raises CalibrationError when there is none."""
-    remedy = "give a calibration (docs/datasets/image_folder.md has its keys), check dataset.path"
+    remedy = "give a calibration: this file (docs/datasets/image_folder.md has its keys), or "
+    remedy += "another one by --camera FILE"
     text = read_text(path, CalibrationError, remedy)
     try:
         values = json.loads(text)

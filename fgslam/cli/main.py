@@ -51,24 +51,30 @@ def _root(version: options.Version = False) -> None:
 def run(
     config: options.Experiment,
     out: options.RunFolder = None,
+    camera: options.Camera = None,
     overrides: options.Overrides = None,
     overwrite: options.Overwrite = False,
     resume: options.Resume = False,
     map_in: options.MapIn = None,
     map_out: options.MapOut = None,
 ) -> None:
-    """Run an experiment: images in, run folder out; measurements, localisation, homing, too.
+    """Map a recording, or run an experiment: images in, run folder out.
+
+    Of a recording the layout is recognised and said; its odometry is used where it has some, and
+    what is known of the truth only to judge. fgslam init prints the configuration that repeats it.
 
     With --map-in it begins in a saved map: map.start says where, map.extend whether it changes it.
 
     Ctrl-C ends it early with all files valid; --resume goes on from there.
     """
-    from fgslam.runs.config import load_experiment
+    from fgslam.runs.bare_recording import experiment_of
 
     existing = _existing(overwrite, resume)
     maps = {"load": map_in, "save": map_out}
     given = [f"map.{key}={json.dumps(str(path))}" for key, path in maps.items() if path]
-    settings = load_experiment(config, [*(overrides or ()), *given])
+    settings, said = experiment_of(config, camera, [*(overrides or ()), *given])
+    if said:
+        typer.echo(said)
     folder = out or Path("runs") / settings.name
 
     # Not before: a wrong key is answered before any library of numbers is loaded.
@@ -79,6 +85,14 @@ def run(
         result = run_experiment(settings, folder, existing, progress, stopped)
     _show([result], resume_command(folder))
     _exit_as([result])
+
+
+@app.command()
+def init(recording: options.BareRecording, camera: options.Camera = None) -> None:
+    """Print the short configuration that repeats `fgslam run RECORDING`, as YAML."""
+    from fgslam.runs.bare_recording import short_config
+
+    typer.echo(short_config(recording, camera), nl=False)
 
 
 @app.command()

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from fgslam.core.errors import ConfigError, DatasetError
-from fgslam.datasets.layouts import recognise_layout
+from fgslam.datasets.layouts import fitting_layouts, recognise_layout
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
 from fgslam.runs.named_experiments import experiment_names, find_experiment, suggestion
 
@@ -21,15 +21,22 @@ def names_beginning_with(incomplete: str) -> list[str]:
 
 
 def experiment(given: str) -> Path:
-    """Path of an experiment's file, given as a path or by name. Raises ConfigError."""
+    """An experiment's file, given as a path or by name, or a recording's folder.
+
+    Raises FgslamError.
+    """
     path = find_experiment(Path(given))
     if path.is_dir():
-        inside = path / RUN_MARKER
-        instead = f"{inside} to repeat that run" if inside.is_file() else "an experiment's .yaml"
-        raise ConfigError(f"{path}: is a folder; give {instead}")
+        fitting_layouts(path)
     if not path.exists():
-        raise ConfigError(f"{path}: no such file; {suggestion(path)}")
+        raise ConfigError(f"{path}: no such file or folder; {suggestion(path)}")
     return path
+
+
+def bare_recording(given: str) -> Path:
+    """Folder of a recording in a known layout. Raises DatasetError."""
+    fitting_layouts(Path(given))
+    return Path(given)
 
 
 def recording(given: str) -> Path:
@@ -105,10 +112,17 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace an earlier
 Experiment = Annotated[
     Path,
     typer.Argument(
-        metavar="EXPERIMENT",
+        metavar="RECORDING|EXPERIMENT",
         parser=experiment,
         autocompletion=names_beginning_with,
-        help="a .yaml file, or the name of one that comes with fgslam, e.g. lab_loop",
+        help="a recording's folder; or an experiment: a .yaml file, or the name of one that comes "
+        "with fgslam, e.g. lab_loop",
+    ),
+]
+Camera = Annotated[
+    Path | None,
+    typer.Option(
+        "--camera", metavar="FILE", help="calibration of a recording, in place of its own"
     ),
 ]
 RunFolder = Annotated[Path | None, typer.Option(help="the run folder itself; default runs/NAME")]
@@ -125,8 +139,12 @@ MapOut = Annotated[
 ]
 
 # --------------------------------------------------------------------------------------------
-# inspect, localize
+# inspect, localize, init
 
+BareRecording = Annotated[
+    Path,
+    typer.Argument(metavar="RECORDING", parser=bare_recording, help="a recording's folder"),
+]
 Recording = Annotated[
     Path,
     typer.Argument(

@@ -8,14 +8,20 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.cameras.calibration_formats import read_asl_camera, read_asl_mounting
-from fgslam.cameras.rectification import RawCamera, Rectifier, rectifier, right_and_left
-from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.cameras.rectification import RawCamera, rectifier, right_and_left
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.files import read_lines
 from fgslam.core.geometry import inverse
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.images import StereoFiles, check_sizes, missing_notes, require_folder
+from fgslam.datasets.images import (
+    RawPairs,
+    StereoFiles,
+    check_sizes,
+    missing_notes,
+    require_folder,
+)
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
 from fgslam.datasets.settings import EurocSettings
 from fgslam.datasets.tables import (
@@ -31,19 +37,6 @@ from fgslam.datasets.tables import (
 CAMERA_FOLDERS = ("cam0", "cam1")
 _MAX_TRUTH_GAP_S = 0.1
 _RECTIFY_ALPHA = 0.0  # crops to valid pixels: black borders would be matched
-
-
-@dataclass(frozen=True, eq=False)
-class RawPairs:
-    """Pairs of raw images, rectified when read."""
-
-    files: StereoFiles
-    rectifier: Rectifier
-
-    def load(self, index: int) -> tuple[Image, ...]:
-        """Rectified (right, left) images of a pair. Raises FrameError as StereoFiles does."""
-        raw = self.files.load(index)
-        return tuple(self.rectifier.rectify(k, image) for k, image in enumerate(raw))
 
 
 def open_euroc(settings: EurocSettings) -> Recording:

@@ -9,15 +9,19 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.cameras.calibration import level_mounting, read_calibration, read_json_object
+from fgslam.cameras.rectification import Rectifier
+from fgslam.cameras.rig import read_rig
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.errors import DatasetError, OdometryError
+from fgslam.core.errors import CalibrationError, DatasetError, OdometryError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import right_from_left_camera
 from fgslam.core.measurements import Odometry
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.images import (
+    RawPairs,
     StereoFiles,
     check_sizes,
+    first_size,
     list_numbered_images,
     missing_notes,
     require_folder,
@@ -60,16 +64,16 @@ def open_image_folder(
     root = Path(settings.path)
     require_folder(root, "the recording")
     folders = _camera_folders(root, settings.use_top)
-    rig = _mounted(read_calibration(root / "calib.json", len(folders) == 3), settings)
+    listed = [list_numbered_images(folder) for folder in folders]
+    rig, raw = _cameras(root, settings, listed)
     numbers, stamps = _read_times(root / "times.txt")
     chosen = select_frames(len(stamps), settings)
-    listed = [list_numbered_images(folder) for folder in folders]
     files = _files(folders, listed, numbers, rig)
     check_sizes(files, root)
     truth = _read_truth(root, rig.baseline)
     odometry_file = _find_odometry(root, settings.odometry_file)
     defining = [
-        root / "calib.json",
+        *([_camera_file(root, settings)] if _camera_file(root, settings).is_file() else []),
         root / "times.txt",
         *([odometry_file] if odometry_file else []),
     ]
@@ -82,10 +86,10 @@ def open_image_folder(
         notes=(
             missing_notes(files, stamps)
             + _unlisted(folders, listed, numbers)
-            + _missing_top(root, settings.use_top)
+            + (_missing_top(root, settings.use_top) if settings.camera_file is None else ())
         ),
         indices=chosen,
-        load_images=files.load,
+        load_images=files.load if raw is None else RawPairs(files, raw).load,
         odometry_source=_odometry_source(odometry_file, odometry),
     )
 
@@ -112,6 +116,28 @@ def _camera_folders(root: Path, use_top: bool) -> list[Path]:
                 "is missing; restore it"
             )
     return folders
+
+
+def _camera_file(root: Path, settings: ImageFolderSettings) -> Path:
+    return root / "calib.json" if settings.camera_file is None else Path(settings.camera_file)
+
+
+def _cameras(
+    root: Path, settings: ImageFolderSettings, listed: list[dict[int, Path]]
+) -> tuple[CameraRig, Rectifier | None]:
+    """The rectified rig, and what rectifies the images where they are raw."""
+    path, three = _camera_file(root, settings), len(listed) == 3
+    if settings.camera_file is None:
+        return _mounted(read_calibration(path, three), settings), None
+    found = read_rig(path, first_size(listed[0].values()))
+    raw = found if isinstance(found, Rectifier) else None
+    rig = found.rig if isinstance(found, Rectifier) else found
+    if three and rig.vertical_baseline is None:
+        raise CalibrationError(
+            f"{path} knows two cameras, but {root} has a third one, top/; give a calibration of "
+            "all three, or leave it out: --set dataset.use_top=false"
+        )
+    return _mounted(rig if three else replace(rig, vertical_baseline=None), settings), raw
 
 
 def _mounted(rig: CameraRig, settings: ImageFolderSettings) -> CameraRig:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from fgslam.cameras.rectification import Rectifier
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 
@@ -141,6 +143,30 @@ class StereoFiles:
             except FrameError:
                 continue
         return None
+
+
+@dataclass(frozen=True, eq=False)
+class RawPairs:
+    """Pairs of raw images, rectified when read."""
+
+    files: StereoFiles
+    rectifier: Rectifier
+
+    def load(self, index: int) -> tuple[Image, ...]:
+        """Rectified (right, left) images of a pair. Raises FrameError as StereoFiles does."""
+        raw = self.files.load(index)
+        return tuple(self.rectifier.rectify(k, image) for k, image in enumerate(raw))
+
+
+def first_size(paths: Iterable[Path]) -> tuple[int, int] | None:
+    """Width and height of the first image that can be read; None without any."""
+    for path in paths:
+        try:
+            height, width = read_grey_image(path).shape
+        except FrameError:
+            continue
+        return width, height
+    return None
 
 
 def size(image: Image) -> str:

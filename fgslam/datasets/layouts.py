@@ -2,28 +2,60 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from fgslam.core.errors import DatasetError
 
-_KITTI_PARTS = ("image_0", "image_1", "calib.txt", "times.txt")
-_NAMES = {
-    "euroc": "an EuRoC folder",
-    "kitti": "a KITTI odometry folder",
-    "light_field": "a light field",
-    "image_folder": "an image folder",
-}
+_DRIVE = ("image_0", "image_1", "calib.txt", "times.txt")
+_RUN_CONFIG = "config.yaml"
 
 
-def recognise_layout(folder: Path) -> dict[str, str]:
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """One of the known layouts.
+
+    Attributes:
+        name: what people call it.
+        lacking: the parts that a folder would need to have it and has not.
+        begun: whether a folder has parts that no other layout has.
+    """
+
+    name: str
+    lacking: Callable[[Path], tuple[str, ...]]
+    begun: Callable[[Path], bool]
+
+
+def recognise_layout(folder: Path, kind: str | None = None) -> dict[str, str]:
     """The keys of ``dataset`` in a configuration that open this folder: kind, path and so on.
 
-    A folder with some but not all parts of a layout counts as that layout where it cannot be
-    another one, so that its reader says what is missing. Of several KITTI drives the first is
-    taken.
+    A folder that has all parts of one layout has that layout. One that has some parts of one
+    alone counts as that, so that its reader says what is missing. Of several KITTI drives the
+    first is taken.
+
+    Args:
+        folder: of the recording.
+        kind: the layout, where it is known; None: it is recognised.
 
     Raises:
-        DatasetError: there is no such folder, or it has none of the known layouts.
+        DatasetError: there is no such folder, it has none of the known layouts, or several.
+    """
+    fitting = fitting_layouts(folder)
+    if kind not in LAYOUTS:
+        if len(fitting) > 1:
+            raise DatasetError(_ambiguous(folder, fitting))
+        kind = fitting[0]
+    if kind == "kitti":
+        return _kitti_keys(folder)
+    return {"kind": kind, "path": str(folder)}
+
+
+def fitting_layouts(folder: Path) -> tuple[str, ...]:
+    """Kinds of the layouts that the folder has; where it has none, of those it has parts of.
+
+    Raises:
+        DatasetError: there is no such folder, or nothing in it belongs to a known layout.
     """
     if folder.is_file():
         raise DatasetError(
@@ -34,18 +66,11 @@ def recognise_layout(folder: Path) -> dict[str, str]:
             f"{folder}: no such folder or experiment file; give the folder of a recording, or an "
             "experiment's .yaml"
         )
-    if (folder / "mav0").is_dir() or (folder / "cam0" / "sensor.yaml").is_file():
-        return {"kind": "euroc", "path": str(folder)}
-    if kitti_drives(folder):
-        return {"kind": "kitti", "path": str(folder), "sequence": kitti_drives(folder)[0]}
-    if (folder / "image_0").is_dir() or (folder / "image_1").is_dir():
-        return _single_drive(folder)
-    if (folder / "positions.csv").is_file():
-        return {"kind": "light_field", "path": str(folder)}
-    stereo = (folder / "left").is_dir() or (folder / "right").is_dir()
-    if stereo or ((folder / "calib.json").is_file() and (folder / "times.txt").is_file()):
-        return {"kind": "image_folder", "path": str(folder)}
-    raise DatasetError(_unknown(folder))
+    complete = [kind for kind, layout in LAYOUTS.items() if not layout.lacking(folder)]
+    fitting = complete or [kind for kind, layout in LAYOUTS.items() if layout.begun(folder)]
+    if not fitting:
+        raise DatasetError(_unknown(folder))
+    return tuple(fitting)
 
 
 def layout_hint(folder: Path, kind: str) -> str:
@@ -58,7 +83,8 @@ def layout_hint(folder: Path, kind: str) -> str:
         return ""
     changed = {key: value for key, value in found.items() if value != str(folder)}
     keys = " ".join(f"--set dataset.{key}={value}" for key, value in changed.items())
-    return f"this is {_NAMES[found['kind']]}: {keys}"
+    name = LAYOUTS[found["kind"]].name
+    return f"this is {'an' if name[0] in 'aeiouE' else 'a'} {name} folder: {keys}"
 
 
 def kitti_drives(root: Path) -> tuple[str, ...]:
@@ -75,37 +101,96 @@ def kitti_drives(root: Path) -> tuple[str, ...]:
     )
 
 
-def _single_drive(folder: Path) -> dict[str, str]:
-    """A drive's own folder, sequences/NN: its root is two levels up."""
-    here = folder.resolve()
-    root = here.parent.parent
-    if here.parent.name == "sequences" and here.name in kitti_drives(root):
-        return {"kind": "kitti", "path": str(root), "sequence": here.name}
+def _kitti_keys(folder: Path) -> dict[str, str]:
+    """A drive's own folder is ROOT/sequences/NN; of a root the first drive is taken."""
+    if kitti_drives(folder):
+        return {"kind": "kitti", "path": str(folder), "sequence": kitti_drives(folder)[0]}
+    if _is_drive(folder):
+        here = folder.resolve()
+        return {"kind": "kitti", "path": str(here.parent.parent), "sequence": here.name}
     raise DatasetError(
         f"{folder} looks like one KITTI drive, but it is not in a folder sequences/ under two "
         "digits; move it to ROOT/sequences/00 (its poses to ROOT/poses/00.txt) and give ROOT"
     )
 
 
+def _ambiguous(folder: Path, fitting: tuple[str, ...]) -> str:
+    names = "; ".join(_with_lacking(folder, LAYOUTS[kind]) for kind in fitting)
+    return (
+        f"{folder} fits several layouts equally well: {names}; say which, e.g. --set "
+        f"dataset.kind={fitting[0]}"
+    )
+
+
 def _unknown(folder: Path) -> str:
     """What was looked for in each layout, and what of it is missing."""
-    if (folder / "config.yaml").is_file():
+    if (folder / _RUN_CONFIG).is_file():
         return (
-            f"{folder} is a run folder, not a recording; inspect what it was made from: fgslam "
-            f"inspect {folder / 'config.yaml'}"
+            f"{folder} is a run folder, not a recording; give what it was made from: "
+            f"{folder / _RUN_CONFIG}"
         )
-    wanted = {
-        "image folder": ("left", "right", "calib.json", "times.txt"),
-        "KITTI": ("sequences/NN",),
-        "one KITTI drive": _KITTI_PARTS,
-        "EuRoC": ("mav0/cam0", "mav0/cam1"),
-        "light field": ("positions.csv", "calib.json"),
-    }
-    missing = [
-        f"{name} (lacks {', '.join(part for part in parts if not (folder / part).exists())})"
-        for name, parts in wanted.items()
-    ]
-    return (
-        f"{folder} has none of the known layouts: {'; '.join(missing)}; docs/datasets/ describes "
-        "each"
-    )
+    if not any(folder.iterdir()):
+        return f"{folder} is empty; give the folder of a recording, docs/datasets/ has the layouts"
+    missing = "; ".join(_with_lacking(folder, layout) for layout in LAYOUTS.values())
+    return f"{folder} has none of the known layouts: {missing}; docs/datasets/ describes each"
+
+
+def _with_lacking(folder: Path, layout: Layout) -> str:
+    lacking = layout.lacking(folder)
+    return f"{layout.name} (lacks {', '.join(lacking)})" if lacking else layout.name
+
+
+# --------------------------------------------------------------------------------------------
+# What each layout needs, and what tells it from the others
+
+
+def _absent(folder: Path, parts: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(part for part in parts if not (folder / part).exists())
+
+
+def _lacking_of_euroc(folder: Path) -> tuple[str, ...]:
+    inside = folder / "mav0" if (folder / "mav0").is_dir() else folder
+    return tuple(f"mav0/{part}" for part in _absent(inside, ("cam0", "cam1")))
+
+
+def _euroc_begun(folder: Path) -> bool:
+    return (folder / "mav0").is_dir() or (folder / "cam0" / "sensor.yaml").is_file()
+
+
+def _lacking_of_kitti(folder: Path) -> tuple[str, ...]:
+    if kitti_drives(folder) or _is_drive(folder):
+        return ()
+    drive = ", ".join(_absent(folder, _DRIVE)) or "its place in ROOT/sequences/NN"
+    return ("sequences/NN", f"or of one drive {drive}")
+
+
+def _kitti_begun(folder: Path) -> bool:
+    return (folder / "image_0").is_dir() or (folder / "image_1").is_dir()
+
+
+def _is_drive(folder: Path) -> bool:
+    """Whether this is one KITTI drive in its place, ROOT/sequences/NN."""
+    here = folder.resolve()
+    return here.parent.name == "sequences" and here.name in kitti_drives(here.parent.parent)
+
+
+def _image_folder_begun(folder: Path) -> bool:
+    pair = (folder / "left").is_dir() or (folder / "right").is_dir()
+    return pair or not _absent(folder, ("calib.json", "times.txt"))
+
+
+LAYOUTS = {
+    "image_folder": Layout(
+        "image folder",
+        lambda folder: _absent(folder, ("left", "right", "calib.json", "times.txt")),
+        _image_folder_begun,
+    ),
+    "kitti": Layout("KITTI odometry", _lacking_of_kitti, _kitti_begun),
+    "euroc": Layout("EuRoC native", _lacking_of_euroc, _euroc_begun),
+    "light_field": Layout(
+        "light field",
+        lambda folder: _absent(folder, ("positions.csv", "calib.json")),
+        lambda folder: (folder / "positions.csv").is_file(),
+    ),
+}
+"""By the value of ``dataset.kind`` that opens it."""

@@ -38,6 +38,13 @@ class ImageFolderSettings(RecordingSettings):
     use_top: Annotated[bool, Field(description="use the third camera where the folder has one")] = (
         True
     )
+    camera_file: Annotated[
+        str | None,
+        Field(
+            description="calibration in place of the folder's calib.json, in any format of "
+            "docs/howto/your_camera.md; images of a rig that is not rectified are rectified by it"
+        ),
+    ] = None
     odometry_file: Annotated[
         str | None,
         Field(

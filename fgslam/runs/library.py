@@ -18,7 +18,8 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.layouts import recognise_layout
 from fgslam.frontend.settings import EgoMotionSettings
-from fgslam.runs.config import ExperimentConfig, load_experiment, make_config
+from fgslam.runs.bare_recording import experiment_of
+from fgslam.runs.config import ExperimentConfig, make_config
 from fgslam.runs.engine import RunResult
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.live import Overrides, override_texts, slam_config
@@ -162,15 +163,18 @@ def run(
     overrides: Overrides = (),
     existing: ExistingFolder = "refuse",
     progress: Progress = lambda what, done, total: None,
+    camera: str | Path | None = None,
 ) -> RunResult:
-    """Runs an experiment of any task into a run folder, as ``fgslam run`` does.
+    """Runs a recording, or an experiment of any task, into a run folder, as ``fgslam run`` does.
 
     Args:
-        experiment: the name of an experiment that comes with fgslam, or a YAML file.
+        experiment: a recording's folder, the name of an experiment that comes with fgslam, or a
+            YAML file.
         out: the run folder; None for runs/NAME.
         overrides: settings that differ, by dotted key: ``{"seed": 3}``; or texts: ``["seed=3"]``.
         existing: what to do where the folder holds a run: `refuse`, `overwrite` or `resume`.
         progress: called with what is under way, how much of it is done, and of how much.
+        camera: of a recording: calibration file in place of its own.
 
     Returns:
         How it ended: `folder`, `status` (`finished` or `interrupted`), `metrics` (the document of
@@ -179,7 +183,8 @@ def run(
     Raises:
         FgslamError: of any kind, with one line that says what to do.
     """
-    config = load_experiment(find_experiment(Path(experiment)), override_texts(overrides))
+    calibration = None if camera is None else Path(camera)
+    config, _ = experiment_of(Path(experiment), calibration, override_texts(overrides))
     folder = Path("runs") / config.name if out is None else Path(out)
     return run_experiment(config, folder, existing, progress)
 

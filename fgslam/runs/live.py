@@ -18,6 +18,7 @@ from fgslam.core.saved_map import load_map
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.settings import OdometrySettings
 from fgslam.frontend.settings import FrontendSettings
+from fgslam.runs.bare_recording import bare_experiment
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.maps import Map, drives_of, map_points
 from fgslam.runs.named_experiments import find_experiment
@@ -143,8 +144,8 @@ class Slam(Session):
         name gives them), it computes the same bytes as ``fgslam run``.
 
         Args:
-            config: the name of an experiment that comes with fgslam, a YAML file, or a
-                configuration.
+            config: a recording's folder, the name of an experiment that comes with fgslam, a YAML
+                file, or a configuration.
             overrides: settings that differ from the file's: ``{"estimator.kind": "ekf"}`` or
                 ``["estimator.kind=ekf"]``.
             rig: the cameras; None for those of the experiment's recording, which is then opened.
@@ -212,14 +213,17 @@ def _beginning(config: ExperimentConfig) -> MapStart | None:
 def slam_config(
     config: str | Path | ExperimentConfig, overrides: Overrides = ()
 ) -> ExperimentConfig:
-    """The configuration of an experiment of SLAM, by name or file, with overrides.
+    """The configuration of an experiment of SLAM, by name or file, or of a recording's folder.
 
     Raises:
         ConfigError: no such experiment, it is of another task, or a key or value is wrong.
     """
     texts = override_texts(overrides)
     if not isinstance(config, ExperimentConfig):
-        return load_config(find_experiment(Path(config)), texts)
+        path = find_experiment(Path(config))
+        return (
+            bare_experiment(path, None, texts).config if path.is_dir() else load_config(path, texts)
+        )
     if texts:
         raise ConfigError("overrides are for experiments by name or file; change the configuration")
     return config

@@ -110,7 +110,7 @@ def test_demo_is_the_loop_of_the_paper(monkeypatch: Patch, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (("run",), "fgslam run: Missing argument 'EXPERIMENT'; see fgslam run --help"),
+        (("run",), "fgslam run: Missing argument 'RECORDING|EXPERIMENT'; see fgslam run --help"),
         (("run", "c.yaml", "--outt", "x"), "No such option: --outt (Possible options: --out)"),
         (("run", "c.yaml", "--foo"), "fgslam run: No such option: --foo; see fgslam run --help"),
         (("compare", "nothere"), "nothere: no such folder; give a run folder"),
@@ -120,7 +120,10 @@ def test_demo_is_the_loop_of_the_paper(monkeypatch: Patch, tmp_path: Path) -> No
         (("inspect", "x", "--frames", "many"), "fgslam inspect: Invalid value for '--frames'"),
         (("run", "lab_loop", "--resume", "--overwrite"), "exclude each other; give one of them"),
         (("run", "absent.yaml"), "absent.yaml: no such file"),
-        (("run", "lab_lop"), "lab_lop: no such file; the experiment lab_loop comes with fgslam"),
+        (
+            ("run", "lab_lop"),
+            "lab_lop: no such file or folder; the experiment lab_loop comes with fgslam",
+        ),
     ],
 )
 def test_mistyped_commands(

@@ -370,6 +370,7 @@ def test_command_prints_the_report_and_succeeds(
 def test_command_refuses_what_is_no_recording_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (tmp_path / "notes.txt").write_text("nothing to see", encoding="utf-8")
     assert run_cli(monkeypatch, "inspect", str(tmp_path)) == 2
     streams = capsys.readouterr()
     assert streams.out == ""

@@ -94,7 +94,7 @@ def test_image_folder_reader_names_the_layout_that_it_finds_instead(tmp_path: Pa
     driving, _ = kitti(tmp_path / "car", 3, "06")
     (tmp_path / "nothing").mkdir()
     expected = {
-        flying: r"no folder left; this is an EuRoC folder: --set dataset\.kind=euroc$",
+        flying: r"no folder left; this is an EuRoC native folder: --set dataset\.kind=euroc$",
         driving: r"this is a KITTI odometry folder: --set dataset\.kind=kitti "
         r"--set dataset\.sequence=06$",
         driving / "sequences" / "06": r"--set dataset\.kind=kitti --set dataset\.path=.*/car",
@@ -112,14 +112,14 @@ def test_unknown_layout_lists_what_is_missing(tmp_path: Path) -> None:
     text = str(caught.value)
     assert "image folder (lacks left, right, times.txt)" in text
     assert "light field (lacks positions.csv)" in text
-    assert "KITTI (lacks sequences/NN)" in text
-    assert "EuRoC (lacks mav0/cam0, mav0/cam1)" in text
+    assert "KITTI odometry (lacks sequences/NN, or of one drive image_0, image_1" in text
+    assert "EuRoC native (lacks mav0/cam0, mav0/cam1)" in text
     assert "\n" not in text
 
 
 def test_run_folder_and_missing_folder(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text("name: a", encoding="utf-8")
-    with pytest.raises(DatasetError, match=r"is a run folder.*inspect .*config\.yaml"):
+    with pytest.raises(DatasetError, match=r"is a run folder, .*made from: .*config\.yaml$"):
         recognise_layout(tmp_path)
     with pytest.raises(DatasetError, match="no such folder or experiment file"):
         recognise_layout(tmp_path / "nowhere")

@@ -1,0 +1,152 @@
+"""The experiment that a recording alone is: everything else is recognised, or the default.
+
+Truth that a recording has is for evaluation; nothing here looks at it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from fgslam.backend.settings import LandmarkKalmanSettings
+from fgslam.core.errors import ConfigError, DatasetError
+from fgslam.datasets.layouts import LAYOUTS, recognise_layout
+from fgslam.runs.config import Experiment, ExperimentConfig, load_experiment, make_config
+from fgslam.runs.named_experiments import find_experiment, suggestion
+
+if TYPE_CHECKING:
+    from fgslam.core.recordings import Sequence
+
+ESTIMATOR = LandmarkKalmanSettings.kind
+"""The estimator of a recording that comes without a configuration."""
+
+_NOT_IN_NAMES = re.compile(r"[^\w.-]+")
+
+
+@dataclass(frozen=True, slots=True)
+class Bare:
+    """A recording as an experiment.
+
+    Attributes:
+        values: the short configuration.
+        config: the same, checked, with overrides.
+        said: what the recording is and how it is taken, in one line.
+    """
+
+    values: dict[str, Any]
+    config: ExperimentConfig
+    said: str
+
+
+def bare_experiment(
+    folder: Path, camera: Path | None = None, overrides: Iterable[str] = ()
+) -> Bare:
+    """Opens a recording and says what it is.
+
+    Its odometry is used where it has some, else the motion is predicted by constant velocity.
+
+    Args:
+        folder: a recording in any known layout.
+        camera: calibration in place of the folder's own.
+        overrides: ``a.b=value``.
+
+    Raises:
+        FgslamError: the layout is not known, or the recording cannot be opened.
+    """
+    from fgslam.runs.opening import open_sequence  # loads arrays; a configuration needs none
+
+    overrides = tuple(overrides)
+    values: dict[str, Any] = {
+        "name": _NOT_IN_NAMES.sub("_", folder.resolve().name).strip("_") or "recording",
+        "dataset": _dataset(folder, camera, overrides),
+        "odometry": {"kind": "recorded"},
+        "estimator": {"kind": ESTIMATOR},
+    }
+    where = str(folder)
+    sequence = open_sequence(make_config(values, where, overrides))
+    if not has_odometry(sequence):
+        values["odometry"] = {"kind": "constant_velocity"}
+    config = make_config(values, where, overrides)
+    return Bare(values, config, _said(config, sequence))
+
+
+def experiment_of(
+    given: Path, camera: Path | None = None, overrides: Iterable[str] = ()
+) -> tuple[Experiment, str]:
+    """The experiment that is meant, and, for a recording, what it is in one line.
+
+    Args:
+        given: a configuration, the name of a shipped one, or else a recording's folder.
+        camera: of a recording: calibration in place of its own.
+        overrides: ``a.b=value``.
+
+    Raises:
+        FgslamError: it is none of these, or cannot be used.
+    """
+    path = find_experiment(given)
+    if path.is_dir():
+        bare = bare_experiment(path, camera, overrides)
+        return bare.config, bare.said
+    if camera is not None:
+        raise ConfigError(
+            f"{path}: --camera is for a recording; in an experiment it is dataset.camera_file"
+        )
+    if not path.exists():
+        raise ConfigError(f"{path}: no such file or folder; {suggestion(path)}")
+    return load_experiment(path, overrides), ""
+
+
+def short_config(folder: Path, camera: Path | None = None) -> str:
+    """YAML of the configuration that repeats the run of a bare recording. Raises FgslamError."""
+    bare = bare_experiment(folder, camera)
+    return f"# {bare.said}\n{yaml.safe_dump(bare.values, sort_keys=False)}"
+
+
+def has_odometry(sequence: Sequence) -> bool:
+    """Whether any step of the recording has odometry. Raises OdometryError where it is damaged."""
+    return any(sequence.odometry(i) is not None for i in range(1, len(sequence)))
+
+
+def _dataset(folder: Path, camera: Path | None, overrides: tuple[str, ...]) -> dict[str, str]:
+    dataset = recognise_layout(folder, _asked_kind(overrides))
+    if camera is None:
+        return dataset
+    if dataset["kind"] != "image_folder":
+        raise ConfigError(
+            f"{folder}: {LAYOUTS[dataset['kind']].name} holds its own calibration; leave --camera "
+            "out"
+        )
+    if not camera.exists():
+        raise DatasetError(f"{camera}: no such calibration file; check --camera")
+    return {**dataset, "camera_file": str(camera)}
+
+
+def _asked_kind(overrides: tuple[str, ...]) -> str | None:
+    """The layout that an override names; None where none does."""
+    pairs = [override.partition("=") for override in overrides]
+    asked = [value.strip() for key, _, value in pairs if key.strip() == "dataset.kind"]
+    if asked and asked[-1] not in LAYOUTS:
+        raise ConfigError(
+            f"dataset.kind={asked[-1]} is no layout of a folder of images; use one of "
+            f"{', '.join(LAYOUTS)}"
+        )
+    return asked[-1] if asked else None
+
+
+def _said(config: ExperimentConfig, sequence: Sequence) -> str:
+    rig, stamps = sequence.rig, sequence.timestamps
+    duration = float(stamps[-1] - stamps[0])
+    rate = f" at {(len(stamps) - 1) / duration:.3g} Hz" if duration > 0.0 else ""
+    motion = {"recorded": "odometry", "constant_velocity": "no odometry"}
+    truth = "" if sequence.ground_truth is None else "; truth, for evaluation only"
+    return (
+        f"{sequence.name}: {LAYOUTS[config.dataset.kind].name}, {rig.cameras} cameras "
+        f"{rig.width}x{rig.height}; {len(stamps)} frames{rate}; "
+        f"{motion.get(config.odometry.kind, config.odometry.kind)}{truth}; estimator "
+        f"{config.estimator.kind}"
+    )

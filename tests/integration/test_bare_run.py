@@ -1,0 +1,69 @@
+"""A recording that is run as it is: from its folder to run folder, page and comparison."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from running import KIND, SAME_BYTES, bytes_of, main, metrics_of
+
+import fgslam as fg
+
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
+MEASURED = tuple(name for name in SAME_BYTES if name != "ground_truth.tum")
+QUIET = ("--set", "output.pictures=false", "--set", "output.report=false")
+
+
+def test_a_recording_alone_gives_a_run_folder_that_compares(
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "run"
+    assert main(monkeypatch, "run", recording, "--out", out) == 0
+    first = capfd.readouterr().out.splitlines()[0]
+    assert first.startswith("boards: image folder, 3 cameras 160x120; 12 frames at 4 Hz; odometry;")
+    assert (out / "report.html").is_file()
+    assert metrics_of(out)["estimators"][KIND]["ate_rmse_m"] < 0.01
+    assert main(monkeypatch, "compare", out, "--estimators", "odometry,batch") == 0
+    assert (out / "compare" / "comparison.csv").is_file()
+
+
+def test_the_printed_configuration_gives_the_same_bytes_as_the_recording(
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    assert main(monkeypatch, "init", recording) == 0
+    (tmp_path / "mine.yaml").write_text(capfd.readouterr().out, encoding="utf-8")
+    for given, out in ((recording, "bare"), (tmp_path / "mine.yaml", "written")):
+        assert main(monkeypatch, "run", given, "--out", tmp_path / out, *QUIET) == 0
+    assert bytes_of(tmp_path / "bare") == bytes_of(tmp_path / "written")
+
+
+def test_truth_in_the_folder_changes_nothing_but_the_evaluation(
+    recording: Path, tmp_path: Path
+) -> None:
+    blind = Path(shutil.copytree(recording, tmp_path / "boards"))
+    (blind / "gt_right_cam.txt").unlink()
+    quiet = {"output.pictures": False, "output.report": False}
+    seen = fg.run(recording, tmp_path / "seen", quiet)
+    unseen = fg.run(blind, tmp_path / "unseen", quiet)
+    assert bytes_of(seen.folder, MEASURED) == bytes_of(unseen.folder, MEASURED)
+    assert unseen.metrics["estimators"][KIND]["ate_rmse_m"] is None
+
+
+def test_frames_pushed_into_the_session_of_a_recording_give_the_run_s_poses(
+    recording: Path, tmp_path: Path
+) -> None:
+    ran = fg.run(recording, tmp_path / "run", {"output.pictures": False, "output.report": False})
+    slam = fg.Slam.from_config(recording)
+    for t, images, odometry in fg.open_recording(recording):
+        slam.track(t, images, odometry)
+    slam.result().trajectory.save(tmp_path / "pushed.tum")
+    expected = (ran.folder / KIND / "final.tum").read_bytes()
+    assert (tmp_path / "pushed.tum").read_bytes() == expected
