@@ -11,6 +11,7 @@ from simulated import RIG, FeatureWorld, assert_same_bits
 from fgslam.backend.settings import EstimatorSettings, LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Prediction
 from fgslam.core.features import Features
 from fgslam.core.measurements import Increment, Odometry
 from fgslam.core.recordings import Frame
@@ -66,7 +67,7 @@ class RingMotion(OdometryMotion):
             step = np.eye(4)
         return Odometry(step @ g.pose(self._wrong, np.zeros(3)), NOISE)
 
-    def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
+    def observe(self, timestamp: float, pose: Prediction, measured: bool) -> None:
         pass
 
     def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:

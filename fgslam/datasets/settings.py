@@ -205,30 +205,36 @@ PositiveVector3: TypeAlias = tuple[
 
 @dataclass(frozen=True, config=STRICT)
 class ConstantVelocitySettings:
-    """No odometry: the camera is expected to keep its velocity, with this random acceleration.
+    """No odometry: the camera is expected to keep its velocity, up to a random acceleration.
 
     Over a step of ``dt`` seconds the prediction's standard deviation is ``sigma * dt**2``, more
-    while the camera is blind: ``sigma * T * dt``, T since the velocity was last measured.
-    Defaults: the change of velocity between frames of the cars of KITTI, rounded (standard
-    deviation per camera axis; KITTI raw 2011_09_26 at 5 Hz: 12, 6, 8 degrees/s^2 and 0.35, 0.43,
-    2.3 m/s^2, without outliers 9, 3, 6 and 0.22, 0.23, 0.57; KITTI 06 at 10 Hz: 5, 2, 5 and 0.12,
-    0.11, 0.18).
+    while the camera is blind: ``sigma * T * dt``, T since the velocity was last measured. How large
+    the acceleration is, is estimated from the frames so far (docs/derivations/motion_noise.md);
+    the first frames are tracked with the values below. They are those of a flying or hand-held
+    camera, wide for any other (cars of KITTI: 12, 6, 8 degrees/s^2 and 0.35, 0.43, 2.3 m/s^2).
     """
 
     kind: Literal["constant_velocity"] = "constant_velocity"
     rotation_sigma_dps2: Annotated[
         PositiveVector3,
-        Field(description="about the camera's axes x, y, z (right, down, forward), degrees/s^2"),
-    ] = (12.0, 15.0, 10.0)
+        Field(
+            description="at first, about the camera's axes x, y, z (right, down, forward), "
+            "degrees/s^2"
+        ),
+    ] = (100.0, 100.0, 100.0)
     translation_sigma_mps2: Annotated[
-        PositiveVector3, Field(description="along the camera's axes x, y, z, m/s^2")
-    ] = (0.5, 0.5, 1.5)
+        PositiveVector3, Field(description="at first, along the camera's axes x, y, z, m/s^2")
+    ] = (3.0, 3.0, 3.0)
     start_speed_sigma_mps: Annotated[
         float, Field(gt=0.0, description="speed per axis before the first motion is known, m/s")
     ] = 15.0
     start_rotation_sigma_dps: Annotated[
         float, Field(gt=0.0, description="turn per axis before the first motion is known, deg/s")
     ] = 20.0
+    adapt: Annotated[
+        bool,
+        Field(description="estimate the acceleration from the frames; false: it stays as at first"),
+    ] = True
 
 
 @dataclass(frozen=True, config=STRICT)

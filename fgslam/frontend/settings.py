@@ -226,11 +226,16 @@ class EgoMotionSettings:
         int, Field(ge=1, description="fewer inliers than this: the odometry is the pose (4.1)")
     ] = 6
     max_correction_m: Annotated[
-        float, Field(gt=0.0, description="cap on the correction of the odometry (5)")
+        float,
+        Field(
+            gt=0.0,
+            description="cap on the correction of the odometry (5), where six standard deviations "
+            "of the prediction are not more",
+        ),
     ] = 0.3
-    max_correction_deg: Annotated[
-        float, Field(gt=0.0, description="cap on the correction of the odometry (5)")
-    ] = 6.0
+    max_correction_deg: Annotated[float, Field(gt=0.0, description="likewise of the rotation")] = (
+        6.0
+    )
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -8,10 +8,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, StateArrays
+from fgslam.core.estimates import Prediction
 from fgslam.core.geometry import inverse, odometry_of_camera, se3_exp, se3_log
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
 from fgslam.datasets.settings import ConstantVelocitySettings
+from fgslam.slam.motion_noise import MotionNoise
 
 
 class MotionModel(Protocol):
@@ -31,8 +33,11 @@ class MotionModel(Protocol):
         """
         ...
 
-    def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
-        """Learns the last frame's pose; ``measured``: tied to odometry or the map, or its first."""
+    def observe(self, timestamp: float, pose: Prediction, measured: bool) -> None:
+        """Learns the last frame's pose; ``measured``: tied to odometry or the map, or its first.
+
+        The pose's covariance is what its matches left of it, beside the map.
+        """
         ...
 
     def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
@@ -75,9 +80,9 @@ class OdometryMotion:
             return self._stand_in.between(timestamp)
         return odometry_of_camera(body, self._bTc)
 
-    def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
-        """Updates the velocity of the stand-in."""
-        self._stand_in.observe(timestamp, wTc, measured)
+    def observe(self, timestamp: float, pose: Prediction, measured: bool) -> None:
+        """Updates the velocity of the stand-in, and how far it is to be trusted."""
+        self._stand_in.observe(timestamp, pose, measured)
 
     def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
         """The stand-in goes on from there."""
@@ -104,12 +109,8 @@ class ConstantVelocityMotion:
     def __init__(self, settings: ConstantVelocitySettings) -> None:
         """Knows nothing until two poses were observed; at first the camera is expected to rest."""
         self._settings = settings
-        self._sigma = np.concatenate(
-            [
-                np.deg2rad(settings.rotation_sigma_dps2),
-                np.array(settings.translation_sigma_mps2),
-            ]
-        )
+        rotation, translation = settings.rotation_sigma_dps2, settings.translation_sigma_mps2
+        self._noise = MotionNoise(np.concatenate([np.deg2rad(rotation), translation]))
         self._start_sigma = np.repeat(
             [np.deg2rad(settings.start_rotation_sigma_dps), settings.start_speed_sigma_mps], 3
         )
@@ -131,22 +132,30 @@ class ConstantVelocityMotion:
         dt = timestamp - self._timestamp
         if self._velocity is None:
             return Odometry(np.eye(4), np.diag((self._start_sigma * dt) ** 2), measured=False)
-        sigma = self._sigma * (timestamp - self._measured_at) * dt
-        return Odometry(se3_exp(self._velocity * dt), np.diag(sigma**2), measured=False)
+        variance = self._noise.variance * ((timestamp - self._measured_at) * dt) ** 2
+        return Odometry(se3_exp(self._velocity * dt), np.diag(variance), measured=False)
 
-    def observe(self, timestamp: float, wTc: FloatArray, measured: bool) -> None:
-        """Updates the velocity from the last two measured poses.
+    def observe(self, timestamp: float, pose: Prediction, measured: bool) -> None:
+        """Updates the velocity from the last two measured poses, its noise from how it changed.
 
         The frame that founds the map counts as one, whatever its pose: what follows is measured
         against it. Until then the start moves on with the frames.
         """
+        wTc = pose.wTc
         if measured and self._founded:
-            dt = timestamp - self._measured_at
-            self._velocity = se3_log(inverse(self._pose) @ wTc) / dt
+            step, dt = inverse(self._pose) @ wTc, timestamp - self._measured_at
+            self._learn(step, np.diagonal(pose.covariance), dt)
+            self._velocity = se3_log(step) / dt
         if measured or not self._founded:
             self._measured_at, self._pose = timestamp, wTc
         self._founded |= measured
         self._timestamp = timestamp
+
+    def _learn(self, step: FloatArray, left: FloatArray, dt: float) -> None:
+        """A step (4, 4) over ``dt`` seconds beside the one that the velocity made expect."""
+        if self._velocity is not None and self._settings.adapt:
+            innovation = se3_log(se3_exp(-self._velocity * dt) @ step)
+            self._noise.learn(innovation, left, dt**2)
 
     def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
         """Goes on from there with the velocity so far; of one that was carried none is known."""
@@ -168,6 +177,7 @@ class ConstantVelocityMotion:
             "founded": np.array(self._founded),
             "pose": self._pose,
             "velocity": np.full(6, np.nan) if self._velocity is None else self._velocity,
+            "noise": self._noise.state(),
         }
 
     def restore(self, state: StateArrays) -> None:
@@ -178,6 +188,7 @@ class ConstantVelocityMotion:
         self._founded = bool(state["founded"])
         self._pose = state["pose"]
         self._velocity = None if np.isnan(state["velocity"][0]) else state["velocity"]
+        self._noise.restore(state["noise"])
 
 
 def body_motion(sequence: Sequence, i: int, motion: MotionModel) -> Odometry | None:

@@ -168,7 +168,8 @@ def observe(
     if any(stats.closed) or increment.relocalised:
         motion.displaced(increment.timestamp, stats.wTc, increment.relocalised)
     else:
-        motion.observe(increment.timestamp, stats.wTc, _anchored(increment, tracking, stats))
+        pose = Prediction(stats.wTc, tracking.covariance)
+        motion.observe(increment.timestamp, pose, _anchored(increment, tracking, stats))
 
 
 def _anchored(increment: Increment, tracking: EgoMotion, stats: UpdateStats) -> bool:

@@ -42,6 +42,7 @@ _REPEATS = 10  # minimisations with the remaining matches; two suffice on all re
 _EXACT_SIGMA = 1e-6  # radians and metres; stands for zero where a covariance is singular
 _KERNEL_WIDTH = 2.0  # standard deviations of a residual at which the robust kernel bends
 MAX_ITERATIONS = 15  # Newton steps of a minimisation, at most
+_CAP_SIGMAS = 6.0  # deviations of the prediction that a correction may amount to
 _MAX_DAMPING = 1e8
 _LEAST_CURVATURE = 1e-10  # of the Hessian with unit diagonal; below it the pose is undetermined
 
@@ -252,7 +253,7 @@ class EgoMotionSolver:
         iterations: int,
     ) -> EgoMotion:
         correction = se3_log(inverse(prediction.wTc) @ minimum.wTc)
-        allowed = self._allowed_fraction(correction)
+        allowed = self._allowed_fraction(correction, prediction.covariance)
         wTc, status = minimum.wTc, EgoMotionStatus.OK
         covariance = self._covariance(wTc, minimum.hessian)
         if allowed < 1.0:
@@ -273,17 +274,19 @@ class EgoMotionSolver:
             iterations=iterations,
         )
 
-    def _allowed_fraction(self, correction: FloatArray) -> float:
-        """Fraction of the correction that is applied under the cap (section 5)."""
-        rotation = float(np.linalg.norm(correction[:3]))
-        translation = float(np.linalg.norm(correction[3:]))
-        return float(
-            min(
-                1.0,
-                np.deg2rad(self._settings.max_correction_deg) / max(rotation, 1e-12),
-                self._settings.max_correction_m / max(translation, 1e-12),
-            )
-        )
+    def _allowed_fraction(self, correction: FloatArray, predicted: FloatArray) -> float:
+        """Fraction of the correction that is applied under the cap (section 5).
+
+        The cap is the settings' own; where the prediction has a say, also what its covariance
+        (6, 6) makes possible.
+        """
+        settings = self._settings
+        size = np.linalg.norm(correction.reshape(2, 3), axis=1)
+        cap = np.array([np.deg2rad(settings.max_correction_deg), settings.max_correction_m])
+        if settings.prior:
+            largest = np.diagonal(predicted).reshape(2, 3).max(axis=1)
+            cap = np.maximum(cap, _CAP_SIGMAS * np.sqrt(largest))
+        return float(min(1.0, *(cap / np.maximum(size, 1e-12))))
 
     def _covariance(self, wTc: FloatArray, hessian: FloatArray) -> FloatArray:
         basis = self.floor.basis(wTc)

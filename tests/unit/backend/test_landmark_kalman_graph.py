@@ -174,7 +174,7 @@ CASES = {
     "uniform": (EgoMotionSettings(weighting="uniform", kernel="none"), {}),
     "image alone": (EgoMotionSettings(residuals="image"), {}),
     "no prior": (EgoMotionSettings(prior=False, kernel="huber"), {}),
-    "capped": (EgoMotionSettings(max_correction_m=0.008), {}),
+    "capped": (EgoMotionSettings(prior=False, max_correction_m=0.008), {}),
     "too few": (EgoMotionSettings(min_matches=25), {}),
 }
 

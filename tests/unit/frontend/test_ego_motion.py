@@ -486,6 +486,17 @@ def test_the_cap_shortens_the_correction_along_itself(dof: int) -> None:
     assert solve(problem, predicted, loose, rig).status is EgoMotionStatus.OK
 
 
+def test_the_cap_is_as_wide_as_the_prediction_is_uncertain() -> None:
+    """A jump of 0.6 m: beyond a cap of 0.3 m, unless the prediction says that it knows little."""
+    rng = np.random.default_rng(33)
+    problem = scene(FORWARD, rng)
+    slipped = FORWARD @ g.se3_exp(np.array([0.0, 0.0, 0.0, 0.6, 0.0, 0.0]))
+    settings = EgoMotionSettings(max_correction_m=0.3)
+    for sigma, status in ((0.045, EgoMotionStatus.CAPPED), (0.15, EgoMotionStatus.OK)):
+        prior = np.diag([0.05, 0.05, 0.05, sigma, sigma, sigma]) ** 2
+        assert solve(problem, slipped, settings, RIG, prior).status is status
+
+
 def test_a_capped_pose_hands_no_far_off_match_to_the_map() -> None:
     """The odometry slipped by 0.6 m: the cap stops at 0.3 m, where all matches are far off."""
     rng = np.random.default_rng(31)

@@ -12,6 +12,7 @@ from simulated import RIG, assert_same_bits
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Prediction
 from fgslam.core.measurements import Odometry
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.settings import ConstantVelocitySettings
@@ -96,6 +97,11 @@ def test_the_cameras_covariance_matches_monte_carlo() -> None:
     np.testing.assert_allclose(measured / scale, stated.covariance / scale, rtol=0, atol=0.06)
 
 
+def at(wTc: FloatArray, sigma: float = 0.0) -> Prediction:
+    """A measured pose, as exact as stated."""
+    return Prediction(wTc, sigma**2 * np.eye(6))
+
+
 def test_the_first_frame_has_no_motion() -> None:
     assert odometry_motion(RIG).between(0.0, None) is None
     assert ConstantVelocityMotion(SETTINGS).between(0.0) is None
@@ -106,15 +112,15 @@ def test_constant_velocity_bridges_a_gap() -> None:
     alone = ConstantVelocityMotion(SETTINGS)
     for t in (0.0, 0.5):
         wTc = g.se3_exp(TWIST * t)
-        motion.observe(t, wTc, measured=True)
-        alone.observe(t, wTc, measured=True)
+        motion.observe(t, at(wTc), measured=True)
+        alone.observe(t, at(wTc), measured=True)
     bridged = motion.between(1.5, None)
     assert bridged is not None
     assert not bridged.measured
     assert_same_bits(bridged, alone.between(1.5))
     np.testing.assert_allclose(bridged.motion, g.se3_exp(TWIST), atol=1e-12)
     # After the gap the odometry is back.
-    motion.observe(1.5, g.se3_exp(TWIST * 1.5), measured=True)
+    motion.observe(1.5, at(g.se3_exp(TWIST * 1.5)), measured=True)
     assert motion.between(2.0, spin(0.1)).measured
 
 
@@ -135,14 +141,14 @@ def test_constant_twists_are_predicted_exactly(start: FloatArray) -> None:
             assert step is not None
             predicted = origin @ g.se3_exp(TWIST * times[k - 1]) @ step.motion
             np.testing.assert_allclose(predicted, origin @ g.se3_exp(TWIST * t), atol=1e-12)
-        motion.observe(t, origin @ g.se3_exp(TWIST * t), measured=True)
+        motion.observe(t, at(origin @ g.se3_exp(TWIST * t)), measured=True)
 
 
 def test_uncertainty_grows_with_the_square_of_the_interval() -> None:
     """A random change of velocity: sigma dt^2, about and along the camera's axes."""
     motion = ConstantVelocityMotion(SETTINGS)
-    motion.observe(0.0, np.eye(4), measured=True)
-    motion.observe(0.5, g.se3_exp(0.5 * TWIST), measured=True)
+    motion.observe(0.0, at(np.eye(4)), measured=True)
+    motion.observe(0.5, at(g.se3_exp(0.5 * TWIST)), measured=True)
     for dt in (0.1, 0.2, 1.0):
         step = motion.between(0.5 + dt)
         assert step is not None
@@ -154,11 +160,11 @@ def test_uncertainty_grows_with_the_square_of_the_interval() -> None:
 
 def test_blind_frames_keep_the_velocity_and_lose_certainty() -> None:
     motion = ConstantVelocityMotion(SETTINGS)
-    motion.observe(0.0, np.eye(4), measured=True)
-    motion.observe(0.5, g.se3_exp(0.5 * TWIST), measured=True)
+    motion.observe(0.0, at(np.eye(4)), measured=True)
+    motion.observe(0.5, at(g.se3_exp(0.5 * TWIST)), measured=True)
     fresh = motion.between(1.0)
-    motion.observe(1.0, np.eye(4), measured=False)  # a pose that nobody measured
-    motion.observe(1.5, np.eye(4), measured=False)
+    motion.observe(1.0, at(np.eye(4)), measured=False)  # a pose that nobody measured
+    motion.observe(1.5, at(np.eye(4)), measured=False)
     blind = motion.between(2.0)
     assert fresh is not None
     assert blind is not None
@@ -166,7 +172,7 @@ def test_blind_frames_keep_the_velocity_and_lose_certainty() -> None:
     ratio = np.sqrt(np.diag(blind.covariance) / np.diag(fresh.covariance))
     np.testing.assert_allclose(ratio, 3.0, rtol=1e-12)
     # Seeing again, the velocity is the mean one since it was last measured.
-    motion.observe(2.0, g.se3_exp(2.0 * TWIST), measured=True)
+    motion.observe(2.0, at(g.se3_exp(2.0 * TWIST)), measured=True)
     again = motion.between(2.5)
     assert again is not None
     np.testing.assert_allclose(again.motion, g.se3_exp(0.5 * TWIST), atol=1e-12)
@@ -175,9 +181,9 @@ def test_blind_frames_keep_the_velocity_and_lose_certainty() -> None:
 def test_a_motion_that_nobody_saw_is_no_part_of_the_velocity() -> None:
     """Frame 0 was blind, frame 1 founded the map where the camera had got to unseen."""
     motion = ConstantVelocityMotion(SETTINGS)
-    motion.observe(0.0, np.eye(4), measured=False)
-    motion.observe(0.1, np.eye(4), measured=True)
-    motion.observe(0.2, g.se3_exp(0.1 * TWIST), measured=True)
+    motion.observe(0.0, at(np.eye(4)), measured=False)
+    motion.observe(0.1, at(np.eye(4)), measured=True)
+    motion.observe(0.2, at(g.se3_exp(0.1 * TWIST)), measured=True)
     step = motion.between(0.3)
     assert step is not None
     np.testing.assert_allclose(step.motion, g.se3_exp(0.1 * TWIST), atol=1e-12)
@@ -185,8 +191,8 @@ def test_a_motion_that_nobody_saw_is_no_part_of_the_velocity() -> None:
 
 def test_an_unmeasured_start_teaches_no_standstill() -> None:
     motion = ConstantVelocityMotion(SETTINGS)
-    motion.observe(0.0, np.eye(4), measured=False)
-    motion.observe(0.1, np.eye(4), measured=False)
+    motion.observe(0.0, at(np.eye(4)), measured=False)
+    motion.observe(0.1, at(np.eye(4)), measured=False)
     step = motion.between(0.2)
     assert step is not None
     assert step.covariance[3, 3] == pytest.approx((0.1 * SETTINGS.start_speed_sigma_mps) ** 2)
@@ -196,8 +202,8 @@ def test_an_unmeasured_start_teaches_no_standstill() -> None:
 def test_a_displacement_does_not_change_the_velocity(carried: bool) -> None:
     """Corrected, it keeps the one that it had; carried, it begins as at first."""
     motion, rested = (ConstantVelocityMotion(ConstantVelocitySettings()) for _ in range(2))
-    motion.observe(0.0, np.eye(4), measured=True)
-    motion.observe(0.5, g.se3_exp(0.5 * TWIST), measured=True)
+    motion.observe(0.0, at(np.eye(4)), measured=True)
+    motion.observe(0.5, at(g.se3_exp(0.5 * TWIST)), measured=True)
     elsewhere = g.pose(np.eye(3), np.array([7.0, 0.0, -3.0]))
     motion.displaced(1.0, elsewhere @ g.se3_exp(TWIST), carried)
     step = motion.between(1.5)
@@ -206,15 +212,15 @@ def test_a_displacement_does_not_change_the_velocity(carried: bool) -> None:
     expected = np.eye(4) if carried else g.se3_exp(0.5 * TWIST)
     np.testing.assert_allclose(step.motion, expected, atol=1e-12)
     if carried:
-        rested.observe(1.0, np.eye(4), measured=True)
+        rested.observe(1.0, at(np.eye(4)), measured=True)
         np.testing.assert_array_equal(step.covariance, rested.between(1.5).covariance)
-    motion.observe(1.5, elsewhere @ g.se3_exp(1.5 * TWIST), measured=True)
+    motion.observe(1.5, at(elsewhere @ g.se3_exp(1.5 * TWIST)), measured=True)
     np.testing.assert_allclose(motion.between(2.0).motion, g.se3_exp(0.5 * TWIST), atol=1e-12)
 
 
 def test_velocity_is_zero_and_uncertain_at_first() -> None:
     motion = ConstantVelocityMotion(SETTINGS)
-    motion.observe(3.0, g.se3_exp(TWIST), measured=True)
+    motion.observe(3.0, at(g.se3_exp(TWIST)), measured=True)
     for dt in (0.1, 0.5):
         step = motion.between(3.0 + dt)
         assert step is not None
@@ -229,8 +235,8 @@ def test_velocity_is_zero_and_uncertain_at_first() -> None:
 
 def test_asking_for_the_motion_changes_nothing() -> None:
     motion = ConstantVelocityMotion(SETTINGS)
-    motion.observe(0.0, np.eye(4), measured=True)
-    motion.observe(0.5, g.se3_exp(0.5 * TWIST), measured=True)
+    motion.observe(0.0, at(np.eye(4)), measured=True)
+    motion.observe(0.5, at(g.se3_exp(0.5 * TWIST)), measured=True)
     first = motion.between(1.0)
     motion.between(7.0)
     assert_same_bits(first, motion.between(1.0))
@@ -246,7 +252,7 @@ def test_a_restored_motion_continues_to_the_same_bits(seen: int, kind: str) -> N
 
     first, second = make(), make()
     for k in range(seen):
-        first.observe(0.5 * k, g.se3_exp(0.5 * k * TWIST), measured=True)
+        first.observe(0.5 * k, at(g.se3_exp(0.5 * k * TWIST)), measured=True)
     state = first.state()
     kept = copy.deepcopy(state)
     second.restore({name: np.array(array) for name, array in state.items()})
@@ -255,8 +261,8 @@ def test_a_restored_motion_continues_to_the_same_bits(seen: int, kind: str) -> N
         assert (a is None) == (b is None)
         if a is not None:
             assert_same_bits(a, b)
-        first.observe(0.5 * k, g.se3_exp(0.5 * k * TWIST), measured=True)
-        second.observe(0.5 * k, g.se3_exp(0.5 * k * TWIST), measured=True)
+        first.observe(0.5 * k, at(g.se3_exp(0.5 * k * TWIST)), measured=True)
+        second.observe(0.5 * k, at(g.se3_exp(0.5 * k * TWIST)), measured=True)
     assert_same_bits(state, kept)
     assert_same_bits(first.state(), second.state())
 
@@ -266,3 +272,64 @@ def test_descriptions_are_plain_values() -> None:
         described = json.loads(json.dumps(motion.description()))
         assert described["kind"] in ("constant_velocity", "recorded")
     assert odometry_motion(RIG).description()["stand_in"]["kind"] == "constant_velocity"
+
+
+# --------------------------------------------------------------------------------------------
+# Its noise
+
+
+def driven(scale: float, frames: int, dt: float = 0.1, sigma: float = 0.0) -> list[FloatArray]:
+    """Predicted deviations (6,) a frame, of accelerations of ``scale`` times ACCELERATION."""
+    rng = np.random.default_rng(3)
+    motion, wTc, twist = ConstantVelocityMotion(SETTINGS), np.eye(4), np.array(TWIST)
+    out = []
+    for k in range(frames):
+        step = motion.between(k * dt)
+        if k >= 2:
+            out.append(np.sqrt(np.diag(step.covariance)) / dt**2)
+        blur = g.se3_exp(sigma * rng.standard_normal(6))
+        motion.observe(k * dt, at(wTc @ blur, sigma), measured=True)
+        twist = twist + scale * ACCELERATION * dt * rng.standard_normal(6)
+        wTc = wTc @ g.se3_exp(twist * dt)
+    return out
+
+
+ACCELERATION = np.array([0.2, 0.5, 0.1, 1.0, 0.3, 2.0])  # rad/s^2, m/s^2
+
+
+@pytest.mark.parametrize("scale", [0.2, 1.0, 5.0])
+def test_noise_is_that_of_the_motion_after_ten_frames(scale: float) -> None:
+    """Within a factor of two: ten samples tell a deviation to a quarter (2.5 sigma)."""
+    for ratio in driven(scale, 40)[10:]:
+        ratio = ratio / (scale * ACCELERATION)
+        assert np.exp(np.abs(np.log(ratio)).mean()) < 1.6
+        assert ratio.max() < 3.0
+        assert ratio.min() > 0.33
+
+
+def test_noise_never_collapses_below_what_the_poses_leave_open() -> None:
+    """A steady motion, measured to a millimetre and a milliradian, is trusted no better."""
+    assert (driven(0.0, 200, sigma=1e-3)[-1] > 1e-3 / 0.1**2).all()
+    assert (driven(0.0, 200)[-1] >= np.repeat([np.deg2rad(0.05), 1e-3], 3)).all()
+
+
+def test_a_sudden_jolt_opens_the_prediction_at_once() -> None:
+    motion, wTc, dt = ConstantVelocityMotion(SETTINGS), np.eye(4), 0.1
+    for k in range(60):
+        motion.observe(k * dt, at(wTc, 1e-4), measured=True)
+        wTc = wTc @ g.se3_exp(dt * TWIST)
+    jolt = np.array([0.0, 0.02, 0.0, 0.05, 0.0, 0.0])  # of the step
+    motion.observe(60 * dt, at(wTc @ g.se3_exp(jolt), 1e-4), measured=True)
+    sigma = np.sqrt(np.diag(motion.between(61 * dt).covariance))
+    assert sigma[1] > 0.25 * jolt[1]
+    assert sigma[3] > 0.25 * jolt[3]
+
+
+def test_noise_that_is_not_to_adapt_stays() -> None:
+    settings = ConstantVelocitySettings(adapt=False)
+    motion = ConstantVelocityMotion(settings)
+    for k in range(10):
+        motion.observe(0.1 * k, at(g.se3_exp(0.1 * k * TWIST)), measured=True)
+    sigma = np.sqrt(np.diag(motion.between(1.0).covariance)) / 0.1**2
+    start = [*np.deg2rad(settings.rotation_sigma_dps2), *settings.translation_sigma_mps2]
+    np.testing.assert_allclose(sigma, start, rtol=1e-9)
