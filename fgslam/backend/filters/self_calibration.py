@@ -1,0 +1,100 @@
+"""A rig that calibrates itself from the drive: an information filter over its correction.
+
+Windows of frames that share no image say what they show (:mod:`.rig_alignment`); their evidence is
+added up, with the noise that the windows themselves show by how far they disagree. Nothing is
+known of the truth. Derived in docs/derivations/self_calibration.md.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from fgslam.backend.filters.rig_alignment import RigAlignment, RigEvidence
+from fgslam.backend.filters.rig_models import WeighedCorrection, weighed
+from fgslam.core.arrays import FloatArray
+from fgslam.core.measurements import Increment, Observations
+from fgslam.core.rig_correction import RigCorrection, prior_information
+from fgslam.core.sensors import CameraRig
+
+WINDOW = 6
+"""Frames of one window: motion enough to see depth change, few enough to cost little."""
+
+_DRIFT_S = 3600.0  # seconds after which as much is unknown as the calibration itself leaves
+_TRUSTED_WINDOWS = 4.0  # how many windows the stated noise is worth, beside the observed one
+_DOUBTFUL = 1e-3  # of the prior's information: less in a direction is no evidence of the noise
+
+
+class SelfCalibration:
+    """Estimates the correction of a rig while it is driven."""
+
+    def __init__(self, rig: CameraRig, pixel_sigma: float) -> None:
+        """Begins with the calibration as stated; ``pixel_sigma`` of one coordinate, pixels."""
+        self._known = RigCorrection.none(rig)
+        self._prior = prior_information(rig)
+        self.found = weighed(self._known, self._prior)
+        """As known now, and what of it is worth applying."""
+        self.windows = 0
+        """How many gave evidence."""
+        self._sigma = pixel_sigma
+        self._frames: list[tuple[FloatArray, Observations]] = []
+        self._last_time: float | None = None
+        self._misfit, self._freedom = 0.0, 0.0
+        self._before: FloatArray | None = None
+
+    @property
+    def noise_factor(self) -> float:
+        """Variance of what windows say, as multiple of what their pixels alone would give."""
+        stated = _TRUSTED_WINDOWS * len(self._prior)
+        return max((stated + self._misfit) / (stated + self._freedom), 1e-3)
+
+    def observe(self, increment: Increment, wTc: FloatArray) -> WeighedCorrection:
+        """Takes in a frame as measured and its pose; returns the correction as known now."""
+        if increment.relocalised:
+            self._frames.clear()
+        kept = increment.observations.select(~increment.rejected)
+        self._frames.append((wTc, kept))
+        if len(self._frames) >= WINDOW:
+            alignment = RigAlignment(self._known.rig, self._frames, self._sigma)
+            self._frames = []
+            self._take(alignment, increment.timestamp)
+        return self.found
+
+    def _take(self, alignment: RigAlignment, timestamp: float) -> None:
+        known, covariance = self._known.values, self._drifted(timestamp)
+        evidence = alignment.evidence(known, np.linalg.inv(covariance))
+        if evidence is None:
+            return
+        self.windows += 1
+        self._judge(evidence, known, covariance)
+        factor = self.noise_factor
+        information = evidence.information / factor
+        pull = (evidence.score + evidence.information @ (evidence.at - known)) / factor
+        covariance = np.linalg.inv(np.linalg.inv(covariance) + information)
+        covariance = (covariance + covariance.T) / 2.0
+        self._known = dataclasses.replace(
+            self._known, values=known + covariance @ pull, covariance=covariance
+        )
+        self.found = weighed(self._known, self._prior)
+
+    def _drifted(self, timestamp: float) -> FloatArray:
+        """The covariance, grown by the rig's drift since the last window."""
+        since = 0.0 if self._last_time is None else timestamp - self._last_time
+        self._last_time = timestamp
+        drift = since / _DRIFT_S * np.linalg.inv(self._prior)
+        return np.asarray(self._known.covariance + drift)
+
+    def _judge(self, evidence: RigEvidence, known: FloatArray, covariance: FloatArray) -> None:
+        """Books how far a window lies from what is known, where it says anything.
+
+        In the window's own principal directions, in units of its own noise and of what is known.
+        """
+        size, axes = np.linalg.eigh(evidence.information)
+        telling = size > _DOUBTFUL * np.diagonal(axes.T @ self._prior @ axes)
+        score = evidence.score + evidence.information @ (evidence.at - known)
+        score = (axes.T @ score)[telling] / np.sqrt(size[telling])
+        spread = axes[:, telling].T @ covariance @ axes[:, telling]
+        known_share = size[telling] * np.diagonal(spread) / self.noise_factor
+        self._misfit += float((score**2 / (1.0 + known_share)).sum())
+        self._freedom += float(telling.sum())
