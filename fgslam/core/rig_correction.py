@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import Brief, FloatArray
-
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Observations
 from fgslam.core.sensors import CameraRig, measurement_map, vertical_to_horizontal
@@ -64,7 +63,7 @@ def displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
     for camera in range(1, rig.cameras):
         at = slice(count * (camera - 1), count * camera)
         out[:, camera, :, at] = focal[:, None] * _terms(rays[:, camera], squared[:, camera])
-    return out.reshape(len(pixels), 2 * rig.cameras, -1)
+    return out.reshape(len(pixels), 2 * rig.cameras, out.shape[3])
 
 
 def _terms(rays: FloatArray, squared: FloatArray) -> FloatArray:
@@ -115,7 +114,8 @@ class RigCorrection(Brief):
     def none(rig: CameraRig) -> RigCorrection:
         """The calibration as stated, with the prior's covariance."""
         information = prior_information(rig)
-        return RigCorrection(rig, np.zeros(len(information)), np.linalg.inv(information))
+        covariance = np.asarray(np.linalg.inv(information), np.float64)
+        return RigCorrection(rig, np.zeros(len(information)), covariance)
 
     def at(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Displacements (k, 2 * cameras) that are taken off pixels, and sigmas of each."""

@@ -54,7 +54,9 @@ def calibrate(log: MeasurementLog, ego_motion: EgoMotionSettings | None = None) 
     """
     rig = _rig_of(log)
     settings = ego_motion or EgoMotionSettings()
-    estimator = LandmarkKalman(rig, LandmarkKalmanSettings(), Prediction(np.eye(4), np.zeros((6, 6))))
+    estimator = LandmarkKalman(
+        rig, LandmarkKalmanSettings(), Prediction(np.eye(4), np.zeros((6, 6)))
+    )
     solver, motion = EgoMotionSolver(rig, settings), replay_motion(log)
     itself = SelfCalibration(rig, StereoSettings().pixel_sigma)
     causal, known = [], []

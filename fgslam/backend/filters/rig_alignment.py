@@ -20,8 +20,8 @@ from fgslam.core.geometry import (
     project,
     projection_jacobian,
     transform_to_camera,
-    triangulate,
     transform_to_world,
+    triangulate,
 )
 from fgslam.core.measurements import Observations
 from fgslam.core.rig_correction import displacements
@@ -33,7 +33,7 @@ from fgslam.core.sensors import (
 )
 
 _KERNEL_WIDTH = 2.0  # standard deviations at which Cauchy's kernel bends, as the ego-motion's
-_GROSS = 10.0  # standard deviations of a coordinate beyond which a landmark is left out
+_GROSS = 50.0  # standard deviations: no error of a point seen once, but another point
 _ITERATIONS = 8
 _TOLERANCE = 1e-4  # relative change of the cost at which a window has come to rest
 _LEAST_DAMPING = 1e-9
@@ -69,7 +69,6 @@ class _State:
 class _Normal:
     """Normal equations with the points eliminated; poses 1.. first, then the correction."""
 
-    cost: float
     hessian: FloatArray
     gradient: FloatArray
     point_inverse: FloatArray
@@ -103,8 +102,6 @@ class RigAlignment:
         ratio = vertical_to_horizontal(rig)
         self._model = pixel_model(rig.cameras, ratio)
         self._fuse = measurement_map("fused", rig.cameras, ratio)
-        flat = self._pixels.reshape(-1, rig.cameras, 2)
-        self._unit = displacements(rig, flat).reshape(*shape, 2 * rig.cameras, -1)
 
     def evidence(self, correction: FloatArray, prior: FloatArray) -> RigEvidence | None:
         """What the window says of the correction; None where it shows too little.
@@ -137,7 +134,7 @@ class RigAlignment:
         """Points from their first sighting; landmarks that fit none of it are left out."""
         if not self._ids.size or len(self._poses) < 2:
             return None
-        corrected = self._measured(correction) @ self._fuse.T
+        corrected = self._corrected(correction) @ self._fuse.T
         near = corrected[..., 2] > _LEAST_DISPARITY_PX
         self._seen &= near
         first = self._seen.argmax(axis=0)
@@ -150,7 +147,7 @@ class RigAlignment:
         for k, wTc in enumerate(self._poses):
             points[first == k] = transform_to_world(wTc, local[first == k])
         state = _State(self._poses, points, correction)
-        residual, depth = self._residuals(state)
+        residual, depth, _ = self._residuals(state)
         wild = (np.abs(residual).max(axis=2) > _GROSS) & self._seen
         usable &= ~((depth < _NEAREST_M) & self._seen).any(axis=0) & ~wild.any(axis=0)
         if usable.sum() < len(correction):
@@ -160,29 +157,39 @@ class RigAlignment:
 
     def _keep(self, which: BoolArray) -> None:
         self._ids, self._seen = self._ids[which], self._seen[:, which]
-        self._pixels, self._unit = self._pixels[:, which], self._unit[:, which]
+        self._pixels = self._pixels[:, which]
 
-    def _measured(self, correction: FloatArray) -> FloatArray:
+    def _raw(self) -> FloatArray:
+        return self._pixels.reshape(*self._seen.shape, 2 * self._rig.cameras)
+
+    def _corrected(self, correction: FloatArray) -> FloatArray:
         """Corrected pixels (f, l, 2 * cameras)."""
-        raw = self._pixels.reshape(*self._seen.shape, -1)
-        return np.asarray(raw - self._unit @ correction)
+        flat = self._pixels.reshape(-1, self._rig.cameras, 2)
+        moved = displacements(self._rig, flat) @ correction
+        return np.asarray(self._raw() - moved.reshape(self._raw().shape))
 
     def _local(self, state: _State) -> FloatArray:
         """Points (f, l, 3) in the frames' cameras; out of view ones somewhere ahead."""
         local = np.stack([transform_to_camera(wTc, state.points) for wTc in state.poses])
         return np.where(self._seen[..., None], local, [0.0, 0.0, 1.0])
 
-    def _residuals(self, state: _State) -> tuple[FloatArray, FloatArray]:
-        """Predicted less corrected pixels (f, l, 2 * cameras) in sigmas, and depths (f, l)."""
+    def _residuals(self, state: _State) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Predicted less raw pixels (f, l, 2 * cameras) in sigmas, depths, and displacements.
+
+        These are taken at the prediction: a measured pixel's noise would correlate with them, and
+        windows without end would agree on a wrong lens.
+        """
         local = self._local(state)
         safe = np.where(local[..., 2:] > _NEAREST_M, local, [0.0, 0.0, 1.0])
-        predicted = project(self._rig, safe.reshape(-1, 3)) @ self._model.T
-        measured = self._measured(state.correction)
-        residual = (predicted.reshape(measured.shape) - measured) / self._sigma
-        return residual * self._seen[..., None], local[..., 2]
+        exact = project(self._rig, safe.reshape(-1, 3)) @ self._model.T
+        unit = displacements(self._rig, exact.reshape(-1, self._rig.cameras, 2))
+        unit = unit.reshape(*self._seen.shape, *unit.shape[1:])
+        predicted = exact.reshape(self._raw().shape) + unit @ state.correction
+        residual = (predicted - self._raw()) / self._sigma
+        return residual * self._seen[..., None], local[..., 2], unit
 
     def _cost(self, state: _State, around: FloatArray, prior: FloatArray) -> float:
-        residual, depth = self._residuals(state)
+        residual, depth, _ = self._residuals(state)
         if (depth[self._seen] < _NEAREST_M).any():
             return np.inf
         off = state.correction - around
@@ -209,7 +216,7 @@ class RigAlignment:
         return state, self._linearise(state)
 
     def _linearise(self, state: _State) -> _Normal:
-        residual, _ = self._residuals(state)
+        residual, _, unit = self._residuals(state)
         frames, landmarks = self._seen.shape
         squared = (residual**2).sum(axis=2)
         weight = self._seen / (1.0 + squared / _KERNEL_WIDTH**2)
@@ -218,7 +225,7 @@ class RigAlignment:
         by_pose = (by_local @ point_pose_jacobian(local)).reshape(frames, landmarks, -1, 6)
         by_local = by_local.reshape(frames, landmarks, -1, 3)
         by_point = by_local @ np.swapaxes(state.poses[:, None, :3, :3], 2, 3)
-        by_rig = self._unit / self._sigma
+        by_rig = unit / self._sigma
         weighted = weight[..., None] * residual
         joint = np.concatenate([by_pose, by_rig], axis=3)
         left = np.swapaxes(weight[..., None, None] * joint, 2, 3)
@@ -234,7 +241,7 @@ class RigAlignment:
         eliminated = np.einsum("nlj,ljk->nlk", coupling, inverse).reshape(len(gradient), -1)
         hessian -= eliminated @ coupling.reshape(len(gradient), -1).T
         gradient = gradient - eliminated @ point_gradient.ravel()
-        return _Normal(0.0, hessian, gradient, inverse, coupling, point_gradient)
+        return _Normal(hessian, gradient, inverse, coupling, point_gradient)
 
     def _step(
         self, state: _State, normal: _Normal, around: FloatArray, prior: FloatArray, damping: float
@@ -245,7 +252,7 @@ class RigAlignment:
         gradient[-p:] += prior @ (state.correction - around)
         hessian.flat[:: len(hessian) + 1] *= 1.0 + damping
         try:
-            step = -np.linalg.solve(hessian, gradient)
+            step = np.asarray(-np.linalg.solve(hessian, gradient), np.float64)
         except np.linalg.LinAlgError:
             return None
         pull = normal.point_gradient + np.einsum("nlj,n->lj", normal.coupling, step)

@@ -63,7 +63,7 @@ class SelfCalibration:
 
     def _take(self, alignment: RigAlignment, timestamp: float) -> None:
         known, covariance = self._known.values, self._drifted(timestamp)
-        evidence = alignment.evidence(known, np.linalg.inv(covariance))
+        evidence = alignment.evidence(known, np.asarray(np.linalg.inv(covariance), np.float64))
         if evidence is None:
             return
         self.windows += 1
@@ -71,7 +71,7 @@ class SelfCalibration:
         factor = self.noise_factor
         information = evidence.information / factor
         pull = (evidence.score + evidence.information @ (evidence.at - known)) / factor
-        covariance = np.linalg.inv(np.linalg.inv(covariance) + information)
+        covariance = np.asarray(np.linalg.inv(np.linalg.inv(covariance) + information), np.float64)
         covariance = (covariance + covariance.T) / 2.0
         self._known = dataclasses.replace(
             self._known, values=known + covariance @ pull, covariance=covariance

@@ -1,0 +1,200 @@
+"""A rig calibrates itself: on a simulated road, with errors of calibration put into its pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from fgslam.backend.filters.rig_models import weighed
+from fgslam.backend.filters.self_calibration import WINDOW, SelfCalibration
+from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray
+from fgslam.core.measurements import Increment, Observations
+from fgslam.core.rig_correction import (
+    RigCorrection,
+    displacements,
+    prior_information,
+    term_names,
+)
+from fgslam.core.sensors import CameraRig, measurement_map, pixel_model, vertical_to_horizontal
+
+RIG = CameraRig(620, 190, 360.0, 360.0, 310.0, 92.0, 0.54, None, np.eye(4))
+THREE = CameraRig(320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, 0.1, np.eye(4))
+SIGMA_PX = 0.3
+NEAR_M, FAR_M = 4.0, 60.0
+
+
+@dataclass(frozen=True)
+class Road:
+    """Frames on a road, 1 m apart, that winds a little; or a camera that stands."""
+
+    frames: int = 36
+    points: int = 900
+    step_m: float = 1.0
+    noise: float = 1.0
+    rig: CameraRig = RIG
+
+
+def poses_of(road: Road) -> list[FloatArray]:
+    out = [np.eye(4)]
+    for k in range(1, road.frames):
+        turn = 0.02 * np.sin(k / 5.0) if road.step_m else 0.0
+        step = g.se3_exp(np.array([0.0, turn, 0.0, 0.0, 0.0, road.step_m]))
+        out.append(g.reorthonormalise(out[-1] @ step))
+    return out
+
+
+def drive(road: Road, wrong: FloatArray, rng: np.random.Generator) -> list[Increment]:
+    """Increments as a rig measures whose calibration is ``wrong`` (p,) by so much."""
+    rig, poses = road.rig, poses_of(road)
+    reach = road.frames * road.step_m + FAR_M
+    points = rng.uniform([-12.0, -4.0, 0.0], [12.0, 1.6, reach], (road.points, 3))
+    ratio = vertical_to_horizontal(rig)
+    model, fuse = pixel_model(rig.cameras, ratio), measurement_map("fused", rig.cameras, ratio)
+    born: set[int] = set()
+    out = []
+    for k, wTc in enumerate(poses):
+        local = g.transform_to_camera(wTc, points)
+        seen = np.flatnonzero((local[:, 2] > NEAR_M) & (local[:, 2] < FAR_M))
+        exact = g.project(rig, local[seen]) @ model.T
+        inside = np.abs(exact - np.tile([310.0, 92.0], rig.cameras)) < [[310.0, 92.0] * rig.cameras]
+        seen, exact = seen[inside.all(axis=1)], exact[inside.all(axis=1)]
+        flat = exact.reshape(-1, rig.cameras, 2)
+        moved = exact + displacements(rig, flat) @ wrong
+        noisy = moved + road.noise * SIGMA_PX * rng.standard_normal(exact.shape)
+        pixels = np.full((len(seen), 3, 2), np.nan)
+        pixels[:, : rig.cameras] = noisy.reshape(-1, rig.cameras, 2)
+        new = np.array([i not in born for i in seen], np.bool_)
+        born |= set(seen.tolist())
+        observed = Observations(
+            seen, noisy @ fuse.T, np.tile(np.eye(3), (len(seen), 1, 1)), pixels, new
+        )
+        none = np.empty(0, np.int64)
+        out.append(Increment(k, 0.1 * k, None, observed, np.zeros(len(seen), np.bool_), none, none))
+    return out
+
+
+def calibrated(road: Road, wrong: FloatArray, seed: int) -> SelfCalibration:
+    """After the drive; poses are known to a centimetre and a tenth of a degree."""
+    rng = np.random.default_rng(seed)
+    itself = SelfCalibration(road.rig, SIGMA_PX)
+    for increment, wTc in zip(drive(road, wrong, rng), poses_of(road), strict=True):
+        error = np.array([2e-3] * 3 + [1e-2] * 3) * rng.standard_normal(6)
+        itself.observe(increment, g.reorthonormalise(wTc @ g.se3_exp(error)))
+    return itself
+
+
+def errors(**terms: float) -> FloatArray:
+    names = list(term_names(RIG))
+    out = np.zeros(len(names))
+    for name, value in terms.items():
+        out[names.index(f"left.{name}" if name != "radial_of_all" else name)] = value
+    return out
+
+
+def image_error(found: RigCorrection, wrong: FloatArray) -> float:
+    """Root mean square over the images of what is left after the correction, pixels."""
+    rig = found.rig
+    column, row = np.meshgrid(np.linspace(0, rig.width - 1, 9), np.linspace(0, rig.height - 1, 9))
+    grid = np.repeat(np.stack([column.ravel(), row.ravel()], 1)[:, None], rig.cameras, axis=1)
+    left = displacements(rig, grid) @ (found.values - wrong)
+    return float(np.sqrt((left[:, 2:] ** 2).mean()))
+
+
+def test_an_exact_rig_is_left_alone() -> None:
+    found = calibrated(Road(), errors(), 1).found
+    assert image_error(found.applied, errors()) < 0.02
+    assert found.probabilities["exact"] > 0.5
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        errors(yaw=np.deg2rad(0.05)),
+        errors(pitch=np.deg2rad(0.1)),
+        errors(roll=np.deg2rad(0.2)),
+        errors(focal=0.003),
+        errors(yaw=np.deg2rad(-0.1), pitch=np.deg2rad(0.05), roll=np.deg2rad(0.1), focal=-0.002),
+        errors(column=0.02, yaw=-0.02, decentring_x=0.006, radial_of_all=0.01),
+    ],
+    ids=["yaw", "pitch", "roll", "focal ratio", "together", "lens"],
+)
+def test_an_error_of_calibration_is_found(wrong: FloatArray) -> None:
+    before = image_error(RigCorrection.none(RIG), wrong)
+    found = calibrated(Road(), wrong, 2).found
+    assert before > 0.2
+    assert image_error(found.applied, wrong) < 0.2 * before + 0.03
+
+
+def test_the_error_of_the_correction_is_what_its_covariance_says() -> None:
+    nees = []
+    spread = np.linalg.cholesky(np.linalg.inv(prior_information(RIG)))
+    for seed in range(8):
+        wrong = 0.5 * spread @ np.random.default_rng(seed).standard_normal(len(spread))
+        found = calibrated(Road(frames=24), wrong, 100 + seed).found.estimated
+        off = found.values - wrong
+        nees.append(off @ np.linalg.solve(found.covariance, off) / len(off))
+    # 80 degrees of freedom: 95 % of means lie within 0.70 and 1.33.
+    assert 0.6 < np.mean(nees) < 1.4
+
+
+def test_noise_that_is_larger_than_stated_widens_the_covariance() -> None:
+    stated, noisy = (calibrated(Road(noise=noise), errors(), 3) for noise in (1.0, 2.0))
+    # The robust kernel takes weight off honest errors, too: less than 1 where the sigma is right.
+    assert 0.4 < stated.noise_factor < 1.2
+    assert noisy.noise_factor > 1.4 * stated.noise_factor
+
+
+def test_a_rig_that_stands_learns_no_disparity_offset() -> None:
+    """Rows are seen without motion; a disparity offset is not: its sigma stays the prior's."""
+    prior = RigCorrection.none(RIG).centre_px()[1]
+    standing = calibrated(Road(step_m=0.0, points=400), errors(), 4).found.estimated
+    driving = calibrated(Road(), errors(), 4).found.estimated
+    # Rows show the yaw, and with it a part of the offset; the principal point is not seen at all.
+    assert standing.centre_px()[1] > 0.5 * prior
+    assert driving.centre_px()[1] < 0.1 * prior
+
+
+def test_frames_without_landmarks_teach_nothing() -> None:
+    itself = calibrated(Road(points=0), errors(), 5)
+    assert itself.windows == 0
+    assert not itself.found.applied.values.any()
+    np.testing.assert_array_equal(
+        itself.found.estimated.covariance, RigCorrection.none(RIG).covariance
+    )
+
+
+def test_an_estimate_of_nothing_but_noise_is_not_applied() -> None:
+    prior = prior_information(RIG)
+    covariance = np.linalg.inv(100.0 * prior)
+    noise = np.linalg.cholesky(covariance) @ np.random.default_rng(6).standard_normal(len(prior))
+    found = weighed(RigCorrection(RIG, noise, covariance), prior)
+    assert sum(found.probabilities.values()) == pytest.approx(1.0)
+    assert found.probabilities["lens"] < 0.01
+
+
+def test_corrections_undo_the_displacement_of_raw_pixels() -> None:
+    wrong = errors(yaw=0.001, roll=0.002)
+    road = Road(frames=WINDOW, noise=0.0)
+    measured, exact = (
+        drive(road, by, np.random.default_rng(7))[0].observations for by in (wrong, errors())
+    )
+    corrected = RigCorrection(RIG, wrong, np.eye(len(wrong))).corrected(measured)
+    assert np.abs(measured.measurement - exact.measurement).max() > 0.3
+    # The displacement is taken where the pixel is seen, a pixel beside where it belongs.
+    np.testing.assert_allclose(corrected.measurement, exact.measurement, rtol=0.0, atol=5e-3)
+    np.testing.assert_array_equal(corrected.pixels, measured.pixels)
+
+
+@pytest.mark.parametrize("rig", [RIG, THREE], ids=["two cameras", "three cameras"])
+def test_the_prior_expects_a_pixel_over_each_image(rig: CameraRig) -> None:
+    column, row = np.meshgrid(np.linspace(0, rig.width - 1, 7), np.linspace(0, rig.height - 1, 7))
+    grid = np.repeat(np.stack([column.ravel(), row.ravel()], 1)[:, None], rig.cameras, axis=1)
+    unit = displacements(rig, grid)[..., :-1]
+    covariance = RigCorrection.none(rig).covariance[:-1, :-1]
+    variance = np.einsum("kap,pq,kaq->ka", unit, covariance, unit)
+    for camera in range(1, rig.cameras):
+        at = variance[:, 2 * camera : 2 * camera + 2]
+        assert np.sqrt(at.mean()) == pytest.approx(1.0, abs=1e-6)
