@@ -15,6 +15,7 @@ from fgslam.backend.filters.rig_alignment import RigAlignment, RigEvidence
 from fgslam.backend.filters.rig_models import WeighedCorrection, weighed
 from fgslam.core.arrays import FloatArray
 from fgslam.core.measurements import Increment, Observations
+from fgslam.core.quantiles import chi_square_quantile
 from fgslam.core.rig_correction import RigCorrection, prior_information
 from fgslam.core.sensors import CameraRig
 
@@ -23,6 +24,7 @@ WINDOW = 6
 
 _DRIFT_S = 3600.0  # seconds after which as much is unknown as the calibration itself leaves
 _TRUSTED_WINDOWS = 4.0  # how many windows the stated noise is worth, beside the observed one
+_KNOCK_PROBABILITY = 1e-6  # of a window so far off, by chance; two in a row are a knock
 _DOUBTFUL = 1e-3  # of the prior's information: less in a direction is no evidence of the noise
 
 
@@ -37,11 +39,13 @@ class SelfCalibration:
         """As known now, and what of it is worth applying."""
         self.windows = 0
         """How many gave evidence."""
+        self.knocks = 0
+        """How often the rig was found to have moved."""
+        self._suspected = False
         self._sigma = pixel_sigma
         self._frames: list[tuple[FloatArray, Observations]] = []
         self._last_time: float | None = None
         self._misfit, self._freedom = 0.0, 0.0
-        self._before: FloatArray | None = None
 
     @property
     def noise_factor(self) -> float:
@@ -67,7 +71,13 @@ class SelfCalibration:
         if evidence is None:
             return
         self.windows += 1
-        self._judge(evidence, known, covariance)
+        if self._contradicts(evidence, known, covariance):
+            if not self._suspected:  # once is something that passed through the view
+                self._suspected = True
+                return
+            self.knocks += 1
+            covariance = covariance + np.linalg.inv(self._prior)
+        self._suspected = False
         factor = self.noise_factor
         information = evidence.information / factor
         pull = (evidence.score + evidence.information @ (evidence.at - known)) / factor
@@ -85,16 +95,25 @@ class SelfCalibration:
         drift = since / _DRIFT_S * np.linalg.inv(self._prior)
         return np.asarray(self._known.covariance + drift)
 
-    def _judge(self, evidence: RigEvidence, known: FloatArray, covariance: FloatArray) -> None:
-        """Books how far a window lies from what is known, where it says anything.
+    def _contradicts(
+        self, evidence: RigEvidence, known: FloatArray, covariance: FloatArray
+    ) -> bool:
+        """True if a window cannot be explained by what is known; else it is booked.
 
-        In the window's own principal directions, in units of its own noise and of what is known.
+        Judged in the window's own principal directions, those in which it says anything: how far
+        it lies from what is known, in units of its own noise and of what is known.
         """
         size, axes = np.linalg.eigh(evidence.information)
         telling = size > _DOUBTFUL * np.diagonal(axes.T @ self._prior @ axes)
         score = evidence.score + evidence.information @ (evidence.at - known)
         score = (axes.T @ score)[telling] / np.sqrt(size[telling])
-        spread = axes[:, telling].T @ covariance @ axes[:, telling]
-        known_share = size[telling] * np.diagonal(spread) / self.noise_factor
-        self._misfit += float((score**2 / (1.0 + known_share)).sum())
-        self._freedom += float(telling.sum())
+        root = axes[:, telling] * np.sqrt(size[telling])
+        known_share = root.T @ covariance @ root / self.noise_factor
+        spread = np.eye(len(score)) + known_share
+        squared = float(score @ np.linalg.solve(spread, score))
+        likely = chi_square_quantile(1.0 - _KNOCK_PROBABILITY, len(score))
+        if self.windows > _TRUSTED_WINDOWS and squared / self.noise_factor > likely:
+            return True
+        self._misfit += squared
+        self._freedom += float(len(score))
+        return False

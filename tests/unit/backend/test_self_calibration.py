@@ -198,3 +198,14 @@ def test_the_prior_expects_a_pixel_over_each_image(rig: CameraRig) -> None:
     for camera in range(1, rig.cameras):
         at = variance[:, 2 * camera : 2 * camera + 2]
         assert np.sqrt(at.mean()) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_knock_in_mid_drive_is_noticed_and_followed() -> None:
+    knocked = errors(yaw=np.deg2rad(0.1))
+    road, itself = Road(frames=84), SelfCalibration(RIG, SIGMA_PX)
+    before, after = (drive(road, by, np.random.default_rng(8)) for by in (errors(), knocked))
+    for k, wTc in enumerate(poses_of(road)):
+        itself.observe((before if k < 6 * WINDOW else after)[k], wTc)
+    assert itself.knocks == 1
+    before_it = image_error(RigCorrection.none(RIG), knocked)
+    assert image_error(itself.found.applied, knocked) < 0.1 * before_it
