@@ -3,7 +3,8 @@
 One uncompressed ``.npz`` (:mod:`fgslam.core.array_files`).
 
 A log without loop closures and relocalised frames is written as version 2, to the same bytes as
-before there were any; one that has them is version 3. All three versions are read.
+before there were any; one that has them is version 3, one of a rig that calibrated itself version
+4. All four versions are read.
 """
 
 from __future__ import annotations
@@ -31,16 +32,17 @@ from fgslam.core.array_files import (
 from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
+from fgslam.core.rig_correction import term_names
 from fgslam.core.sensors import CameraRig, RangeBearingSensor, Sensor
 
 LOG = ArrayFile(
     name="fgslam measurement log",
-    versions=(1, 2, 3),  # version 1 knew cameras only, version 2 no loops
+    versions=(1, 2, 3, 4),  # version 1 knew cameras only, 2 no loops, 3 no corrections of the rig
     error=MeasurementLogError,
     give="give a run folder's measurements.npz",
     again="run again",
 )
-_BEFORE_LOOPS, _WITH_LOOPS = 2, 3
+_BEFORE_LOOPS, _WITH_LOOPS, _WITH_CORRECTIONS = 2, 3, 4
 _UPPER = np.triu_indices(3)
 
 # Arrays by the count that their first axis has, with type and the shape of an item.
@@ -108,7 +110,7 @@ class MeasurementLog(Brief):
         """The log as the arrays of its file."""
         kind = "stereo" if isinstance(self.rig, CameraRig) else "range_bearing"
         sensor = {"kind": kind} | {name: getattr(self.rig, name) for name in _SENSOR_KEYS[kind]}
-        version = _WITH_LOOPS if self._has_loops() else _BEFORE_LOOPS
+        version = self._version()
         header = LOG.header(version, sensor=sensor, motion=self.motion_model)
         out = header | {
             "rig_bTc": self.rig.bTc,
@@ -121,11 +123,19 @@ class MeasurementLog(Brief):
         out |= _ragged("pruned", [s.pruned_ids for s in self])
         out |= _observation_arrays([s.observations for s in self], "")
         out["rejected"] = joined([s.rejected for s in self], (), np.bool_)
-        return out | (self._loop_arrays() if version == _WITH_LOOPS else {})
+        if version >= _WITH_LOOPS:
+            out |= self._loop_arrays()
+        if version >= _WITH_CORRECTIONS:
+            corrections = [s.rig_correction for s in self]
+            none = np.zeros_like(next(c for c in corrections if c is not None))
+            out["rig_correction"] = np.array([none if c is None else c for c in corrections])
+        return out
 
-    def _has_loops(self) -> bool:
-        """Whether anything is there that version 2 had no place for."""
-        return any(s.loops or s.relocalised for s in self)
+    def _version(self) -> int:
+        """The first that has a place for all that is there."""
+        if any(s.rig_correction is not None for s in self):
+            return _WITH_CORRECTIONS
+        return _WITH_LOOPS if any(s.loops or s.relocalised for s in self) else _BEFORE_LOOPS
 
     def _loop_arrays(self) -> StateArrays:
         loops = [loop for s in self for loop in s.loops]
@@ -146,6 +156,7 @@ class MeasurementLog(Brief):
         _require_consistent(arrays, where)
         loops, relocalised = _loops(arrays, header["version"], where)
         log = MeasurementLog(_sensor(header["sensor"], arrays["rig_bTc"]), header["motion"])
+        corrections = _corrections(arrays, header["version"], log.rig, where)
         observed = _split_observations(arrays, "")
         missed = _split(arrays, "missed")
         pruned = _split(arrays, "pruned")
@@ -162,6 +173,7 @@ class MeasurementLog(Brief):
                     pruned_ids=pruned[k],
                     loops=loops[k],
                     relocalised=bool(relocalised[k]),
+                    rig_correction=corrections[k],
                 )
             )
         return log
@@ -250,6 +262,21 @@ def _require_consistent_loops(arrays: StateArrays, where: str) -> None:
     }
     expected = {"relocalised": ("b", (frames,)), "loop_merged": ("i", (merged, 2))}
     LOG.require(arrays, expected | of_rows(count, _PER_LOOP) | of_rows(seen, of_loops), where)
+
+
+def _corrections(
+    arrays: StateArrays, version: int, rig: Sensor, where: str
+) -> list[FloatArray | None]:
+    """The rig's correction in each frame; None before version 4.
+
+    Raises MeasurementLogError where they are not there, or of another rig.
+    """
+    frames = len(arrays["frame_index"])
+    if version < _WITH_CORRECTIONS or not isinstance(rig, CameraRig):
+        return [None] * frames
+    terms = len(term_names(rig))
+    LOG.require(arrays, {"rig_correction": ("f", (frames, terms))}, where)
+    return list(arrays["rig_correction"])
 
 
 def _motion(increment: Increment) -> FloatArray:

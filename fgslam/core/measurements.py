@@ -92,6 +92,9 @@ class Increment(Brief):
             because of the last frame's loop closure among them.
         loops: places recognised in this frame, verified; each estimator judges them for itself.
         relocalised: placed by its landmarks alone, without a prior; its odometry is meaningless.
+        rig_correction: (p,) of the rig against its calibration
+            (:func:`fgslam.core.rig_correction.term_names`), taken off the measurements already, not
+            off the raw pixels; None where the calibration was taken as it is.
     """
 
     index: int
@@ -103,3 +106,4 @@ class Increment(Brief):
     pruned_ids: IntArray
     loops: tuple[LoopClosure, ...] = ()
     relocalised: bool = False
+    rig_correction: FloatArray | None = None

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import Brief, FloatArray
-from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.features import Features
 from fgslam.core.measurements import Increment, Observations
 from fgslam.core.sensors import CameraRig, measurement_map, vertical_to_horizontal
 
@@ -38,12 +38,15 @@ EXPECTED_PX = 1.0
 """Displacement that a calibration is taken to leave, root mean square over the image: what the
 matcher's epipolar gate (``StereoSettings.epipolar_px``) admits; a worse rig matches nothing."""
 
+_CAMERAS = ("left", "top")
+_CHANGES = ("yaw_deg", "pitch_deg", "roll_deg", "focal_percent")
+_CHANGE_UNITS = np.array([180.0 / np.pi] * 3 + [100.0])
 _GRID = 7  # points along each axis of the image at which the prior is stated
 
 
 def term_names(rig: CameraRig) -> tuple[str, ...]:
     """Names of a correction's values, as ``left.yaw``: those of each camera, then the common."""
-    cameras = ("left", "top")[: rig.cameras - 1]
+    cameras = _CAMERAS[: rig.cameras - 1]
     return tuple(f"{camera}.{term}" for camera in cameras for term in TERMS) + COMMON_TERMS
 
 
@@ -54,22 +57,28 @@ def displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
         rig: as calibrated.
         pixels: (k, cameras, 2) raw (column, row) in right, left[, top].
     """
+    of_cameras = [camera_displacements(rig, k, pixels[:, k]) for k in range(rig.cameras)]
+    return np.concatenate(of_cameras, axis=1)
+
+
+def camera_displacements(rig: CameraRig, camera: int, pixels: FloatArray) -> FloatArray:
+    """Displacements (k, 2, p) of pixels (k, 2) of one camera (0: right) by a unit of each term."""
     focal = np.array([rig.fx, rig.fy])
     count = len(TERMS)
-    out = np.zeros((len(pixels), rig.cameras, 2, count * (rig.cameras - 1) + 1))
+    out = np.zeros((len(pixels), 2, count * (rig.cameras - 1) + 1))
     rays = (pixels - [rig.cx, rig.cy]) / focal
-    squared = (rays**2).sum(axis=2, keepdims=True)
-    out[..., -1] = focal * rays * squared
-    for camera in range(1, rig.cameras):
+    squared = (rays**2).sum(axis=1)
+    out[..., -1] = focal * rays * squared[:, None]
+    if camera:
         at = slice(count * (camera - 1), count * camera)
-        out[:, camera, :, at] = focal[:, None] * _terms(rays[:, camera], squared[:, camera])
-    return out.reshape(len(pixels), 2 * rig.cameras, out.shape[3])
+        out[..., at] = focal[:, None] * _terms(rays, squared)
+    return out
 
 
 def _terms(rays: FloatArray, squared: FloatArray) -> FloatArray:
     """Displacements (k, 2, 9) of normalised image points (k, 2) in the order of TERMS."""
     x, y = rays.T
-    r2 = squared[:, 0]
+    r2 = squared
     zero, one = np.zeros_like(x), np.ones_like(x)
     columns = (one, zero, 1.0 + x * x, x * y, -y, x, r2 + 2.0 * x * x, 2.0 * x * y, x * r2)
     rows = (zero, one, x * y, 1.0 + y * y, x, y, 2.0 * x * y, r2 + 2.0 * y * y, y * r2)
@@ -82,9 +91,7 @@ def prior_information(rig: CameraRig, expected_px: float = EXPECTED_PX) -> Float
     As if a grid of displacements in every image had been measured as zero, with a noise for which
     the displacements predicted by the terms have this standard deviation in the mean.
     """
-    column, row = np.meshgrid(*(np.linspace(0, n - 1, _GRID) for n in (rig.width, rig.height)))
-    grid = np.stack([column.ravel(), row.ravel()], axis=1)
-    unit = displacements(rig, np.repeat(grid[:, None], rig.cameras, axis=1))
+    unit = _grid_displacements(rig)
     groups = [slice(c, c + len(TERMS)) for c in range(0, unit.shape[2] - 1, len(TERMS))]
     groups.append(slice(unit.shape[2] - 1, unit.shape[2]))
     out = np.zeros((unit.shape[2], unit.shape[2]))
@@ -94,6 +101,13 @@ def prior_information(rig: CameraRig, expected_px: float = EXPECTED_PX) -> Float
         scale = jacobian.shape[1] / (len(jacobian) * expected_px**2)
         out[group, group] = scale * (jacobian.T @ jacobian)
     return out
+
+
+def _grid_displacements(rig: CameraRig) -> FloatArray:
+    """Displacements (k, 2 * cameras, p) at points spread over the image, by a unit of each term."""
+    column, row = np.meshgrid(*(np.linspace(0, n - 1, _GRID) for n in (rig.width, rig.height)))
+    grid = np.stack([column.ravel(), row.ravel()], axis=1)
+    return displacements(rig, np.repeat(grid[:, None], rig.cameras, axis=1))
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -130,9 +144,53 @@ class RigCorrection(Brief):
         moved, sigma = self.at(middle)
         return float(moved[0, 2]), float(sigma[0, 2])
 
+    @property
+    def sigmas(self) -> FloatArray:
+        """Standard deviations (p,) of the values."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance)))
+
+    def rms_px(self) -> float:
+        """Displacement of the other cameras against the right one, rms over the image, pixels."""
+        moved = (_grid_displacements(self.rig) @ self.values).reshape(-1, self.rig.cameras, 2)
+        against = moved[:, 1:] - moved[:, :1]
+        return float(np.sqrt((against**2).sum(axis=2).mean()))
+
+    def changes(self) -> dict[str, tuple[float, float]]:
+        """The turn and zoom of each other camera that fits its displacements best, with sigmas.
+
+        The terms of a camera nearly cancel each other (its yaw and its principal point, say); over
+        the image as a whole they amount to these. Positive where the camera is turned to the left
+        (yaw), upwards (pitch) or counter-clockwise as seen from behind it (roll), so that its image
+        moves right, down or clockwise; and where its focal length is longer.
+        """
+        unit = _grid_displacements(self.rig)
+        which = [TERMS.index(name) for name in ("yaw", "pitch", "roll", "focal")]
+        out: dict[str, tuple[float, float]] = {}
+        for k, camera in enumerate(_CAMERAS[: self.rig.cameras - 1]):
+            at = slice(len(TERMS) * k, len(TERMS) * (k + 1))
+            own = unit[:, 2 * k + 2 : 2 * k + 4, at].reshape(-1, len(TERMS))
+            fit = np.linalg.pinv(own[:, which]) @ own
+            values = fit @ self.values[at] * _CHANGE_UNITS
+            variances = np.diagonal(fit @ self.covariance[at, at] @ fit.T)
+            sigmas = np.sqrt(variances) * _CHANGE_UNITS
+            pairs = zip(_CHANGES, values.tolist(), sigmas.tolist(), strict=True)
+            out |= {f"{camera}_{name}": (value, sigma) for name, value, sigma in pairs}
+        return out
+
     def significance(self) -> float:
         """Chi-square, of ``len(values)`` degrees of freedom, that the calibration is exact."""
         return float(self.values @ np.linalg.solve(self.covariance, self.values))
+
+    def straightened(self, features: tuple[Features, ...]) -> tuple[Features, ...]:
+        """Features of right, left[, top] where an exact rig had found them."""
+        if not self.values.any():
+            return features
+        moved = [
+            camera_displacements(self.rig, camera, found.xy) @ self.values
+            for camera, found in enumerate(features)
+        ]
+        pairs = zip(features, moved, strict=True)
+        return tuple(dataclasses.replace(found, xy=found.xy - off) for found, off in pairs)
 
     def corrected(self, observed: Observations) -> Observations:
         """The observations as an exact rig had measured them; their raw pixels stay."""
@@ -149,8 +207,3 @@ class RigCorrection(Brief):
         )
         observed = self.corrected(increment.observations)
         return dataclasses.replace(increment, observations=observed, loops=loops)
-
-    def corrected_log(self, log: MeasurementLog) -> MeasurementLog:
-        """A log in which every frame is corrected."""
-        frames = [self.corrected_increment(increment) for increment in log]
-        return MeasurementLog(log.rig, log.motion_model, frames)

@@ -356,3 +356,10 @@ class FrontendSettings:
         LostSettings | None,
         Field(description="search the whole map when lost; null goes on by odometry alone"),
     ] = None
+    self_calibration: Annotated[
+        bool,
+        Field(
+            description="estimate from the drive what the rig's calibration leaves uncorrected, "
+            "and take it off every frame's features; needs stereo.measurement fused"
+        ),
+    ] = True

@@ -11,6 +11,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.geometry import triangulate, triangulation_covariance
+from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.sensors import CameraRig, measurement_map, vertical_to_horizontal
 from fgslam.frontend.features.matching import alike, choose, pairs_within
 from fgslam.frontend.features.settings import AppearanceSettings
@@ -31,14 +32,21 @@ class StereoMatcher:
         self._vertical_to_horizontal = vertical_to_horizontal(rig)
         self._map = measurement_map(settings.measurement, rig.cameras, self._vertical_to_horizontal)
 
-    def match(self, features: tuple[Features, ...]) -> StereoFeatures:
-        """Matches (right, left[, top]) features of one frame."""
-        right, left = features[0], features[1]
-        i, j = self.match_left(right, left)
-        if len(features) == 2:
-            return self._measure(features, (i, j))
-        kept, k = self.match_top(right, left, features[2], (i, j))
-        return self._measure(features, (i[kept], j[kept], k))
+    def match(
+        self, features: tuple[Features, ...], correction: RigCorrection | None = None
+    ) -> StereoFeatures:
+        """Matches (right, left[, top]) features of one frame.
+
+        They are matched and measured where an exact rig had found them, by the ``correction``; the
+        raw pixels stay as they are.
+        """
+        straight = features if correction is None else correction.straightened(features)
+        i, j = self.match_left(straight[0], straight[1])
+        matches: tuple[IntArray, ...] = (i, j)
+        if len(features) > 2:
+            kept, k = self.match_top(straight[0], straight[1], straight[2], (i, j))
+            matches = (i[kept], j[kept], k)
+        return self._measure(features, straight, matches)
 
     def match_left(self, right: Features, left: Features) -> tuple[IntArray, IntArray]:
         """Pairs of right and left features, ascending in the right ones."""
@@ -80,13 +88,16 @@ class StereoMatcher:
         return choose(p[ok], k[ok], descriptors, self._appearance)
 
     def _measure(
-        self, features: tuple[Features, ...], matches: tuple[IntArray, ...]
+        self,
+        features: tuple[Features, ...],
+        straight: tuple[Features, ...],
+        matches: tuple[IntArray, ...],
     ) -> StereoFeatures:
         pixels = np.full((len(matches[0]), 3, 2), np.nan)
         for camera, (found, index) in enumerate(zip(features, matches, strict=True)):
             pixels[:, camera] = found.xy[index]
-        used = pixels[:, : len(features)].reshape(len(pixels), 2 * len(features))
-        measurement = used @ self._map.T
+        used = [found.xy[index] for found, index in zip(straight, matches, strict=True)]
+        measurement = np.concatenate(used, axis=1) @ self._map.T
         variance = self._settings.pixel_sigma**2
         covariance = np.tile(variance * (self._map @ self._map.T), (len(pixels), 1, 1))
         scale, orientation = _average(features, matches)

@@ -46,6 +46,7 @@ _RESULT_FILES = (
     "ground_truth_landmarks.csv",
     METRICS_FILE,
     "timing.csv",
+    "calibration.csv",
     "loops.csv",
     COMPARISON_FILE,
     TRIALS_FILE,

@@ -50,6 +50,7 @@ from fgslam.slam.motion import ConstantVelocityMotion, MotionModel, OdometryMoti
 from fgslam.slam.pipeline import SlamPipeline
 
 if TYPE_CHECKING:
+    from fgslam.backend.filters.self_calibration import SelfCalibration
     from fgslam.frontend.places.recognition import PlaceRecognition
     from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 
@@ -198,8 +199,21 @@ def make_pipeline(
         motion=make_motion(rig, odometry),
         estimator=estimator,
         places=make_places(rig, frontend, tracker, seed),
+        calibration=make_calibration(rig, frontend),
         located=prior if arrival is not None and arrival.relocalised else None,
     )
+
+
+def make_calibration(rig: CameraRig, settings: FrontendSettings) -> SelfCalibration | None:
+    """Calibration of the rig from the drive; None where the calibration is to be taken as it is.
+
+    The paper's measurement is not the least squares over all images that a correction changes.
+    """
+    if not settings.self_calibration or settings.stereo.measurement != "fused":
+        return None
+    from fgslam.backend.filters.self_calibration import SelfCalibration
+
+    return SelfCalibration(rig, settings.stereo.pixel_sigma)
 
 
 def make_places(

@@ -21,6 +21,7 @@ from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import MotionModel
 
 if TYPE_CHECKING:
+    from fgslam.backend.filters.self_calibration import SelfCalibration
     from fgslam.frontend.places.recognition import PlaceRecognition
 
 
@@ -57,6 +58,7 @@ class SlamPipeline:
 
     Attributes:
         places: None where none are recognised.
+        calibration: of the rig, from the drive; None where the calibration is taken as stated.
         located: pose of the first frame, found in a saved map without a prior; None where it was
             not.
     """
@@ -66,6 +68,7 @@ class SlamPipeline:
     motion: MotionModel
     estimator: Estimator
     places: PlaceRecognition | None = None
+    calibration: SelfCalibration | None = None
     located: Prediction | None = None
 
     def process(
@@ -90,15 +93,38 @@ class SlamPipeline:
         watch.lap("track")
         seen = self._recognise(seen, stereo, landmarks, ended)
         watch.lap("places")
-        increment = _increment(index, timestamp, odometry, seen)
+        increment = self._increment(index, timestamp, odometry, seen)
         stats = updated(self.estimator, increment, seen.tracking)
         observe(self.motion, increment, seen.tracking, stats)
         self._remember(increment, seen, stats)
         watch.lap("update")
+        if self.calibration is not None:
+            self.calibration.observe(increment, stats.wTc)
+        watch.lap("calibrate")
         return FrameReport(found, stereo, increment, seen.tracking, stats, watch.ms)
 
     def _match_stereo(self, found: FeatureFrame) -> StereoFeatures:
-        return StereoFeatures.empty() if found.frame is None else self.stereo.match(found.features)
+        if found.frame is None:
+            return StereoFeatures.empty()
+        correction = None if self.calibration is None else self.calibration.found.applied
+        return self.stereo.match(found.features, correction)
+
+    def _increment(
+        self, index: int, timestamp: float, odometry: Odometry | None, seen: _Seen
+    ) -> Increment:
+        association, calibration = seen.association, self.calibration
+        return Increment(
+            index=index,
+            timestamp=timestamp,
+            odometry=odometry,
+            observations=association.observations,
+            rejected=association.rejected,
+            missed_ids=association.missed_ids,
+            pruned_ids=association.pruned_ids,
+            loops=seen.loops,
+            relocalised=seen.relocalised,
+            rig_correction=None if calibration is None else calibration.found.applied.values,
+        )
 
     def _fused(self) -> tuple[LandmarkMap, IntArray]:
         """The map to track on, and which landmarks a loop closed in the last frame ends.
@@ -178,18 +204,3 @@ def _anchored(increment: Increment, tracking: EgoMotion, stats: UpdateStats) -> 
     odometry = increment.odometry
     known = odometry is not None and odometry.measured
     return known or tracking.status.measured or founding
-
-
-def _increment(index: int, timestamp: float, odometry: Odometry | None, seen: _Seen) -> Increment:
-    association = seen.association
-    return Increment(
-        index=index,
-        timestamp=timestamp,
-        odometry=odometry,
-        observations=association.observations,
-        rejected=association.rejected,
-        missed_ids=association.missed_ids,
-        pruned_ids=association.pruned_ids,
-        loops=seen.loops,
-        relocalised=seen.relocalised,
-    )

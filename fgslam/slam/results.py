@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.backend.filters.rig_models import WeighedCorrection
 from fgslam.backend.protocol import Estimator
 from fgslam.core.arrays import BoolArray, Brief, FloatArray, StateArrays
 from fgslam.core.errors import FgslamError
@@ -18,7 +19,7 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Observations
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 
-STAGES = ("load", "sift", "wait", "predict", "stereo", "track", "places", "update")
+STAGES = ("load", "sift", "wait", "predict", "stereo", "track", "places", "update", "calibrate")
 """Per frame: `load` and `sift` run in threads beside the loop, `wait` is what they held it up."""
 
 
@@ -205,6 +206,8 @@ class SessionResult(Brief):
         closed: of all loop closures offered so far, whether the estimator took them.
         frames: the record of every frame, by name of the column.
         notes: what is to be said of the images, and of frames left out.
+        rig: what the drive shows of the rig's calibration: estimated, with its covariance, and
+            applied; None where the calibration is taken as it is stated.
     """
 
     kind: str
@@ -214,6 +217,7 @@ class SessionResult(Brief):
     closed: tuple[bool, ...]
     frames: dict[str, npt.NDArray[Any]]
     notes: tuple[str, ...]
+    rig: WeighedCorrection | None
 
     # What a comparison of estimators asks of a replay, and a live session does not know.
     failure = ""
@@ -266,6 +270,7 @@ def result_of(
         closed=() if pipeline.places is None else tuple(pipeline.places.taken),
         frames=_columns(recorder),
         notes=notes,
+        rig=None if pipeline.calibration is None else pipeline.calibration.found,
     )
 
 

@@ -14,11 +14,12 @@ from fgslam.core.arrays import Brief, FloatArray
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.estimates import Prediction
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.settings import EgoMotionSettings, StereoSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.slam.replay import replay_motion, replay_step
+from fgslam.slam.replay import replay_frame, replay_motion
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -62,15 +63,21 @@ def calibrate(log: MeasurementLog, ego_motion: EgoMotionSettings | None = None) 
     causal, known = [], []
     for k, increment in enumerate(log):
         causal.append(itself.found.applied.corrected_increment(increment))
-        stats = replay_step(causal[-1], estimator, solver, motion, k)
-        known.append(itself.observe(increment, stats.wTc))
+        frame = replay_frame(causal[-1], estimator, solver, motion, k)
+        known.append(itself.observe(increment, frame.stats.wTc))
     return CalibratedDrive(
         found=known[-1],
         values=np.array([c.estimated.values for c in known]),
         sigmas=np.array([np.sqrt(np.diagonal(c.estimated.covariance)) for c in known]),
-        log=known[-1].applied.corrected_log(log),
+        log=corrected_log(log, known[-1].applied),
         causal=MeasurementLog(rig, log.motion_model, causal),
     )
+
+
+def corrected_log(log: MeasurementLog, correction: RigCorrection) -> MeasurementLog:
+    """A log in which every frame is corrected."""
+    frames = [correction.corrected_increment(increment) for increment in log]
+    return MeasurementLog(log.rig, log.motion_model, frames)
 
 
 def _rig_of(log: MeasurementLog) -> CameraRig:

@@ -34,7 +34,7 @@ from fgslam.core.sensors import (
 
 _KERNEL_WIDTH = 2.0  # standard deviations at which Cauchy's kernel bends, as the ego-motion's
 _GROSS = 50.0  # standard deviations: no error of a point seen once, but another point
-_ITERATIONS = 8
+_ITERATIONS = 3  # more change the correction by a tenth of its sigma
 _TOLERANCE = 1e-4  # relative change of the cost at which a window has come to rest
 _LEAST_DAMPING = 1e-9
 _NEAREST_M = 1e-2

@@ -8,12 +8,13 @@ known of the truth. Derived in docs/derivations/self_calibration.md.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
 from fgslam.backend.filters.rig_alignment import RigAlignment, RigEvidence
 from fgslam.backend.filters.rig_models import WeighedCorrection, weighed
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.measurements import Increment, Observations
 from fgslam.core.quantiles import chi_square_quantile
 from fgslam.core.rig_correction import RigCorrection, prior_information
@@ -28,6 +29,52 @@ _KNOCK_PROBABILITY = 1e-6  # of a window so far off, by chance; two in a row are
 _DOUBTFUL = 1e-3  # of the prior's information: less in a direction is no evidence of the noise
 
 
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class CalibrationStep:
+    """What was known after one window.
+
+    Attributes:
+        timestamp: of its last frame, seconds.
+        values: (p,) of the correction, all terms free.
+        covariance: (p, p) of those.
+        applied: (p,) what is taken off the frames after it.
+        knocks: how often the rig was found to have moved, so far.
+    """
+
+    timestamp: float
+    values: FloatArray
+    covariance: FloatArray
+    applied: FloatArray
+    knocks: int
+
+    @staticmethod
+    def of(timestamp: float, found: WeighedCorrection, knocks: int) -> CalibrationStep:
+        """The step after a window that ended at ``timestamp``."""
+        known, applied = found.estimated, found.applied.values
+        return CalibrationStep(timestamp, known.values, known.covariance, applied, knocks)
+
+
+def _step_arrays(steps: Sequence[CalibrationStep], terms: int) -> StateArrays:
+    return {
+        "step_time": np.array([step.timestamp for step in steps], np.float64),
+        "step_values": np.array([step.values for step in steps]).reshape(-1, terms),
+        "step_covariance": np.array([step.covariance for step in steps]).reshape(-1, terms, terms),
+        "step_applied": np.array([step.applied for step in steps]).reshape(-1, terms),
+        "step_knocks": np.array([step.knocks for step in steps], np.int64),
+    }
+
+
+def _steps_of(state: StateArrays) -> list[CalibrationStep]:
+    names = ("step_time", "step_values", "step_covariance", "step_applied", "step_knocks")
+    rows = zip(*(state[name] for name in names), strict=True)
+    return [CalibrationStep(float(t), v, c, a, int(k)) for t, v, c, a, k in rows]
+
+
+def _accepted(increment: Increment) -> Observations:
+    """What the ego-motion accepted."""
+    return increment.observations.select(~increment.rejected)
+
+
 class SelfCalibration:
     """Estimates the correction of a rig while it is driven."""
 
@@ -37,6 +84,8 @@ class SelfCalibration:
         self._prior = prior_information(rig)
         self.found = weighed(self._known, self._prior)
         """As known now, and what of it is worth applying."""
+        self.steps: list[CalibrationStep] = []
+        """How it became known, window by window."""
         self.windows = 0
         """How many gave evidence."""
         self.knocks = 0
@@ -57,8 +106,7 @@ class SelfCalibration:
         """Takes in a frame as measured and its pose; returns the correction as known now."""
         if increment.relocalised:
             self._frames.clear()
-        kept = increment.observations.select(~increment.rejected)
-        self._frames.append((wTc, kept))
+        self._frames.append((wTc, _accepted(increment)))
         if len(self._frames) >= WINDOW:
             alignment = RigAlignment(self._known.rig, self._frames, self._sigma)
             self._frames = []
@@ -87,6 +135,40 @@ class SelfCalibration:
             self._known, values=known + covariance @ pull, covariance=covariance
         )
         self.found = weighed(self._known, self._prior)
+        self.steps.append(CalibrationStep.of(timestamp, self.found, self.knocks))
+
+    # ----------------------------------------------------------------------------------------
+
+    def state(self) -> StateArrays:
+        """All that changes but the frames of the window in work, which the log and poses hold."""
+        return {
+            "values": self._known.values,
+            "covariance": self._known.covariance,
+            "time": np.array(np.nan if self._last_time is None else self._last_time),
+            "evidence": np.array([self._misfit, self._freedom]),
+            "counts": np.array([self.windows, self.knocks, self._suspected, len(self._frames)]),
+        } | _step_arrays(self.steps, len(self._prior))
+
+    def restore(
+        self, state: StateArrays, log: Sequence[Increment], poses: Sequence[FloatArray]
+    ) -> None:
+        """Continues from :meth:`state`, the log so far and the poses as first estimated."""
+        self._known = dataclasses.replace(
+            self._known, values=state["values"], covariance=state["covariance"]
+        )
+        self._last_time = None if np.isnan(state["time"]) else float(state["time"])
+        self._misfit, self._freedom = map(float, state["evidence"])
+        self.windows, self.knocks, suspected, waiting = map(int, state["counts"])
+        self._suspected = bool(suspected)
+        self.steps = _steps_of(state)
+        self.found = weighed(self._known, self._prior)
+        begin = len(log) - waiting
+        self._frames = [
+            (wTc, _accepted(increment))
+            for wTc, increment in zip(poses[begin:], log[begin:], strict=True)
+        ]
+
+    # ----------------------------------------------------------------------------------------
 
     def _drifted(self, timestamp: float) -> FloatArray:
         """The covariance, grown by the rig's drift since the last window."""

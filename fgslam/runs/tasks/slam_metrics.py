@@ -23,7 +23,7 @@ from fgslam.slam.replay import peak_memory_mb
 from fgslam.slam.results import STAGES, RunRecorder
 
 _ESTIMATOR_STAGES = ("predict", "update")
-_LOOP_STAGES = ("predict", "stereo", "track", "places", "update")
+_LOOP_STAGES = ("predict", "stereo", "track", "places", "update", "calibrate")
 
 
 def estimator_metrics(estimate: Estimate, truth: Truth, recorder: RunRecorder) -> EstimatorMetrics:

@@ -33,6 +33,11 @@ from fgslam.runs.estimator_files import write_estimate
 from fgslam.runs.folder import LOG_FILE
 from fgslam.runs.maps import map_points
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, load_truth
+from fgslam.runs.tasks.slam_calibration import (
+    calibration_note,
+    calibration_numbers,
+    write_calibration,
+)
 from fgslam.runs.tasks.slam_map_entry import GivenMap
 from fgslam.runs.tasks.slam_metrics import (
     closures_of,
@@ -96,6 +101,8 @@ class RunOutputs:
         metrics = self._with_kind(estimator_metrics(estimate, truth, self.recorder))
         self.write_metrics({self.title: metrics}, status)
         self._write_timing(estimate.trajectory)
+        if self.pipeline.calibration is not None:
+            write_calibration(self.folder, self.pipeline.calibration)
         return metrics
 
     def write_metrics(self, estimators: Mapping[str, EstimatorMetrics], status: str) -> None:
@@ -106,6 +113,8 @@ class RunOutputs:
             closures = closures_of(self.recorder, self.pipeline.places.taken, truth)
             write_closures(self.folder, self.recorder, closures)
             about["places"] = place_numbers(self.recorder, closures)
+        if self.pipeline.calibration is not None:
+            about["rig"] = calibration_numbers(self.pipeline.calibration)
         write_metrics(self.folder / "metrics.json", len(self.recorder), estimators, about)
 
     def _with_kind(self, metrics: EstimatorMetrics) -> EstimatorMetrics:
@@ -198,6 +207,8 @@ def run_notes(outputs: RunOutputs, metrics: EstimatorMetrics) -> tuple[str, ...]
     lines += problems[:_PROBLEMS_SHOWN]
     if len(problems) > _PROBLEMS_SHOWN:
         lines.append(f"and {len(problems) - _PROBLEMS_SHOWN} more such frames, see metrics.json")
+    if note := calibration_note(outputs.pipeline.calibration):
+        lines.append(note)
     if not metrics.landmarks:
         lines.append(
             "there is no landmark in the map; fgslam inspect says what is wrong with the recording"

@@ -43,6 +43,8 @@ def state_of(pipeline: SlamPipeline, recorder: RunRecorder) -> StateArrays:
     }
     if pipeline.places is not None:
         parts["places"] = pipeline.places.state()
+    if pipeline.calibration is not None:
+        parts["calibration"] = pipeline.calibration.state()
     return {
         f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()
     }
@@ -62,6 +64,9 @@ def restore(
     recorder.restore(_part(state, "recorder"), log)
     if pipeline.places is not None:
         pipeline.places.restore(_part(state, "places"), recorder.log)
+    if pipeline.calibration is not None:
+        part, frames = _part(state, "calibration"), recorder.log.increments
+        pipeline.calibration.restore(part, frames, recorder.online_poses)
 
 
 def has_checkpoint(folder: Path) -> bool:

@@ -209,3 +209,44 @@ def test_a_knock_in_mid_drive_is_noticed_and_followed() -> None:
     assert itself.knocks == 1
     before_it = image_error(RigCorrection.none(RIG), knocked)
     assert image_error(itself.found.applied, knocked) < 0.1 * before_it
+
+
+def test_a_state_taken_within_a_window_goes_on_with_the_same_bits() -> None:
+    road, rng = Road(frames=32, points=400), np.random.default_rng(9)
+    log, poses = drive(road, errors(yaw=0.002), rng), poses_of(road)
+    one = SelfCalibration(RIG, SIGMA_PX)
+    for increment, wTc in zip(log[:21], poses[:21], strict=True):
+        one.observe(increment, wTc)
+    other = SelfCalibration(RIG, SIGMA_PX)
+    other.restore(one.state(), log[:21], poses[:21])
+    for increment, wTc in zip(log[21:], poses[21:], strict=True):
+        one.observe(increment, wTc)
+        other.observe(increment, wTc)
+    assert one.windows == 5
+    assert other.state().keys() == one.state().keys()
+    for name, array in one.state().items():
+        np.testing.assert_array_equal(other.state()[name], array, err_msg=name)
+    np.testing.assert_array_equal(other.found.applied.values, one.found.applied.values)
+
+
+@pytest.mark.parametrize("rig", [RIG, THREE], ids=["two cameras", "three cameras"])
+def test_changes_are_the_turn_of_a_camera_in_degrees(rig: CameraRig) -> None:
+    names = list(term_names(rig))
+    values = np.zeros(len(names))
+    terms = {"yaw": 0.1, "pitch": -0.2, "roll": 0.3}
+    for term, degrees in terms.items():
+        values[names.index(f"left.{term}")] = np.deg2rad(degrees)
+    values[names.index("left.focal")] = 0.004
+    found = RigCorrection(rig, values, np.eye(len(names)) * 1e-12).changes()
+    assert found["left_yaw_deg"][0] == pytest.approx(0.1, abs=1e-9)
+    assert found["left_pitch_deg"][0] == pytest.approx(-0.2, abs=1e-9)
+    assert found["left_roll_deg"][0] == pytest.approx(0.3, abs=1e-9)
+    assert found["left_focal_percent"][0] == pytest.approx(0.4, abs=1e-9)
+    assert ("top_yaw_deg" in found) == (rig.cameras == 3)
+
+
+def test_a_shifted_principal_point_is_told_as_a_turn() -> None:
+    """Over the image, both move the pixels alike."""
+    shifted = RigCorrection(RIG, errors(column=0.001), np.eye(10) * 1e-12).changes()
+    # x^2 of the yaw's 1 + x^2 is 0.25 in the mean over this image.
+    assert shifted["left_yaw_deg"][0] == pytest.approx(np.rad2deg(0.001), rel=0.3)

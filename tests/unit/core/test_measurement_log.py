@@ -16,6 +16,7 @@ from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
+from fgslam.core.rig_correction import term_names
 from fgslam.core.sensors import CameraRig, RangeBearingSensor
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
@@ -177,13 +178,13 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
     assert not (tmp_path / "exploded").exists()
 
 
-@pytest.mark.parametrize("version", [4, 99, "1", None])
+@pytest.mark.parametrize("version", [5, 99, "1", None])
 def test_another_version_is_refused(file: Path, version: object) -> None:
     arrays = load_arrays(file)
     header = json.loads(str(arrays["header"])) | {"version": version}
     arrays["header"] = np.array(json.dumps(header))
     with pytest.raises(
-        MeasurementLogError, match=rf"version {version}, this fgslam reads .* 1 to 3"
+        MeasurementLogError, match=rf"version {version}, this fgslam reads .* 1 to 4"
     ):
         MeasurementLog.from_arrays(arrays, "x.npz")
 
@@ -324,3 +325,19 @@ def test_a_loop_that_does_not_lead_back_is_refused(looped: MeasurementLog, frame
     arrays["loop_frame"] = np.array([frame, *arrays["loop_frame"][1:]])
     with pytest.raises(MeasurementLogError, match=f"frame 2 leads to frame {frame}"):
         MeasurementLog.from_arrays(arrays, "x.npz")
+
+
+def test_corrections_of_the_rig_make_version_4(log: MeasurementLog, tmp_path: Path) -> None:
+    terms = len(term_names(RIG))
+    log.increments[1] = replace(
+        log.increments[1], rig_correction=np.arange(terms, dtype=np.float64)
+    )
+    log.save(tmp_path / "log.npz")
+    arrays = load_arrays(tmp_path / "log.npz")
+    assert json.loads(str(arrays["header"]))["version"] == 4
+    back = MeasurementLog.load(tmp_path / "log.npz")
+    np.testing.assert_array_equal(back.increments[0].rig_correction, np.zeros(terms))
+    np.testing.assert_array_equal(back.increments[1].rig_correction, np.arange(terms))
+    write_arrays(tmp_path / "log.npz", arrays | {"rig_correction": arrays["rig_correction"][:, 1:]})
+    with pytest.raises(MeasurementLogError, match="rig_correction"):
+        MeasurementLog.load(tmp_path / "log.npz")

@@ -11,6 +11,7 @@ from simulated import RIG
 from fgslam.core.arrays import FloatArray
 from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.planar import wrap
+from fgslam.core.rig_correction import RigCorrection, term_names
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import StereoSettings
@@ -304,7 +305,7 @@ def test_covariances_match_monte_carlo(kind: str, vertical: float | None) -> Non
     drawn = np.array(at) + 0.3 * rng.standard_normal((100_000, rig.cameras, 2))
     everyone = np.arange(len(drawn))
     images = [features(drawn[:, camera]) for camera in range(rig.cameras)]
-    noisy = matcher._measure(tuple(images), (everyone,) * rig.cameras)
+    noisy = matcher._measure(tuple(images), tuple(images), (everyone,) * rig.cameras)
     for sample, stated in (
         (noisy.measurement, found.measurement_covariance[0]),
         (noisy.position, found.position_covariance[0]),
@@ -346,3 +347,19 @@ def test_shuffled_features_match_the_same() -> None:
         return found.measurement[np.lexsort(found.measurement.T)]
 
     np.testing.assert_array_equal(ordered(before), ordered(after))
+
+
+@pytest.mark.parametrize("rig", [RIG, TWO_CAMERAS], ids=["three cameras", "two cameras"])
+def test_a_correction_of_the_rig_is_taken_off_before_gates_and_fusion(rig: CameraRig) -> None:
+    """What a knocked rig sees is measured as an exact one sees it; the raw pixels stay."""
+    exact = [features(RIGHT), features((110.0, 80.0)), features((100.0, 90.0))][: rig.cameras]
+    values = np.zeros(len(term_names(rig)))
+    values[term_names(rig).index("left.row")] = 1.5 / rig.fy  # beyond the epipolar gate
+    values[term_names(rig).index("left.column")] = -0.5 / rig.fx
+    correction = RigCorrection(rig, values, np.eye(len(values)))
+    seen = [exact[0], features((109.5, 81.5)), *exact[2:]]
+    matcher = StereoMatcher(rig, GATES, PAPER)
+    assert not len(matcher.match(tuple(seen)))
+    found = matcher.match(tuple(seen), correction)
+    np.testing.assert_allclose(found.measurement, [[100.0, 80.0, 10.0]], rtol=0.0, atol=1e-9)
+    np.testing.assert_array_equal(found.pixels[0, :2], [RIGHT, (109.5, 81.5)])

@@ -1,0 +1,100 @@
+"""What a run says of its rig's calibration: calibration.csv, numbers, one sentence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.backend.filters.self_calibration import SelfCalibration
+from fgslam.core.rig_correction import RigCorrection, term_names
+from fgslam.evaluation.metrics import JsonValue
+from fgslam.report.tables import write_csv
+
+CALIBRATION_FILE = "calibration.csv"
+_TOLD_SIGMAS = 3.0  # what is less than this many of its own is not told as a finding
+_UNITS = {"deg": "degrees", "percent": "%"}
+_WORDS = {
+    "yaw_deg": "turned by {} in yaw",
+    "pitch_deg": "turned by {} in pitch",
+    "roll_deg": "turned by {} in roll",
+    "focal_percent": "longer by {} in focal length",
+}
+
+
+def write_calibration(folder: Path, calibration: SelfCalibration) -> None:
+    """calibration.csv: what was known after each window. Raises OutputError."""
+    known = calibration.found.estimated
+    terms = term_names(known.rig)
+    changes = list(known.changes())
+    columns = ["timestamp", "knocks"]
+    columns += [f"{name}{part}" for name in changes for part in ("", "_sigma")]
+    columns += [f"{name}{part}" for name in terms for part in ("", "_sigma", "_applied")]
+    rows = []
+    for step in calibration.steps:
+        then = replace(known, values=step.values, covariance=step.covariance)
+        of_terms = np.column_stack([step.values, then.sigmas, step.applied])
+        pairs = [number for pair in then.changes().values() for number in pair]
+        rows.append([step.timestamp, step.knocks, *pairs, *of_terms.ravel().tolist()])
+    write_csv(folder / CALIBRATION_FILE, columns, rows)
+
+
+def calibration_numbers(calibration: SelfCalibration) -> dict[str, JsonValue]:
+    """The rig's part of metrics.json."""
+    found = calibration.found
+    known = found.estimated
+    changes: dict[str, JsonValue] = {
+        name: {"value": value, "sigma": sigma} for name, (value, sigma) in known.changes().items()
+    }
+    terms: dict[str, JsonValue] = {
+        name: {"value": float(value), "sigma": float(sigma), "applied": float(applied)}
+        for name, value, sigma, applied in zip(
+            term_names(known.rig), known.values, known.sigmas, found.applied.values, strict=True
+        )
+    }
+    return {
+        "windows": calibration.windows,
+        "knocks": calibration.knocks,
+        "probability_exact": found.probabilities["exact"],
+        "chi_square": known.significance(),
+        "degrees_of_freedom": len(known.values),
+        "displacement_rms_px": found.applied.rms_px(),
+        "changes": changes,
+        "terms": terms,
+    }
+
+
+def calibration_note(calibration: SelfCalibration | None) -> str:
+    """What the drive showed of the calibration, in a sentence; empty where it showed nothing."""
+    if calibration is None or not calibration.windows:
+        return ""
+    found = calibration.found
+    knocks = f"; the rig moved {calibration.knocks} times on the way" * bool(calibration.knocks)
+    if found.probabilities["exact"] > 0.5:
+        return f"the drive agrees with the rig's calibration{knocks}"
+    parts = [text for camera in ("left", "top") if (text := _told(found.estimated, camera))]
+    rms = found.applied.rms_px()
+    what = "; ".join(parts) or "the cameras' lenses or axes differ"
+    return (
+        f"{what} against the rig's calibration, corrected during the drive by {rms:.2f} px "
+        f"(rms over the images){knocks}"
+    )
+
+
+def _told(known: RigCorrection, camera: str) -> str:
+    """One camera's changes that stand out of their uncertainty, the surest first."""
+    changes = {
+        name.removeprefix(f"{camera}_"): pair
+        for name, pair in known.changes().items()
+        if name.startswith(camera)
+    }
+    sure = sorted(changes, key=lambda name: -abs(changes[name][0]) / changes[name][1])
+    told = []
+    for name in sure:
+        value, sigma = changes[name]
+        if abs(value) >= _TOLD_SIGMAS * sigma:
+            unit = _UNITS[name.rsplit("_", 1)[1]]
+            size = f"{value:.3f} {unit}"
+            told.append(f"{_WORDS[name].format(size)} ({abs(value) / sigma:.0f} sigma)")
+    return f"the {camera} camera is {', '.join(told)}" if told else ""
