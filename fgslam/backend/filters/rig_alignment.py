@@ -2,8 +2,8 @@
 
 Bundle adjustment of one short window with errors in all images at both ends of every track. The
 residuals are linear in the correction; poses and points are minimised over, then eliminated by
-Schur complements (Triggs et al. 2000, Bundle adjustment, 6.1). Arrays are (frames, landmarks, ..)
-with weight zero where a landmark is not seen. Derived in docs/derivations/self_calibration.md.
+Schur complements (Triggs et al. 2000, Bundle adjustment, 6.1). Derived in
+docs/derivations/self_calibration.md.
 """
 
 from __future__ import annotations
@@ -19,8 +19,6 @@ from fgslam.core.geometry import (
     point_pose_jacobian,
     project,
     projection_jacobian,
-    transform_to_camera,
-    transform_to_world,
     triangulate,
 )
 from fgslam.core.measurements import Observations
@@ -77,7 +75,7 @@ class _Normal:
 
 
 class RigAlignment:
-    """One window of frames."""
+    """One window of frames: a list of observations, by landmark and then by frame."""
 
     def __init__(
         self,
@@ -89,16 +87,12 @@ class RigAlignment:
         self._rig, self._sigma = rig, pixel_sigma
         self._poses = np.array([wTc for wTc, _ in frames])
         ids = np.concatenate([seen.ids for _, seen in frames])
-        known, count = np.unique(ids, return_counts=True)
-        self._ids = known[count >= 2]
-        shape = (len(frames), len(self._ids))
-        self._seen: BoolArray = np.zeros(shape, np.bool_)
-        self._pixels = np.zeros((*shape, rig.cameras, 2))
-        for k, (_, seen) in enumerate(frames):
-            row = np.flatnonzero(np.isin(seen.ids, self._ids))
-            at = np.searchsorted(self._ids, seen.ids[row])
-            self._seen[k, at] = True
-            self._pixels[k, at] = seen.pixels[row, : rig.cameras]
+        frame = np.repeat(np.arange(len(frames)), [len(seen) for _, seen in frames])
+        pixels = np.concatenate([seen.pixels[:, : rig.cameras] for _, seen in frames])
+        order = np.lexsort((frame, ids))
+        self._landmark, self._frame = ids[order], frame[order]
+        self._pixels = pixels[order]
+        self._keep(np.ones(len(ids), np.bool_))
         ratio = vertical_to_horizontal(rig)
         self._model = pixel_model(rig.cameras, ratio)
         self._fuse = measurement_map("fused", rig.cameras, ratio)
@@ -126,74 +120,69 @@ class RigAlignment:
         information = normal.hessian[-p:, -p:] - mixed.T @ gain[:, :-1]
         score = -(normal.gradient[-p:] - mixed.T @ gain[:, -1])
         information = (information + information.T) / 2.0
-        return RigEvidence(information, score, state.correction, len(self._ids))
+        return RigEvidence(information, score, state.correction, len(self._first))
 
     # ----------------------------------------------------------------------------------------
 
+    def _keep(self, which: BoolArray) -> None:
+        """Drops the other observations, and landmarks of which less than two are left."""
+        landmark = self._landmark[which]
+        _, at, count = np.unique(landmark, return_inverse=True, return_counts=True)
+        often = count[at] >= 2
+        self._landmark = np.unique(landmark[often], return_inverse=True)[1]
+        self._frame, self._pixels = self._frame[which][often], self._pixels[which][often]
+        self._first = np.flatnonzero(np.diff(self._landmark, prepend=-1))
+
     def _start(self, correction: FloatArray) -> _State | None:
         """Points from their first sighting; landmarks that fit none of it are left out."""
-        if not self._ids.size or len(self._poses) < 2:
+        self._keep(self._measured(correction)[:, 2] > _LEAST_DISPARITY_PX)
+        if not self._first.size:
             return None
-        corrected = self._corrected(correction) @ self._fuse.T
-        near = corrected[..., 2] > _LEAST_DISPARITY_PX
-        self._seen &= near
-        first = self._seen.argmax(axis=0)
-        columns = np.arange(len(self._ids))
-        usable = self._seen.sum(axis=0) >= 2
-        at_first = corrected[first, columns]
-        at_first[~usable] = [self._rig.cx, self._rig.cy, self._rig.fx]
-        local = triangulate(self._rig, at_first)
-        points = np.empty_like(local)
-        for k, wTc in enumerate(self._poses):
-            points[first == k] = transform_to_world(wTc, local[first == k])
-        state = _State(self._poses, points, correction)
-        residual, depth, _ = self._residuals(state)
-        wild = (np.abs(residual).max(axis=2) > _GROSS) & self._seen
-        usable &= ~((depth < _NEAREST_M) & self._seen).any(axis=0) & ~wild.any(axis=0)
+        local = triangulate(self._rig, self._measured(correction)[self._first])
+        turn, place = self._poses[:, :3, :3], self._poses[:, :3, 3]
+        at = self._frame[self._first]
+        points = np.einsum("lij,lj->li", turn[at], local) + place[at]
+        residual, depth, _ = self._residuals(_State(self._poses, points, correction))
+        wild = (np.abs(residual).max(axis=1) > _GROSS) | (depth < _NEAREST_M)
+        usable = ~np.logical_or.reduceat(wild, self._first)
+        self._keep(usable[self._landmark])
         if usable.sum() < len(correction):
             return None
-        self._keep(usable)
         return _State(self._poses, points[usable], correction)
 
-    def _keep(self, which: BoolArray) -> None:
-        self._ids, self._seen = self._ids[which], self._seen[:, which]
-        self._pixels = self._pixels[:, which]
+    def _measured(self, correction: FloatArray) -> FloatArray:
+        """(column, row, disparity) (m, 3), corrected."""
+        moved = displacements(self._rig, self._pixels) @ correction
+        return np.asarray((self._raw() - moved) @ self._fuse.T)
 
     def _raw(self) -> FloatArray:
-        return self._pixels.reshape(*self._seen.shape, 2 * self._rig.cameras)
-
-    def _corrected(self, correction: FloatArray) -> FloatArray:
-        """Corrected pixels (f, l, 2 * cameras)."""
-        flat = self._pixels.reshape(-1, self._rig.cameras, 2)
-        moved = displacements(self._rig, flat) @ correction
-        return np.asarray(self._raw() - moved.reshape(self._raw().shape))
+        return self._pixels.reshape(-1, 2 * self._rig.cameras)
 
     def _local(self, state: _State) -> FloatArray:
-        """Points (f, l, 3) in the frames' cameras; out of view ones somewhere ahead."""
-        local = np.stack([transform_to_camera(wTc, state.points) for wTc in state.poses])
-        return np.where(self._seen[..., None], local, [0.0, 0.0, 1.0])
+        """Points (m, 3) in the cameras that see them."""
+        turn, place = state.poses[:, :3, :3], state.poses[:, :3, 3]
+        off = state.points[self._landmark] - place[self._frame]
+        return np.asarray((off[:, None] @ turn[self._frame])[:, 0])
 
     def _residuals(self, state: _State) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Predicted less raw pixels (f, l, 2 * cameras) in sigmas, depths, and displacements.
+        """Predicted less raw pixels (m, 2 * cameras) in sigmas, depths (m,), and displacements.
 
         These are taken at the prediction: a measured pixel's noise would correlate with them, and
         windows without end would agree on a wrong lens.
         """
         local = self._local(state)
-        safe = np.where(local[..., 2:] > _NEAREST_M, local, [0.0, 0.0, 1.0])
-        exact = project(self._rig, safe.reshape(-1, 3)) @ self._model.T
+        safe = np.where(local[:, 2:] > _NEAREST_M, local, [0.0, 0.0, 1.0])
+        exact = project(self._rig, safe) @ self._model.T
         unit = displacements(self._rig, exact.reshape(-1, self._rig.cameras, 2))
-        unit = unit.reshape(*self._seen.shape, *unit.shape[1:])
-        predicted = exact.reshape(self._raw().shape) + unit @ state.correction
-        residual = (predicted - self._raw()) / self._sigma
-        return residual * self._seen[..., None], local[..., 2], unit
+        residual = (exact + unit @ state.correction - self._raw()) / self._sigma
+        return residual, local[:, 2], unit
 
     def _cost(self, state: _State, around: FloatArray, prior: FloatArray) -> float:
         residual, depth, _ = self._residuals(state)
-        if (depth[self._seen] < _NEAREST_M).any():
+        if (depth < _NEAREST_M).any():
             return np.inf
         off = state.correction - around
-        squared = (residual**2).sum(axis=2) / _KERNEL_WIDTH**2
+        squared = (residual**2).sum(axis=1) / _KERNEL_WIDTH**2
         return float(_KERNEL_WIDTH**2 * np.log1p(squared).sum() + off @ prior @ off)
 
     def _minimise(
@@ -217,31 +206,52 @@ class RigAlignment:
 
     def _linearise(self, state: _State) -> _Normal:
         residual, _, unit = self._residuals(state)
-        frames, landmarks = self._seen.shape
-        squared = (residual**2).sum(axis=2)
-        weight = self._seen / (1.0 + squared / _KERNEL_WIDTH**2)
-        local = self._local(state).reshape(-1, 3)
-        by_local = self._model @ projection_jacobian(self._rig, local) / self._sigma
-        by_pose = (by_local @ point_pose_jacobian(local)).reshape(frames, landmarks, -1, 6)
-        by_local = by_local.reshape(frames, landmarks, -1, 3)
-        by_point = by_local @ np.swapaxes(state.poses[:, None, :3, :3], 2, 3)
-        by_rig = unit / self._sigma
-        weighted = weight[..., None] * residual
-        joint = np.concatenate([by_pose, by_rig], axis=3)
-        left = np.swapaxes(weight[..., None, None] * joint, 2, 3)
-        blocks, crossing = left @ joint, left @ by_point
-        gradient = np.einsum("flai,fla->fi", joint, weighted)
-        point_left = np.swapaxes(weight[..., None, None] * by_point, 2, 3)
-        curvature = (point_left @ by_point).sum(axis=0)
+        squared = (residual**2).sum(axis=1)
+        root = 1.0 / (self._sigma * np.sqrt(1.0 + squared / _KERNEL_WIDTH**2))
+        local = self._local(state)
+        by_local = root[:, None, None] * (self._model @ projection_jacobian(self._rig, local))
+        by_pose = by_local @ point_pose_jacobian(local)
+        by_point = by_local @ np.swapaxes(state.poses[:, :3, :3], 1, 2)[self._frame]
+        joint = np.concatenate([by_pose, root[:, None, None] * unit], axis=2)
+        weighted = self._sigma * root[:, None] * residual
+        hessian, gradient = self._of_frames(joint, weighted)
+        point_left = np.swapaxes(by_point, 1, 2)
+        curvature = np.add.reduceat(point_left @ by_point, self._first)
         curvature += 1e-9 * np.trace(curvature, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        point_gradient = np.einsum("flai,fla->li", by_point, weighted)
-        hessian, gradient = _assembled(blocks.sum(axis=1), gradient)
-        coupling = _coupling(crossing)
+        pull = np.add.reduceat((point_left @ weighted[:, :, None])[..., 0], self._first)
+        coupling = self._coupling(np.swapaxes(joint, 1, 2) @ by_point)
         inverse = np.linalg.inv(curvature)
-        eliminated = np.einsum("nlj,ljk->nlk", coupling, inverse).reshape(len(gradient), -1)
-        hessian -= eliminated @ coupling.reshape(len(gradient), -1).T
-        gradient = gradient - eliminated @ point_gradient.ravel()
-        return _Normal(hessian, gradient, inverse, coupling, point_gradient)
+        eliminated = coupling @ inverse
+        flat = np.swapaxes(coupling, 1, 2).reshape(-1, len(gradient))
+        hessian -= np.swapaxes(eliminated, 1, 2).reshape(-1, len(gradient)).T @ flat
+        gradient = gradient - np.einsum("lnj,lj->n", eliminated, pull)
+        return _Normal(hessian, gradient, inverse, coupling, pull)
+
+    def _of_frames(self, joint: FloatArray, weighted: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Joint Hessian and gradient before points are eliminated; the first pose is held."""
+        frames, p = len(self._poses), joint.shape[2] - 6
+        size = 6 * (frames - 1)
+        hessian, out = np.zeros((size + p, size + p)), np.zeros(size + p)
+        for k in range(frames):
+            own = self._frame == k
+            jacobian = joint[own].reshape(-1, 6 + p)
+            block, gradient = jacobian.T @ jacobian, jacobian.T @ weighted[own].ravel()
+            hessian[size:, size:] += block[6:, 6:]
+            out[size:] += gradient[6:]
+            if k:
+                at = slice(6 * k - 6, 6 * k)
+                hessian[at, at], out[at] = block[:6, :6], gradient[:6]
+                hessian[at, size:], hessian[size:, at] = block[:6, 6:], block[6:, :6]
+        return hessian, out
+
+    def _coupling(self, crossing: FloatArray) -> FloatArray:
+        """Points against poses 1.. and correction (l, n, 3), from observations (m, 6 + p, 3)."""
+        landmarks, later = len(self._first), len(self._poses) - 1
+        poses = np.zeros((landmarks, later, 6, 3))
+        moving = self._frame > 0
+        poses[self._landmark[moving], self._frame[moving] - 1] = crossing[moving, :6]
+        rig = np.add.reduceat(crossing[:, 6:], self._first)
+        return np.concatenate([poses.reshape(landmarks, 6 * later, 3), rig], axis=1)
 
     def _step(
         self, state: _State, normal: _Normal, around: FloatArray, prior: FloatArray, damping: float
@@ -255,7 +265,7 @@ class RigAlignment:
             step = np.asarray(-np.linalg.solve(hessian, gradient), np.float64)
         except np.linalg.LinAlgError:
             return None
-        pull = normal.point_gradient + np.einsum("nlj,n->lj", normal.coupling, step)
+        pull = normal.point_gradient + np.einsum("lnj,n->lj", normal.coupling, step)
         points = state.points - np.einsum("lij,lj->li", normal.point_inverse, pull)
         moves = step[:-p].reshape(-1, 6)
         poses = np.stack(
@@ -263,26 +273,3 @@ class RigAlignment:
             + [moved_apart(T, xi) for T, xi in zip(state.poses[1:], moves, strict=True)]
         )
         return _State(poses, points, state.correction + step[-p:])
-
-
-def _assembled(blocks: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Joint Hessian and gradient from those of the frames (f, 6 + p, 6 + p); the first is held."""
-    frames, p = len(blocks), blocks.shape[1] - 6
-    size = 6 * (frames - 1)
-    hessian, out = np.zeros((size + p, size + p)), np.zeros(size + p)
-    for k in range(1, frames):
-        at = slice(6 * k - 6, 6 * k)
-        hessian[at, at] = blocks[k, :6, :6]
-        hessian[at, size:] = blocks[k, :6, 6:]
-        hessian[size:, at] = blocks[k, 6:, :6]
-        out[at] = gradient[k, :6]
-    hessian[size:, size:] = blocks[:, 6:, 6:].sum(axis=0)
-    out[size:] = gradient[:, 6:].sum(axis=0)
-    return hessian, out
-
-
-def _coupling(crossing: FloatArray) -> FloatArray:
-    """Poses 1.. and correction against points (n, l, 3) from (f, l, 6 + p, 3)."""
-    poses = np.moveaxis(crossing[1:, :, :6], 2, 1).reshape(-1, crossing.shape[1], 3)
-    rig = np.moveaxis(crossing[:, :, 6:].sum(axis=0), 1, 0)
-    return np.concatenate([poses, rig])
