@@ -1,4 +1,4 @@
-"""Writes the pages that are made from code: settings, command line, and tutorials from examples.
+"""Writes the pages that are made from code: settings, command line, experiments, and tutorials.
 
 Run `python -m scripts.make_reference` from the root of the checkout; a test fails while a page is
 stale.
@@ -15,6 +15,7 @@ import typer
 from typer.core import TyperArgument, TyperOption
 
 from fgslam.cli.main import app
+from scripts.reference_experiments import experiments_page
 from scripts.reference_settings import item, paragraph, settings_page
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -43,6 +44,7 @@ def pages() -> dict[str, Callable[[], str]]:
     made: dict[str, Callable[[], str]] = {
         "reference/settings.md": settings_page,
         "reference/commands.md": commands_page,
+        "reference/experiments.md": experiments_page,
     }
     for example in sorted(EXAMPLES.glob("*.py")):
         made[f"tutorials/{example.stem}.md"] = partial(tutorial_page, example.stem)

@@ -30,8 +30,7 @@ FIRST = {
     "measurements",
     "seed": "of everything random in the run",
     "frontend.ego_motion.dof": "3 on a flat floor, 5 at a fixed height, 6 for a rig in the hand",
-    "frontend.stereo.pixel_sigma, frontend.stereo.max_disparity_px": "standard deviation of a "
-    "feature's place in the image; what is nearer than this disparity is not matched",
+    "frontend.stereo.pixel_sigma": "standard deviation of a feature's place in the image",
     "estimator.noise_factor": "above 1 on images, whose errors persist from frame to frame",
     "estimator.lag_frames, estimator.keyframe_every": "how far back `fixed_lag` looks; every how "
     "many frames `isam2` keeps one",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -22,8 +23,13 @@ class StereoSettings:
         float, Field(gt=0.0, description="smallest disparity; below it depth is meaningless")
     ] = 1.0
     max_disparity_px: Annotated[
-        float, Field(gt=0.0, description="largest disparity; 20 in IJRR 2002 (1.4 m at 320x240)")
-    ] = 40.0
+        float | None,
+        Field(
+            gt=0.0,
+            description="largest disparity; 20 in IJRR 2002 (1.4 m at 320x240). null: any, "
+            "descriptors tell the right partner",
+        ),
+    ] = None
     scale_ratio: Annotated[
         float, Field(gt=1.0, description="largest ratio of scales; one level is 1.5 in IJRR 2002")
     ] = 1.5
@@ -46,6 +52,11 @@ class StereoSettings:
         Field(gt=0.0, description="standard deviation of a SIFT coordinate, pixels"),
     ] = 0.3
 
+    @property
+    def largest_disparity_px(self) -> float:
+        """Largest disparity; infinite without a limit."""
+        return math.inf if self.max_disparity_px is None else self.max_disparity_px
+
 
 @dataclass(frozen=True, config=STRICT)
 class MapMatchingSettings:
@@ -62,16 +73,17 @@ class MapMatchingSettings:
     refine: Annotated[
         bool,
         Field(
-            description="after a first pose, match again around it, with the smaller uncertainty"
+            description="match again around the first pose where that has moved the landmarks far "
+            "in the image, with its smaller uncertainty"
         ),
-    ] = False
+    ] = True
     rescue: Annotated[
         bool,
         Field(
             description="where too few match, search the largest window by "
             "descriptor before falling back to the odometry; needs appearance.mode descriptor"
         ),
-    ] = False
+    ] = True
 
 
 @dataclass(frozen=True, config=STRICT)

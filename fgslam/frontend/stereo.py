@@ -53,7 +53,7 @@ class StereoMatcher:
         s = self._settings
         i, j = pairs_within(right.xy[:, 1], s.epipolar_px, left.xy[:, 1])
         disparity = left.xy[j, 0] - right.xy[i, 0]
-        ok = (disparity >= s.min_disparity_px) & (disparity <= s.max_disparity_px)
+        ok = (disparity >= s.min_disparity_px) & (disparity <= s.largest_disparity_px)
         i, j = i[ok], j[ok]
         ok = alike(
             (right.scale[i], left.scale[j]),

@@ -146,7 +146,9 @@ def judge_matches(
     return (
         *findings,
         *check_stereo_counts(counts, frames),
-        *check_disparity_gates(along[near], settings.min_disparity_px, settings.max_disparity_px),
+        *check_disparity_gates(
+            along[near], settings.min_disparity_px, settings.largest_disparity_px
+        ),
         *_judge_top(looks, frames, rig),
     )
 

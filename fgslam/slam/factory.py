@@ -74,7 +74,7 @@ def make_stereo_matcher(rig: CameraRig, settings: FrontendSettings) -> StereoMat
 
 def make_tracker(rig: CameraRig, settings: FrontendSettings) -> LandmarkTracker:
     """The landmark database with its matchers and the ego-motion."""
-    database = LandmarkDatabase(rig, settings.database, settings.stereo.max_disparity_px)
+    database = LandmarkDatabase(rig, settings.database, settings.stereo.largest_disparity_px)
     solver = EgoMotionSolver(rig, settings.ego_motion)
     matcher = MapMatcher(settings.matching, settings.appearance)
     return LandmarkTracker(rig, database, matcher, solver)

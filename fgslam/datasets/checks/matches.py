@@ -340,7 +340,7 @@ def check_disparity_gates(
     Args:
         disparities: (n,) of matches found without these gates, pixels.
         smallest: least disparity that the front-end accepts.
-        largest: the greatest.
+        largest: the greatest; infinite without a limit.
     """
     if len(disparities) < _FEWEST_MATCHES:
         return ()

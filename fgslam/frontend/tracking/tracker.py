@@ -9,11 +9,13 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.core.features import StereoFeatures
+from fgslam.core.geometry import in_front, project, transform_to_camera
 from fgslam.core.measurements import Observations
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.map_matching import (
+    REFINE_SHIFT_PX,
     ExpectedLandmarks,
     MapMatcher,
     MapMatches,
@@ -88,18 +90,31 @@ class LandmarkTracker:
     def track(
         self, prediction: Prediction, landmarks: LandmarkMap, features: StereoFeatures
     ) -> Tracked:
-        """Matches expected landmarks and solves for the pose; wider or narrower again if set so."""
+        """Matches expected landmarks and solves for the pose; wider or anew around it if set so."""
         around = Prediction(self._ego_motion.floor.constrain(prediction.wTc), prediction.covariance)
         tracked = self._attempt(prediction, around, landmarks, features)
         if self._matcher.rescues and not tracked.ego_motion.status.measured:
             rescued = self._attempt(prediction, around, landmarks, features, anywhere=True)
             # A failed rescue proves nothing about what is new: the first attempt stands.
             tracked = rescued if rescued.ego_motion.status.measured else tracked
-        if self._matcher.refines and tracked.ego_motion.status.measured:
+        if self._matcher.refines and self._moved_far(tracked, landmarks):
             around = Prediction(tracked.ego_motion.wTc, tracked.ego_motion.covariance)
             refined = self._attempt(prediction, around, landmarks, features)
             tracked = refined if refined.ego_motion.status.measured else tracked
         return tracked
+
+    def _moved_far(self, tracked: Tracked, landmarks: LandmarkMap) -> bool:
+        """Whether the pose found shifts the expected landmarks out of the middle of their windows.
+
+        Where it does not, the windows around the prediction held what there is to match.
+        """
+        if not tracked.ego_motion.status.measured:
+            return False
+        expected = tracked.expected
+        points = transform_to_camera(tracked.ego_motion.wTc, landmarks.positions[expected.rows])
+        ahead = in_front(self._rig, points)
+        shift = project(self._rig, points[ahead]) - expected.measurement[ahead]
+        return bool(np.median(np.abs(shift[:, :2]).max(axis=1)) > REFINE_SHIFT_PX)
 
     def track_anew(
         self, around: Prediction, landmarks: LandmarkMap, features: StereoFeatures

@@ -174,7 +174,7 @@ class TrueSights:
         self._rig = sequence.rig
         self._database: LandmarkDatabase | None = None
         if self._sequence is not None:
-            largest = frontend.stereo.max_disparity_px
+            largest = frontend.stereo.largest_disparity_px
             self._database = LandmarkDatabase(sequence.rig, frontend.database, largest)
             self._database.load(saved)
 

@@ -10,8 +10,9 @@ import typer
 from fgslam.cli.main import app
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.config_models import HOMING_TASKS, TASKS, LocalisationConfig
-from scripts import reference_settings
+from scripts import reference_experiments, reference_settings
 from scripts.make_reference import DOCS, EXAMPLES, commands_page, pages, tutorial_page
+from scripts.reference_experiments import unreasoned
 from scripts.reference_settings import WIDTH, item, settings_page
 
 PAGES = pages()
@@ -31,6 +32,19 @@ def test_committed_page_is_current(path: str) -> None:
 @pytest.mark.parametrize("path", PAGES)
 def test_lines_fit(path: str) -> None:
     assert max(map(len, PAGES[path]().splitlines())) <= WIDTH
+
+
+def test_no_experiment_tunes_what_the_defaults_settle() -> None:
+    """Features, matching, ego-motion: a setting of an experiment needs a reason on the page."""
+    assert unreasoned() == []
+
+
+def test_a_number_that_is_tuned_to_a_recording_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    tuned = {"dataset": {"kind": "euroc"}, "frontend": {"sift": {"base_sigma_px": 2.0}}}
+    others = {"dataset": {"kind": "euroc"}, "compare": [{"kind": "isam2", "gate_px": 3.0}]}
+    files = [("walk", tuned), ("flight", others), ("lab_paper", tuned)]
+    monkeypatch.setattr(reference_experiments, "slam_experiments", lambda: iter(files))
+    assert unreasoned() == ["walk: frontend.sift.base_sigma_px", "flight: compare.gate_px"]
 
 
 def test_no_tutorial_stands_without_its_example() -> None:
