@@ -16,7 +16,7 @@ from fgslam.frontend.tracking.map_matching import ExpectedLandmarks, MapMatcher,
 
 PAPER = AppearanceSettings(mode="paper")
 DESCRIPTOR = AppearanceSettings(mode="descriptor", max_distance=250.0, ratio=0.85)
-FIXED = MapMatchingSettings(widen_sigmas=0.0)
+FIXED = MapMatchingSettings(widen_sigmas=0.0, refine=False, rescue=False)
 AT = (100.0, 80.0, 10.0)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from fgslam.frontend.settings import (
 )
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking import map_matching
-from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
+from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
 from fgslam.slam.factory import make_tracker
 
 COUNT = 60
@@ -258,6 +259,25 @@ def test_refining_matches_again_around_the_pose_found() -> None:
         assert tracked.ego_motion.status is EgoMotionStatus.OK
         matches[refine] = len(tracked.matches.landmarks)
     assert matches[True] > matches[False] + 5
+
+
+@pytest.mark.parametrize(("sideways_m", "attempts"), [(0.0, 1), (0.005, 1), (0.03, 2)])
+def test_a_frame_is_matched_anew_only_where_the_prediction_was_off(
+    sideways_m: float, attempts: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matching = dataclasses.replace(SETTINGS.matching, refine=True)
+    scene = Scene(dataclasses.replace(SETTINGS, matching=matching))
+    scene.step(np.eye(4))
+    made: list[None] = []
+    attempt = scene.tracker._attempt
+
+    def counted(*given: Any, **named: Any) -> Tracked:
+        made.append(None)
+        return attempt(*given, **named)
+
+    monkeypatch.setattr(scene.tracker, "_attempt", counted)
+    scene.step(np.eye(4), predicted=g.se3_exp(np.array([0.0, 0.0, 0.0, sideways_m, 0.0, 0.0])))
+    assert len(made) == attempts
 
 
 def test_tracking_alone_changes_nothing() -> None:
