@@ -20,8 +20,8 @@ from fgslam.core.settings import make_settings
 from fgslam.frontend.features.images import colour_image
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings
-from fgslam.frontend.homing.homing_vector import pair_generator, vector_between
 from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.view_pairs import pair_generator, vector_between
 from fgslam.homing.command import Drive, DriveCommand
 from fgslam.homing.front_end import make_front_end, unusable
 from fgslam.homing.path_following import HomingChain, LegOutcome

@@ -12,7 +12,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT
-from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
+from fgslam.frontend.features.settings import OmniFeatureSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings
 
 
@@ -102,8 +102,7 @@ class FrontEndSettings:
 
 
 DRIVING = FrontEndSettings(
-    OmniFeatureSettings(matching=OmniMatchingSettings(ratio=0.9)),
-    HomingVectorSettings(
+    homing_vector=HomingVectorSettings(
         samples=600,
         confidence=0.999999,
         rival_angle_deg=40.0,

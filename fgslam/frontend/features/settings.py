@@ -119,10 +119,10 @@ class OmniMatchingSettings:
         Field(
             gt=0.0,
             le=1.0,
-            description="SIFT: nearest over second nearest distance below this; high, as the "
-            "colour filter and the planar gates take the wrong ones",
+            description="SIFT: nearest over second nearest distance below this; high, as colour "
+            "and planar gates take wrong ones, and barely distinct ones weigh little",
         ),
-    ] = 0.8
+    ] = 0.9
     root: Annotated[
         bool,
         Field(description="compare square roots of descriptors (Arandjelovic, Zisserman 2012)"),

@@ -11,23 +11,21 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.homing import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
+from fgslam.core.homing import BearingMatches, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import unit, wrap
-from fgslam.frontend.features.settings import OmniMatchingSettings
 from fgslam.frontend.homing.matching import (
     COMMON_CHANCE,
     gain,
     log_likelihood_ratio,
-    match_features,
     right_probability,
 )
 from fgslam.frontend.homing.refinement import HomingRefinement, Refined
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view_geometry import EpipolarTest, TwoPointSamples, solve_two_point
 
-_LEAST_PARALLAX_DEG = 3.0  # of two rays; below, the signs of the distances are noise
+LEAST_PARALLAX = np.deg2rad(3.0)  # of two rays; below, the signs of the distances are noise
 
-_INLIER_SIGMAS = 3.0  # normalised epipolar residual; right matches exceed it in 0.3 %
+INLIER_SIGMAS = 3.0  # normalised epipolar residual; right matches exceed it in 0.3 %
 _BATCH = 50  # samples between two looks at the confidence
 _MAX_LOG_RATIO_SIGMA = 0.7  # of ln rho: matches near the horizon support, but are not sampled
 _SHUFFLES = 10  # times the matches are paired wrongly to learn what chance supports
@@ -50,35 +48,16 @@ def estimate_homing_vector(
         settings: number of samples, thresholds.
         rng: chooses the samples; the same generator state gives the same answer.
     """
-    if len(matches) < settings.min_inliers:
-        return Refusal(
-            RefusalReason.TOO_FEW_MATCHES,
-            f"{len(matches)} matches, of {settings.min_inliers} needed",
-        )
-    search = _Search(matches, settings, rng)
-    candidates = search.candidates()
-    if not len(candidates):
-        return Refusal(
-            RefusalReason.TOO_FEW_INLIERS, "no pair of matches agrees on any homing vector"
-        )
-    refined = search.refined(candidates)
-    best = refined[0]
-    at_target = search.turn_at_target(best)
-    if at_target is not None:
-        return at_target
-    competitors = [r for r in refined[1:] if search.differ(r, best)]
-    covariance = search.covariance(refined)
-    refusal = search.refusal(best, competitors, float(np.sqrt(covariance[0, 0])))
-    if refusal is not None:
-        return refusal
-    theta, psi = (float(v) for v in best.parameters[:2])
-    support = max((search.independent_inliers(r.inliers) for r in competitors), default=0)
-    floor = np.deg2rad([settings.direction_floor_deg, settings.rotation_floor_deg])
-    return TwoViewVector(theta, psi, covariance + np.diag(floor**2), best.inliers, support)
+    return HomingSearch(matches, settings, rng).answer()
 
 
-class _Search:
-    """One search: matches prepared for sampling, testing and refining."""
+class HomingSearch:
+    """One search: matches prepared for sampling, testing and refining.
+
+    Attributes:
+        direction_sigma: of the best solution, radians, without the settings' floor; set by
+            :meth:`answer`.
+    """
 
     def __init__(
         self, matches: BearingMatches, settings: HomingVectorSettings, rng: np.random.Generator
@@ -86,24 +65,53 @@ class _Search:
         self._matches = matches
         self._settings = settings
         self._rng = rng
-        self._least_parallax = np.deg2rad(_LEAST_PARALLAX_DEG)
         tilt = np.deg2rad(settings.tilt_sigma_deg)
         self._test = EpipolarTest.of(matches, tilt)
         self._refinement = HomingRefinement(
-            matches, (tilt, settings.height_sigma), _INLIER_SIGMAS, self._least_parallax
+            matches, (tilt, settings.height_sigma), INLIER_SIGMAS, LEAST_PARALLAX
         )
         self._cells = _cells(matches)
         self._tilt = tilt
         self._right = right_probability(matches)
+        self._found = np.empty((4, 0))
+        self.direction_sigma = np.inf
+
+    def answer(self) -> TwoViewVector | Refusal:
+        """The homing vector that the matches support best, or why there is none."""
+        s, count = self._settings, len(self._matches)
+        if count < s.min_inliers:
+            text = f"{count} matches, of {s.min_inliers} needed"
+            return Refusal(RefusalReason.TOO_FEW_MATCHES, text)
+        self._found = self._sampled()
+        candidates = self.different(_REFINED)
+        if not len(candidates):
+            text = "no pair of matches agrees on any homing vector"
+            return Refusal(RefusalReason.TOO_FEW_INLIERS, text)
+        refined = self.refined(candidates)
+        at_target = self.turn_at_target(refined[0])
+        return self._judged(refined) if at_target is None else at_target
+
+    def _judged(self, refined: list[Refined]) -> TwoViewVector | Refusal:
+        s, best = self._settings, refined[0]
+        competitors = [r for r in refined[1:] if self.differ(r, best)]
+        covariance = self.covariance(refined)
+        self.direction_sigma = float(np.sqrt(covariance[0, 0]))
+        refusal = self.refusal(best, competitors, self.direction_sigma)
+        if refusal is not None:
+            return refusal
+        theta, psi = (float(v) for v in best.parameters[:2])
+        support = max((self.independent_inliers(r.inliers) for r in competitors), default=0)
+        floor = np.deg2rad([s.direction_floor_deg, s.rotation_floor_deg])
+        return TwoViewVector(theta, psi, covariance + np.diag(floor**2), best.inliers, support)
 
     # ----------------------------------------------------------------------------------------
     # Sampling
 
-    def candidates(self) -> FloatArray:
-        """(c, 2) direction and rotation of the best supported, different hypotheses, best first."""
+    def _sampled(self) -> FloatArray:
+        """(4, c) hypotheses as of :meth:`_hypotheses`, until a better one is unlikely."""
         log_ratio, sigma_log, eligible = _log_ratios(self._matches, self._tilt)
         if len(eligible) < 2:
-            return np.empty((0, 2))
+            return self._found
         found: list[FloatArray] = []
         drawn, best = 0, 0.0
         while drawn < self._settings.samples and drawn < self._needed(best):
@@ -114,7 +122,7 @@ class _Search:
             if solutions.shape[1]:
                 found.append(solutions)
                 best = max(best, float(np.max(solutions[2])))
-        return self._different(np.hstack(found)) if found else np.empty((0, 2))
+        return np.hstack(found) if found else self._found
 
     def _needed(self, share: float) -> float:
         """Samples until one of two inliers was drawn with the wanted confidence.
@@ -143,24 +151,22 @@ class _Search:
             )
         )
         direction, rotation = solved.direction[solved.valid], solved.rotation[solved.valid]
-        inliers, residuals = self._test.inliers(
-            direction, rotation, _INLIER_SIGMAS, self._least_parallax
-        )
+        inliers, residuals = self._test.inliers(direction, rotation, INLIER_SIGMAS, LEAST_PARALLAX)
         share = self._right @ inliers / np.sum(self._right)
         return np.stack([direction, rotation, share, self._score(inliers, residuals)])
 
     def _score(self, inliers: BoolArray, residuals: FloatArray) -> FloatArray:
         """(c,) log-likelihoods of hypotheses, up to a constant, of (n, c) residuals."""
-        gains = gain(residuals, _INLIER_SIGMAS, COMMON_CHANCE)
+        gains = gain(residuals, INLIER_SIGMAS, COMMON_CHANCE)
         odds = (self._right / (1.0 - self._right))[:, None]
         return np.asarray(np.sum(np.where(inliers, np.log1p(odds * gains), 0.0), axis=0))
 
-    def _different(self, hypotheses: FloatArray) -> FloatArray:
-        """(c, 2) the best of each group of like hypotheses (4, m)."""
-        ordered = hypotheses[:, np.argsort(-hypotheses[3], kind="stable")]
+    def different(self, most: int) -> FloatArray:
+        """(c, 2) direction and rotation of the best supported, different hypotheses, best first."""
+        ordered = self._found[:, np.argsort(-self._found[3], kind="stable")]
         chosen: list[int] = []
         open_ = np.ones(ordered.shape[1], dtype=np.bool_)
-        while len(chosen) < _REFINED and np.any(open_):
+        while len(chosen) < most and np.any(open_):
             k = int(np.argmax(open_))
             chosen.append(k)
             open_ &= _angle_apart(ordered[:2], ordered[:2, k : k + 1]) > _ALIKE
@@ -270,13 +276,11 @@ class _Search:
         How often a wrong match agrees with this hypothesis is read off wrong matches: the same
         features paired at random (an *a contrario* test, Moisan and Stival 2004).
         """
-        n, sigmas = len(self._matches), _INLIER_SIGMAS
+        n, sigmas = len(self._matches), INLIER_SIGMAS
         shuffled = np.concatenate([self._rng.permutation(n) for _ in range(_SHUFFLES)])
         every = np.tile(np.arange(n), _SHUFFLES)
         wrong = EpipolarTest.of(paired_anew(self._matches, every, shuffled), self._tilt)
-        good, _ = wrong.inliers(
-            best.parameters[:1], best.parameters[1:2], sigmas, self._least_parallax
-        )
+        good, _ = wrong.inliers(best.parameters[:1], best.parameters[1:2], sigmas, LEAST_PARALLAX)
         chance = (np.count_nonzero(good) + 1.0) / (len(good) + 2.0)
         gains = np.where(best.inliers, gain(best.residuals, sigmas, chance), 0.0)
         kept = _one_a_cell(gains, self._cells)
@@ -361,32 +365,3 @@ def paired_anew(matches: BearingMatches, first: IntArray, second: IntArray) -> B
         a.kind, a.index_a, b.index_b, a.bearing_a, a.elevation_a, b.bearing_b, b.elevation_b,
         np.column_stack([a.sigma[:, :2], b.sigma[:, 2:]]), a.quality,
     )  # fmt: skip
-
-
-# --------------------------------------------------------------------------------------------
-# From the features of two images
-
-
-def vector_between(
-    present: OmniFeatures,
-    target: OmniFeatures,
-    matching: OmniMatchingSettings,
-    settings: HomingVectorSettings,
-    rng: np.random.Generator,
-) -> tuple[TwoViewVector | Refusal, BearingMatches]:
-    """The homing vector from one image's place to another's, and the tentative matches.
-
-    Args:
-        present: features of the image where the robot is.
-        target: of the one where it is to go.
-        matching: of features.
-        settings: of the search, and when it refuses.
-        rng: chooses RANSAC's samples.
-    """
-    matches = match_features(present, target, matching)
-    return estimate_homing_vector(matches, settings, rng), matches
-
-
-def pair_generator(seed: int, a: int, b: int) -> np.random.Generator:
-    """What RANSAC draws from for the pair of images (a, b), whichever process and order."""
-    return np.random.default_rng((seed, a, b))

@@ -63,14 +63,21 @@ def match_sift(
 ) -> BearingMatches:
     """Mutual nearest descriptors that are distinct, planar and of one colour."""
     if not len(a) or not len(b):
-        return _sift_matches(a, b, np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
-    squared = _squared_distances(a.descriptors, b.descriptors, settings.root)
-    if settings.planar_gates:
-        _forbid_impossible(squared, a, b, settings)
-    i, j, ratio = _mutual_nearest(squared)
+        return sift_matches(a, b, np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
+    i, j, ratio = _mutual_nearest(planar_distances(a, b, settings))
     colour = np.linalg.norm(a.colour[i] - b.colour[j], axis=1)
     keep = (ratio < settings.ratio) & (colour < settings.max_colour_distance)
-    return _sift_matches(a, b, i[keep], j[keep], 1.0 - ratio[keep])
+    return sift_matches(a, b, i[keep], j[keep], 1.0 - ratio[keep])
+
+
+def planar_distances(
+    a: UprightFeatures, b: UprightFeatures, settings: OmniMatchingSettings
+) -> Float32Array:
+    """(n, m) squared distances of descriptors, infinite where no motion on the plane explains."""
+    squared = _squared_distances(a.descriptors, b.descriptors, settings.root)
+    if settings.planar_gates:
+        _forbid_impossible(squared, a, b)
+    return squared
 
 
 def _squared_distances(a: ByteArray, b: ByteArray, root: bool) -> Float32Array:
@@ -91,9 +98,7 @@ def _comparable(descriptors: ByteArray, root: bool) -> Float32Array:
     return np.asarray(np.sqrt(values / total), np.float32)
 
 
-def _forbid_impossible(
-    squared: Float32Array, a: UprightFeatures, b: UprightFeatures, settings: OmniMatchingSettings
-) -> None:
+def _forbid_impossible(squared: Float32Array, a: UprightFeatures, b: UprightFeatures) -> None:
     """Sets distances of candidates to infinity that no planar motion explains."""
     margin = np.deg2rad(_HORIZON_MARGIN_DEG)
     side_a, side_b = _side(a.elevation, margin), _side(b.elevation, margin)
@@ -132,9 +137,10 @@ def _mutual_nearest(squared: Float32Array) -> tuple[IntArray, IntArray, FloatArr
     return every[keep], j[keep], np.minimum(np.sqrt(best / second), 1.0)
 
 
-def _sift_matches(
+def sift_matches(
     a: UprightFeatures, b: UprightFeatures, i: IntArray, j: IntArray, quality: FloatArray
 ) -> BearingMatches:
+    """Features i (k,) of one view with features j of the other."""
     variances = [
         c[k, axis, axis] for c, k in ((a.covariance, i), (b.covariance, j)) for axis in (0, 1)
     ]

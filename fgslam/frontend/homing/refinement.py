@@ -63,6 +63,7 @@ class HomingRefinement:
         prior: tuple[float, float],
         inlier_sigmas: float,
         least_parallax: float,
+        right: FloatArray | None = None,
     ) -> None:
         """Prepares the matches.
 
@@ -71,6 +72,7 @@ class HomingRefinement:
             prior: standard deviations of the tilts (radians) and of the height (legs).
             inlier_sigmas: largest normalised residual of an inlier.
             least_parallax: radians; below, the signs of distances are noise.
+            right: (n,) probability of being right before any geometry; None: by kind and quality.
         """
         a = unit_rays(matches.bearing_a, matches.elevation_a)
         b = unit_rays(matches.bearing_b, matches.elevation_b)
@@ -85,7 +87,7 @@ class HomingRefinement:
         tilt_sigma, height_sigma = prior
         held = np.maximum([*[tilt_sigma] * 4, height_sigma], _LEAST_SIGMA)
         self._prior = np.concatenate([np.zeros(2), 1.0 / held**2])  # theta and psi are free
-        right = right_probability(matches)
+        right = right_probability(matches) if right is None else right
         self._odds = right / (1.0 - right)
         self._sigmas = inlier_sigmas
         self._least_parallax = least_parallax

@@ -59,6 +59,13 @@ class HomingVectorSettings:
     max_direction_sigma_deg: Annotated[
         float, Field(gt=0.0, description="less certain directions are refused")
     ] = 4.0
+    second_look: Annotated[
+        bool,
+        Field(
+            description="two images whose matches do not decide clearly are looked at again with "
+            "all candidate matches: wider baselines, for a third of a second a pair"
+        ),
+    ] = True
     direction_floor_deg: Annotated[
         float,
         Field(

@@ -18,7 +18,7 @@ from fgslam.core.errors import ConfigError, StoredMapError
 from fgslam.core.homing import OmniFeatures, Refusal, TwoViewVector
 from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.evaluation.metrics import JsonValue
-from fgslam.frontend.homing.homing_vector import vector_between
+from fgslam.frontend.homing.view_pairs import vector_between
 from fgslam.homing.link_consistency import InlierRows
 from fgslam.homing.links import Answer, Link, Pair
 from fgslam.homing.localisation import Localiser

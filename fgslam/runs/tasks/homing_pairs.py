@@ -116,7 +116,7 @@ def _reference(
 
 
 def never_refusing(settings: HomingVectorSettings) -> HomingVectorSettings:
-    """RANSAC's answer whatever speaks against it, but for the number of its inliers."""
+    """RANSAC's first answer whatever speaks against it, but for the number of its inliers."""
     return dataclasses.replace(
         settings,
         min_inliers=PLAIN_INLIERS,
@@ -124,6 +124,7 @@ def never_refusing(settings: HomingVectorSettings) -> HomingVectorSettings:
         rival_log_odds=0.0,
         max_direction_sigma_deg=180.0,
         at_target_parallax_deg=0.0,
+        second_look=False,
     )
 
 

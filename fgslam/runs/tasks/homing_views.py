@@ -28,9 +28,9 @@ from fgslam.datasets.opening import open_omni
 from fgslam.frontend.features.column_segments import empty_segments
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
-from fgslam.frontend.homing.homing_vector import pair_generator, vector_between
 from fgslam.frontend.homing.matching import plain_sift
 from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.view_pairs import pair_generator, vector_between
 from fgslam.report.content import Picture
 from fgslam.runs.engine import Context
 from fgslam.runs.units import Stage, in_blocks, interleaved
