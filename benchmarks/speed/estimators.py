@@ -31,8 +31,9 @@ from fgslam.backend.settings import (
     LandmarkKalmanSettings,
 )
 from fgslam.backend.smoothers.batch import BatchSolver
-from fgslam.backend.smoothers.marginals import marginals_of
+from fgslam.backend.smoothers.marginals import reduced
 from fgslam.backend.smoothers.smoother import Smoother
+from fgslam.backend.smoothers.whole_graph import WholeGraph
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.measurement_log import MeasurementLog
@@ -171,11 +172,12 @@ def all_marginals(repeats: int, seed: int = 0) -> dict[str, float]:
     """
     graph, start = problem(open_drive("lab_trials", BIG_MAP))
     values = minimum(graph, start)
-    keys = marginals_of(graph, values).landmark_keys
+    whole, state = WholeGraph.of(graph, values)
+    keys = np.array(whole.landmark_keys)
     sample = np.random.default_rng(seed).choice(keys, SAMPLE, replace=False)
 
     def at_once() -> FloatArray:
-        return marginals_of(graph, values).landmarks()
+        return reduced(whole.linear(state)).landmarks()
 
     s = interleaved({"all": lambda: cpu_seconds(at_once)}, repeats)["all"]
     built: list[Any] = []

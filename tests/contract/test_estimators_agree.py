@@ -40,6 +40,7 @@ from fgslam.backend.settings import (
 )
 from fgslam.backend.smoothers.isam2 import Isam2Solver
 from fgslam.backend.smoothers.refinement import Refined
+from fgslam.backend.smoothers.whole_graph import WholeGraph
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Estimate, Prediction
@@ -205,7 +206,7 @@ def own_values(solver: Isam2Solver) -> Refined:
     """The tree's own values as they are, without the last word that the estimate has."""
     values = gtsam.Values(solver._values)
     values.insert(solver._new_values)
-    return Refined(solver._builder.kept_factors(), values)
+    return Refined(*WholeGraph.of(solver._builder.kept_factors(), values, solver._builder.kernel))
 
 
 def test_isam2_converges_to_batch(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar
-
-import gtsam
-import numpy as np
+from typing import ClassVar
 
 from fgslam.backend.filters.loop_correction import Constraint
 from fgslam.backend.settings import BatchSettings, KernelSettings
 from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.backend.smoothers.loop_closing import solved
+from fgslam.backend.smoothers.marginals import reduced
 from fgslam.backend.smoothers.refinement import (
+    MINIMUM,
     WholeGraphSolver,
     graduated,
     trimmed,
-    with_kernel,
 )
 from fgslam.backend.smoothers.smoother import GraphProblem, MapSmoother
 from fgslam.backend.smoothers.solver import (
@@ -25,14 +23,11 @@ from fgslam.backend.smoothers.solver import (
     Smoothed,
     allowed_parts,
 )
+from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import reorthonormalise
 from fgslam.core.sensors import Sensor
-from fgslam.factors.graphs import pose_key, poses_of_frame, solver_parameters
-
-_MAX_ITERATIONS = 100  # a bound, for graphs that do not settle
-_RELATIVE_TOLERANCE = 1e-9  # of the cost; the estimate then moves by less than a micrometre
 
 
 def batch_smoother(
@@ -53,7 +48,8 @@ class BatchSolver(WholeGraphSolver):
 
     def __init__(self, problem: GraphProblem, settings: BatchSettings) -> None:
         """Nothing to solve yet."""
-        super().__init__(problem.builder, problem.floor)
+        kernel = KernelSettings() if settings.method == "gnc" else None
+        super().__init__(problem.builder, problem.floor, kernel)
         self._settings = settings
 
     def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
@@ -72,30 +68,23 @@ class BatchSolver(WholeGraphSolver):
 
     def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
         """Tracks on from the solution; where nothing moves, the next one takes the loop in."""
-        found = self._accepted(
-            loop, drive, what, self._factors, lambda graph: solved(graph, self._values)
-        )
+        found = self._accepted(loop, drive, what, solved)
         if found is None:
             return None
         if found.values is None:
             return ClosedLoop()
         self._values = found.values
-        last = self._builder.frames[-1]
-        here = reorthonormalise(poses_of_frame(self._values, last))
-        marginals = gtsam.Marginals(self._factors(), self._values)
-        covariance = np.asarray(marginals.marginalCovariance(pose_key(last)))
+        graph, state = WholeGraph.of(
+            self._builder.kept_factors(), self._values, self._builder.kernel
+        )
+        covariance = reduced(graph.linear(state)).poses()[-1]
+        here = reorthonormalise(state.poses[-1])
         return self._after_loop(allowed_parts(self._floor, here[None], covariance[None])[0])
 
-    def _factors(self) -> Any:
-        """The graph as it is solved when a loop is judged."""
-        graph = self._builder.kept_factors()
-        return with_kernel(graph) if self._settings.method == "gnc" else graph
-
-    def _minimise(self, graph: Any, values: Any) -> tuple[Any, Any]:
+    def _minimise(self, graph: WholeGraph, state: State) -> tuple[State, WholeGraph]:
         """Values at the minimum, and the factors that count there."""
-        params = solver_parameters(_MAX_ITERATIONS, _RELATIVE_TOLERANCE)
         if self._settings.method == "gnc":
-            return graduated(graph, values, params, self._settings.noise_factor)
+            return graduated(graph, state, MINIMUM, self._settings.noise_factor)
         if self._settings.trim:
-            return trimmed(graph, values, params, self._settings.noise_factor)
-        return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize(), graph
+            return trimmed(graph, state, MINIMUM, self._settings.noise_factor)
+        return graph.minimum(state, MINIMUM.iterations, MINIMUM.tolerance), graph

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
-from fgslam.backend.settings import GraphSettings
+from fgslam.backend.settings import GraphSettings, KernelSettings
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting, Track
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
@@ -88,6 +88,7 @@ class GraphBuilder:
         graph: all factors; one taken out leaves an empty slot.
         admission: the landmarks, and which of them the graph holds.
         frames: those whose poses are in the graph, in time order.
+        kernel: around each observation, in the factors' deviations.
     """
 
     def __init__(
@@ -102,14 +103,15 @@ class GraphBuilder:
 
         With ``remember`` off, factors are handed out and not kept: for a bounded lag.
         """
-        kernel = settings.kernel
+        width = settings.kernel.width / settings.noise_factor
+        self.kernel = KernelSettings(settings.kernel.name, width)
         self._remember = remember
         self._sensor = sensor
         self._settings = settings
         self._floor = floor
         self._prior = prior
         self._noise = settings.noise_factor**2
-        whitening = Whitening(kernel.name, kernel.width / settings.noise_factor)
+        whitening = Whitening(self.kernel.name, width)
         self._factors = landmark_factors(sensor, whitening)
         self._rows: dict[int, list[int]] = {}
         self._id_of: list[int] = []

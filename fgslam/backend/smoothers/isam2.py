@@ -12,6 +12,7 @@ from fgslam.backend.settings import Isam2Settings
 from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.backend.smoothers.keyframes import Segments
 from fgslam.backend.smoothers.refinement import (
+    MINIMUM,
     Refined,
     WholeGraphSolver,
     refine,
@@ -25,6 +26,7 @@ from fgslam.backend.smoothers.solver import (
     allowed_parts,
     suspect,
 )
+from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
@@ -36,11 +38,8 @@ from fgslam.factors.graphs import (
     number,
     pose_key,
     poses_of_frame,
-    solver_parameters,
 )
 
-_RELATIVE_TOLERANCE = 1e-9  # of the cost
-_FINAL_ITERATIONS = 5  # of the estimate's solution: everything that moved is linearised anew
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
 
 
@@ -93,8 +92,7 @@ class Isam2Solver(WholeGraphSolver):
         """Updates the tree with the loop, or builds it anew where the loop moves the map."""
         self._updated = self._builder.frames[-1]
         self._flush()
-        values = self._values
-        found = self._accepted(loop, drive, what, self._builder.kept_factors, lambda graph: values)
+        found = self._accepted(loop, drive, what, lambda graph, state: state)
         if found is None:
             return None
         self._join(found.values)
@@ -105,10 +103,9 @@ class Isam2Solver(WholeGraphSolver):
         values.insert(self._new_values)
         return refine(self._builder, values, self._minimise)
 
-    def _minimise(self, graph: Any, values: Any) -> tuple[Any, Any]:
-        """Values after a few iterations, and the factors that count there."""
-        params = solver_parameters(_FINAL_ITERATIONS, _RELATIVE_TOLERANCE)
-        return trimmed(graph, values, params, self._settings.noise_factor)
+    def _minimise(self, graph: WholeGraph, state: State) -> tuple[State, WholeGraph]:
+        """Values at the minimum, and the factors that count there."""
+        return trimmed(graph, state, MINIMUM, self._settings.noise_factor)
 
     def _join(self, found: Any | None) -> None:
         """Goes on with the graph that has the loop; from these values where they are given."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import gtsam
 import numpy as np
@@ -24,19 +24,23 @@ from fgslam.backend.filters.loop_correction import (
     corrected,
     refusal,
 )
+from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.solver import Drive
+from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion
 from fgslam.core.geometry import adjoint, congruence, inverse, transform_to_world
 from fgslam.core.measurements import LoopClosure
 from fgslam.core.quantiles import chi_square_quantile
-from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame, solver_parameters
+from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame
 
 _AGREES = chi_square_quantile(0.99, 6)  # 16.8: a loop that the graph meets as it is
 _ITERATIONS = 20
 _ENOUGH = 2.0  # the last iteration's gain, half squared deviations: far below the gate's square
 _TOLERANCE = 1e-6  # of the cost, where that is small
+
+Minimum: TypeAlias = Callable[[WholeGraph, State], State]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -57,9 +61,9 @@ class Acceptance:
 class GraphLoops:
     """The loops of a graph that keeps every pose: which were accepted, and at what cost."""
 
-    def __init__(self, builder: GraphBuilder) -> None:
-        """No loop yet."""
-        self._builder = builder
+    def __init__(self, builder: GraphBuilder, kernel: KernelSettings) -> None:
+        """No loop yet; the kernel is that of the observations where the graph is solved."""
+        self._builder, self._kernel = builder, kernel
         self._accepted: list[Constraint] = []
 
     def judge(
@@ -67,8 +71,7 @@ class GraphLoops:
         known: Constraint,
         drive: Drive,
         values: Any,
-        graph: Callable[[], Any],
-        minimum: Callable[[Any], Any],
+        minimum: Minimum,
         what: str,
     ) -> Acceptance:
         """Whether the measurements allow a loop closure, which is then a factor of the graph.
@@ -81,27 +84,24 @@ class GraphLoops:
             known: the loop, between two frames of the graph.
             drive: as tracked, without it.
             values: of all variables, as they are now.
-            graph: gives the factors to solve with it.
-            minimum: gives the values at that graph's minimum, without the loop.
+            minimum: gives the graph's minimum without the loop, from these values.
             what: begins the remark.
-
-        Raises:
-            RuntimeError: GTSAM cannot solve the graph.
         """
         if misfit(constraint_factor(known), values) <= _AGREES:
             self._accept(known)
             return Acceptance(True, None, f"{what}: as expected, nothing moved")
-        factors = graph()
-        before = minimum(factors)
-        cost, loops = float(factors.error(before)), [*self._accepted, known]
-        guess = first_guess(self._builder, before, drive.chain, loops)
-        factors.add(constraint_factor(known))
-        found = solved(factors, guess)
-        rise = 2.0 * (float(factors.error(found)) - cost)
+        graph, state = WholeGraph.of(self._builder.kept_factors(), values, self._kernel)
+        state = minimum(graph, state)
+        loops = [*self._accepted, known]
+        guess = first_guess(self._builder, graph.values(state), drive.chain, loops)
+        closed = graph.plus(constraint_factor(known))
+        solution = solved(closed, State.of(guess))
+        rise = 2.0 * (closed.cost(solution) - graph.cost(state))
         refused = refusal(what, rise)
         if refused:
             return Acceptance(False, None, refused)
         self._accept(known)
+        found = closed.values(solution)
         here = poses_of_frame(found, known.after)[:3, 3]
         shift = float(np.linalg.norm(here - drive.wTc[:3, 3]))
         remark = f"{what}: the camera moved by {shift:.2f} m, the graph with it"
@@ -160,11 +160,9 @@ def first_guess(builder: GraphBuilder, values: Any, chain: Chain, loops: list[Co
     return _moved(builder, values, frames, found, changes(poses, found))
 
 
-def solved(graph: Any, values: Any) -> Any:
-    """Values at the minimum of a graph with its kernels."""
-    params = solver_parameters(_ITERATIONS, _TOLERANCE)
-    params.setAbsoluteErrorTol(_ENOUGH)
-    return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+def solved(graph: WholeGraph, state: State) -> State:
+    """The minimum of a graph with its kernels."""
+    return graph.minimum(state, _ITERATIONS, _TOLERANCE, _ENOUGH)
 
 
 def _row(frames: IntArray, frame: int) -> int:

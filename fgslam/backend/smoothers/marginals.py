@@ -7,149 +7,184 @@ system is inverted, and each landmark takes its own covariance back from the pos
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded, lapack, solve_triangular
-from scipy.sparse import csc_matrix, csr_matrix
+from scipy.sparse import block_array, bsr_matrix, csr_matrix, diags_array
 
+from fgslam.backend.smoothers.block_band import BlockBand, order
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import inverse_spd3
 from fgslam.factors.graphs import is_pose
 
 _UNDETERMINED = "the measurements do not determine all variables; no covariances"
+_ROUNDING = 16.0 * np.finfo(np.float64).eps  # a pivot that is nothing but rounding
+_PAIRS_AT_ONCE = 1 << 16
+"""Of poses that see one landmark: a bound for memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinearSystem:
-    """A linearised graph: sparse information matrix, landmarks before poses, keys ascending."""
+    """Normal equations of a graph: half the Hessian of its cost, and the gradient.
+
+    Attributes:
+        pose_keys, landmark_keys: ascending.
+        poses: (6n, 6n) sparse block of the poses.
+        coupling: (6n, 3m) of poses and landmarks, in blocks of 6 x 3.
+        landmarks: (m, 3, 3) each landmark's own block.
+        links: (3m, 3m) of landmarks and each other, empty but for odd graphs.
+        pose_gradient, landmark_gradient: (6n,) and (3m,).
+    """
 
     pose_keys: IntArray
     landmark_keys: IntArray
-    information: csr_matrix
+    poses: csr_matrix
+    coupling: bsr_matrix
+    landmarks: FloatArray
+    links: csr_matrix
+    pose_gradient: FloatArray
+    landmark_gradient: FloatArray
 
     @property
     def columns(self) -> int:
         """How many rows and columns are landmarks'."""
         return 3 * len(self.landmark_keys)
 
-    @staticmethod
-    def of(graph: Any, values: Any) -> LinearSystem:
-        """Linearises a nonlinear graph at ``values``; robust kernels weigh as they do there."""
-        keys = np.array(list(values.keys()), np.uint64)
-        poses = np.array([is_pose(int(key)) for key in keys], np.bool_)
-        size = 3 * int((~poses).sum()) + 6 * int(poses.sum())
-        information = _information(graph.linearize(values), size)
-        return LinearSystem(
-            keys[poses].astype(np.int64), keys[~poses].astype(np.int64), information
-        )
+    @property
+    def information(self) -> csr_matrix:
+        """All of it, landmarks before poses."""
+        own = block_diagonal(self.landmarks) + self.links
+        coupling = self.coupling.tocsr()
+        return block_array([[own, coupling.T], [coupling, self.poses]], format="csr")
+
+    def damped(self, by: float) -> LinearSystem:
+        """With so many times the diagonal added to itself; unseen landmarks are held."""
+        own = self.landmarks.copy()
+        every = np.arange(3)
+        own[:, every, every] *= 1.0 + by
+        own[~own.any(axis=(1, 2))] = np.eye(3)
+        poses = self.poses + diags_array(by * self.poses.diagonal()) if by else self.poses
+        return replace(self, landmarks=own, poses=poses)
 
 
-def marginals_of(graph: Any, values: Any) -> GraphMarginals | ChainMarginals:
-    """Marginals of a graph of poses in a chain and landmarks; the larger group goes first.
+def reduced(system: LinearSystem) -> GraphMarginals | ChainMarginals:
+    """The system with one group of variables eliminated, whichever leaves less to do.
 
     Raises:
         EstimatorError: the measurements do not determine all variables.
     """
-    system = LinearSystem.of(graph, values)
-    if 6 * len(system.pose_keys) > system.columns:
+    band = 12 * order(_seen_together(system))[1]
+    if system.links.nnz or min(band, 6 * len(system.pose_keys)) > system.columns:
         return ChainMarginals.of(system)
     return GraphMarginals.of(system)
 
 
 @dataclass(frozen=True, eq=False)
 class GraphMarginals:
-    """Covariances of poses and landmarks of a linearised graph.
+    """A linearised graph without its landmarks: its solution, and covariances.
 
     Attributes:
-        pose_keys, landmark_keys: ascending.
-        landmark_information: (m, 3, 3) each landmark's own block.
-        coupling: (6n, 3m) sparse block of poses and landmarks.
-        pose_information: (6n, 6n) reduced: landmarks eliminated.
+        system: the graph.
+        inverse: (m, 3, 3) of each landmark's own block.
+        band: (6n, 6n) the poses', reduced.
     """
 
-    pose_keys: IntArray
-    landmark_keys: IntArray
-    landmark_information: FloatArray
-    coupling: csc_matrix
-    pose_information: FloatArray
+    system: LinearSystem
+    inverse: FloatArray
+    band: BlockBand
 
     @staticmethod
     def of(system: LinearSystem) -> GraphMarginals:
         """Eliminates the landmarks.
 
         Raises:
-            EstimatorError: a landmark is not determined by its observations.
+            EstimatorError: a landmark is not determined by its observations, or the poses are not.
         """
-        columns, information = system.columns, system.information
-        own = _diagonal_blocks(information[:columns, :columns])
-        if information[:columns, :columns].nnz > 9 * len(own):
+        if system.links.nnz:
             raise EstimatorError("landmarks depend on each other directly; no joint elimination")
-        coupling = information[columns:, :columns].tocsc()
-        reduced = information[columns:, columns:].toarray()
         with np.errstate(all="ignore"):
-            inverse = inverse_spd3(own)
-        if not np.isfinite(inverse).all():
+            inverse = inverse_spd3(system.landmarks)
+        if not (np.isfinite(inverse).all() and (inverse[:, [0, 1, 2], [0, 1, 2]] > 0.0).all()):
             raise EstimatorError("a landmark's observations do not determine it; no covariances")
-        if columns:
-            eliminated = coupling @ _block_diagonal(inverse) @ coupling.T
-            reduced -= eliminated.toarray()
-        return GraphMarginals(system.pose_keys, system.landmark_keys, own, coupling, reduced)
+        information = system.poses.tobsr((6, 6))
+        if system.coupling.nnz:
+            information = information - _times(system.coupling, inverse) @ system.coupling.T
+        return GraphMarginals(system, inverse, BlockBand(information))
 
-    @cached_property
-    def pose_covariance(self) -> FloatArray:
-        """(6n, 6n) joint covariance of all poses.
-
-        Raises:
-            EstimatorError: the poses are not determined.
-        """
-        return _from_cholesky(*_scaled_cholesky(self.pose_information))
+    def step(self) -> FloatArray:
+        """(3m + 6n,) from where the graph was linearised to its minimum."""
+        s = self.system
+        pull = np.einsum("mij,mj->mi", self.inverse, s.landmark_gradient.reshape(-1, 3)).ravel()
+        poses = -self.band.solve((s.pose_gradient - s.coupling @ pull)[:, None])[:, 0]
+        follows = (s.coupling.T @ poses).reshape(-1, 3)
+        landmarks = -pull - np.einsum("mij,mj->mi", self.inverse, follows).ravel()
+        return np.concatenate([landmarks, poses])
 
     def poses(self) -> FloatArray:
         """(n, 6, 6) marginals, in the order of ``pose_keys``."""
-        n = len(self.pose_keys)
-        blocks = self.pose_covariance.reshape(n, 6, n, 6)
-        every = np.arange(n)
-        return np.asarray(blocks[every, :, every, :])
+        every = np.arange(len(self.system.pose_keys))
+        return self.band.inverse_blocks(every, every)
 
     def landmarks(self) -> FloatArray:
         """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
-        inverse = inverse_spd3(self.landmark_information)
-        out = inverse.copy()
-        covariance, start = self.pose_covariance, self.coupling.indptr
-        for m in range(len(out)):
-            rows, seen = self._seen_by(start, m)
-            if len(rows):
-                gain = seen @ inverse[m]
-                out[m] += gain.T @ covariance[rows[:, None], rows] @ gain
+        coupling = _times(self.system.coupling, self.inverse)
+        pose = np.repeat(np.arange(len(self.system.pose_keys)), np.diff(coupling.indptr))
+        order = np.argsort(coupling.indices, kind="stable")
+        pose, point, gain = pose[order], coupling.indices[order], coupling.data[order]
+        out = self.inverse.copy()
+        for one, other in _pairs(point, len(out)):
+            covariance = self.band.inverse_blocks(pose[one], pose[other])
+            np.add.at(out, point[one], np.swapaxes(gain[one], 1, 2) @ covariance @ gain[other])
         return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))
 
     def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
         """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by row of the key lists."""
-        k = len(landmarks)
+        k, s = len(landmarks), self.system
+        gain = np.zeros((6 * len(s.pose_keys), 6 + 3 * k))
+        gain[6 * pose + np.arange(6), np.arange(6)] = 1.0
         columns = (3 * landmarks[:, None] + np.arange(3)).ravel()
-        rows = 6 * pose + np.arange(6)
-        inverse = inverse_spd3(self.landmark_information[landmarks])
-        gain = np.zeros((6 * len(self.pose_keys), 6 + 3 * k))
-        gain[rows, np.arange(6)] = 1.0
-        seen = self.coupling[:, columns].toarray().reshape(len(gain), k, 3)
+        seen = s.coupling.tocsc()[:, columns].toarray().reshape(len(gain), k, 3)
+        inverse = self.inverse[landmarks]
         gain[:, 6:] = -np.einsum("pki,kij->pkj", seen, inverse).reshape(len(gain), 3 * k)
-        out = gain.T @ self.pose_covariance @ gain
+        out = gain.T @ self.band.solve(gain)
         at = 6 + 3 * np.arange(k)[:, None] + np.arange(3)
         out[at[:, :, None], at[:, None, :]] += inverse
         return np.asarray(0.5 * (out + out.T))
 
-    def _seen_by(self, start: IntArray, m: int) -> tuple[IntArray, FloatArray]:
-        """Rows of the poses that saw landmark ``m``, and their coupling (rows, 3)."""
-        low, high = start[3 * m], start[3 * m + 3]
-        rows, at = np.unique(self.coupling.indices[low:high], return_inverse=True)
-        column = np.repeat(np.arange(3), np.diff(start[3 * m : 3 * m + 4]))
-        seen = np.zeros((len(rows), 3))
-        seen[at, column] = self.coupling.data[low:high]
-        return rows, seen
+
+def _seen_together(system: LinearSystem) -> csr_matrix:
+    """(n, n) which poses are linked, by a factor or by a landmark."""
+    seen, own = system.coupling, system.poses.tobsr((6, 6))
+    n, m = len(system.pose_keys), len(system.landmark_keys)
+    by = csr_matrix((np.ones(len(seen.indices)), seen.indices, seen.indptr), (n, m))
+    return by @ by.T + csr_matrix((np.ones(len(own.indices)), own.indices, own.indptr), (n, n))
+
+
+def _times(coupling: bsr_matrix, blocks: FloatArray) -> bsr_matrix:
+    """Blocks of 6 x 3, each times its landmark's (m, 3, 3)."""
+    data = coupling.data @ blocks[coupling.indices]
+    return bsr_matrix((data, coupling.indices, coupling.indptr), coupling.shape)
+
+
+def _pairs(group: IntArray, groups: int) -> Iterator[tuple[IntArray, IntArray]]:
+    """All pairs of rows of one group, from groups (k,) in ascending order; a few groups a time."""
+    size = np.bincount(group, minlength=groups)
+    first = np.concatenate([[0], np.cumsum(size)])
+    until = np.cumsum(size**2)
+    low = 0
+    while low < groups:
+        done = until[low - 1] if low else 0
+        high = max(low + 1, int(np.searchsorted(until, done + _PAIRS_AT_ONCE, "right")))
+        rows = np.arange(first[low], first[high])
+        repeated = size[group[rows]]
+        one = np.repeat(rows, repeated)
+        start = np.repeat(np.cumsum(repeated) - repeated, repeated)
+        yield one, first[group[one]] + np.arange(len(one)) - start
+        low = high
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +200,9 @@ class ChainMarginals:
         own: (n, 6, 6) covariances of the poses given the landmarks and the poses kept with them.
         gain: (6n, 3m + 6k) how the poses' mean follows those, negated.
         kept_covariance: (3m + 6k, 3m + 6k) joint of all landmarks and the k poses kept.
+        kept: their rows and columns in the system's information.
+        gradient: (3m + 6n,) in that order.
+        alone: (6n,) the poses' step if those are held.
     """
 
     pose_keys: IntArray
@@ -172,6 +210,9 @@ class ChainMarginals:
     own: FloatArray
     gain: FloatArray
     kept_covariance: FloatArray
+    kept: IntArray
+    gradient: FloatArray
+    alone: FloatArray
 
     @staticmethod
     def of(system: LinearSystem) -> ChainMarginals:
@@ -204,7 +245,25 @@ class ChainMarginals:
         follows = np.zeros((6 * len(poses), len(kept)))
         follows[chain - columns] = gain / size[:, None]
         follows[poses[apart].ravel() - columns, np.arange(columns, len(kept))] = -1.0
-        return ChainMarginals(system.pose_keys, system.landmark_keys, own, follows, covariance)
+        gradient = np.concatenate([system.landmark_gradient, system.pose_gradient])
+        alone = np.zeros(6 * len(poses))
+        pull = gradient[chain] / size
+        alone[chain - columns] = -cho_solve_banded((factor, True), pull, check_finite=False) / size
+        return ChainMarginals(
+            system.pose_keys, system.landmark_keys, own, follows, covariance, kept, gradient, alone
+        )
+
+    def step(self) -> FloatArray:
+        """(3m + 6n,) from where the graph was linearised to its minimum."""
+        columns = len(self.gradient) - len(self.alone)
+        pull = self.gradient[self.kept]
+        chain = self.gain.copy()
+        chain[self.kept[columns:] - columns] = 0.0  # those are not eliminated
+        moved = -self.kept_covariance @ (pull - chain.T @ self.gradient[columns:])
+        out = np.empty_like(self.gradient)
+        out[columns:] = self.alone - self.gain @ moved
+        out[:columns] = moved[:columns]
+        return out
 
     def poses(self) -> FloatArray:
         """(n, 6, 6) marginals, in the order of ``pose_keys``."""
@@ -328,6 +387,9 @@ def _scaled_cholesky(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     factor, status = lapack.dpotrf(information / np.outer(size, size), lower=1, overwrite_a=1)
     if status != 0:
         raise UndeterminedError(int(status) - 1, _UNDETERMINED)
+    pivots = np.diagonal(factor)
+    if len(pivots) and pivots.min() ** 2 < _ROUNDING:
+        raise UndeterminedError(int(pivots.argmin()), _UNDETERMINED)
     return factor, size
 
 
@@ -338,32 +400,9 @@ def _from_cholesky(factor: FloatArray, size: FloatArray) -> FloatArray:
     return np.asarray((lower + np.tril(inverse, -1).T) / np.outer(size, size))
 
 
-def _information(linear: Any, columns: int) -> csr_matrix:
-    """Sparse information matrix of a Gaussian graph; columns in the order of the keys."""
-    row, column, value = linear.sparseJacobian_()
-    rows = int(row.max()) if len(row) else 0
-    # GTSAM counts from 1 and puts the right-hand side in the last column.
-    inside = column <= columns
-    shape = (rows, columns)
-    jacobian = csr_matrix(
-        (value[inside], (row[inside].astype(np.int64) - 1, column[inside].astype(np.int64) - 1)),
-        shape,
-    )
-    return (jacobian.T @ jacobian).tocsr()
-
-
-def _diagonal_blocks(matrix: csr_matrix) -> FloatArray:
-    """The (m, 3, 3) diagonal blocks of a sparse matrix (3m, 3m)."""
-    entries = matrix.tocoo()
-    out = np.zeros((matrix.shape[0] // 3, 3, 3))
-    inside = entries.row // 3 == entries.col // 3
-    row, column = entries.row[inside], entries.col[inside]
-    out[row // 3, row % 3, column % 3] = entries.data[inside]
-    return out
-
-
-def _block_diagonal(blocks: FloatArray) -> csr_matrix:
-    """Sparse (3m, 3m) matrix of diagonal blocks (m, 3, 3)."""
-    m = len(blocks)
-    columns = (3 * np.arange(m)[:, None, None] + np.arange(3)[None, None, :]).repeat(3, axis=1)
-    return csr_matrix((blocks.ravel(), columns.ravel(), 3 * np.arange(3 * m + 1)), (3 * m, 3 * m))
+def block_diagonal(blocks: FloatArray) -> csr_matrix:
+    """Sparse (sm, sm) matrix of diagonal blocks (m, s, s)."""
+    m, size, _ = blocks.shape
+    if not m:
+        return csr_matrix((0, 0))
+    return bsr_matrix((blocks, np.arange(m), np.arange(m + 1)), (size * m, size * m)).tocsr()

@@ -10,15 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, TypeAlias
 
 import gtsam
 import numpy as np
 
 from fgslam.backend.filters.loop_correction import Constraint
+from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
-from fgslam.backend.smoothers.loop_closing import Acceptance, GraphLoops
-from fgslam.backend.smoothers.marginals import marginals_of
+from fgslam.backend.smoothers.loop_closing import Acceptance, GraphLoops, Minimum
+from fgslam.backend.smoothers.marginals import ChainMarginals, GraphMarginals, reduced
 from fgslam.backend.smoothers.solver import (
     ClosedLoop,
     Drive,
@@ -26,171 +28,173 @@ from fgslam.backend.smoothers.solver import (
     Solution,
     allowed_joint,
     allowed_parts,
-    points_of,
-    poses_of,
     solver_failed,
 )
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.backend.smoothers.whole_graph import State, WholeGraph
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import reorthonormalise
 from fgslam.core.quantiles import chi_square_quantile
-from fgslam.factors.graphs import (
-    is_pose,
-    landmark_key,
-    number,
-    pose_key,
-    poses_of_frame,
-    solver_parameters,
-)
-from fgslam.factors.noise import plain, robust
+from fgslam.factors.graphs import number, poses_of_frame
 
 _GATE = float(chi_square_quantile(0.999, 3))  # 16.3, of a landmark observation's three numbers
 _KEPT = 0.5  # weights end at 0 or 1
-_ROUNDS = 10  # trims until the observations that fit do not change any more
-_QUICK_WIDTH = 3.0  # deviations, as the kernels' default
-_ROUGH = 1e-4  # of the cost: the minimum with the kernel only chooses what fits
+_ROUNDS = 20  # trims until the observations that fit do not change any more
+_ROUGH = 1e-3  # of the cost: the minimum with the kernel only chooses what fits
+_STEPS_A_ROUND = 1  # what fits is chosen anew after each, and the last solution goes all the way
+_CONTROL_GROWS, _CONTROL_ENDS = 1.4, 1e6  # Yang et al.; with the latter all weights are 0 or 1
+_DECIDED = 1e-4
+_LEAST = 1e-12
 _SOLUTIONS = 5  # solutions until no landmark lies behind a camera any more
 _BEHIND = "came out behind a camera"
 _UNSEEN = "has no observation that fits the others"
 
-Minimise: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
-"""From a graph and initial values to values at the minimum and the factors that count there."""
+Minimise: TypeAlias = Callable[[WholeGraph, State], tuple[State, WholeGraph]]
+"""From a graph and initial values to those at the minimum and the factors that count there."""
 
 
-def graduated(graph: Any, values: Any, inner: Any, noise_factor: float = 1.0) -> tuple[Any, Any]:
-    """Graduated non-convexity (Yang et al. 2020) with truncated least squares, by GTSAM.
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How far a minimum is followed: iterations, and the part of the cost that is let go."""
+
+    iterations: int
+    tolerance: float
+
+
+MINIMUM = Effort(100, 1e-9)
+"""A bound, for graphs that do not settle; the estimate then moves by less than a micrometre."""
+
+
+def graduated(
+    graph: WholeGraph, state: State, effort: Effort, noise_factor: float = 1.0
+) -> tuple[State, WholeGraph]:
+    """Graduated non-convexity (Yang et al. 2020, eqs. 12 to 14) with truncated least squares.
 
     Landmark observations are the possible outliers.
 
     Args:
         graph: factors without kernels.
-        values: initial values.
-        inner: parameters of the Levenberg-Marquardt steps.
+        state: initial values.
+        effort: of each of its solutions.
         noise_factor: by which the factors' deviations exceed the stated ones.
 
     Returns:
         Values at the minimum, and the graph without the observations that were rejected.
     """
-    factors = [graph.at(row) for row in range(graph.size())]
-    observed = [_landmark(factor) is not None for factor in factors]
-    params = gtsam.GncLMParams(inner)
-    params.setLossType(gtsam.GncLossType.TLS)
-    params.setKnownInliers([row for row, is_one in enumerate(observed) if not is_one])
-    optimizer = gtsam.GncLMOptimizer(graph, values, params)
-    # GTSAM's threshold is on the cost, half of the squared residual.
-    optimizer.setInlierCostThresholds(0.5 * _GATE / noise_factor**2)
-    found = optimizer.optimize()
-    weights = optimizer.getWeights()
-    kept = gtsam.NonlinearFactorGraph()
-    for factor, weight, is_one in zip(factors, weights, observed, strict=True):
-        if weight > _KEPT or not is_one:
-            kept.add(factor)
-    return found, kept
+    gate = _GATE / noise_factor**2
+    state = graph.minimum(state, effort.iterations, _ROUGH)
+    ratio = graph.squared(state) / gate
+    worst = 2.0 * float(ratio.max(initial=0.0)) - 1.0
+    control = 1.0 / worst if worst > 0.0 else np.inf
+    weights = np.ones(len(ratio))
+    while worst > 0.0 and control < _CONTROL_ENDS:
+        weights = truncated_weights(graph.squared(state) / gate, control)
+        state = graph.weighed(weights).minimum(state, _STEPS_A_ROUND, effort.tolerance)
+        if np.minimum(weights, 1.0 - weights).max() < _DECIDED:
+            break
+        control *= _CONTROL_GROWS
+    kept = graph.weighed(weights > _KEPT)
+    return kept.minimum(state, effort.iterations, effort.tolerance), kept
 
 
-def trimmed(graph: Any, values: Any, params: Any, noise_factor: float = 1.0) -> tuple[Any, Any]:
-    """Minimises with the factors' own kernels, then without them over what fits.
+def truncated_weights(ratio: FloatArray, control: float) -> FloatArray:
+    """Weights (k,) of squared residuals over the gate's square (k,): Yang et al., eq. 14."""
+    middle = np.sqrt(control * (control + 1.0) / np.maximum(ratio, _LEAST)) - control
+    return np.asarray(np.clip(middle, 0.0, 1.0))
+
+
+def trimmed(
+    graph: WholeGraph, state: State, effort: Effort, noise_factor: float = 1.0
+) -> tuple[State, WholeGraph]:
+    """Minimises with the graph's own kernel, then without it over what fits.
+
+    Loops keep their kernels: they are too few to be separated by a trim.
 
     Args:
         graph: factors, landmark observations with a kernel.
-        values: initial values.
-        params: of Levenberg-Marquardt.
+        state: initial values.
+        effort: of the last solution.
         noise_factor: by which the factors' deviations exceed the stated ones, which judge.
 
     Returns:
         Values at the minimum, and the plain factors that were kept.
     """
-    rough = solver_parameters(params.getMaxIterations(), _ROUGH)
-    values = gtsam.LevenbergMarquardtOptimizer(graph, values, rough).optimize()
-    factors = [graph.at(row) for row in range(graph.size())]
-    observed = [_landmark(factor) is not None for factor in factors]
-    # A robust factor whitens with its kernel's weight, after which everything would seem to fit.
-    # Loops keep their kernels: they are too few to be separated by a trim.
-    factors = [plain(f) if is_one else f for f, is_one in zip(factors, observed, strict=True)]
     gate = _GATE / noise_factor**2
-    fits: list[bool] = []
+    if graph.weights.all():  # else it is known already what fits, but for a few
+        state = graph.minimum(state, effort.iterations, _ROUGH)
+    fits = np.zeros(len(graph.weights), np.bool_)
+    kept = graph
     for _ in range(_ROUNDS):
-        before = fits
-        pairs = zip(factors, observed, strict=True)
-        fits = [not is_one or _squared(factor, values) <= gate for factor, is_one in pairs]
-        if fits == before:
+        before, fits = fits, graph.squared(state) <= gate
+        if (fits == before).all():
             break
-        kept = gtsam.NonlinearFactorGraph()
-        for factor, fit in zip(factors, fits, strict=True):
-            if fit:
-                kept.add(factor)
-        values = gtsam.LevenbergMarquardtOptimizer(kept, values, rough).optimize()
-    return gtsam.LevenbergMarquardtOptimizer(kept, values, params).optimize(), kept
+        kept = graph.weighed(fits)
+        state = kept.minimum(state, _STEPS_A_ROUND, _ROUGH)
+    return kept.minimum(state, effort.iterations, effort.tolerance), kept
 
 
-def with_kernel(graph: Any) -> Any:
-    """The graph with Cauchy's kernel around its landmark observations, for a quick solution."""
-    out = gtsam.NonlinearFactorGraph()
-    for row in range(graph.size()):
-        factor = graph.at(row)
-        observed = _landmark(factor) is not None
-        out.add(robust(factor, "cauchy", _QUICK_WIDTH) if observed else factor)
-    return out
-
-
-def _squared(factor: Any, values: Any) -> float:
-    """Whitened residual squared of a plain factor."""
-    residual = factor.whitenedError(values)
-    return float(residual @ residual)
-
-
-def observed_variables(graph: Any) -> set[int]:
-    """Landmark variables that some pose observes."""
-    found = {_landmark(graph.at(row)) for row in range(graph.size())}
-    return {variable for variable in found if variable is not None}
-
-
-def _landmark(factor: Any) -> int | None:
-    """The landmark variable of an observation; None for other factors."""
-    keys = list(factor.keys())
-    if len(keys) != 2 or not is_pose(keys[0]) or is_pose(keys[1]):
-        return None
-    return number(keys[1])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Refined:
     """A solved graph.
 
     Attributes:
         graph: the factors that count.
-        values: of all variables that are left.
+        state: of all variables that are left.
         remarks: what was left out, in words.
     """
 
-    graph: Any
-    values: Any
+    graph: WholeGraph
+    state: State
     remarks: tuple[str, ...] = ()
 
     @property
     def variables(self) -> list[int]:
         """Landmark variables that are left, ascending."""
-        return landmark_variables(self.values)
+        return [number(key) for key in self.graph.landmark_keys]
+
+    @property
+    def values(self) -> Any:
+        """GTSAM values of all variables."""
+        return self.graph.values(self.state)
+
+    def points(self) -> dict[int, FloatArray]:
+        """Positions (3,) of the landmark variables."""
+        return dict(zip(self.variables, self.state.points, strict=True))
+
+    def poses(self) -> FloatArray:
+        """(n, 4, 4) by frame, up to the last; NaN for those that are no variables."""
+        frames = [number(key) for key in self.graph.pose_keys]
+        out = np.full((frames[-1] + 1, 4, 4), np.nan)
+        out[frames] = self.state.poses
+        return out
+
+    @cached_property
+    def marginals(self) -> GraphMarginals | ChainMarginals:
+        """Of all variables.
+
+        Raises:
+            EstimatorError: the measurements do not determine all variables.
+        """
+        return reduced(self.graph.linear(self.state))
 
 
 def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
     """Solves, without landmarks that come out behind a camera or that nothing supports."""
-    graph = builder.kept_factors()
+    graph, state = WholeGraph.of(builder.kept_factors(), values, builder.kernel)
     remarks: list[str] = []
     for _ in range(_SOLUTIONS):
-        found, kept = minimise(graph, values)
-        lost = _lost(builder, found, kept)
+        state, kept = minimise(graph, state)
+        found = Refined(kept, state, tuple(remarks))
+        lost = _lost(builder, found)
         if not lost:
-            return Refined(kept, found, tuple(remarks))
+            return found
         remarks += [f"{builder.describe(v)} {why}: left out" for v, why in lost.items()]
-        graph = _without(graph, {landmark_key(v) for v in lost})
-        values = gtsam.Values(found)
-        for variable in lost:
-            values.erase(landmark_key(variable))
-    found, kept = minimise(graph, values)
-    return Refined(kept, found, tuple(remarks))
+        rows = np.searchsorted(found.variables, sorted(lost)).astype(np.int64)
+        graph, state = kept.without(rows, state)
+    state, kept = minimise(graph, state)
+    return Refined(kept, state, tuple(remarks))
 
 
 class WholeGraphSolver:
@@ -201,10 +205,12 @@ class WholeGraphSolver:
 
     kind: ClassVar[str]
 
-    def __init__(self, builder: GraphBuilder, floor: Floor) -> None:
-        """Nothing to solve yet."""
+    def __init__(
+        self, builder: GraphBuilder, floor: Floor, kernel: KernelSettings | None = None
+    ) -> None:
+        """Nothing to solve yet; loops are judged with the builder's kernel or with another."""
         self._builder, self._floor = builder, floor
-        self._loops = GraphLoops(builder)
+        self._loops = GraphLoops(builder, kernel or builder.kernel)
         self._values = gtsam.Values()
         self._answer: Refined | None = None
         self.remarks: list[str] = []
@@ -223,8 +229,9 @@ class WholeGraphSolver:
         lost = set(variables) - set(refined.variables)
         if lost:
             raise EstimatorError(f"{self._builder.describe(min(lost))} was left out of the graph")
-        last = self._builder.frames[-1]
-        return joint_of(refined.graph, refined.values, self._floor, last, variables)
+        rows = np.searchsorted(refined.variables, variables).astype(np.int64)
+        joint = refined.marginals.joint(len(refined.state.poses) - 1, rows)
+        return allowed_joint(self._floor, refined.state.poses[-1], joint)
 
     def _refined(self) -> Refined:
         """The graph's last solution."""
@@ -238,23 +245,15 @@ class WholeGraphSolver:
     def _refine(self) -> Refined:
         return refine(self._builder, self._values, self._minimise)
 
-    def _minimise(self, graph: Any, values: Any) -> tuple[Any, Any]:
+    def _minimise(self, graph: WholeGraph, state: State) -> tuple[State, WholeGraph]:
         """Values at the minimum, and the factors that count there."""
         raise NotImplementedError
 
     def _accepted(
-        self,
-        loop: Constraint,
-        drive: Drive,
-        what: str,
-        graph: Callable[[], Any],
-        minimum: Callable[[Any], Any],
+        self, loop: Constraint, drive: Drive, what: str, minimum: Minimum
     ) -> Acceptance | None:
         """The loop in the graph; None, and a remark, if it is refused. See GraphLoops.judge."""
-        try:
-            found = self._loops.judge(loop, drive, self._values, graph, minimum, what)
-        except RuntimeError as error:
-            raise self._failed(error) from None
+        found = self._loops.judge(loop, drive, self._values, minimum, what)
         self.remarks.append(found.remark)
         if not found.closed:
             return None
@@ -272,13 +271,11 @@ class WholeGraphSolver:
 
 def solution(refined: Refined, frames: list[int], floor: Floor) -> Solution:
     """Everything about frames of a solved graph and its landmark variables."""
-    graph, values, variables = refined.graph, refined.values, refined.variables
-    poses, points = poses_of(values, frames), points_of(values, variables)
+    poses, points, variables = refined.poses(), refined.points(), refined.variables
     kept = np.full((len(poses), 6, 6), np.nan)
     try:
-        marginals = marginals_of(graph, values)
-        by_key = dict(zip(marginals.landmark_keys.tolist(), marginals.landmarks(), strict=True))
-        covariances = {v: by_key[landmark_key(v)] for v in variables}
+        marginals = refined.marginals
+        covariances = dict(zip(variables, marginals.landmarks(), strict=True))
         kept[frames] = allowed_parts(floor, poses[frames], marginals.poses())
     except EstimatorError as error:
         missing = {v: np.full((3, 3), np.nan) for v in variables}
@@ -286,32 +283,7 @@ def solution(refined: Refined, frames: list[int], floor: Floor) -> Solution:
     return Solution(poses, kept, points, covariances, refined.remarks)
 
 
-def joint_of(graph: Any, values: Any, floor: Floor, frame: int, variables: list[int]) -> FloatArray:
-    """Joint covariance (6 + 3k, 6 + 3k) of a frame's pose and landmark variables."""
-    marginals = marginals_of(graph, values)
-    pose = int(np.searchsorted(marginals.pose_keys, pose_key(frame)))
-    keys = np.array([landmark_key(v) for v in variables], np.int64)
-    rows: IntArray = np.searchsorted(marginals.landmark_keys, keys).astype(np.int64)
-    return allowed_joint(floor, poses_of_frame(values, frame), marginals.joint(pose, rows))
-
-
-def landmark_variables(values: Any) -> list[int]:
-    """Landmark variables among GTSAM values, ascending."""
-    return [number(key) for key in list(values.keys()) if not is_pose(key)]
-
-
-def _lost(builder: GraphBuilder, values: Any, kept: Any) -> dict[int, str]:
-    variables = landmark_variables(values)
-    poses, points = poses_of(values, builder.frames), points_of(values, variables)
-    behind = dict.fromkeys(builder.behind(poses, points), _BEHIND)
-    unseen = sorted(set(variables) - observed_variables(kept))
-    return behind | dict.fromkeys(unseen, _UNSEEN)
-
-
-def _without(graph: Any, keys: set[int]) -> Any:
-    kept = gtsam.NonlinearFactorGraph()
-    for row in range(graph.size()):
-        factor = graph.at(row)
-        if keys.isdisjoint(factor.keys()):
-            kept.add(factor)
-    return kept
+def _lost(builder: GraphBuilder, found: Refined) -> dict[int, str]:
+    behind = dict.fromkeys(builder.behind(found.poses(), found.points()), _BEHIND)
+    variables = found.variables
+    return behind | {variables[row]: _UNSEEN for row in found.graph.unseen().tolist()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
 import pytest
 from simulated import assert_same_bits, play
@@ -25,6 +24,7 @@ from smoothing import (
 from fgslam.backend.settings import BatchSettings
 from fgslam.backend.smoothers import refinement
 from fgslam.backend.smoothers.smoother import MapSmoother
+from fgslam.backend.smoothers.whole_graph import WholeGraph
 from fgslam.core.errors import EstimatorError
 from fgslam.evaluation.consistency import judge
 
@@ -54,7 +54,7 @@ def test_final_solution_is_the_minimum_over_what_fits() -> None:
     estimator, _ = run(BatchSettings(), spoilt)
     assert isinstance(estimator, MapSmoother)
     refined = estimator._solver._refined()
-    graph, values = refined.graph, refined.values
+    graph, values = refined.graph.kept(), refined.values
     total = estimator._builder.kept_factors().size()
     assert 0.7 * total < graph.size() < 0.85 * total
     gradient = graph.linearize(values).gradientAtZero()
@@ -96,7 +96,7 @@ def test_failing_solver_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch)
     def failing(*arguments: object) -> None:
         raise RuntimeError("\nout of\nluck\n")
 
-    monkeypatch.setattr(gtsam, "LevenbergMarquardtOptimizer", failing)
+    monkeypatch.setattr(WholeGraph, "minimum", failing)
     with pytest.raises(EstimatorError, match=r"^batch: the solver failed after frame 5 \(out of l"):
         estimator.estimate()
 
@@ -124,8 +124,8 @@ def test_landmarks_lost_in_every_round_come_to_an_end(monkeypatch: pytest.Monkey
     simulation = drawn(7)
     estimator, _ = run(BatchSettings(), simulation.increments)
 
-    def lost(builder: object, values: gtsam.Values, kept: object) -> dict[int, str]:
-        return {refinement.landmark_variables(values)[0]: "is lost"}
+    def lost(builder: object, found: refinement.Refined) -> dict[int, str]:
+        return {found.variables[0]: "is lost"}
 
     monkeypatch.setattr(refinement, "_lost", lost)
     found = estimator.estimate()

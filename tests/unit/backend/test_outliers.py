@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
-from smoothing import SMOOTHERS, answer, ate, build, drawn, run, wrong_matches
+from smoothing import SMOOTHERS, answer, ate, drawn, run, wrong_matches
 
 from fgslam.backend.settings import BatchSettings, EstimatorSettings, KernelSettings
 from fgslam.backend.smoothers import admission
 from fgslam.backend.smoothers.refinement import (
+    MINIMUM,
     graduated,
-    observed_variables,
     trimmed,
 )
+from fgslam.backend.smoothers.whole_graph import WholeGraph
 from fgslam.core.arrays import FloatArray
-from fgslam.factors.graphs import solver_parameters
 
 CAUCHY = KernelSettings("cauchy", 3.0)
 ROBUST: dict[str, EstimatorSettings] = SMOOTHERS | {
@@ -60,6 +62,14 @@ def problem(kernel: KernelSettings, share: float) -> tuple[gtsam.NonlinearFactor
     return estimator._builder.kept_factors(), estimator._solver._values, wrong
 
 
+def solved(
+    method: Callable[..., Any], graph: Any, values: Any, kernel: KernelSettings
+) -> tuple[Any, Any]:
+    """GTSAM's values and factors that a treatment of outliers ends with."""
+    state, kept = method(*WholeGraph.of(graph, values, kernel), MINIMUM)
+    return kept.values(state), kept.kept()
+
+
 def residuals(graph: gtsam.NonlinearFactorGraph, values: object) -> FloatArray:
     """Squared whitened residuals of the landmark observations, without kernels."""
     out = []
@@ -75,7 +85,7 @@ def residuals(graph: gtsam.NonlinearFactorGraph, values: object) -> FloatArray:
 @pytest.mark.parametrize("name", ["huber", "cauchy", "geman_mcclure"])
 def test_the_trim_keeps_what_is_within_the_quantile_and_nothing_else(name: str) -> None:
     graph, values, wrong = problem(KernelSettings(name, 3.0), 0.3)
-    found, kept = trimmed(graph, values, solver_parameters(100, 1e-9))
+    found, kept = solved(trimmed, graph, values, KernelSettings(name, 3.0))
     everything, inside = residuals(graph, found), residuals(kept, found)
     assert len(inside) == (everything <= 16.2662).sum()
     assert inside.max() <= 16.2663
@@ -89,13 +99,13 @@ def test_the_trim_keeps_what_is_within_the_quantile_and_nothing_else(name: str) 
 def test_the_trim_leaves_a_clean_problem_nearly_whole() -> None:
     graph, values, wrong = problem(CAUCHY, 0.0)
     assert wrong == 0
-    _, kept = trimmed(graph, values, solver_parameters(100, 1e-9))
+    _, kept = solved(trimmed, graph, values, CAUCHY)
     assert graph.size() - 5 <= kept.size() <= graph.size()
 
 
 def test_graduated_non_convexity_finds_the_wrong_ones() -> None:
     graph, values, wrong = problem(KernelSettings("none"), 0.3)
-    found, kept = graduated(graph, values, solver_parameters(100, 1e-9))
+    found, kept = solved(graduated, graph, values, KernelSettings("none"))
     left_out = graph.size() - kept.size()
     assert 0.9 * wrong < left_out < 1.1 * wrong
     assert residuals(kept, found).max() < 20.0
@@ -103,14 +113,10 @@ def test_graduated_non_convexity_finds_the_wrong_ones() -> None:
     assert kept.size() - len(residuals(kept, values)) == others
 
 
-def test_observed_variables_are_those_with_an_observation() -> None:
+def test_unseen_landmarks_are_those_of_which_no_observation_counts() -> None:
     estimator, _ = run(PLAIN, drawn(0).increments)
-    builder = estimator._builder
-    graph = builder.kept_factors()
-    assert observed_variables(graph) == set(range(builder.variables))
-    priors = gtsam.NonlinearFactorGraph()
-    for row in range(graph.size()):
-        if len(graph.at(row).keys()) == 1:
-            priors.add(graph.at(row))
-    assert observed_variables(priors) == set()
-    assert observed_variables(build(PLAIN)._builder.kept_factors()) == set()
+    graph, _ = WholeGraph.of(estimator._builder.kept_factors(), estimator._solver._values)
+    assert graph.unseen().tolist() == []
+    assert graph.weighed(np.zeros(len(graph.weights))).unseen().tolist() == list(
+        range(estimator._builder.variables)
+    )

@@ -1,0 +1,179 @@
+"""Landmark observations of a whole graph in arrays: whitened residuals and their derivatives.
+
+A rig's stereo factors are linearised here, all at once; any other factor of a pose and a landmark
+(of range and bearing) by GTSAM. Either way they are those of the factors' own cost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeAlias
+
+import gtsam
+import numpy as np
+
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.geometry import skew
+from fgslam.factors.graphs import is_pose
+from fgslam.factors.noise import plain
+
+Look: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+"""Whitened residuals (k, 3), derivatives by the poses (k, 3, 6) and by the points (k, 3, 3)."""
+
+
+class Sightings(Protocol):
+    """Observations of one kind."""
+
+    @property
+    def rows(self) -> IntArray:
+        """Of their factors in the graph (k,)."""
+        ...
+
+    @property
+    def poses(self) -> IntArray:
+        """Rows (k,) of their poses."""
+        ...
+
+    @property
+    def points(self) -> IntArray:
+        """Rows (k,) of their landmarks."""
+        ...
+
+    def residuals(self, poses: FloatArray, points: FloatArray) -> FloatArray:
+        """Whitened residuals (k, 3) at all poses (n, 4, 4) and points (m, 3)."""
+        ...
+
+    def look(self, poses: FloatArray, points: FloatArray) -> Look:
+        """The same, with derivatives."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoSightings:
+    """Those of one rig, on :class:`Sightings`, measured as GTSAM does: (u_left, u_right, v).
+
+    Attributes:
+        rows, poses, points: see there.
+        measured: (k, 3) pixels.
+        roots: (k, 3, 3) square roots of the informations.
+        camera: GTSAM's calibration.
+    """
+
+    rows: IntArray
+    poses: IntArray
+    points: IntArray
+    measured: FloatArray
+    roots: FloatArray
+    camera: Any
+
+    @staticmethod
+    def of(factors: list[Any], rows: IntArray, poses: IntArray, points: IntArray) -> Sightings:
+        """Of stereo factors, with or without kernels."""
+        measured = np.array([factor.measured().vector() for factor in factors])
+        roots = np.empty((len(factors), 3, 3))
+        for root, factor in zip(roots, factors, strict=True):
+            model = factor.noiseModel()
+            bare: Any = model.noise() if isinstance(model, gtsam.noiseModel.Robust) else model
+            root[:] = bare.R()
+        camera = factors[0].calibration()
+        return StereoSightings(rows, poses, points, measured, roots, camera)
+
+    def residuals(self, poses: FloatArray, points: FloatArray) -> FloatArray:
+        """See :class:`Sightings`."""
+        return self._residuals(self._local(poses, points))
+
+    def look(self, poses: FloatArray, points: FloatArray) -> Look:
+        """See :class:`Sightings`; behind the camera there is no derivative, as GTSAM does it."""
+        local = self._local(poses, points)
+        x, y, z = local.T
+        fx, fy, base = self.camera.fx(), self.camera.fy(), self.camera.baseline()
+        nearer = np.where(z > 0.0, 1.0 / np.where(z > 0.0, z, 1.0), 0.0)
+        seen = np.zeros((len(z), 3, 3))
+        seen[:, 0, 0] = seen[:, 1, 0] = fx * nearer
+        seen[:, 2, 1] = fy * nearer
+        seen[:, 0, 2] = -fx * (x + base) * nearer**2
+        seen[:, 1, 2] = -fx * x * nearer**2
+        seen[:, 2, 2] = -fy * y * nearer**2
+        seen = self.roots @ seen
+        by_pose = np.empty((len(z), 3, 6))
+        by_pose[:, :, :3] = seen @ skew(local)
+        by_pose[:, :, 3:] = -seen
+        by_point = seen @ np.swapaxes(poses[self.poses, :3, :3], 1, 2)
+        return self._residuals(local), by_pose, by_point
+
+    def _local(self, poses: FloatArray, points: FloatArray) -> FloatArray:
+        """(k, 3) the points in their cameras' axes."""
+        own = poses[self.poses]
+        offset = points[self.points] - own[:, :3, 3]
+        return np.asarray(np.einsum("kji,kj->ki", own[:, :3, :3], offset))
+
+    def _residuals(self, local: FloatArray) -> FloatArray:
+        x, y, z = local.T
+        k = self.camera
+        ahead = z > 0.0
+        nearer = 1.0 / np.where(ahead, z, 1.0)
+        difference = np.empty((len(z), 3))
+        difference[:, 0] = k.px() + k.fx() * (x + k.baseline()) * nearer
+        difference[:, 1] = k.px() + k.fx() * x * nearer
+        difference[:, 2] = k.py() + k.fy() * y * nearer
+        difference -= self.measured
+        difference[~ahead] = 2.0 * k.fx()
+        return np.asarray(np.einsum("kij,kj->ki", self.roots, difference))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FactorSightings:
+    """Those that GTSAM linearises, on :class:`Sightings`.
+
+    Attributes:
+        rows, poses, points: see there.
+        graph: the factors without kernels.
+        keys: rows of the variables among poses and points, by GTSAM's keys.
+    """
+
+    rows: IntArray
+    poses: IntArray
+    points: IntArray
+    graph: Any
+    keys: dict[int, int]
+
+    @staticmethod
+    def of(factors: list[Any], rows: IntArray, poses: IntArray, points: IntArray) -> Sightings:
+        """Of factors with one pose and one landmark each and three numbers."""
+        graph = gtsam.NonlinearFactorGraph()
+        keys: dict[int, int] = {}
+        for factor, pose, point in zip(factors, poses.tolist(), points.tolist(), strict=True):
+            graph.add(plain(factor))
+            keys.update(zip(factor.keys(), (pose, point), strict=True))
+        return FactorSightings(rows, poses, points, graph, keys)
+
+    def residuals(self, poses: FloatArray, points: FloatArray) -> FloatArray:
+        """See :class:`Sightings`."""
+        return self.look(poses, points)[0]
+
+    def look(self, poses: FloatArray, points: FloatArray) -> Look:
+        """See :class:`Sightings`."""
+        linear = self.graph.linearize(values_of(self.keys, poses, points))
+        row, column, value = linear.sparseJacobian_()
+        row, column = row.astype(np.int64) - 1, column.astype(np.int64) - 1
+        border = 3 * sum(not is_pose(key) for key in self.keys)  # landmarks come first
+        last = border + 6 * sum(is_pose(key) for key in self.keys)
+        k = len(self.rows)
+        out = np.zeros((k, 3)), np.zeros((k, 3, 6)), np.zeros((k, 3, 3))
+        of_point, of_pose, right = (
+            column < border,
+            (column >= border) & (column < last),
+            column == last,
+        )
+        out[0].ravel()[row[right]] = -value[right]
+        out[1].reshape(-1, 6)[row[of_pose], (column[of_pose] - border) % 6] = value[of_pose]
+        out[2].reshape(-1, 3)[row[of_point], column[of_point] % 3] = value[of_point]
+        return out
+
+
+def values_of(keys: dict[int, int], poses: FloatArray, points: FloatArray) -> Any:
+    """GTSAM values of variables, given by their rows among poses (n, 4, 4) and points (m, 3)."""
+    values = gtsam.Values()
+    for key, row in keys.items():
+        values.insert(key, gtsam.Pose3(poses[row]) if is_pose(key) else points[row])
+    return values
