@@ -7,6 +7,8 @@ Derivation: docs/derivations/homing_graph.md.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.linalg import LinAlgError
 from scipy.linalg import cho_factor, cho_solve, lapack
@@ -16,13 +18,12 @@ from fgslam.backend.homing.schur_model import STATE, Look, NormalEquations, Schu
 from fgslam.backend.homing.settings import HomingGraphSettings
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
+from fgslam.core.levenberg import Damping
 from fgslam.core.planar import wrapped_pose
 
 _ROWS, _COLUMNS = np.indices((STATE, STATE))
 _LOWER = np.tril_indices(STATE)
 _STILL = 0.3  # deviations, of all variables together: a shorter step ends the iteration
-_FIRST_DAMPING, _MORE, _MOST = 1e-3, 10.0, 1e6
-_ROUNDING = 1e-9
 _EVERY = 4  # images: a doubt costs half as much as an update
 _STEPS = 1
 """Gauss-Newton steps with an image, at most: what is left after one is gone with the next image."""
@@ -178,32 +179,23 @@ class SchurSolver:
 
     def _go_on(self, steps: int) -> Look:
         """Up to so many steps; what is left of the way is gone with the next image."""
-        look = self._model.look(self._state)
-        damping = 0.0
+        look, damping = self._model.look(self._state), Damping()
         self._factored = None
         for _ in range(steps):
-            tried = self._step(look, damping)
-            if tried is None:
+            attempt = partial(self._tried, look.state, self._model.normal(look))
+            found = damping.step(look.cost, attempt)
+            if found is None:
                 break
-            look, factored, damping = tried
+            look, factored = found[1]
             self._state = look.state
-            self._factored = factored if damping == 0.0 else None
-            if damping == 0.0 and factored.decrement < _STILL:
+            self._factored = factored if damping.last == 0.0 else None
+            if damping.last == 0.0 and factored.decrement < _STILL:
                 break
-            damping = damping / _MORE if damping > _FIRST_DAMPING else 0.0
         return look
 
-    def _step(self, look: Look, damping: float) -> tuple[Look, Factored, float] | None:
-        """One that does not raise the cost, damped as much as that needs; none where none does."""
-        equations = self._model.normal(look)
-        while damping < _MOST:
-            try:
-                factored = Factored(equations, damping)
-            except LinAlgError:
-                pass
-            else:
-                ahead = self._model.look(look.state.moved(factored.chain, factored.border))
-                if ahead.cost <= look.cost * (1.0 + _ROUNDING):
-                    return ahead, factored, damping
-            damping = max(_MORE * damping, _FIRST_DAMPING)
-        return None
+    def _tried(
+        self, state: State, equations: NormalEquations, damping: float
+    ) -> tuple[float, tuple[Look, Factored]]:
+        factored = Factored(equations, damping)
+        ahead = self._model.look(state.moved(factored.chain, factored.border))
+        return ahead.cost, (ahead, factored)

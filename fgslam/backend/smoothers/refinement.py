@@ -37,14 +37,17 @@ from fgslam.core.estimates import Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import reorthonormalise
 from fgslam.core.quantiles import chi_square_quantile
+from fgslam.core.threads import one_blas_thread
 from fgslam.factors.graphs import number, poses_of_frame
 
 _GATE = float(chi_square_quantile(0.999, 3))  # 16.3, of a landmark observation's three numbers
 _KEPT = 0.5  # weights end at 0 or 1
 _ROUNDS = 20  # trims until the observations that fit do not change any more
-_ROUGH = 1e-3  # of the cost: the minimum with the kernel only chooses what fits
-_STEPS_A_ROUND = 1  # what fits is chosen anew after each, and the last solution goes all the way
+_ROUGH = 1e-2  # of the cost: the minimum with the kernel only says roughly what fits
 _CONTROL_GROWS, _CONTROL_ENDS = 1.4, 1e6  # Yang et al.; with the latter all weights are 0 or 1
+_NEAR_BEGINS, _NEAR_GROWS, _NEAR_ENDS = 0.3, 4.0, 20.0
+"""From a robust solution the convex beginning is left out and the rest taken in larger steps: at
+first what fits by half the gate's width counts in full, and nothing beyond twice of it."""
 _DECIDED = 1e-4
 _LEAST = 1e-12
 _SOLUTIONS = 5  # solutions until no landmark lies behind a camera any more
@@ -91,7 +94,7 @@ def graduated(
     weights = np.ones(len(ratio))
     while worst > 0.0 and control < _CONTROL_ENDS:
         weights = truncated_weights(graph.squared(state) / gate, control)
-        state = graph.weighed(weights).minimum(state, _STEPS_A_ROUND, effort.tolerance)
+        state = graph.weighed(weights).minimum(state, 1, effort.tolerance)
         if np.minimum(weights, 1.0 - weights).max() < _DECIDED:
             break
         control *= _CONTROL_GROWS
@@ -108,9 +111,13 @@ def truncated_weights(ratio: FloatArray, control: float) -> FloatArray:
 def trimmed(
     graph: WholeGraph, state: State, effort: Effort, noise_factor: float = 1.0
 ) -> tuple[State, WholeGraph]:
-    """Minimises with the graph's own kernel, then without it over what fits.
+    """Minimises roughly with the graph's own kernel, then without it over what fits.
 
-    Loops keep their kernels: they are too few to be separated by a trim.
+    In between the weights go from the kernel's to 0 and 1 by the last part of the graduation: cut
+    at once, what the kernel has let go a little too far would stay out. The sum of squares, each at
+    most the gate's, ends lower than after a cut at a closely followed minimum with the kernel, in
+    a third of the steps (docs/derivations/smoothers.md). Loops keep their kernels: they are too few
+    to be separated by a trim.
 
     Args:
         graph: factors, landmark observations with a kernel.
@@ -124,14 +131,25 @@ def trimmed(
     gate = _GATE / noise_factor**2
     if graph.weights.all():  # else it is known already what fits, but for a few
         state = graph.minimum(state, effort.iterations, _ROUGH)
-    fits = np.zeros(len(graph.weights), np.bool_)
-    kept = graph
+        control = _NEAR_BEGINS
+        while control < _NEAR_ENDS:
+            weights = truncated_weights(graph.squared(state) / gate, control)
+            state = graph.weighed(weights).minimum(state, 1, effort.tolerance)
+            control *= _NEAR_GROWS
+    return _settled(graph, state, gate, effort)
+
+
+def _settled(
+    graph: WholeGraph, state: State, gate: float, effort: Effort
+) -> tuple[State, WholeGraph]:
+    """The minimum over what fits there: chosen and solved for by turns, until that is the same."""
+    fits, kept = graph.weights > 0.0, graph.weighed(graph.weights)
     for _ in range(_ROUNDS):
         before, fits = fits, graph.squared(state) <= gate
         if (fits == before).all():
             break
         kept = graph.weighed(fits)
-        state = kept.minimum(state, _STEPS_A_ROUND, _ROUGH)
+        state = kept.minimum(state, 1, effort.tolerance)
     return kept.minimum(state, effort.iterations, effort.tolerance), kept
 
 
@@ -215,10 +233,12 @@ class WholeGraphSolver:
         self._answer: Refined | None = None
         self.remarks: list[str] = []
 
+    @one_blas_thread()
     def solution(self) -> Solution:
         """All poses and landmarks at the minimum over all that was measured, with marginals."""
         return solution(self._refined(), self._builder.frames, self._floor)
 
+    @one_blas_thread()
     def joint(self, variables: list[int]) -> FloatArray:
         """Joint covariance of the graph's last pose and landmark variables.
 
@@ -249,6 +269,7 @@ class WholeGraphSolver:
         """Values at the minimum, and the factors that count there."""
         raise NotImplementedError
 
+    @one_blas_thread()
     def _accepted(
         self, loop: Constraint, drive: Drive, what: str, minimum: Minimum
     ) -> Acceptance | None:
