@@ -7,7 +7,16 @@ from collections.abc import Callable, Mapping
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.speed import estimators, homing, images, long_drive, maps, relocalising, starting
+from benchmarks.speed import (
+    estimators,
+    homing,
+    images,
+    long_drive,
+    maps,
+    relocalising,
+    smoothers,
+    starting,
+)
 from benchmarks.speed.drives import open_drive
 from fgslam.core.threads import one_blas_thread
 
@@ -18,6 +27,7 @@ LIMITS: dict[str, float] = (
     | homing.LIMITS
     | maps.LIMITS
     | relocalising.LIMITS
+    | smoothers.LIMITS
     | starting.LIMITS
 )
 """Largest allowed value of each bounded ratio, by its name in `bench.json`."""
@@ -40,6 +50,7 @@ PARTS: dict[str, Callable[[int], dict[str, float]]] = {
     "estimators": lambda frames: over_measurements(),
     "maps": lambda frames: over_maps(),
     "homing": lambda frames: homing.ratios_of_homing(),
+    "smoothers": lambda frames: smoothers.ratios_of_smoothers(),
     "starting": lambda frames: starting.ratios_of_starting(),
 }
 """Each part, called with the number of frames of the drive over images."""

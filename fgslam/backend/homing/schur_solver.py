@@ -23,6 +23,7 @@ from fgslam.core.planar import wrapped_pose
 
 _ROWS, _COLUMNS = np.indices((STATE, STATE))
 _LOWER = np.tril_indices(STATE)
+_LEAST_DAMPING = 1e-3  # an image later the start is another, and covariances want none
 _STILL = 0.3  # deviations, of all variables together: a shorter step ends the iteration
 _EVERY = 4  # images: a doubt costs half as much as an update
 _STEPS = 1
@@ -179,7 +180,7 @@ class SchurSolver:
 
     def _go_on(self, steps: int) -> Look:
         """Up to so many steps; what is left of the way is gone with the next image."""
-        look, damping = self._model.look(self._state), Damping()
+        look, damping = self._model.look(self._state), Damping(_LEAST_DAMPING)
         self._factored = None
         for _ in range(steps):
             attempt = partial(self._tried, look.state, self._model.normal(look))

@@ -132,7 +132,11 @@ def test_marginals_of_all_variables(name: str, kind: Whole, rng: np.random.Gener
     problem = problems()[name](rng)
     reference = problem.reference()
     kernel = KernelSettings("cauchy", 0.5) if name == "robust" else PLAIN
-    found = whole(kind, problem.graph, problem.values, kernel)
+    graph, state = WholeGraph.of(problem.graph, problem.values, kernel)
+    system = graph.linear(state)
+    assert system.pose_keys.tolist() == problem.poses
+    assert system.landmark_keys.tolist() == problem.landmarks
+    found = kind.of(system)
     poses, landmarks = found.poses(), found.landmarks()
     assert poses.shape == (len(problem.poses), 6, 6)
     assert landmarks.shape == (len(problem.landmarks), 3, 3)
