@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from simulated import assert_same_bits, play
@@ -20,11 +22,12 @@ from smoothing import (
     run,
     wrong_matches,
 )
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from fgslam.backend.settings import BatchSettings
 from fgslam.backend.smoothers import refinement
 from fgslam.backend.smoothers.smoother import MapSmoother
-from fgslam.backend.smoothers.whole_graph import WholeGraph
+from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.errors import EstimatorError
 from fgslam.evaluation.consistency import judge
 
@@ -142,3 +145,19 @@ def test_restored_smoother_continues_to_the_bit(name: str) -> None:
     second.restore({key: np.array(array) for key, array in first.state().items()})
     play(second, increments[7:], FREE)
     assert_same_bits(second.estimate(), straight.estimate())
+
+
+def test_the_solution_takes_one_blas_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Its sums, and so its bytes, must not depend on how many threads the environment allows.
+    estimator, _ = run(BatchSettings(), drawn(0).increments)
+    threads: list[int] = []
+    minimum = WholeGraph.minimum
+
+    def counted(self: WholeGraph, *arguments: Any) -> State:
+        threads.extend(x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas")
+        return minimum(self, *arguments)
+
+    monkeypatch.setattr(WholeGraph, "minimum", counted)
+    with threadpool_limits(limits=2, user_api="blas"):
+        estimator.estimate()
+    assert set(threads) == {1}
