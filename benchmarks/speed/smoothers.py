@@ -15,6 +15,7 @@ from benchmarks.speed.drives import MeasuredDrive, cpu_seconds, interleaved, ope
 from fgslam.backend.settings import BatchSettings, Isam2Settings, KernelSettings
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.backend.smoothers.whole_graph import WholeGraph
+from fgslam.core.arrays import FloatArray
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.factors.noise import KernelName
@@ -54,7 +55,7 @@ class PlainGtsam:
             for i, row in enumerate(points.rows(seen.ids).tolist()):
                 point = gtsam.symbol("l", row)
                 column, line, disparity = seen.measurement[i].tolist()
-                model = gtsam.noiseModel.Gaussian.Covariance(_in_both(seen.covariance[i]))
+                model: Any = gtsam.noiseModel.Gaussian.Covariance(_in_both(seen.covariance[i]))
                 if loss is not None:
                     model = gtsam.noiseModel.Robust.Create(loss, model)
                 measured = gtsam.StereoPoint2(column + disparity, column, line)
@@ -82,10 +83,10 @@ def _loss(name: KernelName) -> Any:
     return None
 
 
-def _in_both(covariance: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+def _in_both(covariance: FloatArray) -> FloatArray:
     """Covariance of (left column, right column, row), of one of (column, row, disparity)."""
     both = np.array([[1.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    return both @ covariance @ both.T
+    return np.asarray(both @ covariance @ both.T)
 
 
 @one_blas_thread()
