@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.cameras.calibration import read_calibration, read_json_object
+from fgslam.cameras.calibration import read_json_object
 from fgslam.cameras.calibration_formats import (
     read_asl_camera,
     read_camchain,
@@ -18,6 +18,7 @@ from fgslam.cameras.calibration_formats import (
     read_opencv_pair,
     read_projections,
 )
+from fgslam.cameras.corrected import read_own_format
 from fgslam.cameras.rectification import Rectifier, rectifier, right_and_left
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.checks import is_finite_number
@@ -194,7 +195,7 @@ def _of_folder(folder: Path, size: Size | None) -> CameraRig | Rectifier:
 
 def _own_format(path: Path, _: Size | None) -> CameraRig | Rectifier:
     three = "vertical_baseline_m" in read_json_object(path)
-    return read_calibration(path, three)
+    return read_own_format(path, three)
 
 
 def _of_camera_info(path: Path, _: Size | None) -> CameraRig | Rectifier:

@@ -48,7 +48,7 @@ def _root(version: options.Version = False) -> None:
 
 
 @app.command(epilog=f"Experiments that come with fgslam: {', '.join(experiment_names())}.")
-def run(
+def run(  # noqa: PLR0913 - each option is a parameter
     config: options.Experiment,
     out: options.RunFolder = None,
     camera: options.Camera = None,
@@ -57,6 +57,7 @@ def run(
     resume: options.Resume = False,
     map_in: options.MapIn = None,
     map_out: options.MapOut = None,
+    camera_out: options.CameraOut = None,
 ) -> None:
     """Map a recording, or run an experiment: images in, run folder out.
 
@@ -80,10 +81,15 @@ def run(
     # Not before: a wrong key is answered before any library of numbers is loaded.
     from fgslam.runs.engine import resume_command
     from fgslam.runs.run import run_experiment
+    from fgslam.runs.tasks.slam_calibration import corrected_camera, require_camera
 
+    if camera_out is not None:
+        require_camera(settings, camera_out)
     with _under_way() as (progress, stopped):
         result = run_experiment(settings, folder, existing, progress, stopped)
     _show([result], resume_command(folder))
+    if camera_out is not None:
+        typer.echo(corrected_camera(folder, camera_out))
     _exit_as([result])
 
 

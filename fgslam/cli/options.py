@@ -137,6 +137,14 @@ MapOut = Annotated[
     Path | None,
     typer.Option("--map-out", metavar="MAP", help="where to save the map; sets map.save"),
 ]
+CameraOut = Annotated[
+    Path | None,
+    typer.Option(
+        "--camera-out",
+        metavar="FILE",
+        help="where to save the calibration as the drive corrected it, for --camera",
+    ),
+]
 
 # --------------------------------------------------------------------------------------------
 # inspect, localize, init

@@ -1,9 +1,9 @@
 """What a stated calibration leaves uncorrected, as displacements of a rig's pixels.
 
 A rectified pair is as good as its calibration. What remains is smooth over each image: the second
-camera is turned, its focal length, principal point and lens differ a little from those stated, and
-the lens of all cameras bends what it should not. To first order in each, the terms of
-:data:`TERMS` (Brown 1971 for the lens). Derived in docs/derivations/self_calibration.md.
+camera is turned, its focal length, principal point and lens differ a little from those stated. To
+first order in each, the terms of :data:`TERMS` (Brown 1971 for the lens). Derived in
+docs/derivations/self_calibration.md.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ TERMS = (
     "decentring_y",
     "radial",
 )
-"""Of each camera beside the reference, in units of the focal length."""
+"""Of each camera beside the reference, in units of the focal length.
 
-COMMON_TERMS = ("radial_of_all",)
-"""What all cameras share; a common focal length is not among them: a straight drive hides it."""
+What all cameras share is taken as calibrated: a common focal length, which a straight drive hides,
+and a common radial term, which trades against it."""
 
 EXPECTED_PX = 1.0
 """Displacement that a calibration is taken to leave, root mean square over the image: what the
@@ -45,9 +45,9 @@ _GRID = 7  # points along each axis of the image at which the prior is stated
 
 
 def term_names(rig: CameraRig) -> tuple[str, ...]:
-    """Names of a correction's values, as ``left.yaw``: those of each camera, then the common."""
+    """Names of a correction's values, as ``left.yaw``: those of each camera in turn."""
     cameras = _CAMERAS[: rig.cameras - 1]
-    return tuple(f"{camera}.{term}" for camera in cameras for term in TERMS) + COMMON_TERMS
+    return tuple(f"{camera}.{term}" for camera in cameras for term in TERMS)
 
 
 def displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
@@ -65,20 +65,17 @@ def camera_displacements(rig: CameraRig, camera: int, pixels: FloatArray) -> Flo
     """Displacements (k, 2, p) of pixels (k, 2) of one camera (0: right) by a unit of each term."""
     focal = np.array([rig.fx, rig.fy])
     count = len(TERMS)
-    out = np.zeros((len(pixels), 2, count * (rig.cameras - 1) + 1))
-    rays = (pixels - [rig.cx, rig.cy]) / focal
-    squared = (rays**2).sum(axis=1)
-    out[..., -1] = focal * rays * squared[:, None]
+    out = np.zeros((len(pixels), 2, count * (rig.cameras - 1)))
     if camera:
         at = slice(count * (camera - 1), count * camera)
-        out[..., at] = focal[:, None] * _terms(rays, squared)
+        out[..., at] = focal[:, None] * _terms((pixels - [rig.cx, rig.cy]) / focal)
     return out
 
 
-def _terms(rays: FloatArray, squared: FloatArray) -> FloatArray:
+def _terms(rays: FloatArray) -> FloatArray:
     """Displacements (k, 2, 9) of normalised image points (k, 2) in the order of TERMS."""
     x, y = rays.T
-    r2 = squared
+    r2 = x * x + y * y
     zero, one = np.zeros_like(x), np.ones_like(x)
     columns = (one, zero, 1.0 + x * x, x * y, -y, x, r2 + 2.0 * x * x, 2.0 * x * y, x * r2)
     rows = (zero, one, x * y, 1.0 + y * y, x, y, 2.0 * x * y, r2 + 2.0 * y * y, y * r2)
@@ -92,12 +89,10 @@ def prior_information(rig: CameraRig, expected_px: float = EXPECTED_PX) -> Float
     the displacements predicted by the terms have this standard deviation in the mean.
     """
     unit = _grid_displacements(rig)
-    groups = [slice(c, c + len(TERMS)) for c in range(0, unit.shape[2] - 1, len(TERMS))]
-    groups.append(slice(unit.shape[2] - 1, unit.shape[2]))
     out = np.zeros((unit.shape[2], unit.shape[2]))
-    for k, group in enumerate(groups):
-        rows = slice(2 * k + 2, 2 * k + 4) if k < rig.cameras - 1 else slice(None)
-        jacobian = unit[:, rows, group].reshape(-1, group.stop - group.start)
+    for k in range(rig.cameras - 1):
+        group = slice(len(TERMS) * k, len(TERMS) * (k + 1))
+        jacobian = unit[:, 2 * k + 2 : 2 * k + 4, group].reshape(-1, len(TERMS))
         scale = jacobian.shape[1] / (len(jacobian) * expected_px**2)
         out[group, group] = scale * (jacobian.T @ jacobian)
     return out
@@ -152,8 +147,7 @@ class RigCorrection(Brief):
     def rms_px(self) -> float:
         """Displacement of the other cameras against the right one, rms over the image, pixels."""
         moved = (_grid_displacements(self.rig) @ self.values).reshape(-1, self.rig.cameras, 2)
-        against = moved[:, 1:] - moved[:, :1]
-        return float(np.sqrt((against**2).sum(axis=2).mean()))
+        return float(np.sqrt((moved[:, 1:] ** 2).sum(axis=2).mean()))
 
     def changes(self) -> dict[str, tuple[float, float]]:
         """The turn and zoom of each other camera that fits its displacements best, with sigmas.

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.calibration import level_mounting, read_calibration, read_json_object
+from fgslam.cameras.calibration import level_mounting, read_json_object
+from fgslam.cameras.corrected import read_own_format
 from fgslam.cameras.rectification import Rectifier
 from fgslam.cameras.rig import read_rig
 from fgslam.core.arrays import FloatArray, IntArray
@@ -128,8 +129,9 @@ def _cameras(
     """The rectified rig, and what rectifies the images where they are raw."""
     path, three = _camera_file(root, settings), len(listed) == 3
     if settings.camera_file is None:
-        return _mounted(read_calibration(path, three), settings), None
-    found = read_rig(path, first_size(listed[0].values()))
+        found = read_own_format(path, three)
+    else:
+        found = read_rig(path, first_size(listed[0].values()))
     raw = found if isinstance(found, Rectifier) else None
     rig = found.rig if isinstance(found, Rectifier) else found
     if three and rig.vertical_baseline is None:

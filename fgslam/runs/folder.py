@@ -47,6 +47,7 @@ _RESULT_FILES = (
     METRICS_FILE,
     "timing.csv",
     "calibration.csv",
+    "camera.json",
     "loops.csv",
     COMPARISON_FILE,
     TRIALS_FILE,

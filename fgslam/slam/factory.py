@@ -204,12 +204,17 @@ def make_pipeline(
     )
 
 
-def make_calibration(rig: CameraRig, settings: FrontendSettings) -> SelfCalibration | None:
-    """Calibration of the rig from the drive; None where the calibration is to be taken as it is.
+def calibrates_itself(settings: FrontendSettings) -> bool:
+    """Whether the rig is to be calibrated from the drive.
 
     The paper's measurement is not the least squares over all images that a correction changes.
     """
-    if not settings.self_calibration or settings.stereo.measurement != "fused":
+    return settings.self_calibration and settings.stereo.measurement == "fused"
+
+
+def make_calibration(rig: CameraRig, settings: FrontendSettings) -> SelfCalibration | None:
+    """Calibration of the rig from the drive; None where the calibration is to be taken as it is."""
+    if not calibrates_itself(settings):
         return None
     from fgslam.backend.filters.self_calibration import SelfCalibration
 

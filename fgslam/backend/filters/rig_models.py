@@ -28,7 +28,8 @@ class WeighedCorrection:
 
     Attributes:
         estimated: with all terms free; its sigmas are the honest ones.
-        applied: the mean over the models, under the covariance of the above.
+        applied: the mean over the models, or an older one that lies within the noise of it; with
+            the covariance of the above.
         probabilities: of each model.
     """
 

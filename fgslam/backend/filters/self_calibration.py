@@ -134,7 +134,7 @@ class SelfCalibration:
         self._known = dataclasses.replace(
             self._known, values=known + covariance @ pull, covariance=covariance
         )
-        self.found = weighed(self._known, self._prior)
+        self.found = self._held(weighed(self._known, self._prior))
         self.steps.append(CalibrationStep.of(timestamp, self.found, self.knocks))
 
     # ----------------------------------------------------------------------------------------
@@ -143,6 +143,7 @@ class SelfCalibration:
         """All that changes but the frames of the window in work, which the log and poses hold."""
         return {
             "values": self._known.values,
+            "applied": self.found.applied.values,
             "covariance": self._known.covariance,
             "time": np.array(np.nan if self._last_time is None else self._last_time),
             "evidence": np.array([self._misfit, self._freedom]),
@@ -161,7 +162,9 @@ class SelfCalibration:
         self.windows, self.knocks, suspected, waiting = map(int, state["counts"])
         self._suspected = bool(suspected)
         self.steps = _steps_of(state)
-        self.found = weighed(self._known, self._prior)
+        found = weighed(self._known, self._prior)
+        applied = dataclasses.replace(found.applied, values=state["applied"])
+        self.found = dataclasses.replace(found, applied=applied)
         begin = len(log) - waiting
         self._frames = [
             (wTc, _accepted(increment))
@@ -169,6 +172,17 @@ class SelfCalibration:
         ]
 
     # ----------------------------------------------------------------------------------------
+
+    def _held(self, found: WeighedCorrection) -> WeighedCorrection:
+        """With the old correction where the new one is no farther from it than noise goes.
+
+        The map was measured with the old one, and contradicts the new one.
+        """
+        old = self.found.applied.values
+        change = found.applied.values - old
+        if change @ np.linalg.solve(found.estimated.covariance, change) > len(change):
+            return found
+        return dataclasses.replace(found, applied=dataclasses.replace(found.applied, values=old))
 
     def _drifted(self, timestamp: float) -> FloatArray:
         """The covariance, grown by the rig's drift since the last window."""

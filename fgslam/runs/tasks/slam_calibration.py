@@ -8,11 +8,18 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.backend.filters.self_calibration import SelfCalibration
+from fgslam.cameras.corrected import write_corrected
+from fgslam.core.errors import ConfigError, OutputError
+from fgslam.core.files import read_text, require_writable, write_text
 from fgslam.core.rig_correction import RigCorrection, term_names
+from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.tables import write_csv
+from fgslam.runs.config_models import Experiment, ExperimentConfig
+from fgslam.slam.factory import calibrates_itself
 
 CALIBRATION_FILE = "calibration.csv"
+CAMERA_FILE = "camera.json"
 _TOLD_SIGMAS = 3.0  # what is less than this many of its own is not told as a finding
 _UNITS = {"deg": "degrees", "percent": "%"}
 _WORDS = {
@@ -24,7 +31,11 @@ _WORDS = {
 
 
 def write_calibration(folder: Path, calibration: SelfCalibration) -> None:
-    """calibration.csv: what was known after each window. Raises OutputError."""
+    """camera.json and calibration.csv: the rig, corrected, and what was known after each window.
+
+    Raises OutputError.
+    """
+    write_corrected(folder / CAMERA_FILE, calibration.found.applied)
     known = calibration.found.estimated
     terms = term_names(known.rig)
     changes = list(known.changes())
@@ -98,3 +109,27 @@ def _told(known: RigCorrection, camera: str) -> str:
             size = f"{value:.3f} {unit}"
             told.append(f"{_WORDS[name].format(size)} ({abs(value) / sigma:.0f} sigma)")
     return f"the {camera} camera is {', '.join(told)}" if told else ""
+
+
+def require_camera(config: Experiment, path: Path) -> None:
+    """Refuses, before a run, to write the calibration that it will not find.
+
+    Raises:
+        ConfigError: its rig does not calibrate itself.
+        OutputError: the folder of the file is not there or not writable.
+    """
+    slam = config if isinstance(config, ExperimentConfig) else None
+    measured = slam is not None and isinstance(slam.dataset, MeasurementDatasetSettings)
+    if slam is None or measured or not calibrates_itself(slam.frontend):
+        raise ConfigError(
+            "--camera-out: this run takes its cameras as calibrated; it needs SLAM on images with "
+            "frontend.self_calibration true and stereo.measurement fused"
+        )
+    require_writable(path.parent)
+
+
+def corrected_camera(run: Path, path: Path) -> str:
+    """Copies the run's corrected calibration to ``path``; a line about it. Raises OutputError."""
+    text = read_text(run / CAMERA_FILE, OutputError)
+    write_text(path, text)
+    return f"camera      {path}: the calibration, corrected; use it by --camera {path}"

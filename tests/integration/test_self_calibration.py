@@ -1,0 +1,83 @@
+"""A recording whose left images are turned: the run says so, and its calibration undoes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from recordings import BASELINE, FOCAL, HEIGHT, WIDTH, experiment, write_recording
+from running import bytes_of, main, metrics_of, run_values, stop_after
+
+from fgslam.cameras.corrected import rectifier_of
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.rig_correction import term_names
+from fgslam.core.sensors import CameraRig
+
+ROLL_DEG = 0.4
+RIG = CameraRig(
+    WIDTH, HEIGHT, FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, BASELINE, None, np.eye(4)
+)
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording whose left camera is turned about its axis."""
+    root = write_recording(tmp_path_factory.mktemp("turned") / "recording", frames=20, top=False)
+    values = np.zeros(len(term_names(RIG)))
+    values[term_names(RIG).index("left.roll")] = -np.deg2rad(ROLL_DEG)
+    turn = rectifier_of(RIG, values)  # undoes the opposite turn: it turns
+    for path in sorted((root / "left").glob("*.png")):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        assert cv2.imwrite(str(path), turn.rectify(1, image))
+    return root
+
+
+def test_the_turn_is_found_told_and_written(
+    turned: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    better = tmp_path / "better.json"
+    run = ("run", turned, "--out")
+    assert main(monkeypatch, *run, tmp_path / "a", "--camera-out", better) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "the left camera is turned by" in said
+    assert "in roll" in said
+    found = metrics_of(tmp_path / "a")["rig"]
+    roll = found["changes"]["left_roll_deg"]
+    assert roll["value"] == pytest.approx(ROLL_DEG, abs=0.08)
+    assert abs(roll["value"]) > 5.0 * roll["sigma"]
+    assert better.read_bytes() == (tmp_path / "a" / "camera.json").read_bytes()
+    assert main(monkeypatch, *run, tmp_path / "b", "--camera", better) == 0
+    again = metrics_of(tmp_path / "b")["rig"]
+    assert abs(again["changes"]["left_roll_deg"]["value"]) < 0.1
+
+
+def test_an_interrupted_run_goes_on_with_the_same_corrections(turned: Path, tmp_path: Path) -> None:
+    values = experiment(turned)
+    whole = run_values(values, tmp_path / "whole")
+    assert (
+        MeasurementLog.load(whole.folder / "measurements.npz").increments[-1].rig_correction.any()
+    )
+    partial = run_values(values, tmp_path / "run", stopped=stop_after(9))
+    resumed = run_values(values, partial.folder, "resume")
+    assert resumed.result.status == "finished"
+    assert bytes_of(partial.folder) == bytes_of(whole.folder)
+    name = "calibration.csv"
+    assert (partial.folder / name).read_bytes() == (whole.folder / name).read_bytes()
+
+
+def test_paper_pipelines_write_no_calibration(
+    turned: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    arguments = ("run", turned, "--out", tmp_path / "a", "--camera-out", tmp_path / "b.json")
+    assert main(monkeypatch, *arguments, "--set", "frontend.stereo.measurement=paper") == 2
+    assert "takes its cameras as calibrated" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "a").exists()
