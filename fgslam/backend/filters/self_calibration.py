@@ -24,6 +24,12 @@ WINDOW = 6
 """Frames of one window: motion enough to see depth change, few enough to cost little."""
 
 _DRIFT_S = 3600.0  # seconds after which as much is unknown as the calibration itself leaves
+_KERNEL_FACTOR = {2: 0.61, 3: 0.49}
+"""By cameras: variance under Gaussian noise as multiple of what the kernel's weights alone claim.
+
+Sandwich of an M-estimator (Huber 1981, ch. 6): E[w] E[w^2 s / d] / E[w - 2 w^2 s / (c^2 d)]^2 with
+Cauchy's weights w = 1 / (1 + s / c^2), s the squared residual of d = 2 * cameras coordinates.
+"""
 _TRUSTED_WINDOWS = 4.0  # how many windows the stated noise is worth, beside the observed one
 _KNOCK_PROBABILITY = 1e-6  # of a window so far off, by chance; two in a row are a knock
 _DOUBTFUL = 1e-3  # of the prior's information: less in a direction is no evidence of the noise
@@ -100,7 +106,8 @@ class SelfCalibration:
     def noise_factor(self) -> float:
         """Variance of what windows say, as multiple of what their pixels alone would give."""
         stated = _TRUSTED_WINDOWS * len(self._prior)
-        return max((stated + self._misfit) / (stated + self._freedom), 1e-3)
+        usual = _KERNEL_FACTOR[self._known.rig.cameras]
+        return max((usual * stated + self._misfit) / (stated + self._freedom), 1e-3)
 
     def observe(self, increment: Increment, wTc: FloatArray) -> WeighedCorrection:
         """Takes in a frame as measured and its pose; returns the correction as known now."""
@@ -204,12 +211,12 @@ class SelfCalibration:
         score = evidence.score + evidence.information @ (evidence.at - known)
         score = (axes.T @ score)[telling] / np.sqrt(size[telling])
         root = axes[:, telling] * np.sqrt(size[telling])
-        known_share = root.T @ covariance @ root / self.noise_factor
-        spread = np.eye(len(score)) + known_share
-        squared = float(score @ np.linalg.solve(spread, score))
+        known_share, turn = np.linalg.eigh(root.T @ covariance @ root / self.noise_factor)
+        squared = (turn.T @ score) ** 2 / (1.0 + known_share)
         likely = chi_square_quantile(1.0 - _KNOCK_PROBABILITY, len(score))
-        if self.windows > _TRUSTED_WINDOWS and squared / self.noise_factor > likely:
+        if self.windows > _TRUSTED_WINDOWS and squared.sum() / self.noise_factor > likely:
             return True
-        self._misfit += squared
-        self._freedom += float(len(score))
+        noisy = known_share < 1.0  # elsewhere it is the prior that is judged
+        self._misfit += float(squared[noisy].sum())
+        self._freedom += float(np.count_nonzero(noisy))
         return False
