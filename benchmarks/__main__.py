@@ -17,6 +17,7 @@ from typing import Any
 from benchmarks.evidence import (
     chess,
     drives,
+    false_matches,
     lasting,
     light,
     noise,
@@ -42,6 +43,7 @@ EVIDENCE: dict[str, Callable[[Path], Iterable[Table]]] = {
     "paired": lambda data: [variants.paired_table()],
     "real": lambda data: [drives.real_table(data)],
     "light": light.tables,
+    "false_matches": lambda data: false_matches.tables(),
     "noise": lambda data: noise.tables(),
     "lasting": lambda data: lasting.tables(),
     "visits": lambda data: visits.tables(),

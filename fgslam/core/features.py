@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import ByteArray, FloatArray, IntArray, Rows
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
 from fgslam.core.measurements import Observations
 
 
@@ -41,6 +41,8 @@ class StereoFeatures(Rows):
         position: (n, 3) in the reference camera's frame, metres.
         position_covariance: (n, 3, 3), metres squared.
         pixels: (n, 3, 2) raw (column, row) in right, left and top image; NaN without a top camera.
+        complete: (n,) found in every image of the rig, complete ones first; None if all are. The
+            others may be a landmark known already; they start none.
     """
 
     measurement: FloatArray
@@ -51,6 +53,15 @@ class StereoFeatures(Rows):
     position: FloatArray
     position_covariance: FloatArray
     pixels: FloatArray
+    complete: BoolArray | None = None
+
+    @property
+    def whole(self) -> StereoFeatures:
+        """Those found in every image, under the same numbers."""
+        if self.complete is None:
+            return self
+        found = self.select(np.flatnonzero(self.complete))
+        return replace(found, complete=None)
 
     def observations(self, which: IntArray, ids: IntArray, is_new: bool) -> Observations:
         """Some of the features as observations of the landmarks ``ids``."""

@@ -42,7 +42,8 @@ class Observations(Rows):
         measurement: (k, 3) (column, row, disparity), pixels; of a range-bearing sensor
             (azimuth, elevation, range), radians and metres.
         covariance: (k, 3, 3) of the measurement.
-        pixels: (k, 3, 2) raw pixels in right, left, top; NaN where there is no such camera.
+        pixels: (k, 3, 2) raw pixels in right, left, top; NaN where there is no such camera, or
+            its image did not show the landmark.
         is_new: (k,) True where this observation initiates the landmark (Type IV).
     """
 

@@ -16,7 +16,7 @@ import numpy as np
 from fgslam.core.arrays import Brief, FloatArray
 from fgslam.core.features import Features
 from fgslam.core.measurements import Increment, Observations
-from fgslam.core.sensors import CameraRig, measurement_map, vertical_to_horizontal
+from fgslam.core.sensors import CameraRig, partial_map, vertical_to_horizontal
 
 TERMS = (
     "column",  # principal point
@@ -187,11 +187,20 @@ class RigCorrection(Brief):
         return tuple(dataclasses.replace(found, xy=found.xy - off) for found, off in pairs)
 
     def corrected(self, observed: Observations) -> Observations:
-        """The observations as an exact rig had measured them; their raw pixels stay."""
+        """The observations as an exact rig had measured them; their raw pixels stay.
+
+        Of three images two may show a landmark; NaN where fewer do.
+        """
         rig, pixels = self.rig, observed.pixels[:, : self.rig.cameras]
-        moved = displacements(rig, pixels) @ self.values
-        fuse = measurement_map("fused", rig.cameras, vertical_to_horizontal(rig))
-        return dataclasses.replace(observed, measurement=observed.measurement - moved @ fuse.T)
+        moved = (displacements(rig, pixels) @ self.values).reshape(pixels.shape)
+        shown = np.isfinite(pixels).all(axis=2)
+        off = np.full((len(pixels), 3), np.nan)
+        for pattern in np.unique(shown, axis=0):
+            rows, seen = (shown == pattern).all(axis=1), np.flatnonzero(pattern).tolist()
+            if len(seen) > 1:
+                fuse = partial_map(seen, rig.cameras, vertical_to_horizontal(rig))
+                off[rows] = moved[rows][:, seen].reshape(-1, 2 * len(seen)) @ fuse.T
+        return dataclasses.replace(observed, measurement=observed.measurement - off)
 
     def corrected_increment(self, increment: Increment) -> Increment:
         """A frame's increment with corrected observations, those of its loops included."""

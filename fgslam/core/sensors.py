@@ -6,6 +6,7 @@ docs/derivations/stereo_measurement.md and docs/derivations/range_bearing.md.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -165,6 +166,18 @@ def measurement_map(kind: str, cameras: int, ratio: float) -> FloatArray:
         out[2, 5] = (1.0 - weight) * ratio
         out[2, 1] = -out[2, 5]
     return out
+
+
+def partial_map(seen: Sequence[int], cameras: int, ratio: float) -> FloatArray:
+    """The map `fused` (3, 2 * seen) from the pixels of two cameras or more of a rig's.
+
+    Args:
+        seen: which: 0 right, 1 left, 2 top.
+        cameras: how many the rig has.
+        ratio: :func:`vertical_to_horizontal`.
+    """
+    model = pixel_model(cameras, ratio).reshape(cameras, 2, 3)[list(seen)]
+    return np.asarray(np.linalg.pinv(model.reshape(-1, 3)), np.float64)
 
 
 def _horizontal_weight(ratio: float) -> float:

@@ -6,13 +6,15 @@ partner is ambiguous. Two-camera rigs use the same code without the last step.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.rig_correction import RigCorrection
-from fgslam.core.sensors import CameraRig, measurement_map, vertical_to_horizontal
+from fgslam.core.sensors import CameraRig, measurement_map, partial_map, vertical_to_horizontal
 from fgslam.frontend.features.matching import alike, choose, pairs_within
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import StereoSettings
@@ -41,27 +43,36 @@ class StereoMatcher:
         raw pixels stay as they are.
         """
         straight = features if correction is None else correction.straightened(features)
-        i, j = self.match_left(straight[0], straight[1])
-        matches: tuple[IntArray, ...] = (i, j)
-        if len(features) > 2:
-            kept, k = self.match_top(straight[0], straight[1], straight[2], (i, j))
-            matches = (i[kept], j[kept], k)
-        return self._measure(features, straight, matches)
+        pairs = self.match_left(straight[0], straight[1])
+        return self._measure(features, straight, self._confirmed(straight, pairs))
+
+    def match_all(
+        self, features: tuple[Features, ...], correction: RigCorrection | None = None
+    ) -> StereoFeatures:
+        """The same, and after them what only two of three images show; ``complete`` tells them.
+
+        The third image confirms what is new (Se et al. 2.2). A landmark is confirmed by the map
+        that predicts it, and SIFT misses a fifth of all landmarks in each image, however small the
+        motion. Without descriptors, as in the paper, one more candidate would only be ambiguous.
+        """
+        if len(features) == 2 or self._appearance.mode == "paper":
+            return self.match(features, correction)
+        straight = features if correction is None else correction.straightened(features)
+        i, j = pairs = self.match_left(straight[0], straight[1])
+        confirmed = self._confirmed(straight, pairs)
+        whole = self._measure(features, straight, confirmed)
+        n, k = self._match_along(1, straight[0], straight[2], self._vertical_to_horizontal)
+        # What both images show, but not at one depth, is contradicted and not seen twice.
+        beside = np.isin(i, np.union1d(n, confirmed[0]), invert=True)
+        above = np.isin(n, i, invert=True)
+        without_top = self._measure(features, straight, (i[beside], j[beside], None))
+        without_left = self._measure(features, straight, (n[above], None, k[above]))
+        every = whole.join(without_top).join(without_left)
+        return replace(every, complete=np.arange(len(every)) < len(whole))
 
     def match_left(self, right: Features, left: Features) -> tuple[IntArray, IntArray]:
         """Pairs of right and left features, ascending in the right ones."""
-        s = self._settings
-        i, j = pairs_within(right.xy[:, 1], s.epipolar_px, left.xy[:, 1])
-        disparity = left.xy[j, 0] - right.xy[i, 0]
-        ok = (disparity >= s.min_disparity_px) & (disparity <= s.largest_disparity_px)
-        i, j = i[ok], j[ok]
-        ok = alike(
-            (right.scale[i], left.scale[j]),
-            (right.orientation[i], left.orientation[j]),
-            s.scale_ratio,
-            self._angle,
-        )
-        return choose(i[ok], j[ok], (right.descriptors, left.descriptors), self._appearance)
+        return self._match_along(0, right, left, 1.0)
 
     def match_top(
         self, right: Features, left: Features, top: Features, pairs: tuple[IntArray, IntArray]
@@ -87,37 +98,67 @@ class StereoMatcher:
         descriptors = (right.descriptors[i], top.descriptors)
         return choose(p[ok], k[ok], descriptors, self._appearance)
 
+    def _confirmed(
+        self, features: tuple[Features, ...], pairs: tuple[IntArray, IntArray]
+    ) -> tuple[IntArray, ...]:
+        """The pairs that the third image confirms, with its features; all where there is none."""
+        if len(features) == 2:
+            return pairs
+        kept, k = self.match_top(features[0], features[1], features[2], pairs)
+        return pairs[0][kept], pairs[1][kept], k
+
+    def _match_along(
+        self, axis: int, right: Features, other: Features, to_horizontal: float
+    ) -> tuple[IntArray, IntArray]:
+        """Pairs (k,) with a camera beside the right one (``axis`` 0) or above it (1)."""
+        s = self._settings
+        i, j = pairs_within(right.xy[:, 1 - axis], s.epipolar_px, other.xy[:, 1 - axis])
+        disparity = (other.xy[j, axis] - right.xy[i, axis]) * to_horizontal
+        ok = (disparity >= s.min_disparity_px) & (disparity <= s.largest_disparity_px)
+        i, j = i[ok], j[ok]
+        ok = alike(
+            (right.scale[i], other.scale[j]),
+            (right.orientation[i], other.orientation[j]),
+            s.scale_ratio,
+            self._angle,
+        )
+        return choose(i[ok], j[ok], (right.descriptors, other.descriptors), self._appearance)
+
     def _measure(
         self,
         features: tuple[Features, ...],
         straight: tuple[Features, ...],
-        matches: tuple[IntArray, ...],
+        matches: tuple[IntArray | None, ...],
     ) -> StereoFeatures:
-        pixels = np.full((len(matches[0]), 3, 2), np.nan)
-        for camera, (found, index) in enumerate(zip(features, matches, strict=True)):
-            pixels[:, camera] = found.xy[index]
-        used = [found.xy[index] for found, index in zip(straight, matches, strict=True)]
-        measurement = np.concatenate(used, axis=1) @ self._map.T
+        """Matched features (n,) of each camera, None for one that does not show them."""
+        seen = [(camera, m) for camera, m in enumerate(matches) if m is not None]
+        first = seen[0][1]
+        pixels = np.full((len(first), 3, 2), np.nan)
+        for camera, index in seen:
+            pixels[:, camera] = features[camera].xy[index]
+        used = [straight[camera].xy[index] for camera, index in seen]
+        cameras = [camera for camera, _ in seen]
+        linear = self._map
+        if len(cameras) < len(features):
+            linear = partial_map(cameras, len(features), self._vertical_to_horizontal)
+        measurement = np.concatenate(used, axis=1) @ linear.T
         variance = self._settings.pixel_sigma**2
-        covariance = np.tile(variance * (self._map @ self._map.T), (len(pixels), 1, 1))
-        scale, orientation = _average(features, matches)
+        covariance = np.tile(variance * (linear @ linear.T), (len(pixels), 1, 1))
+        scale, orientation = _average([(features[camera], index) for camera, index in seen])
         return StereoFeatures(
             measurement=measurement,
             measurement_covariance=covariance,
             scale=scale,
             orientation=orientation,
-            descriptors=features[0].descriptors[matches[0]],
+            descriptors=features[0].descriptors[first],
             position=triangulate(self._rig, measurement),
             position_covariance=triangulation_covariance(self._rig, measurement, covariance),
             pixels=pixels,
         )
 
 
-def _average(
-    features: tuple[Features, ...], matches: tuple[IntArray, ...]
-) -> tuple[FloatArray, FloatArray]:
+def _average(pairs: list[tuple[Features, IntArray]]) -> tuple[FloatArray, FloatArray]:
     """Mean scale and circular mean orientation over the images (Se et al. 2.2)."""
-    pairs = list(zip(features, matches, strict=True))
     scale = np.mean([f.scale[m] for f, m in pairs], axis=0)
     angles = np.array([f.orientation[m] for f, m in pairs])
     orientation = np.arctan2(np.sin(angles).sum(axis=0), np.cos(angles).sum(axis=0))

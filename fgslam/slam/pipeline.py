@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameReport:
-    """What one frame gave, for outputs and pictures."""
+    """What one frame gave, for outputs and pictures; ``stereo`` is what all images show."""
 
     found: FeatureFrame
     stereo: StereoFeatures
@@ -86,10 +86,11 @@ class SlamPipeline:
         odometry = self.motion.between(timestamp, body)
         prediction = predicted(self.estimator, odometry)
         watch.lap("predict")
-        stereo = self._match_stereo(found)
+        every = self._match_stereo(found)
+        stereo = every.whole
         watch.lap("stereo")
         landmarks, ended = self._fused()
-        seen = self._track(prediction, found, stereo, landmarks)
+        seen = self._track(prediction, found, every, landmarks)
         watch.lap("track")
         seen = self._recognise(seen, stereo, landmarks, ended)
         watch.lap("places")
@@ -107,7 +108,7 @@ class SlamPipeline:
         if found.frame is None:
             return StereoFeatures.empty()
         correction = None if self.calibration is None else self.calibration.found.applied
-        return self.stereo.match(found.features, correction)
+        return self.stereo.match_all(found.features, correction)
 
     def _increment(
         self, index: int, timestamp: float, odometry: Odometry | None, seen: _Seen
@@ -152,7 +153,7 @@ class SlamPipeline:
             tracked = anew if relocalised else tracked
         elif self.places is not None and found.i > 0:
             tracked = self.places.placed_by_recent(tracked, prediction, landmarks, stereo)
-            tracked, relocalised = self.places.recover(tracked, landmarks, stereo)
+            tracked, relocalised = self.places.recover(tracked, landmarks, stereo.whole)
             maps_on = self.places.maps_on
         image = found.frame.images[0]
         association = self.tracker.associate(tracked, stereo, image, maps_on)

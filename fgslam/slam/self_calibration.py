@@ -87,7 +87,8 @@ def _rig_of(log: MeasurementLog) -> CameraRig:
         )
     if not len(log):
         raise MeasurementLogError("calibrate: the log holds no frame; give that of a drive")
-    if any(np.isnan(s.observations.pixels[:, : log.rig.cameras]).any() for s in log):
+    seen = (s.observations.pixels[:, : log.rig.cameras] for s in log)
+    if not any(np.isfinite(pixels).all(axis=(1, 2)).any() for pixels in seen):
         raise MeasurementLogError(
             "calibrate: the log lacks raw pixels of its cameras; give one of a run on images"
         )

@@ -92,7 +92,8 @@ class RigAlignment:
         order = np.lexsort((frame, ids))
         self._landmark, self._frame = ids[order], frame[order]
         self._pixels = pixels[order]
-        self._keep(np.ones(len(ids), np.bool_))
+        # What one image does not show says little of the rig, and would take a model of its own.
+        self._keep(np.isfinite(self._pixels).all(axis=(1, 2)))
         ratio = vertical_to_horizontal(rig)
         self._model = pixel_model(rig.cameras, ratio)
         self._fuse = measurement_map("fused", rig.cameras, ratio)

@@ -24,6 +24,8 @@ from fgslam.frontend.features.matching import alike, pairs_within, pick, resembl
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import DatabaseSettings, MapMatchingSettings
 
+Pairs: TypeAlias = tuple[IntArray, IntArray, FloatArray]
+"""(k,) landmarks, features, and distances of their descriptors."""
 Wanted: TypeAlias = Callable[[IntArray, FloatArray], BoolArray]
 """Of rows (k,) of the map and their depths: which (k,) to consider at all."""
 _CONE_DEG = 30.0  # half angle of the cone in which the paper expects landmarks (4.4)
@@ -269,7 +271,19 @@ class MapMatcher:
         pairs = resembling(i[same], j[same], descriptors, self._appearance)
         had_candidates = np.zeros(len(features), np.bool_)
         had_candidates[pairs[1]] = True
-        return MapMatches(*pick(pairs, self._appearance), had_candidates)
+        if features.complete is None:
+            return MapMatches(*pick(pairs, self._appearance), had_candidates)
+        return MapMatches(*self._pick_complete_first(pairs, features.complete), had_candidates)
+
+    def _pick_complete_first(self, pairs: Pairs, complete: BoolArray) -> tuple[IntArray, IntArray]:
+        """Matches as without incomplete features, then with them what nothing else resembles."""
+        i, j, cost = pairs
+        whole = complete[j]
+        rest = np.isin(i, i[whole], invert=True)
+        first = pick((i[whole], j[whole], cost[whole]), self._appearance)
+        second = pick((i[rest], j[rest], cost[rest]), self._appearance)
+        order = np.argsort(found := np.concatenate([first[0], second[0]]), kind="stable")
+        return found[order], np.concatenate([first[1], second[1]])[order]
 
     def _reach(self, count: int, uncertainty: FloatArray | None) -> FloatArray:
         """Half widths (v, 3) of the gates in column, row and disparity."""

@@ -53,9 +53,10 @@ class Association:
     features: IntArray
 
     def partners(self, count: int) -> IntArray:
-        """The landmark that each of ``count`` features is taken for; -1 for none."""
+        """The landmark that each of the first ``count`` features is taken for; -1 for none."""
         out = np.full(count, -1, np.int64)
-        out[self.features[~self.rejected]] = self.observations.ids[~self.rejected]
+        taken = ~self.rejected & (self.features < count)
+        out[self.features[taken]] = self.observations.ids[taken]
         return out
 
     @staticmethod
@@ -177,8 +178,10 @@ class LandmarkTracker:
         self.database.record_misses(missed_ids)
         if tracked.ego_motion.status.measured:
             rejected = matched.ids[~inliers]
-            self.database.weigh(expected, missed_ids, rejected, features.measurement)
+            self.database.weigh(expected, missed_ids, rejected, features.whole.measurement)
         fresh = np.flatnonzero(~matches.had_candidates & start_new)
+        if features.complete is not None:
+            fresh = fresh[features.complete[fresh]]
         colour = _grey_values(image, features, fresh)
         new_ids = self.database.add(features, fresh, colour, directions[fresh])
         new = features.observations(fresh, new_ids, is_new=True)

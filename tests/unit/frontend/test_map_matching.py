@@ -215,3 +215,29 @@ def test_a_feature_that_resembles_no_landmark_is_new() -> None:
     )
     assert len(found.features) == 0
     assert not found.had_candidates.any()
+
+
+def test_incomplete_features_are_matched_where_nothing_complete_resembles() -> None:
+    apart = np.zeros((2, 128), np.uint8)
+    apart[1, 0] = 200
+    expected = landmarks([AT, (200.0, 80.0, 10.0)], descriptors=apart)
+    near = (101.0, 80.0, 10.0)
+    complete = features([near, AT, (200.0, 80.0, 10.0)], descriptors=apart[[0, 0, 1]])
+    found = match(
+        expected,
+        dataclasses.replace(complete, complete=np.array([True, False, False])),
+        DESCRIPTOR,
+    )
+    # The incomplete one at the very place neither replaces the complete one nor makes it ambiguous.
+    assert found.landmarks.tolist() == [0, 1]
+    assert found.features.tolist() == [0, 2]
+
+
+def test_an_ambiguous_landmark_is_not_given_to_an_incomplete_feature() -> None:
+    described = np.zeros((3, 128), np.uint8)
+    described[:2, 0] = 100
+    rows = [(99.0, 80.0, 10.0), (101.0, 80.0, 10.0), AT]
+    found = dataclasses.replace(
+        features(rows, descriptors=described), complete=np.array([True, True, False])
+    )
+    assert len(match(landmarks(descriptors=described[2:]), found, DESCRIPTOR).landmarks) == 0

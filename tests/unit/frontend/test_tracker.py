@@ -108,6 +108,24 @@ def test_seen_again_is_type_III() -> None:
     assert (scene.tracker.database.missed[rows] == 0).all()
 
 
+def test_what_two_images_show_is_matched_but_starts_no_landmark() -> None:
+    scene = Scene()
+    _, association = scene.step(np.eye(4))
+    first = len(association.observations)
+    right, left, top = scene.world.features(np.eye(4))
+    stereo = scene._stereo.match_all((right, left, top.select(np.arange(0))))
+    assert stereo.complete is not None
+    assert not stereo.complete.any()
+    fresh = Scene()
+    tracked = fresh.tracker.track(Prediction(np.eye(4), CERTAIN), fresh.map, stereo)
+    assert len(fresh.tracker.associate(tracked, stereo, IMAGE).observations) == 0
+    tracked = scene.tracker.track(Prediction(np.eye(4), CERTAIN), scene.map, stereo)
+    association = scene.tracker.associate(tracked, stereo, IMAGE)
+    assert not association.observations.is_new.any()
+    assert len(association.observations) > 0.8 * first
+    assert (association.partners(0) == -1).all()
+
+
 def test_types_partition_map_and_features() -> None:
     """Each landmark is out of view, missed or matched; each feature matched, new or held."""
     scene = Scene()

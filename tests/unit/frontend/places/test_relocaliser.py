@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -227,13 +228,11 @@ def test_nothing_handed_in_is_changed(rng: np.random.Generator) -> None:
 
 
 def _first(view: StereoFeatures, count: int) -> StereoFeatures:
-    names = StereoFeatures.__dataclass_fields__
-    return StereoFeatures(**{name: getattr(view, name)[:count] for name in names})
+    return view.select(np.arange(count))
 
 
 def _joined(views: list[StereoFeatures]) -> StereoFeatures:
-    names = StereoFeatures.__dataclass_fields__
-    return StereoFeatures(**{n: np.concatenate([getattr(v, n) for v in views]) for n in names})
+    return functools.reduce(StereoFeatures.join, views)
 
 
 def _carried(view: StereoFeatures, lTc: FloatArray) -> StereoFeatures:
