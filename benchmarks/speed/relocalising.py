@@ -40,7 +40,13 @@ from fgslam.slam.motion import body_motion
 SIZES = (1_000, 3_000, 10_000, 30_000, 100_000)
 FRAMES, EVERY = 120, 8
 ROUNDS = 3
-LIMITS = {"look_100k_over_frontend": 2.0, "look_100k_worst_over_frontend": 2.0}
+LIMITS = {
+    "look_100k_over_frontend": 2.0,
+    "look_100k_worst_over_frontend": 2.0,
+    "look_10k_over_1k": 1.5,
+    "look_100k_over_10k": 1.5,
+}
+_RIGHT_M = 0.2
 _APART_M = 12.0
 _REACH = np.arange(-4, 5)  # rooms to each side of the first one
 _CELLS, _BINS = 16, 8
@@ -66,7 +72,8 @@ class Lost:
     tracker: LandmarkTracker
     places: PlaceRecognition
     rounds: list[list[float]] = field(default_factory=list)
-    right: int = 0
+    right: list[bool] = field(default_factory=list)
+    false: int = 0
 
     @property
     def seconds(self) -> list[float]:
@@ -90,7 +97,8 @@ class Lost:
         tracked, found = self.places.recover(tracked, self.landmarks, features)
         self.rounds[-1].append(time.process_time() - start)
         off = np.linalg.norm(tracked.ego_motion.wTc[:3, 3] - wTc[:3, 3])
-        self.right += int(found and off < 0.2)
+        self.right.append(bool(found and off < _RIGHT_M))
+        self.false += int(found and off >= _RIGHT_M)
 
 
 def drive() -> Driven:
@@ -202,7 +210,8 @@ def ratios_of_relocalising() -> dict[str, float]:
             if k == 0:  # in the first one libraries and memory were fetched
                 for robot in robots.values():
                     robot.rounds.clear()
-                    robot.right = 0
+                    robot.right.clear()
+                    robot.false = 0
     finally:
         cv2.setNumThreads(threads)
     frontend = statistics.median(driven.frontend_s)
@@ -212,5 +221,20 @@ def ratios_of_relocalising() -> dict[str, float]:
         out[f"{name}_ms"] = 1e3 * statistics.median(robot.seconds)
         out[f"{name}_over_frontend"] = statistics.median(robot.seconds) / frontend
         out[f"{name}_worst_over_frontend"] = max(robot.seconds) / frontend
-        out[f"{name}_right"] = robot.right / (ROUNDS * len(driven.queries))
+        out[f"{name}_right"] = float(np.mean(robot.right))
+        out[f"{name}_false"] = float(robot.false)
+    return out | _growth(robots)
+
+
+def _growth(robots: dict[int, Lost]) -> dict[str, float]:
+    """Time in a map over that in one of a tenth of it, of the frames that both locate."""
+    out = {}
+    for size, robot in robots.items():
+        tenth = robots.get(size // 10)
+        if tenth is None:
+            continue
+        count = len(robot.seconds)
+        both = np.flatnonzero(np.array(robot.right[:count]) & np.array(tenth.right[:count]))
+        slow, fast = (np.median(np.array(r.seconds)[both]) for r in (robot, tenth))
+        out[f"look_{size // 1000}k_over_{size // 10_000}k"] = float(slow / fast)
     return out

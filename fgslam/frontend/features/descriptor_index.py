@@ -71,6 +71,8 @@ _AT_ONCE = 1024  # queries; more than a frame has, and their distances are tens 
 _LEADING = 1024  # of a query's distances bound the rest: those of its nearest cells
 
 _Floats = npt.NDArray[np.float32]
+Cell = tuple[ByteArray, _Floats]
+"""Descriptors (m, 128) of one cell, and their squares (m,)."""
 Candidates = tuple[IntArray, IntArray, _Floats]
 """Queries (c,), rows (c,) that may be among their nearest, squared distances less the query's own
 square (c,)."""
@@ -104,6 +106,7 @@ class AppearanceIndex:
             self._order = np.argsort(words, kind="stable")
             counts = np.bincount(words, minlength=len(vocabulary()))
             self._starts = np.concatenate([[0], np.cumsum(counts)])
+            self._held: dict[int, Cell] = {}
 
     def __len__(self) -> int:
         """Number of descriptors held."""
@@ -168,11 +171,11 @@ class AppearanceIndex:
         squared = np.empty(ends[-1], np.float32)
         first = np.searchsorted(cell, np.arange(len(self._starts))).tolist()
         for k in np.unique(cell).tolist():
-            held = self._order[self._starts[k] : self._starts[k + 1]]
+            values, squares = self._cell(k)
             stop = ends[first[k + 1] - 1]
-            part = squared[stop - len(held) * (first[k + 1] - first[k]) : stop]
+            part = squared[stop - len(values) * (first[k + 1] - first[k]) : stop]
             of = asked[query[first[k] : first[k + 1]]]
-            _squared(of, self._descriptors.take(held, axis=0), part.reshape(len(of), len(held)))
+            _less_own(of, values.astype(np.float32), squares, part.reshape(len(of), len(values)))
         place = np.empty(cells.shape, np.int64)
         place.flat[wanted] = ends - sizes
         bound = _bound(self._leading(squared, place, cells), neighbours)
@@ -180,6 +183,16 @@ class AppearanceIndex:
         at = np.searchsorted(ends, near, side="right")
         row = self._order[self._starts[cell[at]] + near - (ends - sizes)[at]]
         return query[at], row, squared[near]
+
+    def _cell(self, k: int) -> Cell:
+        """What a cell holds, found when it is first searched."""
+        if k not in self._held:
+            values = self._descriptors.take(
+                self._order[self._starts[k] : self._starts[k + 1]], axis=0
+            )
+            wide = values.astype(np.float32)
+            self._held[k] = values, np.vecdot(wide, wide)
+        return self._held[k]
 
     def _leading(self, squared: _Floats, place: IntArray, cells: IntArray) -> _Floats:
         """Distances (q, m) of each query to what its nearest cells hold, padded with infinity."""
@@ -199,8 +212,13 @@ def _squared(asked: _Floats, held: ByteArray, out: _Floats | None = None) -> _Fl
     Exact in float32: all sums of 128 products of bytes, and their doubles, are below 2^24.
     """
     values = held.astype(np.float32)
+    return _less_own(asked, values, np.vecdot(values, values), out)
+
+
+def _less_own(asked: _Floats, values: _Floats, squares: _Floats, out: _Floats | None) -> _Floats:
+    """The same of values (m, 128) whose squares (m,) are known."""
     products = (values @ (-2.0 * asked).T).T  # this way round in half the time
-    return np.add(products, np.vecdot(values, values), out=out)
+    return np.add(products, squares, out=out)
 
 
 def _bound(values: _Floats, count: int) -> _Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -33,6 +33,8 @@ pose may be off (frontend.relocalisation.max_sigma_*)."""
 _WORDS_EVERY = 16
 """Frames after which the words of new and renewed views are found, half a millisecond's work: the
 first look after a long time would find them all at once."""
+_Looks: TypeAlias = tuple[int, IntArray, LandmarkAppearances | None]
+"""State of the database's views, landmarks (n,), and their appearances then."""
 _NOBODY: IntArray = np.empty(0, np.int64)
 _NO_PAIRS: IntArray = np.empty((0, 2), np.int64)
 
@@ -78,6 +80,7 @@ class PlaceRecognition:
         self._merging = _NO_PAIRS  # landmarks that are one, by the closure just taken
         self._fuse_since = -1  # a frame: landmarks made after it may be older ones' doubles
         self._pose: FloatArray = np.eye(4)
+        self._looks: _Looks = (-1, _NOBODY, None)
         tracker.database.find_words()
 
     @property
@@ -313,10 +316,19 @@ class PlaceRecognition:
         self, landmarks: LandmarkMap, among: IntArray, features: StereoFeatures
     ) -> Relocalisation:
         rng = np.random.default_rng([self._parts.seed, _STREAM, len(self._memory)])
-        chosen = landmarks.select(np.flatnonzero(np.isin(landmarks.ids, among)))
-        looks = self._tracker.database.appearances(chosen.ids, with_words=True)
-        self._parts.relocaliser.learn(chosen, looks)
+        self._learn(landmarks, among)
         return self._parts.relocaliser.locate(features, rng)
+
+    def _learn(self, landmarks: LandmarkMap, among: IntArray) -> None:
+        """Hands the map to the relocaliser; looks that it has seen keep their index."""
+        database = self._tracker.database
+        named = np.isin(landmarks.ids, among)
+        chosen = landmarks if named.all() else landmarks.select(np.flatnonzero(named))
+        changes, ids, looks = self._looks
+        if looks is None or changes != database.changes or not np.array_equal(ids, chosen.ids):
+            looks = database.appearances(chosen.ids, with_words=True)
+            self._looks = database.changes, chosen.ids, looks
+        self._parts.relocaliser.learn(chosen, looks)
 
 
 def _one_place(a: FloatArray, b: FloatArray) -> bool:

@@ -97,6 +97,11 @@ class LandmarkTable:
             words=self._pool.words(places) if with_words else None,
         )
 
+    @property
+    def changes(self) -> int:
+        """Grows with every change of a view: of the same landmarks the appearances are the same."""
+        return self._pool.changes
+
     def find_words(self) -> None:
         """Computes the visual words of all views in advance, so that a search need not wait."""
         self._pool.find_words()

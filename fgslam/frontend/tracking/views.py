@@ -76,6 +76,8 @@ class ViewPool:
         self._direction: Directions = np.zeros((0, 3), np.float32)
         self._used: IntArray = np.zeros(0, np.int64)
         self._words: Words = np.zeros(0, np.int16)
+        self.changes = 0
+        """Counts what was stored or renewed: while it stands, all views are as they were."""
 
     @property
     def several(self) -> bool:
@@ -226,6 +228,7 @@ class ViewPool:
         return places
 
     def _write(self, places: npt.NDArray[np.int32], views: Views) -> None:
+        self.changes += len(places)
         self._size[places] = views.size
         self._orientation[places] = views.orientation
         self._descriptors[places] = views.descriptors

@@ -44,16 +44,19 @@ class KnownMap:
 
     @staticmethod
     def of(
-        landmarks: LandmarkMap, appearances: LandmarkAppearances, map_sigma_m: float = 0.0
+        landmarks: LandmarkMap,
+        appearances: LandmarkAppearances,
+        map_sigma_m: float = 0.0,
+        index: AppearanceIndex | None = None,
     ) -> KnownMap:
         """Landmarks without a view, and views without a landmark, are left out.
 
-        ``map_sigma_m`` is added to the landmarks' noise. Positions and views are not copied where
-        all are kept, and must not change.
+        ``map_sigma_m`` is added to the landmarks' noise; ``index`` is one over these appearances.
+        Positions and views are not copied where all are kept, and must not change.
         """
         owners, counts = _owners(landmarks.ids, appearances.ids)
         if (owners < 0).any():
-            appearances = appearances.of(landmarks.ids)
+            appearances, index = appearances.of(landmarks.ids), None
         if (counts == 0).any():
             landmarks = landmarks.select(counts > 0)
             owners, counts = _owners(landmarks.ids, appearances.ids)
@@ -70,7 +73,7 @@ class KnownMap:
             starts,
             np.maximum.reduceat(appearances.size, starts[:-1]) if len(owners) else np.empty(0),
             np.ascontiguousarray(landmarks.positions.T),
-            AppearanceIndex(appearances.descriptors, appearances.words),
+            AppearanceIndex(appearances.descriptors, appearances.words) if index is None else index,
         )
 
     @property

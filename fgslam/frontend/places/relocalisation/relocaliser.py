@@ -64,9 +64,12 @@ class Relocaliser:
     def learn(self, landmarks: LandmarkMap, appearances: LandmarkAppearances) -> None:
         """Replaces the map; landmarks without a stored view cannot be recognised: left out.
 
-        Its arrays are not copied, and must not change until the next map is learnt.
+        Its arrays are not copied, and must not change until the next map is learnt. The very
+        appearances of the last map keep their index: who is lost asks in every frame.
         """
-        self._known = KnownMap.of(landmarks, appearances, self._settings.map_sigma_m)
+        known = self._known
+        index = known.index if known.views is appearances else None
+        self._known = KnownMap.of(landmarks, appearances, self._settings.map_sigma_m, index)
 
     def locate(self, features: StereoFeatures, rng: np.random.Generator) -> Relocalisation:
         """The frame's pose, or why there is none to be believed.

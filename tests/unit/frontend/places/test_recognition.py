@@ -28,10 +28,13 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotionStatus
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.datasets.settings import ConstantVelocitySettings
+from fgslam.frontend.features.descriptor_index import AppearanceIndex
 from fgslam.frontend.places.closures import difference
 from fgslam.frontend.places.recognition import PlaceRecognition
+from fgslam.frontend.places.relocalisation import known_map
 from fgslam.frontend.settings import LostSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.landmark_table import LandmarkTable
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline, observe
@@ -264,6 +267,28 @@ def test_kidnapped_robot_is_relocalised_in_its_own_map() -> None:
     assert error_m(reports[-1], poses[-1]) < 0.1
     lost = reports[41 : found[0]]
     assert sum(int(r.increment.observations.is_new.sum()) for r in lost) == 0, "not while lost"
+
+
+def test_who_is_lost_indexes_the_same_looks_once_with_the_same_answers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Frames in unmapped surroundings: each looks at the whole map, and none changes its looks."""
+    poses = [on_ring(k) for k in range(12)] + [on_ring(k) for k in range(36, 46)]
+    settings = dataclasses.replace(
+        SETTINGS, lost=LostSettings(after=1, give_up_after=20), loops=None
+    )
+    made = []
+    monkeypatch.setattr(
+        known_map, "AppearanceIndex", lambda *held: (made.append(1), AppearanceIndex(*held))[1]
+    )
+    once = drive(pipeline_of(poses, 0.1, settings), seen(poses))
+    first = len(made)
+    monkeypatch.setattr(LandmarkTable, "changes", property(lambda self: len(made)))
+    every = drive(pipeline_of(poses, 0.1, settings), seen(poses))
+    assert first < len(made) - first == len(poses) - 12 + 1
+    for one, other in zip(once, every, strict=True):
+        assert_same_increments(one.increment, other.increment)
+        assert_same_bits(one.tracking, other.tracking)
 
 
 def test_kidnapped_robot_stays_lost_without_relocalisation() -> None:
