@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -18,7 +18,13 @@ from fgslam.core.rig_correction import (
     prior_information,
     term_names,
 )
-from fgslam.core.sensors import CameraRig, measurement_map, pixel_model, vertical_to_horizontal
+from fgslam.core.sensors import (
+    CameraRig,
+    measurement_map,
+    partial_map,
+    pixel_model,
+    vertical_to_horizontal,
+)
 
 RIG = CameraRig(620, 190, 360.0, 360.0, 310.0, 92.0, 0.54, None, np.eye(4))
 THREE = CameraRig(320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, 0.1, np.eye(4))
@@ -298,3 +304,50 @@ def test_a_shifted_principal_point_is_told_as_a_turn() -> None:
     shifted = RigCorrection(RIG, errors(column=0.001), np.eye(9) * 1e-12).changes()
     # x^2 of the yaw's 1 + x^2 is 0.25 in the mean over this image.
     assert shifted["left_yaw_deg"][0] == pytest.approx(np.rad2deg(0.001), rel=0.3)
+
+
+# -- what two of three images show -----------------------------------------------------------
+
+
+def test_what_one_image_does_not_show_says_nothing_of_the_rig() -> None:
+    """Observations that lack an image are left out, the others count as before."""
+    road = Road(frames=WINDOW, step_m=0.1, rig=THREE, points=3000)
+    wrong = np.zeros(len(term_names(THREE)))
+    increments = drive(road, wrong, np.random.default_rng(0))
+    missing = [np.random.default_rng(k).uniform(size=len(i.observations)) < 0.3
+               for k, i in enumerate(increments)]  # fmt: skip
+    found = []
+    for lack in (True, False):
+        itself = SelfCalibration(THREE, SIGMA_PX)
+        for increment, out, wTc in zip(increments, missing, poses_of(road), strict=True):
+            observed = increment.observations
+            pixels = observed.pixels.copy()
+            pixels[out, 2] = np.nan
+            seen = replace(observed, pixels=pixels) if lack else observed.select(~out)
+            rejected = np.zeros(len(seen), np.bool_)
+            itself.observe(replace(increment, observations=seen, rejected=rejected), wTc)
+        assert itself.windows == 1
+        found.append(itself.found.estimated)
+    np.testing.assert_array_equal(found[0].values, found[1].values)
+    np.testing.assert_array_equal(found[0].covariance, found[1].covariance)
+
+
+def test_observations_by_two_images_are_corrected_as_their_features_would_be() -> None:
+    wrong = 0.02 * np.random.default_rng(2).standard_normal(len(term_names(THREE)))
+    correction = RigCorrection(THREE, wrong, np.linalg.inv(prior_information(THREE)))
+    rng = np.random.default_rng(3)
+    pixels = rng.uniform(20.0, 200.0, (30, 3, 2))
+    pixels[10:20, 2], pixels[20:, 1] = np.nan, np.nan
+    ratio = vertical_to_horizontal(THREE)
+    straight = pixels - (displacements(THREE, pixels) @ wrong).reshape(pixels.shape)
+    measured, expected = np.empty((30, 3)), np.empty((30, 3))
+    for rows, seen in ((slice(10), [0, 1, 2]), (slice(10, 20), [0, 1]), (slice(20, 30), [0, 2])):
+        fuse = partial_map(seen, 3, ratio)
+        measured[rows] = pixels[rows][:, seen].reshape(10, -1) @ fuse.T
+        expected[rows] = straight[rows][:, seen].reshape(10, -1) @ fuse.T
+    observed = Observations(
+        np.arange(30), measured, np.tile(np.eye(3), (30, 1, 1)), pixels, np.zeros(30, np.bool_)
+    )
+    found = correction.corrected(observed).measurement
+    assert np.abs(measured - expected).max() > 1e-3
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
