@@ -6,12 +6,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from fgslam.report.content import Page
+from fgslam.report.figures.calibration import calibration_over_time
 from fgslam.report.figures.over_time import (
     error_by_axis,
     error_over_time,
     nees_over_time,
     time_per_frame,
 )
+from fgslam.report.figures.traces import Figure
 from fgslam.report.figures.trajectory import drive_from_above, map_to_turn
 from fgslam.report.page import write_html
 from fgslam.report.run_results import EstimatorReport, ReportData
@@ -46,6 +48,7 @@ def slam_page(data: ReportData) -> Page:
             error_by_axis(data),
             nees_over_time(data),
             time_per_frame(data),
+            *_calibration(data),
         ),
         pictures=data.pictures,
         series=tuple(e.title for e in data.estimators),
@@ -57,6 +60,12 @@ def slam_page(data: ReportData) -> Page:
         config_yaml=data.config_yaml,
         versions=data.versions,
     )
+
+
+def _calibration(data: ReportData) -> Iterator[Figure]:
+    """The rig's calibration, where the run kept one."""
+    if data.calibration is not None:
+        yield calibration_over_time(data.calibration, data.start)
 
 
 def headline(data: ReportData) -> tuple[str, ...]:

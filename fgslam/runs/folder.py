@@ -34,6 +34,8 @@ REPORT_FILE = "report.html"
 LOG_FILE = "measurements.npz"
 STATE_FILE = "checkpoint.npz"
 COMPARISON_FILE = "comparison.csv"
+CALIBRATION_FILE = "calibration.csv"
+CAMERA_FILE = "camera.json"
 TRIALS_FILE = "trials.csv"
 TIMING_FILE = "trials_timing.csv"
 
@@ -46,8 +48,8 @@ _RESULT_FILES = (
     "ground_truth_landmarks.csv",
     METRICS_FILE,
     "timing.csv",
-    "calibration.csv",
-    "camera.json",
+    CALIBRATION_FILE,
+    CAMERA_FILE,
     "loops.csv",
     COMPARISON_FILE,
     TRIALS_FILE,

@@ -29,7 +29,7 @@ from fgslam.report.run_results import (
 )
 from fgslam.report.slam_page import write_report
 from fgslam.report.tables import read_metrics
-from fgslam.runs.folder import LOG_FILE, REPORT_FILE, RUN_MARKER
+from fgslam.runs.folder import CALIBRATION_FILE, LOG_FILE, REPORT_FILE, RUN_MARKER
 from fgslam.runs.metric_tables import page_table
 from fgslam.runs.tasks.slam_metrics import LOOPS_FILE, read_closures
 
@@ -92,6 +92,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
         versions=_versions(config),
         up=_up(_find(folders, LOG_FILE)),
         alignment="after SE3 alignment",
+        calibration=_calibration(_find(folders, CALIBRATION_FILE)),
     )
 
 
@@ -241,6 +242,20 @@ def _live_times(path: Path | None) -> dict[float, float]:
     for stamp, milliseconds in _number_pairs(path, rows, "milliseconds"):
         out[stamp] = out.get(stamp, 0.0) + milliseconds
     return out
+
+
+def _calibration(path: Path | None) -> dict[str, FloatArray] | None:
+    """The columns of calibration.csv; None where there is none, or nothing in it."""
+    if path is None:
+        return None
+    rows = list(csv.reader(io.StringIO(_text(path))))
+    try:
+        values = np.array([[float(cell) for cell in row] for row in rows[1:]])
+        return dict(zip(rows[0], values.T, strict=True)) if len(values) else None
+    except (IndexError, ValueError) as error:
+        raise DatasetError(
+            f"{path}: not a table of numbers ({error}); run the experiment again"
+        ) from error
 
 
 def _number_pairs(path: Path, rows: Any, name: str) -> list[tuple[float, float]]:

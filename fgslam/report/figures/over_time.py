@@ -101,7 +101,7 @@ def error_by_axis(data: ReportData) -> Figure:
         "Estimate minus truth of the final positions of the estimator chosen, the first pose "
         "aligned. Band: three standard deviations as claimed, which should hold nearly all of it.",
         tuple(traces),
-        _panels([f"{name} ({unit})" for name in _ALONG]),
+        panels([f"{name} ({unit})" for name in _ALONG]),
         choices=tuple(known),
         chosen=data.best if data.best in known else min(known, default=0),
         missing=_missing(data),
@@ -163,7 +163,7 @@ def matches_over_time(
         axes = {"x": frames.astype(np.float64), "y": counts.astype(np.float64)}
         owner = Owner(name, colour=colour)
         traces.append(trace(owner, axes, mode="lines", line={"width": 1.8}, yaxis=axis))
-    layout = _panels(["landmarks a frame", "landmarks in the map"], "frame")
+    layout = panels(["landmarks a frame", "landmarks in the map"], "frame")
     for name in ("yaxis", "yaxis2"):
         layout[name]["rangemode"] = "tozero"
     note = f"median {np.median(matched):.0f} matched, least {matched.min()}" if len(frames) else ""
@@ -264,7 +264,7 @@ def _band(band: tuple[float, float], end: float) -> Trace:
     return trace(owner, corners, mode="lines", fill="toself", line={"width": 0}, hoverinfo="skip")
 
 
-def _panels(titles: Sequence[str], time: str = "time since the start (s)") -> dict[str, Any]:
+def panels(titles: Sequence[str], time: str = "time since the start (s)") -> dict[str, Any]:
     """Panels over each other that share their axis of time."""
     n = len(titles)
     layout: dict[str, Any] = {

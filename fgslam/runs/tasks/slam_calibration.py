@@ -16,10 +16,9 @@ from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.tables import write_csv
 from fgslam.runs.config_models import Experiment, ExperimentConfig
+from fgslam.runs.folder import CALIBRATION_FILE, CAMERA_FILE
 from fgslam.slam.factory import calibrates_itself
 
-CALIBRATION_FILE = "calibration.csv"
-CAMERA_FILE = "camera.json"
 _TOLD_SIGMAS = 3.0  # what is less than this many of its own is not told as a finding
 _UNITS = {"deg": "degrees", "percent": "%"}
 _WORDS = {

@@ -337,6 +337,21 @@ def test_controls_have_labels_and_pictures_have_words() -> None:
     assert len(ids) == len(set(ids))
 
 
+def test_the_calibration_is_drawn_with_its_band_where_the_run_kept_one() -> None:
+    assert "calibration" not in {figure.key for figure in slam_page(full_report()).figures}
+    changes = [f"left_{name}" for name in ("yaw_deg", "pitch_deg", "roll_deg", "focal_percent")]
+    found = {"timestamp": np.array([1.0, 2.0]), "knocks": np.array([0.0, 1.0])}
+    found |= {name: np.array([0.1, 0.2]) for name in changes}
+    found |= {f"{name}_sigma": np.array([0.02, 0.01]) for name in changes}
+    page = slam_page(dataclasses.replace(full_report(), calibration=found))
+    figure = next(figure for figure in page.figures if figure.key == "calibration")
+    band, line = figure.traces[:2]
+    assert len(figure.traces) == 8
+    np.testing.assert_allclose(unpacked(line["y"]), [0.1, 0.2], rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(unpacked(band["y"]), [0.16, 0.23, 0.17, 0.04], rtol=0.0, atol=1e-6)
+    assert "moved 1 times" in figure.note
+
+
 def test_a_failed_estimator_has_a_row_and_no_switch() -> None:
     reader = Reader(render(full_report()))
     assert [a["data-estimator"] for a in reader.all("input") if "data-estimator" in a] == ["0", "1"]
