@@ -263,6 +263,11 @@ EstimatorSettings: TypeAlias = Annotated[
 ]
 
 
+DEFAULT_ESTIMATOR = Isam2Settings.kind
+"""Of a recording that comes without a configuration, and of a session; why: the table in
+docs/howto/your_recording.md."""
+
+
 def family_of(kind: str) -> Family:
     """Whether estimators of a kind are filters, smoothers or neither."""
     return _FAMILIES.get(kind, "other")

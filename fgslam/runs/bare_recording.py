@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from fgslam.backend.settings import LandmarkKalmanSettings
+from fgslam.backend.settings import DEFAULT_ESTIMATOR
 from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.datasets.layouts import LAYOUTS, recognise_layout
 from fgslam.runs.config import Experiment, ExperimentConfig, load_experiment, make_config
@@ -21,9 +21,6 @@ from fgslam.runs.named_experiments import find_experiment, suggestion
 
 if TYPE_CHECKING:
     from fgslam.core.recordings import Sequence
-
-ESTIMATOR = LandmarkKalmanSettings.kind
-"""The estimator of a recording that comes without a configuration."""
 
 _NOT_IN_NAMES = re.compile(r"[^\w.-]+")
 
@@ -65,7 +62,7 @@ def bare_experiment(
         "name": _NOT_IN_NAMES.sub("_", folder.resolve().name).strip("_") or "recording",
         "dataset": _dataset(folder, camera, overrides),
         "odometry": {"kind": "recorded"},
-        "estimator": {"kind": ESTIMATOR},
+        "estimator": {"kind": DEFAULT_ESTIMATOR},
     }
     where = str(folder)
     sequence = open_sequence(make_config(values, where, overrides))

@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 
 from fgslam.backend.protocol import Estimator
-from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.settings import DEFAULT_ESTIMATOR, EstimatorSettings
 from fgslam.core import __version__
 from fgslam.core.errors import ConfigError, MapError
 from fgslam.core.saved_map import load_map
@@ -69,7 +69,7 @@ class Slam(Session):
     def __init__(
         self,
         rig: CameraRig,
-        estimator: str | EstimatorSettings | Estimator = "isam2",
+        estimator: str | EstimatorSettings | Estimator = DEFAULT_ESTIMATOR,
         *,
         frontend: FrontendSettings | Mapping[str, Any] | None = None,
         odometry: OdometrySettings | None = None,

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.backend.protocol import Estimator
-from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.settings import DEFAULT_ESTIMATOR, EstimatorSettings
 from fgslam.cameras.rig import require_rig
 from fgslam.core.arrays import FloatArray
 from fgslam.core.checks import later_time, require_seed
@@ -71,7 +71,7 @@ class Session:
     def __init__(
         self,
         rig: CameraRig,
-        estimator: str | EstimatorSettings | Estimator = "isam2",
+        estimator: str | EstimatorSettings | Estimator = DEFAULT_ESTIMATOR,
         *,
         frontend: FrontendSettings | Mapping[str, Any] | None = None,
         odometry: OdometrySettings | None = None,

@@ -9,10 +9,12 @@ import pytest
 from running import KIND, SAME_BYTES, bytes_of, main, metrics_of
 
 import fgslam as fg
+from fgslam.backend.settings import DEFAULT_ESTIMATOR
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
-MEASURED = tuple(name for name in SAME_BYTES if name != "ground_truth.tum")
+EVERYTHING = tuple(name.replace(KIND, DEFAULT_ESTIMATOR) for name in SAME_BYTES)
+MEASURED = tuple(name for name in EVERYTHING if name != "ground_truth.tum")
 QUIET = ("--set", "output.pictures=false", "--set", "output.report=false")
 
 
@@ -27,7 +29,7 @@ def test_a_recording_alone_gives_a_run_folder_that_compares(
     first = capfd.readouterr().out.splitlines()[0]
     assert first.startswith("boards: image folder, 3 cameras 160x120; 12 frames at 4 Hz; odometry;")
     assert (out / "report.html").is_file()
-    assert metrics_of(out)["estimators"][KIND]["ate_rmse_m"] < 0.01
+    assert metrics_of(out)["estimators"][DEFAULT_ESTIMATOR]["ate_rmse_m"] < 0.01
     assert main(monkeypatch, "compare", out, "--estimators", "odometry,batch") == 0
     assert (out / "compare" / "comparison.csv").is_file()
 
@@ -42,7 +44,7 @@ def test_the_printed_configuration_gives_the_same_bytes_as_the_recording(
     (tmp_path / "mine.yaml").write_text(capfd.readouterr().out, encoding="utf-8")
     for given, out in ((recording, "bare"), (tmp_path / "mine.yaml", "written")):
         assert main(monkeypatch, "run", given, "--out", tmp_path / out, *QUIET) == 0
-    assert bytes_of(tmp_path / "bare") == bytes_of(tmp_path / "written")
+    assert bytes_of(tmp_path / "bare", EVERYTHING) == bytes_of(tmp_path / "written", EVERYTHING)
 
 
 def test_truth_in_the_folder_changes_nothing_but_the_evaluation(
@@ -54,7 +56,7 @@ def test_truth_in_the_folder_changes_nothing_but_the_evaluation(
     seen = fg.run(recording, tmp_path / "seen", quiet)
     unseen = fg.run(blind, tmp_path / "unseen", quiet)
     assert bytes_of(seen.folder, MEASURED) == bytes_of(unseen.folder, MEASURED)
-    assert unseen.metrics["estimators"][KIND]["ate_rmse_m"] is None
+    assert unseen.metrics["estimators"][DEFAULT_ESTIMATOR]["ate_rmse_m"] is None
 
 
 def test_frames_pushed_into_the_session_of_a_recording_give_the_run_s_poses(
@@ -65,5 +67,5 @@ def test_frames_pushed_into_the_session_of_a_recording_give_the_run_s_poses(
     for t, images, odometry in fg.open_recording(recording):
         slam.track(t, images, odometry)
     slam.result().trajectory.save(tmp_path / "pushed.tum")
-    expected = (ran.folder / KIND / "final.tum").read_bytes()
+    expected = (ran.folder / DEFAULT_ESTIMATOR / "final.tum").read_bytes()
     assert (tmp_path / "pushed.tum").read_bytes() == expected

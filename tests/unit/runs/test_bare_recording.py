@@ -20,6 +20,7 @@ from dataset_builders import (
     write_tum,
 )
 
+from fgslam.backend.settings import Isam2Settings
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
 from fgslam.core.geometry import pose
 from fgslam.datasets.layouts import recognise_layout
@@ -39,7 +40,10 @@ MOUNTINGS = (pose(AHEAD, np.zeros(3)), pose(AHEAD, np.array([0.0, -0.1, 0.0])))
 def test_a_recording_without_odometry_runs_by_constant_velocity(tmp_path: Path) -> None:
     found = bare_experiment(image_folder(tmp_path / "walk"))
     assert found.config == ExperimentConfig(
-        name="walk", dataset=found.config.dataset, odometry=ConstantVelocitySettings()
+        name="walk",
+        dataset=found.config.dataset,
+        odometry=ConstantVelocitySettings(),
+        estimator=Isam2Settings(),
     )
     assert found.said.startswith("walk: image folder, 2 cameras 32x24; 6 frames at 10 Hz; no odom")
     assert "truth" not in found.said
