@@ -353,6 +353,13 @@ class LoopSettings:
 class FrontendSettings:
     """All of the front-end."""
 
+    kind: Annotated[
+        Literal["sift", "hybrid"],
+        Field(
+            description="`sift`: SIFT on every frame; `hybrid`: on key frames, between them the "
+            "landmarks are carried by their patches (KLT): a third of the cost"
+        ),
+    ] = "sift"
     sift: SiftSettings = SiftSettings()
     stereo: StereoSettings = StereoSettings()
     appearance: AppearanceSettings = AppearanceSettings()

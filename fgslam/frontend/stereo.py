@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.rig_correction import RigCorrection
@@ -69,6 +69,26 @@ class StereoMatcher:
         without_left = self._measure(features, straight, (n[above], None, k[above]))
         every = whole.join(without_top).join(without_left)
         return replace(every, complete=np.arange(len(every)) < len(whole))
+
+    def measured(
+        self, found: tuple[Features, ...], correction: RigCorrection | None = None
+    ) -> tuple[StereoFeatures, BoolArray]:
+        """Stereo features of points found row by row in all images, and which (n,) can be right.
+
+        The latter lie on the epipolar lines and at one depth, by the gates of :meth:`match`.
+        """
+        straight = found if correction is None else correction.straightened(found)
+        s, right, left = self._settings, straight[0].xy, straight[1].xy
+        horizontal = left[:, 0] - right[:, 0]
+        good = np.abs(left[:, 1] - right[:, 1]) <= s.epipolar_px
+        good &= (horizontal >= s.min_disparity_px) & (horizontal <= s.max_disparity_px)
+        if len(straight) > 2:
+            top = straight[2].xy
+            vertical = (top[:, 1] - right[:, 1]) * self._vertical_to_horizontal
+            good &= np.abs(top[:, 0] - right[:, 0]) <= s.epipolar_px
+            good &= np.abs(vertical - horizontal) <= s.disparity_agreement_px
+        kept = np.flatnonzero(good)
+        return self._measure(found, straight, (kept,) * len(found)), np.asarray(good)
 
     def match_left(self, right: Features, left: Features) -> tuple[IntArray, IntArray]:
         """Pairs of right and left features, ascending in the right ones."""

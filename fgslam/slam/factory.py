@@ -40,8 +40,10 @@ from fgslam.datasets.settings import (
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
 from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.tracking.carrying import LandmarkCarrier
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.key_frames import KeyFrameTracker
 from fgslam.frontend.tracking.map_matching import MapMatcher
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.slam.arrival import Arrival, take_over, trusted
@@ -57,9 +59,11 @@ if TYPE_CHECKING:
 _LOCATING_STREAM = 12  # of random numbers, beside those of the recording
 
 
-def make_stream(sequence: Sequence, settings: FrontendSettings) -> FeatureStream:
-    """Features of the sequence's frames, found ahead of the loop."""
-    return FeatureStream(sequence, make_extractor(settings))
+def make_stream(
+    sequence: Sequence, settings: FrontendSettings, ahead: bool = True
+) -> FeatureStream:
+    """Features of the sequence's frames, found ahead of the loop; its images alone if not so."""
+    return FeatureStream(sequence, make_extractor(settings) if ahead else None)
 
 
 def make_extractor(settings: FrontendSettings) -> FeatureExtractor:
@@ -78,6 +82,16 @@ def make_tracker(rig: CameraRig, settings: FrontendSettings) -> LandmarkTracker:
     solver = EgoMotionSolver(rig, settings.ego_motion)
     matcher = MapMatcher(settings.matching, settings.appearance)
     return LandmarkTracker(rig, database, matcher, solver)
+
+
+def make_key_frames(
+    rig: CameraRig, settings: FrontendSettings, tracker: LandmarkTracker
+) -> KeyFrameTracker | None:
+    """Tracking between key frames; None where every frame is one."""
+    if settings.kind == "sift":
+        return None
+    carrier = LandmarkCarrier(rig, make_stereo_matcher(rig, settings))
+    return KeyFrameTracker(tracker, carrier)
 
 
 def make_motion(rig: CameraRig, settings: OdometrySettings) -> MotionModel:
@@ -200,6 +214,7 @@ def make_pipeline(
         estimator=estimator,
         places=make_places(rig, frontend, tracker, seed),
         calibration=make_calibration(rig, frontend),
+        key_frames=make_key_frames(rig, frontend, tracker),
         located=prior if arrival is not None and arrival.relocalised else None,
     )
 

@@ -27,6 +27,8 @@ _FRAMES_AHEAD = 3
 class FeatureFrame:
     """A frame with its features, or the reason why it has none.
 
+    Where SIFT runs on key frames only, a frame has none until it is found to be one.
+
     Attributes:
         i: position in the sequence.
         frame: the images, or None when they could not be read.
@@ -72,13 +74,18 @@ class FrameDescriber:
 
     def describe(self, i: int, frame: Frame | None) -> FeatureFrame:
         """Frame ``i`` with its features; without images (None) it has none."""
-        if frame is None:
-            return FeatureFrame(i, None, (), "no images were given", 0.0, 0.0)
+        return self.complete(undescribed(i, frame))
+
+    def complete(self, found: FeatureFrame) -> FeatureFrame:
+        """The frame with its features, found now unless it has them."""
+        frame = found.frame
+        if frame is None or found.features:
+            return found
         if self._pool is None:
             self._pool = ThreadPoolExecutor(len(frame.images))
         timed = partial(_timed, self._extract)
         tasks = [self._pool.submit(timed, image) for image in frame.images]
-        return _Pending(i, frame, "", 0.0, tasks).finish()
+        return _Pending(found.i, frame, "", found.load_ms, tasks).finish()
 
     def close(self) -> None:
         """Ends the threads."""
@@ -86,11 +93,16 @@ class FrameDescriber:
             self._pool.shutdown()
 
 
+def undescribed(i: int, frame: Frame | None) -> FeatureFrame:
+    """Frame ``i`` before its features are found."""
+    return FeatureFrame(i, frame, (), "" if frame else "no images were given", 0.0, 0.0)
+
+
 class FeatureStream:
     """Iterates over a sequence's frames in order, features found in parallel ahead of time."""
 
-    def __init__(self, sequence: Sequence, extract: FeatureExtractor) -> None:
-        """Takes any extractor; it must be safe to call from several threads."""
+    def __init__(self, sequence: Sequence, extract: FeatureExtractor | None) -> None:
+        """Takes any extractor; it must be safe to call from several threads. None: only images."""
         self._sequence = sequence
         self._extract = extract
 
@@ -128,6 +140,8 @@ class FeatureStream:
     ) -> _Pending:
         if isinstance(frame, str):
             return _Pending(i, None, frame, load_ms, [])
+        if self._extract is None:
+            return _Pending(i, frame, "", load_ms, [])
         timed = partial(_timed, self._extract)
         tasks = [pool.submit(timed, image) for image in frame.images]
         return _Pending(i, frame, "", load_ms, tasks)

@@ -31,8 +31,8 @@ class FirstImages:
         self._uint16 = False
 
     def add(self, found: FeatureFrame, uint16: bool) -> None:
-        """Counts a frame with images; ``uint16``: they were given so."""
-        if found.frame is None or len(self._left) >= _FRAMES:
+        """Counts a frame with features; ``uint16``: they were given so."""
+        if found.frame is None or not found.features or len(self._left) >= _FRAMES:
             return
         self._left.append(len(found.features[1]))
         self._brightest = max(self._brightest, *(int(image.max()) for image in found.frame.images))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,8 +15,10 @@ from fgslam.core.arrays import IntArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.features import StereoFeatures
 from fgslam.core.measurements import Increment, LoopClosure, Odometry
+from fgslam.core.rig_correction import RigCorrection
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.ego_motion import unmeasured
+from fgslam.frontend.tracking.key_frames import CarriedFrame, KeyFrameTracker
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import MotionModel
@@ -59,6 +62,8 @@ class SlamPipeline:
     Attributes:
         places: None where none are recognised.
         calibration: of the rig, from the drive; None where the calibration is taken as stated.
+        key_frames: tracking between key frames; None where every frame is one.
+        describe: finds the features of a key frame that came without.
         located: pose of the first frame, found in a saved map without a prior; None where it was
             not.
     """
@@ -69,7 +74,9 @@ class SlamPipeline:
     estimator: Estimator
     places: PlaceRecognition | None = None
     calibration: SelfCalibration | None = None
+    key_frames: KeyFrameTracker | None = None
     located: Prediction | None = None
+    describe: Callable[[FeatureFrame], FeatureFrame] | None = None
 
     def process(
         self, found: FeatureFrame, index: int, timestamp: float, body: Odometry | None = None
@@ -86,14 +93,23 @@ class SlamPipeline:
         odometry = self.motion.between(timestamp, body)
         prediction = predicted(self.estimator, odometry)
         watch.lap("predict")
-        every = self._match_stereo(found)
-        stereo = every.whole
-        watch.lap("stereo")
         landmarks, ended = self._fused()
-        seen = self._track(prediction, found, every, landmarks)
+        carried = self._carried(prediction, found, landmarks)
         watch.lap("track")
-        seen = self._recognise(seen, stereo, landmarks, ended)
+        if self.key_frames is not None and carried is not None and self._goes_on(carried):
+            stereo = carried.carried.features
+            seen = _Seen(carried.tracked.ego_motion, self.key_frames.book(carried))
+        else:
+            found = self._described(found)
+            watch.lap("sift")
+            every = self._match_stereo(found)
+            watch.lap("stereo")
+            every, seen = self._track(prediction, found, every, landmarks, carried)
+            stereo = every.whole
+            watch.lap("track")
+            seen = self._recognise(seen, stereo, landmarks)
         watch.lap("places")
+        seen = seen.without(ended)
         increment = self._increment(index, timestamp, odometry, seen)
         stats = updated(self.estimator, increment, seen.tracking)
         observe(self.motion, increment, seen.tracking, stats)
@@ -104,11 +120,28 @@ class SlamPipeline:
         watch.lap("calibrate")
         return FrameReport(found, stereo, increment, seen.tracking, stats, watch.ms)
 
+    def _carried(
+        self, prediction: Prediction, found: FeatureFrame, landmarks: LandmarkMap
+    ) -> CarriedFrame | None:
+        """The frame by the landmarks carried into it; None where there are none."""
+        if self.key_frames is None or found.frame is None:
+            return None
+        return self.key_frames.carry(prediction, landmarks, found.frame.images, self._correction())
+
+    def _goes_on(self, carried: CarriedFrame) -> bool:
+        """Whether the frame needs no features: enough is carried, and no place is looked for."""
+        return carried.suffices and (self.places is None or not self.places.wants_features)
+
+    def _described(self, found: FeatureFrame) -> FeatureFrame:
+        return found if self.describe is None else self.describe(found)
+
     def _match_stereo(self, found: FeatureFrame) -> StereoFeatures:
         if found.frame is None:
             return StereoFeatures.empty()
-        correction = None if self.calibration is None else self.calibration.found.applied
-        return self.stereo.match_all(found.features, correction)
+        return self.stereo.match_all(found.features, self._correction())
+
+    def _correction(self) -> RigCorrection | None:
+        return None if self.calibration is None else self.calibration.found.applied
 
     def _increment(
         self, index: int, timestamp: float, odometry: Odometry | None, seen: _Seen
@@ -142,10 +175,15 @@ class SlamPipeline:
         found: FeatureFrame,
         stereo: StereoFeatures,
         landmarks: LandmarkMap,
-    ) -> _Seen:
+        carried: CarriedFrame | None,
+    ) -> tuple[StereoFeatures, _Seen]:
+        """A key frame by all its features, those carried among them."""
         if found.frame is None:
-            return _Seen(self.tracker.track_blind(prediction), Association.nothing())
-        tracked = self.tracker.track(prediction, landmarks, stereo)
+            return stereo, _Seen(self.tracker.track_blind(prediction), Association.nothing())
+        if self.key_frames is None:
+            tracked = self.tracker.track(prediction, landmarks, stereo)
+        else:
+            tracked, stereo = self.key_frames.beside(carried, prediction, landmarks, stereo)
         relocalised, maps_on = False, True
         if found.i == 0 and self.located is not None:
             anew = self.tracker.track_anew(self.located, landmarks, stereo)
@@ -157,21 +195,18 @@ class SlamPipeline:
             maps_on = self.places.maps_on
         image = found.frame.images[0]
         association = self.tracker.associate(tracked, stereo, image, maps_on)
+        if self.key_frames is not None:
+            self.key_frames.begin(image, stereo, association)
         if found.i == 0 and not len(landmarks):
-            return _Seen(unmeasured(prediction, EgoMotionStatus.FIRST), association)
-        return _Seen(tracked.ego_motion, association, relocalised=relocalised)
+            return stereo, _Seen(unmeasured(prediction, EgoMotionStatus.FIRST), association)
+        return stereo, _Seen(tracked.ego_motion, association, relocalised=relocalised)
 
-    def _recognise(
-        self, seen: _Seen, stereo: StereoFeatures, landmarks: LandmarkMap, ended: IntArray
-    ) -> _Seen:
-        """The frame with the loops that it may close; landmarks that ended go with it."""
+    def _recognise(self, seen: _Seen, stereo: StereoFeatures, landmarks: LandmarkMap) -> _Seen:
+        """The frame with the loops that it may close."""
         if self.places is None:
             return seen
         loops = self.places.look(seen.tracking.wTc, landmarks, stereo, seen.association)
-        association = dataclasses.replace(
-            seen.association, pruned_ids=np.union1d(seen.association.pruned_ids, ended)
-        )
-        return dataclasses.replace(seen, association=association, loops=loops)
+        return dataclasses.replace(seen, loops=loops)
 
     def _remember(self, increment: Increment, seen: _Seen, stats: UpdateStats) -> None:
         if self.places is not None:
@@ -186,6 +221,15 @@ class _Seen:
     association: Association
     loops: tuple[LoopClosure, ...] = ()
     relocalised: bool = False
+
+    def without(self, ended: IntArray) -> _Seen:
+        """Landmarks that ended before the frame go with it."""
+        if not len(ended):
+            return self
+        pruned = np.union1d(self.association.pruned_ids, ended)
+        return dataclasses.replace(
+            self, association=dataclasses.replace(self.association, pruned_ids=pruned)
+        )
 
 
 def observe(

@@ -56,7 +56,8 @@ class RunRecorder:
     def add(self, report: FrameReport, wait_ms: float, stereo_precision: float) -> None:
         """Appends one frame."""
         beside = {"load": report.found.load_ms, "sift": report.found.sift_ms, "wait": wait_ms}
-        times = beside | report.stage_ms
+        stages = dict.fromkeys(STAGES, 0.0) | report.stage_ms
+        times = stages | beside
         row = _row(report, stereo_precision)
         self.stage_ms.append(np.array([times[stage] for stage in STAGES]))
         self.tracked_poses.append(report.tracking.wTc)

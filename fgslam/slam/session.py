@@ -33,10 +33,15 @@ from fgslam.slam.factory import (
     make_locator,
     make_pipeline,
 )
-from fgslam.slam.feature_stream import FeatureExtractor, FeatureFrame, FrameDescriber
+from fgslam.slam.feature_stream import (
+    FeatureExtractor,
+    FeatureFrame,
+    FrameDescriber,
+    undescribed,
+)
 from fgslam.slam.first_images import FirstImages, any_uint16, stereo_remarks
 from fgslam.slam.inputs import Images, checked_images, checked_odometry
-from fgslam.slam.pipeline import FrameReport
+from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.results import RunRecorder, SessionResult, Step, result_of
 
 
@@ -116,14 +121,19 @@ class Session:
         self._start: MapStart | None = None
         if isinstance(beginning, MapStart):
             beginning = self._begun(beginning, chosen, seed)
-        self.pipeline = self._make(beginning)
+        self._describer = FrameDescriber(features or make_extractor(frontend))
+        self.pipeline = self._made(beginning)
         self.recorder = RunRecorder(MeasurementLog(rig, self.pipeline.motion.description()))
         self._left_out = _LeftOut()
         self._seen = FirstImages()
         self._odometry = odometry
-        self._describer = FrameDescriber(features or make_extractor(frontend))
         self._ended = ""
         self._failed = False
+
+    def _made(self, beginning: Arrival | None) -> SlamPipeline:
+        pipeline = self._make(beginning)
+        pipeline.describe = self._describer.complete
+        return pipeline
 
     def _begun(
         self, start: MapStart, estimator: EstimatorSettings | Estimator, seed: int
@@ -179,11 +189,16 @@ class Session:
         checked = None if images is None else checked_images(images, self.rig)
         frame = None if checked is None else Frame(i, timestamp, checked)
         with one_blas_thread():
-            found = self._describer.describe(i, frame)
+            found = undescribed(i, frame)
+            if self.frontend.kind == "sift" or self._start is not None:
+                found = self._describer.complete(found)
             if images is not None:
                 self._seen.add(found, any_uint16(images))
             if self._start is None:
-                return Step.of(self.advance(found, timestamp, body))
+                report = self.advance(found, timestamp, body)
+                if images is not None and not found.features:
+                    self._seen.add(report.found, any_uint16(images))
+                return Step.of(report)
             if not self._arrives(self._start, found, timestamp):
                 return Step.not_located(timestamp, len(self.pipeline.tracker.database))
             return Step.of(self.advance(replace(found, i=0), timestamp))
@@ -195,7 +210,7 @@ class Session:
             located = self._locate(found)
             why = located.why
             if located.found:
-                self.pipeline = self._make(start.at(located.wTc, relocalised=True))
+                self.pipeline = self._made(start.at(located.wTc, relocalised=True))
                 first, stride = self.numbering
                 self.numbering = (first + stride * left_out.count, stride)
                 self._start = None

@@ -2,7 +2,7 @@
 
 Eq. 2's matrix is summed over the window. A point is lost for good when it cannot be tracked
 back to where it came from, when it no longer looks as it did when its tracking began
-(:mod:`fgslam.frontend.homing.reference_patches`), or when it leaves the view.
+(:mod:`fgslam.frontend.features.patches`), or when it leaves the view.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.checks import later_time
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import TrackedBearings
-from fgslam.frontend.homing.reference_patches import ReferencePatches, align, anchor
+from fgslam.frontend.features.patches import ReferencePatches, align, anchor
 from fgslam.frontend.homing.stabilised_view import StabilisedImage, StabilisedView
 
 _MAX_VIEW_WIDTH = 720  # columns: half a degree; coarser cameras get fewer

@@ -102,6 +102,14 @@ class PlaceRecognition:
         """(m,) landmarks that the last frame's closure showed to be older ones: they end next."""
         return np.asarray(self._merging[:, 0])
 
+    @property
+    def wants_features(self) -> bool:
+        """Whether the next frame is looked at, so that its features must be found."""
+        loops, confirmation = self._parts.loops, self._confirmation
+        if loops is None or confirmation is None:
+            return self._lost > 0
+        return self._lost > 0 or self._time_to_look(loops, confirmation)
+
     # -- lost --------------------------------------------------------------------------------
 
     def recover(

@@ -95,15 +95,16 @@ class LandmarkDatabase(LandmarkTable):
             which: (k,) the features that they match.
             directions: (k, 3) from the camera to each, unit, world; None where nobody asks.
         """
-        rows = self.rows(ids)
-        self.missed[rows] = 0
-        self._columns["contradicted"][rows] = 0
-        self._columns["seen"][rows] = self._frame
-        self.hits[rows] += 1
+        rows = self._hit(ids)
         self._refresh(rows, Views.of(features, which, directions, self._frame))
         permanence = self._settings.permanence
         if permanence is not None and permanence.when == "running":
             self.permanent[rows] |= self._reliable(rows, permanence)
+
+    def record_carried(self, ids: IntArray) -> None:
+        """A whole frame between key frames: landmarks hit whose looks nobody has described anew."""
+        self._hit(ids)
+        self._frame += 1
 
     def record_misses(self, ids: IntArray) -> None:
         """Type II: expected in view and not matched."""
@@ -180,6 +181,15 @@ class LandmarkDatabase(LandmarkTable):
         return pruned
 
     # ----------------------------------------------------------------------------------------
+
+    def _hit(self, ids: IntArray) -> IntArray:
+        """Counts a hit; returns the rows."""
+        rows = self.rows(ids)
+        self.missed[rows] = 0
+        self._columns["contradicted"][rows] = 0
+        self._columns["seen"][rows] = self._frame
+        self.hits[rows] += 1
+        return rows
 
     def _larger_than(self, least: float, ids: IntArray) -> Wanted:
         """Predicate on landmarks, by rows and depths: expected scale at least that large."""

@@ -126,6 +126,28 @@ class LandmarkTracker:
         problem = PoseProblem.of(landmarks, _matched(expected, matches, features))
         return Tracked(expected, matches, self.resection.solve(problem))
 
+    def expected(self, prediction: Prediction, landmarks: LandmarkMap) -> ExpectedLandmarks:
+        """Landmarks that may be in view of the prediction, as the floor allows it."""
+        return self.database.expected(landmarks, self._ego_motion.floor.constrain(prediction.wTc))
+
+    def matched_around(
+        self, around: Prediction, landmarks: LandmarkMap, features: StereoFeatures
+    ) -> tuple[ExpectedLandmarks, MapMatches]:
+        """Landmarks expected from a pose, and their matches."""
+        expected = self.database.expected(landmarks, around.wTc)
+        return expected, self._match_around(around, expected, landmarks, features)
+
+    def solved(
+        self,
+        prediction: Prediction,
+        landmarks: LandmarkMap,
+        matched: tuple[ExpectedLandmarks, MapMatches, StereoFeatures],
+    ) -> Tracked:
+        """The frame by matches that are known."""
+        expected, matches, _ = matched
+        problem = PoseProblem.of(landmarks, _matched(*matched))
+        return Tracked(expected, matches, self._ego_motion.solve(prediction, problem))
+
     def track_blind(self, prediction: Prediction) -> EgoMotion:
         """The odometry's pose, for a frame without images; the same that its replay will find."""
         nothing = PoseProblem.empty()
@@ -146,8 +168,7 @@ class LandmarkTracker:
             matches = self._matcher.match_anywhere(expected, features)
         else:
             matches = self._match_around(around, expected, landmarks, features)
-        problem = PoseProblem.of(landmarks, _matched(expected, matches, features))
-        return Tracked(expected, matches, self._ego_motion.solve(prediction, problem))
+        return self.solved(prediction, landmarks, (expected, matches, features))
 
     def _match_around(
         self,
@@ -192,6 +213,14 @@ class LandmarkTracker:
             pruned_ids=self.database.prune(),
             features=np.concatenate([matches.features, fresh]),
         )
+
+    def associate_carried(self, tracked: Tracked, features: StereoFeatures) -> Association:
+        """Records hits of carried landmarks, between key frames; nothing is missed or new there."""
+        matched = _matched(tracked.expected, tracked.matches, features)
+        inliers, none = tracked.ego_motion.inliers, np.empty(0, np.int64)
+        if not self.keeps_map:
+            self.database.record_carried(matched.ids[inliers])
+        return Association(matched, ~inliers, none, none, tracked.matches.features)
 
     def merge(self, pairs: IntArray) -> IntArray:
         """Makes landmarks found to be one into one; returns the identities that end.

@@ -231,7 +231,8 @@ def _loop(
     """Processes the remaining frames; what was saved when stopped before the last one, or None."""
     sequence, recorder = outputs.sequence, outputs.recorder
     shown = frames_to_show(len(sequence)) if outputs.config.output.pictures else frozenset()
-    stream = make_stream(sequence, outputs.config.frontend)(start=len(recorder))
+    frontend = outputs.config.frontend
+    stream = make_stream(sequence, frontend, frontend.kind == "sift")(start=len(recorder))
     waiting = time.perf_counter()
     interval = outputs.config.output.checkpoint_seconds
     saved = -math.inf  # the first frame is saved at once: from then on any end can be resumed

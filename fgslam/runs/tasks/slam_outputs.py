@@ -289,7 +289,8 @@ def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
     folder = make_subfolder(outputs.folder, FOLDER)
     images = report.found.frame.images
     title = _title(outputs, f"frame {report.increment.index}")
-    draw_features(folder / f"features_{i:06d}.png", images, report.found.features, title)
+    if report.found.features:
+        draw_features(folder / f"features_{i:06d}.png", images, report.found.features, title)
     draw_disparities(folder / f"disparities_{i:06d}.png", images[0], report.stereo.pixels, title)
     if len(outputs.recorder.log) > 1:
         earlier, now = outputs.recorder.log.increments[-2:]

@@ -45,6 +45,8 @@ def state_of(pipeline: SlamPipeline, recorder: RunRecorder) -> StateArrays:
         parts["places"] = pipeline.places.state()
     if pipeline.calibration is not None:
         parts["calibration"] = pipeline.calibration.state()
+    if pipeline.key_frames is not None:
+        parts["key_frames"] = pipeline.key_frames.state()
     return {
         f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()
     }
@@ -67,6 +69,8 @@ def restore(
     if pipeline.calibration is not None:
         part, frames = _part(state, "calibration"), recorder.log.increments
         pipeline.calibration.restore(part, frames, recorder.online_poses)
+    if pipeline.key_frames is not None:
+        pipeline.key_frames.restore(_part(state, "key_frames"))
 
 
 def has_checkpoint(folder: Path) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.frontend.homing.reference_patches import align, anchor
+from fgslam.frontend.features.patches import align, anchor
 from tests.textured_room import TEXTURE
 
 PLACES = np.array([[60.0, 60.0], [100.0, 60.0], [60.0, 100.0], [90.0, 90.0]])

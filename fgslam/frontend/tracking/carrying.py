@@ -1,0 +1,255 @@
+"""Landmarks carried from image to image by their patches, and across to the other cameras (KLT).
+
+A landmark keeps the patch of the reference image in which SIFT found it. In the next image the
+pyramid of Lucas and Kanade (Bouguet 2001) finds where it went, started where the predicted pose
+expects it, and one patch alignment (:mod:`fgslam.frontend.features.patches`) holds it to its own
+patch, so that errors do not add up. The same patch, as deformed by then, is aligned in the other
+images where the predicted disparity expects it: all coordinates are of one physical point.
+What survives has the patch's looks in every image and lies on the epipolar lines.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows, StateArrays
+from fgslam.core.features import Features, StereoFeatures
+from fgslam.core.rig_correction import RigCorrection
+from fgslam.core.sensors import CameraRig, vertical_to_horizontal
+from fgslam.frontend.features.patches import ReferencePatches, align, anchor
+from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.tracking.map_matching import ExpectedLandmarks
+
+PATCH_PX = 15  # side of the patch and of the window of the search before it
+_GREY_NOISE = 4.0  # sigma of a grey value: noise, and what no affine map does
+_DEFORMATION = 0.05  # sigma of a patch's stretching from image to image, beside the predicted one
+_MIN_CORRELATION = 0.75  # of a patch with its first look, gain and offset taken out
+_FARTHEST_PX = 2.0  # between what the search found and the patch: beyond, it is another thing
+_MARGIN_PX = 4.0  # of the patch's middle to the border of the reference image
+_PYRAMID_LEVELS = 2
+_SEARCH = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03)
+_MIN_EIGENVALUE = 1e-4
+_ALIGNMENTS = 2  # in the reference image, after the search
+_ALIGNMENTS_ACROSS = 3  # in the others, from the predicted disparity
+_FARTHEST_FLOW = 0.06
+"""Of the image's width: where the landmarks are expected to have moved farther in the median,
+patches are not looked for at all: half of them would be lost (EuRoC's key frames)."""
+
+NOISE_SHARE = 1.0
+"""Sigma of a carried coordinate over that of a SIFT one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Carried(Rows):
+    """Landmarks found again by their patches.
+
+    Attributes:
+        ids: (k,) ascending.
+        rows: (k,) which of the expected landmarks they are, ascending.
+        features: as measured in all images, with the looks that were expected of them.
+    """
+
+    ids: IntArray
+    rows: IntArray
+    features: StereoFeatures
+
+    @staticmethod
+    def nothing() -> Carried:
+        """No landmark."""
+        none = np.empty(0, np.int64)
+        return Carried(none, none, StereoFeatures.empty())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Points(Rows):
+    """Landmarks in the last reference image: identities (ascending), places (n, 2), depths."""
+
+    ids: IntArray
+    places: FloatArray
+    depths: FloatArray
+
+    @staticmethod
+    def none() -> _Points:
+        return _Points(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
+
+
+class LandmarkCarrier:
+    """The patches of the landmarks in view, and the last reference image."""
+
+    def __init__(self, rig: CameraRig, stereo: StereoMatcher) -> None:
+        """Carries nothing yet; ``stereo`` measures, by its gates."""
+        self._rig = rig
+        self._stereo = stereo
+        self._last: Image | None = None
+        self._points = _Points.none()
+        self._patches: ReferencePatches | None = None
+        self._fresh = _Points.none()  # of the last image, their patches yet to be taken
+
+    @property
+    def ids(self) -> IntArray:
+        """(n,) landmarks with a patch, ascending."""
+        return np.union1d(self._points.ids, self._fresh.ids)
+
+    def begin(self, image: Image, ids: IntArray, places: FloatArray, depths: FloatArray) -> None:
+        """Takes patches of landmarks seen in the reference image (ascending), in place of older.
+
+        Only when they are looked for: a frame that is given up before costs nothing.
+        """
+        self._keep(~np.isin(self._points.ids, ids))
+        self._last, self._fresh = image, _Points(ids, places, depths)
+
+    def forget(self, ids: IntArray) -> None:
+        """Carries these no further."""
+        self._keep(~np.isin(self._points.ids, ids))
+
+    def follow(
+        self,
+        images: tuple[Image, ...],
+        expected: ExpectedLandmarks,
+        correction: RigCorrection | None = None,
+    ) -> Carried | None:
+        """The landmarks in the next frame; the others are forgotten. None: all have moved too far.
+
+        Args:
+            images: right, left[, top].
+            expected: landmarks of the map where the predicted pose expects them.
+            correction: of the rig; None where its calibration is taken as stated.
+        """
+        last, self._last = self._last, images[0]
+        self._keep(np.isin(self._points.ids, expected.ids))
+        self._fresh = self._fresh.select(np.isin(self._fresh.ids, expected.ids))
+        if last is None or not self._within_reach(expected):
+            self._points = self._fresh = _Points.none()
+            self._patches = None
+            return None
+        patches = self._anchored(last)
+        rows = np.searchsorted(expected.ids, self._points.ids)
+        predicted = expected.measurement[rows]
+        depths = self._rig.fx * self._rig.baseline / predicted[:, 2]
+        # What comes nearer grows.
+        maps = patches.maps * (self._points.depths / depths)[:, None, None]
+        patches = dataclasses.replace(patches, maps=maps)
+        patches, places, good = self._in_reference(last, images[0], patches, predicted)
+        pixels = [places]
+        for camera in range(1, len(images)):
+            seen, fits = self._across(images[camera], camera, patches, places, predicted[:, 2])
+            pixels.append(seen)
+            good &= fits
+        looks = (expected.scale[rows], expected.orientation[rows], expected.descriptors[rows])
+        found = tuple(Features(seen, *looks).select(good) for seen in pixels)
+        features, consistent = self._stereo.measured(found, correction)
+        good[good] = consistent
+        self._points = _Points(self._points.ids[good], places[good], depths[good])
+        self._patches = patches.select(good)
+        return Carried(self._points.ids, rows[good], _noisier(features, NOISE_SHARE))
+
+    def state(self) -> StateArrays:
+        """All that is carried over."""
+        points, fresh = self._points, self._fresh
+        out: StateArrays = {f"fresh_{name}": getattr(fresh, name) for name in fresh.__slots__}
+        out |= {name: getattr(points, name) for name in points.__slots__}
+        out["last"] = np.empty((0, 0), np.uint8) if self._last is None else self._last
+        if self._patches is not None:
+            out |= {f"patch_{name}": getattr(self._patches, name) for name in _PATCH_ARRAYS}
+        return out
+
+    def restore(self, state: StateArrays) -> None:
+        """Continues from :meth:`state`, to the same bits."""
+        names = _Points.__slots__
+        self._points = _Points(**{name: state[name] for name in names})
+        self._fresh = _Points(**{name: state[f"fresh_{name}"] for name in names})
+        self._last = state["last"] if state["last"].size else None
+        self._patches = None
+        if "patch_first" in state:
+            patches = {name: state[f"patch_{name}"] for name in _PATCH_ARRAYS}
+            self._patches = ReferencePatches(PATCH_PX, **patches)
+
+    # ----------------------------------------------------------------------------------------
+
+    def _keep(self, keep: BoolArray) -> None:
+        self._points = self._points.select(keep)
+        if self._patches is not None:
+            self._patches = self._patches.select(keep)
+
+    def _within_reach(self, expected: ExpectedLandmarks) -> bool:
+        """False where there is nothing to look for, or the image has moved too far."""
+        flow = []
+        for points in (self._points, self._fresh):
+            there = expected.measurement[np.searchsorted(expected.ids, points.ids), :2]
+            flow.append(np.linalg.norm(there - points.places, axis=1))
+        moved = np.concatenate(flow)
+        return bool(len(moved)) and float(np.median(moved)) <= _FARTHEST_FLOW * self._rig.width
+
+    def _anchored(self, last: Image) -> ReferencePatches:
+        """The patches of all points, those of the fresh ones taken now."""
+        fresh, self._fresh = self._fresh, _Points.none()
+        if len(fresh) or self._patches is None:
+            new = anchor(last, fresh.places, PATCH_PX, _GREY_NOISE, _DEFORMATION)
+            patches = new if self._patches is None else self._patches.join(new)
+            points = self._points.join(fresh)
+            order = np.argsort(points.ids)
+            self._points, self._patches = points.select(order), patches.select(order)
+        return self._patches
+
+    def _in_reference(
+        self, last: Image, image: Image, patches: ReferencePatches, predicted: FloatArray
+    ) -> tuple[ReferencePatches, FloatArray, BoolArray]:
+        """Patches as deformed now, places (n, 2), and which (n,) are the same things."""
+        found, status, _ = cv2.calcOpticalFlowPyrLK(
+            last, image, self._points.places.astype(np.float32),
+            predicted[:, :2].astype(np.float32), None, None, (PATCH_PX, PATCH_PX),
+            _PYRAMID_LEVELS, _SEARCH, cv2.OPTFLOW_USE_INITIAL_FLOW, _MIN_EIGENVALUE,
+        )  # fmt: skip
+        at = np.asarray(found, np.float64)
+        patches, places, correlation = _aligned(patches, image, at, _ALIGNMENTS)
+        good = (status[:, 0] == 1) & (correlation >= _MIN_CORRELATION)
+        good &= np.linalg.norm(places - at, axis=1) < _FARTHEST_PX
+        return patches, places, np.asarray(good & self._inside(places, _MARGIN_PX))
+
+    def _across(
+        self,
+        image: Image,
+        camera: int,
+        patches: ReferencePatches,
+        places: FloatArray,
+        disparity: FloatArray,
+    ) -> tuple[FloatArray, BoolArray]:
+        """Pixels (n, 2) of the points in another camera's image, and which (n,) fit there."""
+        start = places.copy()
+        if camera == 1:
+            start[:, 0] += disparity
+        else:
+            start[:, 1] += disparity / vertical_to_horizontal(self._rig)
+        _, seen, correlation = _aligned(patches, image, start, _ALIGNMENTS_ACROSS)
+        fits = (correlation >= _MIN_CORRELATION) & self._inside(seen, 0.0)
+        return seen, fits
+
+    def _inside(self, places: FloatArray, margin: float) -> BoolArray:
+        last = np.array([self._rig.width, self._rig.height]) - 1.0 - margin
+        return np.asarray(((places >= margin) & (places <= last)).all(axis=1))
+
+
+_PATCH_ARRAYS = ("first", "light", "step", "contrast", "maps")
+
+
+def _noisier(features: StereoFeatures, share: float) -> StereoFeatures:
+    """The features with sigmas times ``share``."""
+    return dataclasses.replace(
+        features,
+        measurement_covariance=share**2 * features.measurement_covariance,
+        position_covariance=share**2 * features.position_covariance,
+    )
+
+
+def _aligned(
+    patches: ReferencePatches, image: Image, places: FloatArray, times: int
+) -> tuple[ReferencePatches, FloatArray, FloatArray]:
+    """Patches, places and correlations after so many alignments."""
+    correlation = np.empty(0)
+    for _ in range(times):
+        patches, places, correlation = align(patches, image, places)
+    return patches, places, correlation

@@ -1,0 +1,175 @@
+"""Frames tracked by carried landmarks, and when it takes a key frame instead.
+
+On a key frame SIFT finds features, describes the landmarks that are carried, finds again those that
+were lost, and starts new ones. Between key frames the carried landmarks alone place the camera, and
+nothing is missed, pruned or started.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, StateArrays
+from fgslam.core.estimates import LandmarkMap, Prediction
+from fgslam.core.features import StereoFeatures
+from fgslam.core.rig_correction import RigCorrection
+from fgslam.frontend.tracking.carrying import Carried, LandmarkCarrier
+from fgslam.frontend.tracking.map_matching import ExpectedLandmarks, MapMatches
+from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
+
+_LEAST_SHARE = 0.5  # of the key frame's landmarks; fewer left take a new one
+_LEAST_LANDMARKS = 40  # a pose by fewer is poor, whatever the key frame had
+_LEAST_COVERAGE = 0.6  # of the image's cells that the key frame's landmarks covered
+_CELLS = (4, 3)  # columns, rows
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CarriedFrame:
+    """A frame as its carried landmarks place it.
+
+    Attributes:
+        carried: the landmarks found again.
+        tracked: the pose that follows; its matches are rows of ``carried``.
+        suffices: it needs no key frame.
+    """
+
+    carried: Carried
+    tracked: Tracked
+    suffices: bool
+
+
+class KeyFrameTracker:
+    """A tracker that is asked for matches of SIFT features on key frames only."""
+
+    def __init__(self, tracker: LandmarkTracker, carrier: LandmarkCarrier) -> None:
+        """Takes the tracker whose landmarks are carried."""
+        self._tracker = tracker
+        self._carrier = carrier
+        self._count = 0  # landmarks of the last key frame
+        self._cells = 0  # of the image that they covered
+
+    def carry(
+        self,
+        prediction: Prediction,
+        landmarks: LandmarkMap,
+        images: tuple[Image, ...],
+        correction: RigCorrection | None = None,
+    ) -> CarriedFrame | None:
+        """The next frame by its carried landmarks; None where there are none to be expected."""
+        expected = self._tracker.expected(prediction, landmarks)
+        carried = self._carrier.follow(images, expected, correction)
+        if carried is None or not len(carried):
+            return None
+        every = np.arange(len(carried))
+        matches = MapMatches(carried.rows, every, np.ones(len(carried), np.bool_))
+        tracked = self._tracker.solved(prediction, landmarks, (expected, matches, carried.features))
+        return CarriedFrame(carried, tracked, self._suffices(carried, tracked, images[0]))
+
+    def book(self, frame: CarriedFrame) -> Association:
+        """Records a frame between key frames; outliers are carried no further."""
+        inliers = frame.tracked.ego_motion.inliers
+        self._carrier.forget(frame.carried.ids[~inliers])
+        return self._tracker.associate_carried(frame.tracked, frame.carried.features)
+
+    def beside(
+        self,
+        frame: CarriedFrame | None,
+        prediction: Prediction,
+        landmarks: LandmarkMap,
+        sift: StereoFeatures,
+    ) -> tuple[Tracked, StereoFeatures]:
+        """A key frame: what is carried, and of the others what SIFT finds; all features of both.
+
+        Landmarks that are carried and found by SIFT are measured by their patch, whose place in
+        the image has not changed, and described by SIFT.
+        """
+        if frame is None or not frame.tracked.ego_motion.status.measured:
+            return self._tracker.track(prediction, landmarks, sift), sift
+        pose = frame.tracked.ego_motion
+        around = Prediction(pose.wTc, pose.covariance)
+        expected, matches = self._tracker.matched_around(around, landmarks, sift)
+        kept = pose.inliers & np.isin(frame.carried.ids, expected.ids)
+        features, joined = _joined(expected, matches, frame.carried.select(kept), sift)
+        tracked = self._tracker.solved(prediction, landmarks, (expected, joined, features))
+        if not tracked.ego_motion.status.measured:
+            return self._tracker.track(prediction, landmarks, sift), sift
+        return tracked, features
+
+    def begin(self, image: Image, features: StereoFeatures, association: Association) -> None:
+        """After a key frame: its landmarks are carried from here, those in use by their patch.
+
+        Args:
+            image: the reference image.
+            features: all of the frame's.
+            association: what they were taken for.
+        """
+        observed, good = association.observations, ~association.rejected
+        self._carrier.forget(observed.ids[~good])
+        self._carrier.forget(np.setdiff1d(self._carrier.ids, observed.ids))
+        self._count = int(good.sum())
+        self._cells = len(_cells(observed.pixels[good, 0], image))
+        fresh = np.flatnonzero(good & ~np.isin(observed.ids, self._carrier.ids))
+        fresh = fresh[np.argsort(observed.ids[fresh])]
+        depths = features.position[association.features[fresh], 2]
+        self._carrier.begin(image, observed.ids[fresh], observed.pixels[fresh, 0], depths)
+
+    def state(self) -> StateArrays:
+        """What the last key frame was like, and what is carried."""
+        return self._carrier.state() | {"key_frame": np.array([self._count, self._cells])}
+
+    def restore(self, state: StateArrays) -> None:
+        """Continues from :meth:`state`."""
+        self._count, self._cells = state["key_frame"].tolist()
+        self._carrier.restore(state)
+
+    def _suffices(self, carried: Carried, tracked: Tracked, image: Image) -> bool:
+        pose = tracked.ego_motion
+        if not (pose.status.measured and pose.coherent):
+            return False
+        left = int(pose.inliers.sum())
+        if left < max(_LEAST_LANDMARKS, _LEAST_SHARE * self._count):
+            return False
+        cells = _cells(carried.features.pixels[pose.inliers, 0], image)
+        return len(cells) >= _LEAST_COVERAGE * self._cells
+
+
+def _cells(places: FloatArray, image: Image) -> IntArray:
+    """Cells of the image in which there are places (n, 2)."""
+    size = np.array([image.shape[1], image.shape[0]])
+    at = np.clip(places * _CELLS // size, 0, np.array(_CELLS) - 1).astype(np.int64)
+    return np.unique(at[:, 0] * _CELLS[1] + at[:, 1])
+
+
+def _joined(
+    expected: ExpectedLandmarks, matches: MapMatches, carried: Carried, sift: StereoFeatures
+) -> tuple[StereoFeatures, MapMatches]:
+    """Features carried, then those of SIFT that are none of these; matches of both, ascending."""
+    rows = np.searchsorted(expected.ids, carried.ids)
+    described = np.full(len(expected), -1)
+    described[matches.landmarks] = matches.features
+    also = described[rows]
+    features = _described(carried.features, also, sift)
+    rest: BoolArray = np.ones(len(sift), np.bool_)
+    rest[also[also >= 0]] = False
+    place = np.cumsum(rest) - 1 + len(carried)  # of a feature of SIFT among all
+    others = ~np.isin(matches.landmarks, rows)
+    landmarks = np.concatenate([rows, matches.landmarks[others]])
+    seen = np.concatenate([np.arange(len(carried)), place[matches.features[others]]])
+    order = np.argsort(landmarks)
+    had = np.concatenate([np.ones(len(carried), np.bool_), matches.had_candidates[rest]])
+    return features.join(sift.select(rest)), MapMatches(landmarks[order], seen[order], had)
+
+
+def _described(carried: StereoFeatures, also: IntArray, sift: StereoFeatures) -> StereoFeatures:
+    """Carried features with the looks of the features of SIFT ``also`` (k,); -1 for none."""
+    known = also >= 0
+    scale, orientation = carried.scale.copy(), carried.orientation.copy()
+    descriptors = carried.descriptors.copy()
+    scale[known], orientation[known] = sift.scale[also[known]], sift.orientation[also[known]]
+    descriptors[known] = sift.descriptors[also[known]]
+    return dataclasses.replace(
+        carried, scale=scale, orientation=orientation, descriptors=descriptors
+    )
