@@ -27,7 +27,7 @@ from fgslam.frontend.tracking.map_matching import ExpectedLandmarks
 PATCH_PX = 15  # side of the patch and of the window of the search before it
 _GREY_NOISE = 4.0  # sigma of a grey value: noise, and what no affine map does
 _DEFORMATION = 0.05  # sigma of a patch's stretching from image to image, beside the predicted one
-_MIN_CORRELATION = 0.75  # of a patch with its first look, gain and offset taken out
+_MIN_CORRELATION = 0.65  # of a patch with its first look, gain and offset taken out
 _FARTHEST_PX = 2.0  # between what the search found and the patch: beyond, it is another thing
 _MARGIN_PX = 4.0  # of the patch's middle to the border of the reference image
 _PYRAMID_LEVELS = 2
@@ -39,7 +39,7 @@ _FARTHEST_FLOW = 0.06
 """Of the image's width: where the landmarks are expected to have moved farther in the median,
 patches are not looked for at all: half of them would be lost (EuRoC's key frames)."""
 
-NOISE_SHARE = 1.0
+NOISE_SHARE = 0.6
 """Sigma of a carried coordinate over that of a SIFT one."""
 
 

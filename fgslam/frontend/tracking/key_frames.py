@@ -20,7 +20,7 @@ from fgslam.frontend.tracking.carrying import Carried, LandmarkCarrier
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks, MapMatches
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
 
-_LEAST_SHARE = 0.5  # of the key frame's landmarks; fewer left take a new one
+_LEAST_SHARE = 0.4  # of the key frame's landmarks; fewer left take a new one
 _LEAST_LANDMARKS = 40  # a pose by fewer is poor, whatever the key frame had
 _LEAST_COVERAGE = 0.6  # of the image's cells that the key frame's landmarks covered
 _CELLS = (4, 3)  # columns, rows
@@ -160,7 +160,12 @@ def _joined(
     seen = np.concatenate([np.arange(len(carried)), place[matches.features[others]]])
     order = np.argsort(landmarks)
     had = np.concatenate([np.ones(len(carried), np.bool_), matches.had_candidates[rest]])
-    return features.join(sift.select(rest)), MapMatches(landmarks[order], seen[order], had)
+    others_seen = sift.select(rest)
+    every = features.join(others_seen)
+    if others_seen.complete is not None:
+        complete = np.concatenate([np.ones(len(carried), np.bool_), others_seen.complete])
+        every = dataclasses.replace(every, complete=complete)
+    return every, MapMatches(landmarks[order], seen[order], had)
 
 
 def _described(carried: StereoFeatures, also: IntArray, sift: StereoFeatures) -> StereoFeatures:
