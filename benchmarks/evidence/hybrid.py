@@ -100,7 +100,7 @@ def _row(
     config: ExperimentConfig, found: Found, estimator: str, kind: Literal["sift", "hybrid"]
 ) -> tuple[Cell, ...]:
     """Share of key frames, share located, ATE, CPU a frame and with the final estimate."""
-    frontend = replace(config.frontend, kind=kind)
+    frontend = replace(config.frontend, tracking=kind)
     kind_of = {"kind": estimator}
     config = type(config).model_validate(config.as_values() | {"estimator": kind_of})
     config = config.model_copy(update={"frontend": frontend})

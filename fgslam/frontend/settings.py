@@ -353,11 +353,11 @@ class LoopSettings:
 class FrontendSettings:
     """All of the front-end."""
 
-    kind: Annotated[
+    tracking: Annotated[
         Literal["sift", "hybrid"],
         Field(
             description="`sift`: SIFT on every frame; `hybrid`: on key frames, between them the "
-            "landmarks are carried by their patches (KLT): a third of the cost"
+            "landmarks are carried by their patches (KLT), at a fraction of the cost"
         ),
     ] = "sift"
     sift: SiftSettings = SiftSettings()

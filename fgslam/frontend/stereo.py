@@ -81,7 +81,7 @@ class StereoMatcher:
         s, right, left = self._settings, straight[0].xy, straight[1].xy
         horizontal = left[:, 0] - right[:, 0]
         good = np.abs(left[:, 1] - right[:, 1]) <= s.epipolar_px
-        good &= (horizontal >= s.min_disparity_px) & (horizontal <= s.max_disparity_px)
+        good &= (horizontal >= s.min_disparity_px) & (horizontal <= s.largest_disparity_px)
         if len(straight) > 2:
             top = straight[2].xy
             vertical = (top[:, 1] - right[:, 1]) * self._vertical_to_horizontal

@@ -88,7 +88,7 @@ def make_key_frames(
     rig: CameraRig, settings: FrontendSettings, tracker: LandmarkTracker
 ) -> KeyFrameTracker | None:
     """Tracking between key frames; None where every frame is one."""
-    if settings.kind == "sift":
+    if settings.tracking == "sift":
         return None
     carrier = LandmarkCarrier(rig, make_stereo_matcher(rig, settings))
     return KeyFrameTracker(tracker, carrier)

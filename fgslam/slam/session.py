@@ -190,7 +190,7 @@ class Session:
         frame = None if checked is None else Frame(i, timestamp, checked)
         with one_blas_thread():
             found = undescribed(i, frame)
-            if self.frontend.kind == "sift" or self._start is not None:
+            if self.frontend.tracking == "sift" or self._start is not None:
                 found = self._describer.complete(found)
             if images is not None:
                 self._seen.add(found, any_uint16(images))

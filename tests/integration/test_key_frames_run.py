@@ -17,7 +17,7 @@ FRAMES = 12
 
 
 def values_of(recording: Path, **changes: object) -> dict[str, Any]:
-    frontend = {"kind": "hybrid", "matching": {"widen_sigmas": 3.0}}
+    frontend = {"tracking": "hybrid", "matching": {"widen_sigmas": 3.0}}
     return experiment(recording, frontend=frontend) | changes
 
 

@@ -232,7 +232,7 @@ def _loop(
     sequence, recorder = outputs.sequence, outputs.recorder
     shown = frames_to_show(len(sequence)) if outputs.config.output.pictures else frozenset()
     frontend = outputs.config.frontend
-    stream = make_stream(sequence, frontend, frontend.kind == "sift")(start=len(recorder))
+    stream = make_stream(sequence, frontend, frontend.tracking == "sift")(start=len(recorder))
     waiting = time.perf_counter()
     interval = outputs.config.output.checkpoint_seconds
     saved = -math.inf  # the first frame is saved at once: from then on any end can be resumed
