@@ -25,6 +25,7 @@ from benchmarks.evidence import (
     paper_views,
     person,
     relocalising,
+    sizes,
     variants,
     visits,
 )
@@ -48,6 +49,7 @@ EVIDENCE: dict[str, Callable[[Path], Iterable[Table]]] = {
     "false_matches": lambda data: false_matches.tables(),
     "noise": lambda data: noise.tables(),
     "lasting": lambda data: lasting.tables(),
+    "sizes": lambda data: sizes.tables(),
     "visits": lambda data: visits.tables(),
     "unmapped": lambda data: relocalising.unmapped_tables(),
     "recognised": relocalising.recognised_tables,

@@ -1,0 +1,21 @@
+"""The lab at other sizes of the image."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[3]))
+
+from benchmarks.evidence.sizes import sizes_table
+
+
+@pytest.mark.slow
+def test_larger_images_are_located_more_exactly_with_more_features() -> None:
+    table = sizes_table((320, 640), frames=3)
+    assert table.column("located") == ["3 of 3", "3 of 3"]
+    for name, sign in (("features an image", 1.0), ("inliers", 1.0), ("ATE cm", -1.0)):
+        small, large = (float(str(cell)) for cell in table.column(name))
+        assert sign * (large - small) > 0.0, name
