@@ -13,9 +13,9 @@ from benchmarks.evidence.sizes import sizes_table
 
 
 @pytest.mark.slow
-def test_larger_images_are_located_more_exactly_with_more_features() -> None:
+def test_larger_images_have_more_features_and_inliers() -> None:
     table = sizes_table((320, 640), frames=3)
     assert table.column("located") == ["3 of 3", "3 of 3"]
-    for name, sign in (("features an image", 1.0), ("inliers", 1.0), ("ATE cm", -1.0)):
+    for name in ("features an image", "inliers"):
         small, large = (float(str(cell)) for cell in table.column(name))
-        assert sign * (large - small) > 0.0, name
+        assert large > 1.5 * small, name
