@@ -27,7 +27,10 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Filters and smoothers": ("filter_or_smoother", "robustness"),
     "Maps": ("lasting_landmarks", "saved_maps", "relocalisation", "loops"),
     "Homing": ("homing_vectors", "homing_drives", "topological_maps", "homing_estimators"),
-    "Speed": ("speed",),
+    "Speed": (
+        "key_frames",
+        "speed",
+    ),
 }
 """Pages in the order of the site."""
 
