@@ -223,7 +223,7 @@ def test_the_left_camera_sees_columns_shifted_by_the_disparity(
     rig: CameraRig, points: FloatArray, wTr: FloatArray
 ) -> None:
     world = g.transform_to_world(wTr, points)
-    wTl = g.left_from_right_camera(wTr, rig.baseline)
+    wTl = g.right_from_left_camera(wTr, -rig.baseline)
     seen_right = g.project(rig, points)
     seen_left = g.project(rig, g.transform_to_camera(wTl, world))
     scale = 1.0 + np.abs(seen_left).max()

@@ -137,7 +137,7 @@ def gtsam_update(
     k = gtsam.Cal3_S2Stereo(RIG.fx, RIG.fy, 0.0, RIG.cx, RIG.cy, RIG.baseline)
     factor = gtsam.GenericStereoFactor3D(gtsam.StereoPoint2(*(to_lrv @ z)), noise, 0, 1, k)
     values = gtsam.Values()
-    values.insert(0, gtsam.Pose3(g.left_from_right_camera(wTc, RIG.baseline)))
+    values.insert(0, gtsam.Pose3(g.right_from_left_camera(wTc, -RIG.baseline)))
     values.insert(1, x)
     matrix, rhs = factor.linearize(values).jacobian()
     a = matrix[:, 6:]

@@ -306,7 +306,7 @@ def gtsam_stereo(left: FloatArray) -> gtsam.StereoCamera:
 
 def test_projection_is_gtsams_seen_from_the_right_camera(rng: np.random.Generator) -> None:
     wTr = random_pose(rng)
-    wTl = g.left_from_right_camera(wTr, RIG.baseline)
+    wTl = g.right_from_left_camera(wTr, -RIG.baseline)
     camera = gtsam_stereo(wTl)
     points = g.transform_to_world(wTr, points_in_view(rng))
     measured = g.project(RIG, g.transform_to_camera(wTr, points))
@@ -319,7 +319,7 @@ def test_projection_is_gtsams_seen_from_the_right_camera(rng: np.random.Generato
 def test_the_left_camera_is_a_baseline_to_the_left(rng: np.random.Generator) -> None:
     wTr = np.stack([random_pose(rng) for _ in range(4)])
     kept = wTr.copy()
-    wTl = g.left_from_right_camera(wTr, RIG.baseline)
+    wTl = g.right_from_left_camera(wTr, -RIG.baseline)
     in_right = g.inverse(wTr) @ wTl
     np.testing.assert_allclose(
         in_right[:, :3, :3], np.tile(np.eye(3), (4, 1, 1)), rtol=0, atol=1e-14
@@ -371,7 +371,7 @@ def test_point_pose_jacobian_against_differences_and_gtsam(rng: np.random.Genera
 
 def test_triangulate_agrees_with_gtsam_backproject(rng: np.random.Generator) -> None:
     measured = g.project(RIG, points_in_view(rng))
-    camera = gtsam_stereo(g.left_from_right_camera(np.eye(4), RIG.baseline))
+    camera = gtsam_stereo(g.right_from_left_camera(np.eye(4), -RIG.baseline))
     for point, (column, row, disparity) in zip(g.triangulate(RIG, measured), measured, strict=True):
         expected = camera.backproject(gtsam.StereoPoint2(column + disparity, column, row))
         np.testing.assert_allclose(point, expected, rtol=0, atol=1e-9)
