@@ -45,9 +45,6 @@ REASONS = {
 
 BY_HAND = {
     "frontend.stereo.pixel_sigma": "noise of SIFT, measured on rendered images against the truth",
-    "frontend.ego_motion.max_correction_m": "what a step may be off that only the last foretells",
-    "frontend.ego_motion.max_correction_deg": "as above",
-    "frontend.ego_motion.outlier_sigmas": "far points of a road whose noise is larger than stated",
     "estimator.noise_factor": "errors of a landmark that persist from frame to frame",
     "compare.noise_factor": "as above",
     "frontend.database.valid_hits": "frames half a metre apart: by the default 35 of 50 queries "
