@@ -248,7 +248,7 @@ def wrong_uses() -> dict[str, tuple[type[FgslamError], str, Any]]:
         "key": (ConfigError, "unknown key sed", lambda p: fg.run("lab_loop", p, {"sed": 1})),
         "one text": (ConfigError, "is one text", lambda p: fg.run("lab_loop", p, "seed=1")),
         "array": (ConfigError, "seed is a ndarray", lambda p: fg.run("x", p, {"seed": np.ones(2)})),
-        "folder": (DatasetError, "none of the known layouts", lambda p: fg.open_recording(p)),
+        "folder": (DatasetError, "is empty; give the folder", lambda p: fg.open_recording(p)),
         "no folder": (DatasetError, "no such folder", lambda p: fg.open_recording(p / "x")),
         "session": (ConfigError, "comes with fgslam", lambda _: fg.Slam.from_config("kiti06")),
         "homing": (ConfigError, "homing", lambda _: fg.Slam.from_config("homing_lab")),
