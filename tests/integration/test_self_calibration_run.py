@@ -10,6 +10,7 @@ import pytest
 from recordings import BASELINE, FOCAL, HEIGHT, WIDTH, experiment, write_recording
 from running import bytes_of, main, metrics_of, run_values, stop_after
 
+import fgslam
 from fgslam.cameras.corrected import rectifier_of
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.rig_correction import term_names
@@ -69,6 +70,18 @@ def test_an_interrupted_run_goes_on_with_the_same_corrections(turned: Path, tmp_
     assert bytes_of(partial.folder) == bytes_of(whole.folder)
     name = "calibration.csv"
     assert (partial.folder / name).read_bytes() == (whole.folder / name).read_bytes()
+
+
+def test_a_replay_gives_the_bits_of_the_live_run(turned: Path) -> None:
+    recording = fgslam.open_recording(turned)
+    with fgslam.Slam(recording.rig, "landmark_kalman") as slam:
+        for t, images, odometry in recording:
+            slam.track(t, images, odometry)
+        live, found = slam.result(), slam.result().rig
+    assert found is not None
+    assert found.applied.values.any()
+    again = fgslam.replay(slam.log, "landmark_kalman")
+    np.testing.assert_array_equal(again.online.poses, live.online.poses)
 
 
 def test_paper_pipelines_write_no_calibration(
