@@ -50,7 +50,7 @@ def admit_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def relinearise_beyond(monkeypatch: pytest.MonkeyPatch, threshold: float) -> None:
-    """The incremental smoothers linearise anew what moves by more than a threshold."""
+    """iSAM2 linearises anew what moves by more than a threshold."""
     monkeypatch.setattr(graphs, "_RELINEARISED", threshold)
 
 

@@ -16,6 +16,7 @@ from fgslam.core.arrays import FloatArray
 
 _POSE, _LANDMARK = "x", "l"
 _TARGET, _VELOCITY, _HEIGHT = "t", "v", "h"
+_FIRST_LANDMARK = int(gtsam.symbol(_LANDMARK, 0))
 
 
 def pose_key(frame: int) -> int:
@@ -25,7 +26,7 @@ def pose_key(frame: int) -> int:
 
 def landmark_key(variable: int) -> int:
     """Key of the landmark variable number ``variable``, counted from 0."""
-    return int(gtsam.symbol(_LANDMARK, variable))
+    return _FIRST_LANDMARK + variable
 
 
 def is_pose(key: int) -> bool:

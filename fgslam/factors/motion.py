@@ -70,8 +70,3 @@ def point_prior(landmark: int, position: FloatArray, covariance: FloatArray) -> 
     """Prior on a world point (3,), covariance (3, 3) metres squared."""
     noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
     return gtsam.PriorFactorPoint3(landmark, position, noise)
-
-
-def weak_point_prior(landmark: int, position: FloatArray, sigma: float) -> Any:
-    """Prior on a world point (3,), the same standard deviation in all directions, metres."""
-    return gtsam.PriorFactorPoint3(landmark, position, gtsam.noiseModel.Isotropic.Sigma(3, sigma))

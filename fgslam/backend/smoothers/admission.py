@@ -76,6 +76,7 @@ class LandmarkAdmission:
         self._saved: dict[int, tuple[FloatArray, FloatArray]] = {}
         self._first_frame = 0
         self.tracks: dict[int, Track] = {}
+        self._recent: dict[int, Track] = {}
         self.remarks: list[str] = []
 
     # -- what a frame's observations say of their landmarks --------------------------------------
@@ -145,6 +146,7 @@ class LandmarkAdmission:
         track = self.tracks.get(identity)
         if track is None:
             track = self.tracks[identity] = Track(LEAST_PARALLAX, sighting)
+        self._recent[identity] = track
         track.last = sighting
         track.sightings += 1
         return track
@@ -165,12 +167,14 @@ class LandmarkAdmission:
         """Drops landmarks as the front-end did: what they said stays in the graph, they do not."""
         for identity in identities.tolist():
             self.tracks.pop(identity, None)
+            self._recent.pop(identity, None)
             self._saved.pop(identity, None)
 
     def start_anew(self, identities: Iterable[int], why: str) -> None:
         """Closes the variables of landmarks; their next sighting begins new ones."""
         for identity in identities:
             self._saved.pop(identity, None)
+            self._recent.pop(identity, None)
             track = self.tracks.pop(identity, None)
             if track is not None and why:
                 self.remarks.append(
@@ -194,11 +198,18 @@ class LandmarkAdmission:
             Identity and track of each; it keeps its variable until the caller closes it.
         """
         self._first_frame = frame
-        return [(i, t) for i, t in self.tracks.items() if t.variable >= 0 and t.last.frame < frame]
+        left = [(i, track) for i, track in self._recent.items() if track.last.frame < frame]
+        for identity, _ in left:
+            del self._recent[identity]
+        return [(i, track) for i, track in left if track.variable >= 0]
 
     def waiting(self) -> Iterator[tuple[int, Track]]:
-        """Landmarks that are not in the graph."""
-        return ((i, track) for i, track in self.tracks.items() if track.variable < 0)
+        """Landmarks that are not in the graph, seen since a bounded lag began."""
+        return ((i, track) for i, track in self._recent.items() if track.variable < 0)
+
+    def in_graph(self) -> Iterator[tuple[int, Track]]:
+        """Landmarks that are in the graph."""
+        return ((i, track) for i, track in self._recent.items() if track.variable >= 0)
 
     def describe(self, identity: int, variable: int) -> str:
         """A landmark's identity and sightings, in words."""

@@ -1,13 +1,14 @@
-"""Incremental fixed-lag smoothing: poses and landmarks older than the lag are marginalised.
+"""Fixed-lag smoothing: poses and landmarks older than the lag are marginalised.
 
-What a marginalised variable said about the others stays, as a linear factor; the variable itself
-can no longer change. A landmark that comes back after the lag is a new variable: the smoother
-has forgotten it, which is the price of a constant effort.
+What a marginalised variable said about the others stays, as a quadratic; the variable itself can
+no longer change. A landmark that comes back after the lag is a new variable: the smoother has
+forgotten it, which is the price of a constant effort.
 """
 
 from __future__ import annotations
 
-from collections import deque
+import dataclasses
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import gtsam
@@ -20,9 +21,10 @@ from fgslam.backend.filters.loop_correction import (
     refusal,
 )
 from fgslam.backend.settings import FixedLagSettings
+from fgslam.backend.smoothers.admission import Track
 from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.backend.smoothers.loop_closing import misfit
-from fgslam.backend.smoothers.marginals import DenseMarginals, UndeterminedError
+from fgslam.backend.smoothers.marginals import UndeterminedError
 from fgslam.backend.smoothers.smoother import GraphProblem, Smoother
 from fgslam.backend.smoothers.solver import (
     ClosedLoop,
@@ -31,9 +33,13 @@ from fgslam.backend.smoothers.solver import (
     Solution,
     allowed_joint,
     allowed_parts,
-    points_of,
     solver_failed,
-    suspect,
+)
+from fgslam.backend.smoothers.window import (
+    Landmarks,
+    LandmarkUndeterminedError,
+    Solved,
+    Window,
 )
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
@@ -44,22 +50,12 @@ from fgslam.core.geometry import (
     congruence,
     inverse,
     point_pose_jacobian,
-    reorthonormalise,
     se3_exp,
     se3_log,
     transform_to_camera,
-    transform_to_world,
 )
 from fgslam.core.sensors import Sensor
-from fgslam.factors.graphs import (
-    is_pose,
-    isam2_parameters,
-    landmark_key,
-    number,
-    pose_key,
-    poses_of_frame,
-    without_gaps,
-)
+from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.motion import pose_prior
 
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
@@ -80,7 +76,7 @@ def fixed_lag_smoother(
 
 
 class FixedLagSolver:
-    """Solves a window of the last frames by GTSAM's incremental fixed-lag smoother."""
+    """Solves a window of the last frames anew with each of them."""
 
     kind: ClassVar[str] = "fixed_lag"
 
@@ -89,13 +85,15 @@ class FixedLagSolver:
         self._builder, self._floor = problem.builder, problem.floor
         self._in_seconds = settings.lag_frames is None
         self._lag = float(settings.lag_frames or settings.lag_s or 0.0)
-        self._solver = self._new_solver()
-        self._values = gtsam.Values()
+        self._noise = settings.noise_factor**2
+        width = settings.kernel.width / settings.noise_factor
+        kernel = dataclasses.replace(settings.kernel, width=width)
+        self._window = Window(problem.sensor, kernel)
+        self._solved: Solved | None = None
         self._oldest = 0
         self._poses: list[FloatArray] = []
         self._covariances: list[FloatArray] = []
         self._clock: list[float] = []
-        self._recent: deque[NewFactors] = deque()
         self.remarks: list[str] = []
 
     def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
@@ -103,8 +101,8 @@ class FixedLagSolver:
         self._clock.append(timestamp)
         self._poses.append(np.eye(4))
         self._covariances.append(np.full((6, 6), np.nan))
-        self._recent.append(new)
-        self._update(new)
+        self._take(new)
+        self._solve()
         self._move_window(landmarks)
 
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
@@ -112,14 +110,11 @@ class FixedLagSolver:
         return self._smoothed({self._oldest, frame})  # the one that leaves next, and the last one
 
     def _smoothed(self, frames: set[int]) -> Smoothed:
-        """Keeps the window's poses, and the covariances of some frames of it."""
+        """Keeps the covariances of some frames of the window."""
         last = len(self._poses) - 1
-        for frame in range(self._oldest, last + 1):
-            self._poses[frame] = poses_of_frame(self._values, frame)
-        marginals = self._marginals()
         for frame in frames:
-            self._covariances[frame] = self._covariance(marginals, frame)
-        return Smoothed(self._values, Prediction(self._poses[last], self._covariances[last]))
+            self._covariances[frame] = self._covariance(frame)
+        return Smoothed(self._values(), Prediction(self._poses[last], self._covariances[last]))
 
     def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
         """Moves the window as a whole to where the loop has the last pose; the past stays.
@@ -141,12 +136,12 @@ class FixedLagSolver:
     def _taken_in(self, known: Constraint, what: str) -> bool:
         """Adds a loop within the lag, where hardly anything drifts, as a factor; or refuses it."""
         factor = constraint_factor(known)
-        refused = refusal(what, misfit(factor, self._values))
+        refused = refusal(what, misfit(factor, self._window.pose_values()))
         if refused:
             self.remarks.append(refused)
             return False
-        self._recent[-1].graph.add(factor)
-        self._rebuild(gtsam.Values(self._values))
+        self._window.factors.add(factor)
+        self._solve()
         self.remarks.append(f"{what}: within the lag, a factor more")
         return True
 
@@ -177,139 +172,152 @@ class FixedLagSolver:
 
     def _move_all(self, last: Prediction) -> None:
         """Takes the window along with its last pose, as it is, and starts from there."""
-        moved, values = last.wTc @ inverse(self._poses[-1]), gtsam.Values(self._values)
-        for key in list(values.keys()):
-            if is_pose(key):
-                pose = reorthonormalise(moved @ poses_of_frame(values, number(key)))
-                values.update(key, gtsam.Pose3(pose))
-                self._poses[number(key)] = pose
-            else:
-                values.update(key, transform_to_world(moved, values.atPoint3(key)[None])[0])
-        to_oldest = adjoint(inverse(self._poses[self._oldest]) @ last.wTc)
-        self._covariances[self._oldest] = congruence(to_oldest, last.covariance)
-        self._rebuild(values)
+        oldest = self._oldest
+        moved = last.wTc @ inverse(self._poses[-1])
+        to_oldest = adjoint(inverse(self._poses[oldest]) @ last.wTc)
+        self._covariances[oldest] = congruence(to_oldest, last.covariance)
+        there = Prediction(moved @ self._poses[oldest], self._covariances[oldest])
+        self._window.carried_along(moved, pose_prior(pose_key(oldest), there))
+        self._solve()
 
     def solution(self) -> Solution:
         """Poses as they left the window, and those inside with their marginals."""
-        marginals = self._marginals()
         covariances = np.array(self._covariances)  # our own stay as the updates left them
         for frame in range(self._oldest, len(self._poses)):
-            covariances[frame] = self._covariance(marginals, frame)
-        inside = [
-            track.variable
-            for track in self._builder.admission.tracks.values()
-            if track.variable >= 0 and self._values.exists(landmark_key(track.variable))
-        ]
-        found = marginals.landmarks([landmark_key(v) for v in inside])
+            covariances[frame] = self._covariance(frame)
+        solved, landmarks = self._at_last(), self._window.landmarks
+        inside = [track.variable for _, track in self._builder.admission.in_graph()]
+        places = landmarks.points[np.searchsorted(landmarks.variables, inside)]
+        found = solved.eliminated.landmarks()[solved.rows(inside)]
         return Solution(
             np.array(self._poses),
             covariances,
-            points_of(self._values, inside),
+            dict(zip(inside, places, strict=True)),
             dict(zip(inside, found, strict=True)),
         )
 
     def joint(self, variables: list[int]) -> FloatArray:
         """Joint covariance of the last pose and landmark variables of the window."""
-        last = len(self._poses) - 1
-        joint = self._marginals().joint(pose_key(last), [landmark_key(v) for v in variables])
+        solved = self._at_last()
+        joint = solved.eliminated.joint(len(solved.frames) - 1, solved.rows(variables))
         return allowed_joint(self._floor, self._poses[-1], joint)
 
     # ----------------------------------------------------------------------------------------
 
-    def _new_solver(self) -> Any:
-        params = isam2_parameters(gtsam.ISAM2GaussNewtonParams())
-        # Without it the list of factors, and the effort, grow with the run.
-        params.findUnusedFactorSlots = True
-        return gtsam.IncrementalFixedLagSmoother(self._lag, params)
-
     def _time(self, frame: int) -> float:
         return self._clock[frame] if self._in_seconds else float(frame)
 
-    def _update(self, new: NewFactors) -> None:
-        stamp = self._time(new.frame)
-        stamps = {pose_key(new.frame): stamp} | {landmark_key(v): stamp for v in new.seen}
-        before = self._values
-        try:
-            self._solver.update(new.graph, new.values, stamps)
-            self._values = self._solver.calculateEstimate()
-        except RuntimeError as error:
-            together = gtsam.Values(before)
-            together.insert(new.values)
-            self._repair(together, error)
+    def _take(self, new: NewFactors) -> None:
+        """A frame's pose, landmarks and observations into the window."""
+        pose = new.values.atPose3(pose_key(new.frame)).matrix()
+        self._window.add_pose(new.frame, pose, new.graph)
+        known = self._window.landmarks.variables
+        before = int(known[-1]) if len(known) else -1
+        entered = sorted({v for v, _ in new.sightings if v > before})
+        if entered:
+            self._window.add_landmarks(_landmarks(new, entered))
+        if new.sightings:
+            self._window.observe(
+                np.array([s.frame for _, s in new.sightings], np.int64),
+                np.array([v for v, _ in new.sightings], np.int64),
+                np.array([s.measurement for _, s in new.sightings]),
+                self._noise * np.array([s.covariance for _, s in new.sightings]),
+            )
+
+    def _solve(self) -> None:
+        """Solves the window, without landmarks on which it fails."""
+        for _ in range(_REPAIRS):
+            try:
+                self._solved = self._window.solve()
+                break
+            except LandmarkUndeterminedError as error:
+                self._take_out(error)
+            except (UndeterminedError, np.linalg.LinAlgError) as error:
+                raise solver_failed(self.kind, error, self._builder.frames[-1]) from None
+        else:
+            many = EstimatorError("too many landmarks left it indeterminate")
+            raise solver_failed(self.kind, many, self._builder.frames[-1])
+        for frame, pose in zip(self._window.frames, self._window.poses, strict=True):
+            self._poses[frame] = pose
+
+    def _take_out(self, error: LandmarkUndeterminedError) -> None:
+        self._window.take_out(error.variable)
+        self.remarks.append(
+            f"{self._builder.take_out(error.variable)} left the system indeterminate at frame "
+            f"{self._builder.frames[-1]}: taken out"
+        )
 
     def _move_window(self, known: LandmarkMap) -> None:
         """Notes which poses and landmarks have left; landmarks keep their last place."""
         last = len(self._poses) - 1
         while self._time(self._oldest) < self._time(last) - self._lag:
             self._oldest += 1
-        while self._recent and self._recent[0].frame < self._oldest:
-            self._recent.popleft()
-        left = self._builder.forget_before(self._oldest)
-        rows = known.rows(np.array([identity for identity, _ in left], np.int64))
-        for (_, track), row in zip(left, rows.tolist(), strict=True):
-            position, covariance = known.positions[row].copy(), known.covariances[row]
-            track.left_at = position, self._with_pose(track.last.frame, position, covariance)
+        try:
+            self._window.let_go_before(self._oldest)
+        except (UndeterminedError, np.linalg.LinAlgError) as error:
+            raise solver_failed(self.kind, error, self._builder.frames[-1]) from None
+        last_seen: dict[int, list[tuple[int, Track]]] = {}
+        for identity, track in self._builder.forget_before(self._oldest):
+            last_seen.setdefault(track.last.frame, []).append((identity, track))
+        for frame, left in last_seen.items():
+            rows = known.rows(np.array([identity for identity, _ in left], np.int64))
+            places = known.positions[rows]
+            found = self._with_pose(frame, places, known.covariances[rows])
+            for (_, track), *left_at in zip(left, places, found, strict=True):
+                track.left_at = left_at[0], left_at[1]
 
-    def _with_pose(self, frame: int, position: FloatArray, given_poses: FloatArray) -> FloatArray:
-        """Covariance of a landmark that left: what was known given the poses, and of the pose."""
+    def _with_pose(self, frame: int, places: FloatArray, given_poses: FloatArray) -> FloatArray:
+        """Covariances (k, 3, 3) of landmarks that left: given the poses, and of the last pose."""
         wTc = self._poses[frame]
-        point = transform_to_camera(wTc, position[None])
-        by_pose = congruence(point_pose_jacobian(point), self._covariances[frame])
-        return np.asarray(given_poses + congruence(wTc[:3, :3], by_pose)[0])
+        jacobians = point_pose_jacobian(transform_to_camera(wTc, places))
+        by_pose = congruence(jacobians, self._covariances[frame])
+        return np.asarray(given_poses + congruence(wTc[:3, :3], by_pose))
 
-    def _marginals(self) -> DenseMarginals:
-        """Of the window: all at once, faster than GTSAM's for one pose of a dense root clique."""
-        while True:  # each repair takes a landmark out, and after a few it raises
-            try:
-                return DenseMarginals(without_gaps(self._solver.getFactors()), self._values)
-            except UndeterminedError as error:
-                self._repair(gtsam.Values(self._values), error)
+    def _at_last(self) -> Solved:
+        """The window as it was solved last."""
+        if self._solved is None:
+            raise EstimatorError("fixed_lag: no frame yet")
+        return self._solved
 
-    def _covariance(self, marginals: DenseMarginals, frame: int) -> FloatArray:
-        covariance = marginals.pose(pose_key(frame))
+    def _covariance(self, frame: int) -> FloatArray:
+        solved = self._at_last()
+        covariance = solved.eliminated.pose(solved.frames.index(frame))
         kept = allowed_parts(self._floor, self._poses[frame][None], covariance[None])
         return np.asarray(kept[0])
 
-    def _repair(self, values: Any, error: Exception) -> None:
-        """Builds the solver anew over the window, without the landmark that failed."""
-        for _ in range(_REPAIRS):
-            key = suspect(error)
-            if key is None or is_pose(key) or not self._builder.in_graph(number(key)):
-                break
-            self.remarks.append(
-                f"{self._builder.take_out(number(key))} left the system indeterminate at frame "
-                f"{self._recent[-1].frame}: taken out, solver built anew over the lag"
-            )
-            try:
-                self._rebuild(values)
-                return
-            except RuntimeError as another:
-                error = another
-        raise solver_failed(self.kind, error, self._builder.frames[-1])
+    def _values(self) -> WindowValues:
+        frames, known = self._window.frames, self._window.landmarks
+        return WindowValues(
+            dict(zip(map(pose_key, frames), self._window.poses, strict=True)),
+            dict(zip(map(landmark_key, known.variables.tolist()), known.points, strict=True)),
+        )
 
-    def _rebuild(self, values: Any) -> None:
-        oldest = self._oldest
-        graph, kept = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        stamps: dict[int, float] = {}
-        if oldest:  # the first frame has its own prior among its factors
-            covariance = self._covariances[oldest]
-            if not np.isfinite(covariance).all():
-                covariance = np.zeros((6, 6))
-            graph.add(pose_prior(pose_key(oldest), Prediction(self._poses[oldest], covariance)))
-        for new in self._recent:
-            for row in range(new.graph.size()):
-                factor = new.graph.at(row)
-                keys = list(factor.keys())
-                if all(self._is_inside(key) for key in keys):
-                    graph.add(factor)
-                    # A landmark is as old as its last sighting, a pose as its frame.
-                    stamps |= {k: self._time(number(k) if is_pose(k) else new.frame) for k in keys}
-        for key in stamps:
-            kept.insert(key, values.atPose3(key) if is_pose(key) else values.atPoint3(key))
-        self._solver = self._new_solver()
-        self._solver.update(graph, kept, stamps)
-        self._values = self._solver.calculateEstimate()
 
-    def _is_inside(self, key: int) -> bool:
-        """Whether a variable is within the lag and was not taken out."""
-        return number(key) >= self._oldest if is_pose(key) else self._builder.in_graph(number(key))
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowValues:
+    """What is asked of GTSAM's values between two frames, by key: poses (4, 4) and points (3,)."""
+
+    poses: dict[int, FloatArray]
+    points: dict[int, FloatArray]
+
+    def exists(self, key: int) -> bool:
+        """Whether the window holds a variable."""
+        return key in self.points or key in self.poses
+
+    def atPoint3(self, key: int) -> FloatArray:
+        """A landmark."""
+        return self.points[key]
+
+    def atPose3(self, key: int) -> Any:
+        """A pose."""
+        return gtsam.Pose3(self.poses[key])
+
+
+def _landmarks(new: NewFactors, entered: list[int]) -> Landmarks:
+    """Landmarks that enter with a frame, at their initial values."""
+    points = np.array([new.values.atPoint3(landmark_key(v)) for v in entered])
+    mean, information = points.copy(), np.zeros((len(entered), 3, 3))
+    for variable, known, covariance in new.priors:
+        row = entered.index(variable)
+        mean[row], information[row] = known, np.linalg.inv(covariance)
+    return Landmarks(np.array(entered, np.int64), points, mean, information)

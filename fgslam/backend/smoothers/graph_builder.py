@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import gtsam
@@ -22,7 +22,6 @@ from fgslam.factors.motion import (
     odometry_factor,
     point_prior,
     pose_prior,
-    weak_point_prior,
 )
 from fgslam.factors.noise import Whitening
 
@@ -72,13 +71,16 @@ class NewFactors:
         frame: counted from 0.
         graph: the factors.
         values: initial values of the new variables.
-        seen: variables of all landmarks that the frame's factors touch.
+        priors: landmark variables, mean (3,) and covariance (3, 3) of what is known of them
+            beforehand; where no factors are made of it.
+        sightings: landmark variables and what was seen of them, for the same case.
     """
 
     frame: int
     graph: Any
     values: Any
-    seen: list[int]
+    priors: list[tuple[int, FloatArray, FloatArray]] = field(default_factory=list)
+    sightings: list[tuple[int, Sighting]] = field(default_factory=list)
 
 
 class GraphBuilder:
@@ -101,7 +103,8 @@ class GraphBuilder:
     ) -> None:
         """An empty graph; ``prior`` will be that of the first pose.
 
-        With ``remember`` off, factors are handed out and not kept: for a bounded lag.
+        With ``remember`` off, for a bounded lag, nothing is kept: factors of poses are handed out,
+        and observations as they are.
         """
         width = settings.kernel.width / settings.noise_factor
         self.kernel = KernelSettings(settings.kernel.name, width)
@@ -134,7 +137,7 @@ class GraphBuilder:
             landmarks: the tracker's map after this frame: initial values, and how well each
                 landmark is known given the poses.
         """
-        new = NewFactors(tracked.frame, gtsam.NonlinearFactorGraph(), gtsam.Values(), [])
+        new = NewFactors(tracked.frame, gtsam.NonlinearFactorGraph(), gtsam.Values())
         self._add_pose(new, tracked)
         self.frames.append(tracked.frame)
         self._add_observations(new, tracked, landmarks)
@@ -257,18 +260,27 @@ class GraphBuilder:
         new.values.insert(key, position)
         saved = self.admission.saved(identity)
         if saved is not None:
-            self._rows[track.variable].append(self._push(new, point_prior(key, *saved)))
+            self._add_prior(new, track.variable, *saved)
         elif parallax < WEAK_PARALLAX:
-            distance = float(np.linalg.norm(position - wTc[:3, 3]))
-            sigma = _WEAK_PRIOR_RANGES * distance
-            self._rows[track.variable].append(
-                self._push(new, weak_point_prior(key, position, sigma))
-            )
+            sigma = _WEAK_PRIOR_RANGES * float(np.linalg.norm(position - wTc[:3, 3]))
+            self._add_prior(new, track.variable, position, sigma**2 * np.eye(3))
         for sighting in track.waiting:
             self._observe(new, track, sighting)
         track.waiting = []
 
+    def _add_prior(
+        self, new: NewFactors, variable: int, mean: FloatArray, covariance: FloatArray
+    ) -> None:
+        if self._remember:
+            factor = point_prior(landmark_key(variable), mean, covariance)
+            self._rows[variable].append(self._push(new, factor))
+        else:
+            new.priors.append((variable, mean, covariance))
+
     def _observe(self, new: NewFactors, track: Track, sighting: Sighting) -> None:
+        if not self._remember:
+            new.sightings.append((track.variable, sighting))
+            return
         factor = self._factors.factor(
             pose_key(sighting.frame),
             landmark_key(track.variable),
@@ -276,11 +288,8 @@ class GraphBuilder:
             self._noise * sighting.covariance,
         )
         self._rows[track.variable].append(self._push(new, factor))
-        if self._remember:
-            self._seen_frame.append(sighting.frame)
-            self._seen_variable.append(track.variable)
-        if not new.seen or new.seen[-1] != track.variable:
-            new.seen.append(track.variable)
+        self._seen_frame.append(sighting.frame)
+        self._seen_variable.append(track.variable)
 
     def _push(self, new: NewFactors, factor: Any) -> int:
         new.graph.add(factor)

@@ -236,7 +236,7 @@ class ChainMarginals:
         reduced = information[kept][:, kept].toarray() - coupling.T @ gain
         covariance = np.empty((0, 0))
         if len(kept):
-            covariance = _from_cholesky(*_scaled_cholesky(reduced))
+            covariance = from_cholesky(*scaled_cholesky(reduced))
         blocks = size.reshape(-1, 6)
         own = np.zeros((len(poses), 6, 6))
         own[np.delete(np.arange(len(poses)), apart)] = _inverse_blocks(factor) / (
@@ -312,7 +312,7 @@ class DenseMarginals:
             self._start[key] = rows
             rows += 6 if is_pose(key) else 3
         try:
-            self._factor, self._size = _scaled_cholesky(information)
+            self._factor, self._size = scaled_cholesky(information)
         except UndeterminedError as error:
             near = max(key for key, start in self._start.items() if start <= error.row)
             raise UndeterminedError(error.row, f"indeterminate near variable {near}") from None
@@ -324,7 +324,7 @@ class DenseMarginals:
     def landmarks(self, keys: list[int]) -> FloatArray:
         """(k, 3, 3) marginals of landmarks."""
         at = np.array([self._start[key] for key in keys], np.int64)[:, None] + np.arange(3)
-        covariance = _from_cholesky(self._factor, self._size)
+        covariance = from_cholesky(self._factor, self._size)
         return np.asarray(covariance[at[:, :, None], at[:, None, :]])
 
     def joint(self, pose: int, landmarks: list[int]) -> FloatArray:
@@ -376,7 +376,7 @@ def _inverse_blocks(factor: FloatArray) -> FloatArray:
     return out
 
 
-def _scaled_cholesky(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+def scaled_cholesky(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Lower Cholesky factor of a positive definite matrix scaled to a unit diagonal, and the scale.
 
     Without the scaling, digits would be lost beside poses that are held stiffly.
@@ -393,8 +393,8 @@ def _scaled_cholesky(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     return factor, size
 
 
-def _from_cholesky(factor: FloatArray, size: FloatArray) -> FloatArray:
-    """The inverse of the matrix that :func:`_scaled_cholesky` took apart."""
+def from_cholesky(factor: FloatArray, size: FloatArray) -> FloatArray:
+    """The inverse of the matrix that :func:`scaled_cholesky` took apart."""
     inverse, _ = lapack.dpotri(factor, lower=1)
     lower = np.tril(inverse)
     return np.asarray((lower + np.tril(inverse, -1).T) / np.outer(size, size))

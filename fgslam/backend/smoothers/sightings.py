@@ -1,6 +1,6 @@
 """Landmark observations of a whole graph in arrays: whitened residuals and their derivatives.
 
-A rig's stereo factors are linearised here, all at once; any other factor of a pose and a landmark
+A rig's stereo factors are linearised all at once (:mod:`fgslam.factors.stacked`); any other factor of a pose and a landmark
 (of range and bearing) by GTSAM. Either way they are those of the factors' own cost.
 """
 
@@ -13,9 +13,11 @@ import gtsam
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.geometry import skew
+from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import is_pose
+from fgslam.factors.landmark import FROM_MEASUREMENT
 from fgslam.factors.noise import plain
+from fgslam.factors.stacked import linearised, residuals
 
 Look: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 """Whitened residuals (k, 3), derivatives by the poses (k, 3, 6) and by the points (k, 3, 3)."""
@@ -50,13 +52,13 @@ class Sightings(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoSightings:
-    """Those of one rig, on :class:`Sightings`, measured as GTSAM does: (u_left, u_right, v).
+    """Those of one rig, on :class:`Sightings`.
 
     Attributes:
         rows, poses, points: see there.
-        measured: (k, 3) pixels.
-        roots: (k, 3, 3) square roots of the informations.
-        camera: GTSAM's calibration.
+        measured: (k, 3) column, row, disparity, pixels.
+        roots: (k, 3, 3) square roots of their informations.
+        rig: the cameras; their images' size is not known.
     """
 
     rows: IntArray
@@ -64,61 +66,32 @@ class StereoSightings:
     points: IntArray
     measured: FloatArray
     roots: FloatArray
-    camera: Any
+    rig: CameraRig
 
     @staticmethod
     def of(factors: list[Any], rows: IntArray, poses: IntArray, points: IntArray) -> Sightings:
         """Of stereo factors, with or without kernels."""
-        measured = np.array([factor.measured().vector() for factor in factors])
+        left, right, row = np.array([factor.measured().vector() for factor in factors]).T
         roots = np.empty((len(factors), 3, 3))
         for root, factor in zip(roots, factors, strict=True):
             model = factor.noiseModel()
             bare: Any = model.noise() if isinstance(model, gtsam.noiseModel.Robust) else model
             root[:] = bare.R()
-        camera = factors[0].calibration()
-        return StereoSightings(rows, poses, points, measured, roots, camera)
+        k = factors[0].calibration()
+        rig = CameraRig(0, 0, k.fx(), k.fy(), k.px(), k.py(), k.baseline(), None, np.eye(4))
+        measured = np.column_stack([right, row, left - right])
+        return StereoSightings(rows, poses, points, measured, roots @ FROM_MEASUREMENT, rig)
 
     def residuals(self, poses: FloatArray, points: FloatArray) -> FloatArray:
         """See :class:`Sightings`."""
-        return self._residuals(self._local(poses, points))
+        own, seen = poses[self.poses], points[self.points]
+        return residuals(self.rig, own, seen, self.measured, self.roots)
 
     def look(self, poses: FloatArray, points: FloatArray) -> Look:
-        """See :class:`Sightings`; behind the camera there is no derivative, as GTSAM does it."""
-        local = self._local(poses, points)
-        x, y, z = local.T
-        fx, fy, base = self.camera.fx(), self.camera.fy(), self.camera.baseline()
-        nearer = np.where(z > 0.0, 1.0 / np.where(z > 0.0, z, 1.0), 0.0)
-        seen = np.zeros((len(z), 3, 3))
-        seen[:, 0, 0] = seen[:, 1, 0] = fx * nearer
-        seen[:, 2, 1] = fy * nearer
-        seen[:, 0, 2] = -fx * (x + base) * nearer**2
-        seen[:, 1, 2] = -fx * x * nearer**2
-        seen[:, 2, 2] = -fy * y * nearer**2
-        seen = self.roots @ seen
-        by_pose = np.empty((len(z), 3, 6))
-        by_pose[:, :, :3] = seen @ skew(local)
-        by_pose[:, :, 3:] = -seen
-        by_point = seen @ np.swapaxes(poses[self.poses, :3, :3], 1, 2)
-        return self._residuals(local), by_pose, by_point
-
-    def _local(self, poses: FloatArray, points: FloatArray) -> FloatArray:
-        """(k, 3) the points in their cameras' axes."""
-        own = poses[self.poses]
-        offset = points[self.points] - own[:, :3, 3]
-        return np.asarray(np.einsum("kji,kj->ki", own[:, :3, :3], offset))
-
-    def _residuals(self, local: FloatArray) -> FloatArray:
-        x, y, z = local.T
-        k = self.camera
-        ahead = z > 0.0
-        nearer = 1.0 / np.where(ahead, z, 1.0)
-        difference = np.empty((len(z), 3))
-        difference[:, 0] = k.px() + k.fx() * (x + k.baseline()) * nearer
-        difference[:, 1] = k.px() + k.fx() * x * nearer
-        difference[:, 2] = k.py() + k.fy() * y * nearer
-        difference -= self.measured
-        difference[~ahead] = 2.0 * k.fx()
-        return np.asarray(np.einsum("kij,kj->ki", self.roots, difference))
+        """See :class:`Sightings`."""
+        own, seen = poses[self.poses], points[self.points]
+        rows = linearised(self.rig, own, seen, self.measured, self.roots)
+        return rows.residual, rows.by_pose, rows.by_point
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -82,15 +82,15 @@ class TrackerMap:
 
     def _in_graph(self, values: Any) -> tuple[IntArray, FloatArray]:
         """Identities and positions of the tracker's landmarks that ``values`` hold."""
-        tracks, ids, positions = self._admission.tracks, [], []
-        for identity in self._tracker.landmarks().ids.tolist():
-            track = tracks.get(identity)
-            if track is not None and track.variable >= 0:
-                key = landmark_key(track.variable)
-                if values.exists(key):
-                    ids.append(identity)
-                    positions.append(values.atPoint3(key))
-        return np.array(ids, np.int64), np.array(positions, np.float64).reshape(-1, 3)
+        ids, positions = [], []
+        for identity, track in self._admission.in_graph():
+            key = landmark_key(track.variable)
+            if values.exists(key):
+                ids.append(identity)
+                positions.append(values.atPoint3(key))
+        found = np.array(ids, np.int64)
+        known = np.isin(found, self._tracker.landmarks().ids)
+        return found[known], np.array(positions, np.float64).reshape(-1, 3)[known]
 
     def _waiting(self, values: Any) -> tuple[IntArray, FloatArray]:
         """Landmarks outside the graph, moved along with the pose that saw them last."""

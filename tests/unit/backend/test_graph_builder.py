@@ -83,7 +83,6 @@ def test_a_landmark_waits_for_its_second_sighting_and_loses_none() -> None:
     second = made.add(frame(1, points), known(points))
     key = landmark_key(0)
     assert landmarks_of(second.graph) == [(pose_key(0), key), (pose_key(1), key)]
-    assert second.seen == [0]
     assert list(made.admission.waiting()) == []
     np.testing.assert_array_equal(second.values.atPoint3(key), points[4])
 

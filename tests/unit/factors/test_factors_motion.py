@@ -23,7 +23,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Prediction
 from fgslam.core.floor import DegreesOfFreedom, Floor
 from fgslam.core.measurements import Odometry
-from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior, weak_point_prior
+from fgslam.factors.motion import floor_factors, odometry_factor, point_prior, pose_prior
 from fgslam.factors.noise import STIFF_M, STIFF_RAD, positive_definite
 
 TILTED = g.so3_exp(np.array([0.31, 0.1, -0.24])) @ np.array([0.0, 1.0, 0.0])
@@ -90,8 +90,8 @@ def test_planar_odometry_holds_what_it_excludes(rng: np.random.Generator) -> Non
         assert factor.error(values) == pytest.approx(0.5, rel=1e-6)
 
 
-def test_a_weak_prior_on_a_point() -> None:
-    factor = weak_point_prior(0, np.array([1.0, 2.0, 3.0]), 4.0)
+def test_a_prior_on_a_point() -> None:
+    factor = point_prior(0, np.array([1.0, 2.0, 3.0]), 16.0 * np.eye(3))
     values = values_of(np.array([1.0, 6.0, 3.0]))
     assert_near(factor.whitenedError(values), np.array([0.0, 1.0, 0.0]), 1e-12)
 

@@ -1,0 +1,120 @@
+"""Landmark observations of many frames, linearised together: the factors of landmark.py as arrays.
+
+For solvers that eliminate landmarks themselves. An observation that cannot be predicted, of a point
+behind the camera (or on the range sensor's vertical axis), pulls nothing; in a camera it costs as
+much as GTSAM's stereo factor then does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.geometry import (
+    in_front,
+    measurement_difference,
+    point_pose_jacobian,
+    project,
+    projection_jacobian,
+)
+from fgslam.core.sensors import CameraRig, Sensor
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """Linearised observations, whitened and weighed: ``residual + by_pose dx + by_point dl``.
+
+    Attributes:
+        residual: (k, 3).
+        by_pose: (k, 3, 6) by the tangent of ``wTc``.
+        by_point: (k, 3, 3) by the world point.
+    """
+
+    residual: FloatArray
+    by_pose: FloatArray
+    by_point: FloatArray
+
+
+def whitening(covariances: FloatArray) -> FloatArray:
+    """(k, 3, 3) that turn residuals of covariances (k, 3, 3) into ones of unit covariance."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
+
+
+def in_cameras(poses: FloatArray, points: FloatArray) -> FloatArray:
+    """World points (k, 3) in the frames of poses ``wTc`` (k, 4, 4), one each."""
+    offset = points - poses[:, :3, 3]
+    return np.asarray((offset[:, None, :] @ poses[:, :3, :3])[:, 0])
+
+
+def residuals(
+    sensor: Sensor,
+    poses: FloatArray,
+    points: FloatArray,
+    measurement: FloatArray,
+    roots: FloatArray,
+) -> FloatArray:
+    """Whitened residuals (k, 3), predicted minus measured; arguments of :func:`linearised`."""
+    return products(roots, _off(sensor, in_cameras(poses, points), measurement)[0])
+
+
+def linearised(
+    sensor: Sensor,
+    poses: FloatArray,
+    points: FloatArray,
+    measurement: FloatArray,
+    roots: FloatArray,
+) -> Rows:
+    """Whitened observations, predicted minus measured.
+
+    Args:
+        sensor: the cameras, or the range-bearing sensor.
+        poses: (k, 4, 4) ``wTc`` of each observation.
+        points: (k, 3) of its landmark, world.
+        measurement: (k, 3).
+        roots: (k, 3, 3) of :func:`whitening`.
+    """
+    local = in_cameras(poses, points)
+    off, seen = _off(sensor, local, measurement)
+    local = np.where(seen[:, None], local, 1.0)
+    jacobian = np.where(seen[:, None, None], roots, 0.0) @ projection_jacobian(sensor, local)
+    by_point = jacobian @ np.swapaxes(poses[:, :3, :3], 1, 2)
+    by_pose = jacobian @ point_pose_jacobian(local)
+    return Rows(products(roots, off), by_pose, by_point)
+
+
+def _off(
+    sensor: Sensor, local: FloatArray, measurement: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Residuals (k, 3) of points in the sensor's frame, and which can be predicted (k,)."""
+    seen = in_front(sensor, local)
+    predicted = project(sensor, np.where(seen[:, None], local, 1.0))
+    off = measurement_difference(sensor, predicted, measurement)
+    # As GTSAM's factor has it: both columns and the row are two focal lengths off.
+    unseen = [2.0 * sensor.fx, 2.0 * sensor.fx, 0.0] if isinstance(sensor, CameraRig) else [0.0] * 3
+    off[~seen] = unseen
+    return off, seen
+
+
+def weighed(rows: Rows, weight: FloatArray) -> Rows:
+    """The rows with weights (k,) of their squares."""
+    root = np.sqrt(weight)[:, None]
+    return Rows(
+        root * rows.residual, root[:, :, None] * rows.by_pose, root[:, :, None] * rows.by_point
+    )
+
+
+def products(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+    """(k, i) products of matrices (k, i, j) and vectors (k, j)."""
+    return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
+
+
+def summed(index: IntArray, values: FloatArray, size: int) -> FloatArray:
+    """(size, ...) sums of values (k, ...) by their index (k,)."""
+    shape = values.shape[1:]
+    flat = values.reshape(len(values), math.prod(shape))
+    out = np.empty((size, flat.shape[1]))
+    for column in range(flat.shape[1]):
+        out[:, column] = np.bincount(index, flat[:, column], size)
+    return out.reshape(size, *shape)
