@@ -16,11 +16,12 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.geometry import (
     in_front,
     measurement_difference,
-    point_pose_jacobian,
     project,
     projection_jacobian,
+    skew,
 )
 from fgslam.core.sensors import CameraRig, Sensor
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
@@ -45,7 +46,7 @@ def whitening(covariances: FloatArray) -> FloatArray:
 def in_cameras(poses: FloatArray, points: FloatArray) -> FloatArray:
     """World points (k, 3) in the frames of poses ``wTc`` (k, 4, 4), one each."""
     offset = points - poses[:, :3, 3]
-    return np.asarray((offset[:, None, :] @ poses[:, :3, :3])[:, 0])
+    return np.asarray(np.einsum("kji,kj->ki", poses[:, :3, :3], offset))
 
 
 def residuals(
@@ -77,10 +78,11 @@ def linearised(
     """
     local = in_cameras(poses, points)
     off, seen = _off(sensor, local, measurement)
-    local = np.where(seen[:, None], local, 1.0)
-    jacobian = np.where(seen[:, None, None], roots, 0.0) @ projection_jacobian(sensor, local)
+    jacobian = roots @ projection_jacobian(sensor, np.where(seen[:, None], local, 1.0))
+    jacobian[~seen] = 0.0
+    by_pose = np.empty((len(local), 3, 6))
+    by_pose[:, :, :3], by_pose[:, :, 3:] = jacobian @ skew(local), -jacobian
     by_point = jacobian @ np.swapaxes(poses[:, :3, :3], 1, 2)
-    by_pose = jacobian @ point_pose_jacobian(local)
     return Rows(products(roots, off), by_pose, by_point)
 
 
@@ -107,7 +109,7 @@ def weighed(rows: Rows, weight: FloatArray) -> Rows:
 
 def products(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
     """(k, i) products of matrices (k, i, j) and vectors (k, j)."""
-    return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
+    return np.asarray(np.einsum("kij,kj->ki", matrices, vectors))
 
 
 def summed(index: IntArray, values: FloatArray, size: int) -> FloatArray:

@@ -9,17 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded, lapack, solve_triangular
+from scipy.linalg import cho_solve_banded, cholesky_banded, lapack
 from scipy.sparse import block_array, bsr_matrix, csr_matrix, diags_array
 
 from fgslam.backend.smoothers.block_band import BlockBand, order
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import inverse_spd3
-from fgslam.factors.graphs import is_pose
 
 _UNDETERMINED = "the measurements do not determine all variables; no covariances"
 _ROUNDING = 16.0 * np.finfo(np.float64).eps  # a pivot that is nothing but rounding
@@ -294,48 +292,6 @@ class UndeterminedError(EstimatorError):
         """Row of the information matrix and the message."""
         super().__init__(message)
         self.row = row
-
-
-class DenseMarginals:
-    """Covariances of a small graph, whatever its factors: one dense Cholesky decomposition."""
-
-    def __init__(self, graph: Any, values: Any) -> None:
-        """Linearises a graph at ``values``.
-
-        Raises:
-            EstimatorError: the variables are not determined.
-        """
-        information, _ = graph.linearize(values).hessian()
-        self._start: dict[int, int] = {}
-        rows = 0
-        for key in list(values.keys()):  # ascending, as the rows of the information matrix
-            self._start[key] = rows
-            rows += 6 if is_pose(key) else 3
-        try:
-            self._factor, self._size = scaled_cholesky(information)
-        except UndeterminedError as error:
-            near = max(key for key, start in self._start.items() if start <= error.row)
-            raise UndeterminedError(error.row, f"indeterminate near variable {near}") from None
-
-    def pose(self, key: int) -> FloatArray:
-        """(6, 6) marginal of a pose."""
-        return self.joint(key, [])
-
-    def landmarks(self, keys: list[int]) -> FloatArray:
-        """(k, 3, 3) marginals of landmarks."""
-        at = np.array([self._start[key] for key in keys], np.int64)[:, None] + np.arange(3)
-        covariance = from_cholesky(self._factor, self._size)
-        return np.asarray(covariance[at[:, :, None], at[:, None, :]])
-
-    def joint(self, pose: int, landmarks: list[int]) -> FloatArray:
-        """Joint covariance (6 + 3k, 6 + 3k) of a pose and landmarks, in that order."""
-        rows = [np.arange(6) + self._start[pose]]
-        rows += [np.arange(3) + self._start[key] for key in landmarks]
-        at = np.concatenate(rows)
-        unit = np.zeros((len(self._size), len(at)))
-        unit[at, np.arange(len(at))] = 1.0 / self._size[at]
-        half = solve_triangular(self._factor, unit, lower=True, check_finite=False)
-        return np.asarray(half.T @ half)
 
 
 def _led_back_to(matrix: csr_matrix) -> IntArray:

@@ -1,7 +1,8 @@
 """Landmark observations of a whole graph in arrays: whitened residuals and their derivatives.
 
-A rig's stereo factors are linearised all at once (:mod:`fgslam.factors.stacked`); any other factor of a pose and a landmark
-(of range and bearing) by GTSAM. Either way they are those of the factors' own cost.
+A rig's stereo factors are linearised all at once (:mod:`fgslam.factors.stacked`); any other factor
+of a pose and a landmark (of range and bearing) by GTSAM. Either way they are those of the factors'
+own cost.
 """
 
 from __future__ import annotations
