@@ -51,6 +51,7 @@ PARTS: dict[str, Callable[[int], dict[str, float]]] = {
     "maps": lambda frames: over_maps(),
     "homing": lambda frames: homing.ratios_of_homing(),
     "smoothers": lambda frames: smoothers.ratios_of_smoothers(),
+    "fixed_lag": lambda frames: smoothers.ratios_of_fixed_lag(),
     "starting": lambda frames: starting.ratios_of_starting(),
 }
 """Each part, called with the number of frames of the drive over images."""

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from benchmarks.speed.drives import MeasuredDrive, cpu_seconds, interleaved, open_drive, play
-from fgslam.backend.settings import BatchSettings, Isam2Settings, KernelSettings
+from fgslam.backend.settings import BatchSettings, FixedLagSettings, Isam2Settings, KernelSettings
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.backend.smoothers.whole_graph import WholeGraph
 from fgslam.core.arrays import FloatArray
@@ -26,6 +26,7 @@ LIMITS = {
     "whole_graph_cauchy_over_plain_gtsam": 0.5,
     "batch_estimate_over_plain_gtsam_huber": 0.5,
     "isam2_final_over_plain_gtsam_huber": 0.5,
+    "fixed_lag_kitti00_ms_per_frame": 100.0,
 }
 WIDTHS: dict[KernelName, float] = {"none": 1.0, "huber": 1.345, "cauchy": 3.0}
 _TOLERANCE = 1e-5  # GTSAM's own
@@ -140,3 +141,13 @@ def _estimate_s(drive: MeasuredDrive, settings: BatchSettings | Isam2Settings) -
     """The answer for the whole drive: outliers, minimum, all covariances."""
     estimator = play(drive, settings).estimator
     return cpu_seconds(estimator.estimate)
+
+
+@one_blas_thread()
+def ratios_of_fixed_lag() -> dict[str, float]:
+    """Of the fixed lag's frames where some 2,500 landmarks are within it: processor time."""
+    ms = 1e3 * play(open_drive("kitti00_tracks"), FixedLagSettings()).cpu_s
+    return {
+        "fixed_lag_kitti00_ms_per_frame": float(ms.mean()),
+        "fixed_lag_kitti00_ms_worst": float(ms.max()),
+    }
