@@ -22,6 +22,7 @@ from fgslam.frontend.tracking.map_matching import (
     FieldOfView,
     Wanted,
     directions_to,
+    lean,
 )
 from fgslam.frontend.tracking.views import Views
 
@@ -41,6 +42,7 @@ class LandmarkDatabase(LandmarkTable):
         else:
             super().__init__(viewpoints.max_views, float(np.deg2rad(_VIEW_ANGLE_DEG)))
         self._settings = settings
+        self._rig = rig
         self._field_of_view = FieldOfView(rig, settings, max_disparity_px)
 
     @property
@@ -68,7 +70,7 @@ class LandmarkDatabase(LandmarkTable):
             rows=found.rows,
             measurement=found.measurement,
             scale=views.size / found.points[:, 2],
-            orientation=views.orientation,
+            orientation=views.orientation + lean(self._rig, wTc, found.points),
             descriptors=views.descriptors,
             certain=found.certain & known,
         )

@@ -176,6 +176,19 @@ def directions_to(wTc: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
 
 
+def lean(rig: CameraRig, wTc: FloatArray, points: FloatArray) -> FloatArray:
+    """(v,) how far the world's y axis is turned in the image, at points (v, 3) of the camera.
+
+    Radians, clockwise from the image's y axis, as SIFT's orientation. Level cameras have none. A
+    feature's orientation turns with it when the camera rolls, pitches, or sees it elsewhere in a
+    tilted image; along a ray parallel to the axis it is not defined.
+    """
+    x, y, z = points.T
+    down = wTc[1, :3]
+    right, below = rig.fx * (down[0] * z - x * down[2]), rig.fy * (down[1] * z - y * down[2])
+    return np.asarray(np.arctan2(-right, below))
+
+
 _SCALE_RATIO = 1.5
 """Largest ratio to the predicted scale: one level of the scale space (Se et al., IJRR 2002)."""
 

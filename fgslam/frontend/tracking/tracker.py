@@ -20,6 +20,7 @@ from fgslam.frontend.tracking.map_matching import (
     MapMatcher,
     MapMatches,
     directions_to,
+    lean,
     predicted_covariance,
 )
 from fgslam.frontend.tracking.resection import Resection
@@ -194,8 +195,9 @@ class LandmarkTracker:
         hit[matches.landmarks[inliers]] = True
         missed_ids = self.database.missing(expected, hit)
         directions = directions_to(tracked.ego_motion.wTc, features.position)
+        upright = self._upright(features, tracked.ego_motion.wTc)
         seen = matches.features[inliers]
-        self.database.record_hits(matched.ids[inliers], features, seen, directions[seen])
+        self.database.record_hits(matched.ids[inliers], upright, seen, directions[seen])
         self.database.record_misses(missed_ids)
         if tracked.ego_motion.status.measured:
             rejected = matched.ids[~inliers]
@@ -204,7 +206,7 @@ class LandmarkTracker:
         if features.complete is not None:
             fresh = fresh[features.complete[fresh]]
         colour = _grey_values(image, features, fresh)
-        new_ids = self.database.add(features, fresh, colour, directions[fresh])
+        new_ids = self.database.add(upright, fresh, colour, directions[fresh])
         new = features.observations(fresh, new_ids, is_new=True)
         return Association(
             observations=matched.join(new),
@@ -221,6 +223,11 @@ class LandmarkTracker:
         if not self.keeps_map:
             self.database.record_carried(matched.ids[inliers])
         return Association(matched, ~inliers, none, none, tracked.matches.features)
+
+    def _upright(self, features: StereoFeatures, wTc: FloatArray) -> StereoFeatures:
+        """The features with their orientations as a level camera sees them."""
+        level = features.orientation - lean(self._rig, wTc, features.position)
+        return replace(features, orientation=level)
 
     def merge(self, pairs: IntArray) -> IntArray:
         """Makes landmarks found to be one into one; returns the identities that end.
