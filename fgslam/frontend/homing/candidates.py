@@ -47,11 +47,11 @@ vector than with twenty drawn by lot. 0.78 of those nearer than 0.2 are right, 0
 at 0.65, 0.05 at 0.75.
 """
 
-_SIZE_SIGMA = 0.3  # of ln of the ratio of sizes, of right candidates
+_SIZE_SIGMA = 0.35  # of ln of the ratio of sizes, of right candidates
 _SIZE_RANGE = 1.6  # that of wrong ones is even over so much: the planar gates admit a factor 2
 _NEAR_LEG = 0.05  # sine of the angle to the leg below which the distances' ratio says nothing
 _CELL_DEG = 2.0  # candidates within one cell in both views count as one
-_BLOCK_DEG, _BLOCK_FULL = 10.0, 6.0
+_BLOCK_DEG, _BLOCK_FULL = 7.0, 6.0
 """Evidence s within a block of so many degrees of a view counts f ln(1 + s / f)."""
 
 
