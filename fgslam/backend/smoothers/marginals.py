@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded, lapack
+from scipy.linalg import cho_solve, cho_solve_banded, cholesky_banded, lapack
 from scipy.sparse import block_array, bsr_matrix, csr_matrix, diags_array
 
 from fgslam.backend.smoothers.block_band import BlockBand, order
@@ -21,6 +22,9 @@ from fgslam.core.geometry import inverse_spd3
 
 _UNDETERMINED = "the measurements do not determine all variables; no covariances"
 _ROUNDING = 16.0 * np.finfo(np.float64).eps  # a pivot that is nothing but rounding
+_POSES_A_LANDMARK = 4
+"""How many times more numbers landmarks have than the poses that cut a long chain: cuts make each
+stretch see little, and the system that is left larger."""
 _PAIRS_AT_ONCE = 1 << 16
 """Of poses that see one landmark: a bound for memory."""
 
@@ -185,32 +189,73 @@ def _pairs(group: IntArray, groups: int) -> Iterator[tuple[IntArray, IntArray]]:
         low = high
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretch:
+    """Neighbouring poses, eliminated together: they hang on what they see and on their ends.
+
+    Attributes:
+        rows: (6k,) of the system's poses.
+        columns: (c,) of what is kept that they hang on.
+        own: (k, 6, 6) their covariances if those are held.
+        gain: (6k, c) how their mean follows those, negated.
+        alone: (6k,) their step if those are held.
+    """
+
+    rows: IntArray
+    columns: IntArray
+    own: FloatArray
+    gain: FloatArray
+    alone: FloatArray
+
+    @staticmethod
+    def of(
+        rows: IntArray, chain: csr_matrix, coupling: csr_matrix, gradient: FloatArray
+    ) -> tuple[Stretch, FloatArray]:
+        """Of rows of the poses' block, their coupling with all that is kept, and their gradient.
+
+        Returns:
+            The stretch, and the information (c, c) that it takes from its columns.
+
+        Raises:
+            EstimatorError: the poses are not determined.
+        """
+        band, size = _scaled_band(chain)
+        try:
+            factor = cholesky_banded(band, lower=True, check_finite=False)
+        except np.linalg.LinAlgError:
+            raise EstimatorError(_UNDETERMINED) from None
+        columns = np.unique(coupling.indices).astype(np.int64)
+        scaled = coupling[:, columns].toarray() / size[:, None]
+        gain = cho_solve_banded((factor, True), scaled, check_finite=False)
+        alone = -cho_solve_banded((factor, True), gradient / size, check_finite=False) / size
+        blocks = size.reshape(-1, 6)
+        own = _inverse_blocks(factor) / (blocks[:, :, None] * blocks[:, None, :])
+        return Stretch(rows, columns, own, gain / size[:, None], alone), scaled.T @ gain
+
+
 @dataclass(frozen=True, eq=False)
 class ChainMarginals:
-    """The same where poses are many and landmarks few: the chain of poses is eliminated first.
+    """The same where poses are many and landmarks few: the poses are eliminated first.
 
     Poses are tied to their neighbours by odometry, so their block is a band, and its Cholesky
     decomposition and the diagonal blocks of its inverse cost a constant a pose. The few poses to
     which a loop leads back are kept with the landmarks instead: without them the rest is a chain.
+    Some more are kept that cut it into stretches, each of which hangs on the landmarks seen from
+    there and on no others.
 
     Attributes:
-        pose_keys, landmark_keys: ascending.
-        own: (n, 6, 6) covariances of the poses given the landmarks and the poses kept with them.
-        gain: (6n, 3m + 6k) how the poses' mean follows those, negated.
-        kept_covariance: (3m + 6k, 3m + 6k) joint of all landmarks and the k poses kept.
-        kept: their rows and columns in the system's information.
-        gradient: (3m + 6n,) in that order.
-        alone: (6n,) the poses' step if those are held.
+        system: the graph.
+        stretches: poses that are eliminated.
+        kept: (3m + 6k,) rows in the system's information of all landmarks and the k poses kept.
+        factor: of their information, scaled; lower.
+        size: (3m + 6k,) the scale.
     """
 
-    pose_keys: IntArray
-    landmark_keys: IntArray
-    own: FloatArray
-    gain: FloatArray
-    kept_covariance: FloatArray
+    system: LinearSystem
+    stretches: list[Stretch]
     kept: IntArray
-    gradient: FloatArray
-    alone: FloatArray
+    factor: FloatArray
+    size: FloatArray
 
     @staticmethod
     def of(system: LinearSystem) -> ChainMarginals:
@@ -219,70 +264,80 @@ class ChainMarginals:
         Raises:
             EstimatorError: the poses are not determined.
         """
-        columns, information = system.columns, system.information
-        apart = _led_back_to(information[columns:, columns:])
-        poses = columns + np.arange(6 * len(system.pose_keys)).reshape(-1, 6)
-        chain = np.delete(poses, apart, axis=0).ravel()
-        kept = np.concatenate([np.arange(columns), poses[apart].ravel()])
-        band, size = _scaled_band(information[chain][:, chain])
-        try:
-            factor = cholesky_banded(band, lower=True, check_finite=False)
-        except np.linalg.LinAlgError:
-            raise EstimatorError(_UNDETERMINED) from None
-        coupling = information[chain][:, kept].toarray() / size[:, None]
-        gain = cho_solve_banded((factor, True), coupling, check_finite=False)
-        reduced = information[kept][:, kept].toarray() - coupling.T @ gain
-        covariance = np.empty((0, 0))
-        if len(kept):
-            covariance = from_cholesky(*scaled_cholesky(reduced))
-        blocks = size.reshape(-1, 6)
-        own = np.zeros((len(poses), 6, 6))
-        own[np.delete(np.arange(len(poses)), apart)] = _inverse_blocks(factor) / (
-            blocks[:, :, None] * blocks[:, None, :]
-        )
-        follows = np.zeros((6 * len(poses), len(kept)))
-        follows[chain - columns] = gain / size[:, None]
-        follows[poses[apart].ravel() - columns, np.arange(columns, len(kept))] = -1.0
-        gradient = np.concatenate([system.landmark_gradient, system.pose_gradient])
-        alone = np.zeros(6 * len(poses))
-        pull = gradient[chain] / size
-        alone[chain - columns] = -cho_solve_banded((factor, True), pull, check_finite=False) / size
-        return ChainMarginals(
-            system.pose_keys, system.landmark_keys, own, follows, covariance, kept, gradient, alone
-        )
+        columns, information, n = system.columns, system.information, len(system.pose_keys)
+        among = information[columns:, columns:]
+        cuts = np.arange(n)[:: _POSES_A_LANDMARK * 6 * n // max(columns, 1) + 2][1:]
+        apart = np.union1d(_led_back_to(among), cuts)
+        rows = np.arange(6 * n).reshape(-1, 6)
+        kept = np.concatenate([np.arange(columns), columns + rows[apart].ravel()])
+        coupling = information[columns:][:, kept]
+        border = information[kept][:, kept].toarray()
+        left = np.delete(np.arange(n), apart)
+        stretches = []
+        for chosen in np.split(left, np.flatnonzero(np.diff(left) > 1) + 1):
+            if not len(chosen):
+                continue
+            own = rows[chosen].ravel()
+            stretch, taken = Stretch.of(
+                own, among[own][:, own], coupling[own], system.pose_gradient[own]
+            )
+            border[np.ix_(stretch.columns, stretch.columns)] -= taken
+            stretches.append(stretch)
+        return ChainMarginals(system, stretches, kept, *scaled_cholesky(border))
 
     def step(self) -> FloatArray:
         """(3m + 6n,) from where the graph was linearised to its minimum."""
-        columns = len(self.gradient) - len(self.alone)
-        pull = self.gradient[self.kept]
-        chain = self.gain.copy()
-        chain[self.kept[columns:] - columns] = 0.0  # those are not eliminated
-        moved = -self.kept_covariance @ (pull - chain.T @ self.gradient[columns:])
-        out = np.empty_like(self.gradient)
-        out[columns:] = self.alone - self.gain @ moved
-        out[:columns] = moved[:columns]
+        s = self.system
+        gradient = np.concatenate([s.landmark_gradient, s.pose_gradient])
+        pull = gradient[self.kept]
+        for stretch in self.stretches:
+            pull[stretch.columns] -= stretch.gain.T @ s.pose_gradient[stretch.rows]
+        moved = -cho_solve((self.factor, True), pull / self.size, check_finite=False) / self.size
+        out = np.empty_like(gradient)
+        out[self.kept] = moved
+        for stretch in self.stretches:
+            out[s.columns + stretch.rows] = stretch.alone - stretch.gain @ moved[stretch.columns]
         return out
+
+    @cached_property
+    def kept_covariance(self) -> FloatArray:
+        """(3m + 6k, 3m + 6k) joint of all landmarks and the poses kept."""
+        return from_cholesky(self.factor, self.size)
 
     def poses(self) -> FloatArray:
         """(n, 6, 6) marginals, in the order of ``pose_keys``."""
-        gain = self.gain.reshape(len(self.own), 6, -1)
-        return np.asarray(self.own + gain @ self.kept_covariance @ np.swapaxes(gain, 1, 2))
+        columns, covariance = self.system.columns, self.kept_covariance
+        out = np.empty((len(self.system.pose_keys), 6, 6))
+        out[(self.kept[columns::6] - columns) // 6] = _diagonal(covariance[columns:, columns:], 6)
+        for stretch in self.stretches:
+            gain = stretch.gain.reshape(len(stretch.own), 6, -1)
+            among = covariance[np.ix_(stretch.columns, stretch.columns)]
+            out[stretch.rows[::6] // 6] = stretch.own + gain @ among @ np.swapaxes(gain, 1, 2)
+        return out
 
     def landmarks(self) -> FloatArray:
         """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
-        m = len(self.landmark_keys)
-        every = np.arange(m)
-        among = self.kept_covariance[: 3 * m, : 3 * m]
-        return np.asarray(among.reshape(m, 3, m, 3)[every, :, every, :])
+        columns = self.system.columns
+        return _diagonal(self.kept_covariance[:columns, :columns], 3)
 
     def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
         """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by row of the key lists."""
         columns = (3 * landmarks[:, None] + np.arange(3)).ravel()
-        gain = self.gain[6 * pose : 6 * pose + 6]
-        cross = -(gain @ self.kept_covariance[:, columns])
-        own = self.own[pose] + gain @ self.kept_covariance @ gain.T
-        among = self.kept_covariance[np.ix_(columns, columns)]
-        return np.block([[own, cross], [cross.T, among]])
+        on, gain, alone = self._hangs(pose)
+        covariance = self.kept_covariance
+        cross = -(gain @ covariance[np.ix_(on, columns)])
+        own = alone + gain @ covariance[np.ix_(on, on)] @ gain.T
+        return np.block([[own, cross], [cross.T, covariance[np.ix_(columns, columns)]]])
+
+    def _hangs(self, pose: int) -> tuple[IntArray, FloatArray, FloatArray]:
+        """What of the kept a pose hangs on, how (6, c), and its covariance if that is held."""
+        for stretch in self.stretches:
+            at = np.flatnonzero(stretch.rows == 6 * pose)
+            if len(at):
+                first = int(at[0])
+                return stretch.columns, stretch.gain[first : first + 6], stretch.own[first // 6]
+        first = int(np.searchsorted(self.kept, self.system.columns + 6 * pose))
+        return first + np.arange(6), -np.eye(6), np.zeros((6, 6))
 
 
 class UndeterminedError(EstimatorError):
@@ -292,6 +347,13 @@ class UndeterminedError(EstimatorError):
         """Row of the information matrix and the message."""
         super().__init__(message)
         self.row = row
+
+
+def _diagonal(matrix: FloatArray, size: int) -> FloatArray:
+    """(k, size, size) blocks on the diagonal of a matrix (k size, k size)."""
+    k = len(matrix) // size
+    every = np.arange(k)
+    return np.asarray(matrix.reshape(k, size, k, size)[every, :, every, :])
 
 
 def _led_back_to(matrix: csr_matrix) -> IntArray:
@@ -340,7 +402,9 @@ def scaled_cholesky(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     size = np.sqrt(np.maximum(np.diagonal(information), 0.0))
     if not (size > 0.0).all():
         raise UndeterminedError(int(np.argmin(size > 0.0)), _UNDETERMINED)
-    factor, status = lapack.dpotrf(information / np.outer(size, size), lower=1, overwrite_a=1)
+    scaled = information / size[:, None]
+    scaled /= size
+    factor, status = lapack.dpotrf(scaled.T, lower=1, overwrite_a=1)
     if status != 0:
         raise UndeterminedError(int(status) - 1, _UNDETERMINED)
     pivots = np.diagonal(factor)
@@ -352,8 +416,11 @@ def scaled_cholesky(information: FloatArray) -> tuple[FloatArray, FloatArray]:
 def from_cholesky(factor: FloatArray, size: FloatArray) -> FloatArray:
     """The inverse of the matrix that :func:`scaled_cholesky` took apart."""
     inverse, _ = lapack.dpotri(factor, lower=1)
-    lower = np.tril(inverse)
-    return np.asarray((lower + np.tril(inverse, -1).T) / np.outer(size, size))
+    for row in range(len(size)):  # in place: it may be large
+        inverse[row, row + 1 :] = inverse[row + 1 :, row]
+    inverse /= size[:, None]
+    inverse /= size
+    return np.asarray(inverse)
 
 
 def block_diagonal(blocks: FloatArray) -> csr_matrix:
