@@ -415,6 +415,8 @@ def scaled_cholesky(information: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def from_cholesky(factor: FloatArray, size: FloatArray) -> FloatArray:
     """The inverse of the matrix that :func:`scaled_cholesky` took apart."""
+    if not len(size):  # LAPACK would complain on the terminal
+        return np.zeros((0, 0))
     inverse, _ = lapack.dpotri(factor, lower=1)
     for row in range(len(size)):  # in place: it may be large
         inverse[row, row + 1 :] = inverse[row + 1 :, row]

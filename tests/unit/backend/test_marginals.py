@@ -16,7 +16,9 @@ from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.marginals import (
     ChainMarginals,
     GraphMarginals,
+    from_cholesky,
     reduced,
+    scaled_cholesky,
 )
 from fgslam.backend.smoothers.whole_graph import PLAIN, WholeGraph
 from fgslam.core import geometry as g
@@ -298,3 +300,11 @@ def test_values_and_graph_are_left_alone(rng: np.random.Generator) -> None:
         found.poses(), found.landmarks(), found.joint(0, np.array([1]))
     assert problem.values.equals(values, 0.0)
     assert problem.graph.size() == size
+
+
+def test_nothing_is_inverted_without_a_word_on_the_terminal(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    assert from_cholesky(*scaled_cholesky(np.zeros((0, 0)))).shape == (0, 0)
+    written = capfd.readouterr()
+    assert written.out + written.err == ""
