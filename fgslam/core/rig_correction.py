@@ -15,7 +15,7 @@ import numpy as np
 
 from fgslam.core.arrays import Brief, FloatArray
 from fgslam.core.features import Features
-from fgslam.core.measurements import Increment, Observations
+from fgslam.core.measurements import Observations
 from fgslam.core.sensors import CameraRig, partial_map, vertical_to_horizontal
 
 TERMS = (
@@ -201,12 +201,3 @@ class RigCorrection(Brief):
                 fuse = partial_map(seen, rig.cameras, vertical_to_horizontal(rig))
                 off[rows] = moved[rows][:, seen].reshape(-1, 2 * len(seen)) @ fuse.T
         return dataclasses.replace(observed, measurement=observed.measurement - off)
-
-    def corrected_increment(self, increment: Increment) -> Increment:
-        """A frame's increment with corrected observations, those of its loops included."""
-        loops = tuple(
-            dataclasses.replace(loop, observations=self.corrected(loop.observations))
-            for loop in increment.loops
-        )
-        observed = self.corrected(increment.observations)
-        return dataclasses.replace(increment, observations=observed, loops=loops)

@@ -108,10 +108,6 @@ class WholeGraph:
         new = np.asarray(weights, np.float64)
         return dataclasses.replace(self, weights=new, kernel=PLAIN)
 
-    def with_kernel(self, kernel: KernelSettings) -> WholeGraph:
-        """Another kernel around all observations."""
-        return dataclasses.replace(self, kernel=kernel)
-
     def without(self, rows: IntArray, state: State) -> tuple[WholeGraph, State]:
         """Without landmarks, by row, and their factors, at the state (of all) without them."""
         gone = {self.landmark_keys[row] for row in rows.tolist()}
