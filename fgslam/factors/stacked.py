@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
 from fgslam.core.geometry import (
     in_front,
     measurement_difference,
@@ -24,7 +24,7 @@ from fgslam.core.sensors import CameraRig, Sensor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rows:
+class LinearRows(Rows):
     """Linearised observations, whitened and weighed: ``residual + by_pose dx + by_point dl``.
 
     Attributes:
@@ -66,7 +66,7 @@ def linearised(
     points: FloatArray,
     measurement: FloatArray,
     roots: FloatArray,
-) -> Rows:
+) -> LinearRows:
     """Whitened observations, predicted minus measured.
 
     Args:
@@ -83,7 +83,7 @@ def linearised(
     by_pose = np.empty((len(local), 3, 6))
     by_pose[:, :, :3], by_pose[:, :, 3:] = jacobian @ skew(local), -jacobian
     by_point = jacobian @ np.swapaxes(poses[:, :3, :3], 1, 2)
-    return Rows(products(roots, off), by_pose, by_point)
+    return LinearRows(products(roots, off), by_pose, by_point)
 
 
 def _off(
@@ -99,10 +99,10 @@ def _off(
     return off, seen
 
 
-def weighed(rows: Rows, weight: FloatArray) -> Rows:
+def weighed(rows: LinearRows, weight: FloatArray) -> LinearRows:
     """The rows with weights (k,) of their squares."""
     root = np.sqrt(weight)[:, None]
-    return Rows(
+    return LinearRows(
         root * rows.residual, root[:, :, None] * rows.by_pose, root[:, :, None] * rows.by_point
     )
 

@@ -8,7 +8,7 @@ own cost.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
@@ -18,10 +18,7 @@ from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import is_pose
 from fgslam.factors.landmark import FROM_MEASUREMENT
 from fgslam.factors.noise import plain
-from fgslam.factors.stacked import linearised, residuals
-
-Look: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
-"""Whitened residuals (k, 3), derivatives by the poses (k, 3, 6) and by the points (k, 3, 3)."""
+from fgslam.factors.stacked import LinearRows, linearised, residuals
 
 
 class Sightings(Protocol):
@@ -46,7 +43,7 @@ class Sightings(Protocol):
         """Whitened residuals (k, 3) at all poses (n, 4, 4) and points (m, 3)."""
         ...
 
-    def look(self, poses: FloatArray, points: FloatArray) -> Look:
+    def look(self, poses: FloatArray, points: FloatArray) -> LinearRows:
         """The same, with derivatives."""
         ...
 
@@ -88,11 +85,10 @@ class StereoSightings:
         own, seen = poses[self.poses], points[self.points]
         return residuals(self.rig, own, seen, self.measured, self.roots)
 
-    def look(self, poses: FloatArray, points: FloatArray) -> Look:
+    def look(self, poses: FloatArray, points: FloatArray) -> LinearRows:
         """See :class:`Sightings`."""
         own, seen = poses[self.poses], points[self.points]
-        rows = linearised(self.rig, own, seen, self.measured, self.roots)
-        return rows.residual, rows.by_pose, rows.by_point
+        return linearised(self.rig, own, seen, self.measured, self.roots)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,9 +119,9 @@ class FactorSightings:
 
     def residuals(self, poses: FloatArray, points: FloatArray) -> FloatArray:
         """See :class:`Sightings`."""
-        return self.look(poses, points)[0]
+        return self.look(poses, points).residual
 
-    def look(self, poses: FloatArray, points: FloatArray) -> Look:
+    def look(self, poses: FloatArray, points: FloatArray) -> LinearRows:
         """See :class:`Sightings`."""
         linear = self.graph.linearize(values_of(self.keys, poses, points))
         row, column, value = linear.sparseJacobian_()
@@ -133,15 +129,15 @@ class FactorSightings:
         border = 3 * sum(not is_pose(key) for key in self.keys)  # landmarks come first
         last = border + 6 * sum(is_pose(key) for key in self.keys)
         k = len(self.rows)
-        out = np.zeros((k, 3)), np.zeros((k, 3, 6)), np.zeros((k, 3, 3))
+        out = LinearRows(np.zeros((k, 3)), np.zeros((k, 3, 6)), np.zeros((k, 3, 3)))
         of_point, of_pose, right = (
             column < border,
             (column >= border) & (column < last),
             column == last,
         )
-        out[0].ravel()[row[right]] = -value[right]
-        out[1].reshape(-1, 6)[row[of_pose], (column[of_pose] - border) % 6] = value[of_pose]
-        out[2].reshape(-1, 3)[row[of_point], column[of_point] % 3] = value[of_point]
+        out.residual.ravel()[row[right]] = -value[right]
+        out.by_pose.reshape(-1, 6)[row[of_pose], (column[of_pose] - border) % 6] = value[of_pose]
+        out.by_point.reshape(-1, 3)[row[of_point], column[of_point] % 3] = value[of_point]
         return out
 
 

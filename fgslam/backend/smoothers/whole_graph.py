@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, partial, reduce
 from typing import Any
 
 import gtsam
@@ -27,6 +27,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.levenberg import Damping
 from fgslam.factors.graphs import is_pose
 from fgslam.factors.noise import kernel_losses, kernel_weights, plain
+from fgslam.factors.stacked import LinearRows
 
 PLAIN = KernelSettings("none")
 
@@ -170,7 +171,8 @@ class WholeGraph:
         looks = [kind.look(state.poses, state.points) for kind in self.kinds]
         if not looks:
             return rest
-        residual, by_pose, by_point = (np.concatenate(parts) for parts in zip(*looks, strict=True))
+        rows = reduce(LinearRows.join, looks)
+        residual, by_pose, by_point = rows.residual, rows.by_pose, rows.by_point
         squared = self.weights * np.einsum("ki,ki->k", residual, residual)
         weights = self.weights * kernel_weights(self.kernel.name, self.kernel.width, squared)
         known = weights[:, None, None] * np.swapaxes(by_pose, 1, 2)  # (k, 6, 3)

@@ -24,13 +24,13 @@ from fgslam.backend.smoothers.landmark_elimination import (
 )
 from fgslam.backend.smoothers.marginals import UndeterminedError
 from fgslam.backend.smoothers.window_prior import WindowPrior
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
 from fgslam.core.geometry import reorthonormalise, se3_exp, transform_to_world
 from fgslam.core.sensors import Sensor
 from fgslam.factors.graphs import number, pose_key
 from fgslam.factors.noise import kernel_weights
 from fgslam.factors.stacked import (
-    Rows,
+    LinearRows,
     linearised,
     products,
     summed,
@@ -46,7 +46,7 @@ _LEFT_BETWEEN = 5  # poses that leave until their hidden numbers are looked thro
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Observed:
+class Observed(Rows):
     """Observations of the window (k, ...): frame, landmark variable, numbers and whitening."""
 
     frame: IntArray
@@ -54,15 +54,9 @@ class Observed:
     measurement: FloatArray
     root: FloatArray
 
-    def select(self, kept: BoolArray) -> Observed:
-        """Those of a mask (k,)."""
-        return Observed(
-            self.frame[kept], self.variable[kept], self.measurement[kept], self.root[kept]
-        )
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Landmarks:
+class Landmarks(Rows):
     """Landmarks of the window (m, ...): variables ascending, places, what was known beforehand.
 
     That is a mean and its information (3, 3), zero where nothing was known.
@@ -72,12 +66,6 @@ class Landmarks:
     points: FloatArray
     mean: FloatArray
     information: FloatArray
-
-    def select(self, kept: BoolArray) -> Landmarks:
-        """Those of a mask (m,)."""
-        return Landmarks(
-            self.variables[kept], self.points[kept], self.mean[kept], self.information[kept]
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +77,7 @@ class Look:
 
     pose: IntArray
     point: IntArray
-    rows: Rows
+    rows: LinearRows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,17 +140,14 @@ class Window:
 
     def add_landmarks(self, new: Landmarks) -> None:
         """New landmarks, numbered above all others."""
-        old = self.landmarks
-        pairs = zip(_columns(old), _columns(new), strict=True)
-        self.landmarks = Landmarks(*(np.concatenate(pair) for pair in pairs))
+        self.landmarks = self.landmarks.join(new)
 
     def observe(
         self, frame: IntArray, variable: IntArray, measurement: FloatArray, noise: FloatArray
     ) -> None:
         """Observations (k,) of landmarks of the window from its frames; noise (k, 3, 3)."""
-        old, new = self.observed, Observed(frame, variable, measurement, whitening(noise))
-        pairs = zip(_columns(old), _columns(new), strict=True)
-        self.observed = Observed(*(np.concatenate(pair) for pair in pairs))
+        new = Observed(frame, variable, measurement, whitening(noise))
+        self.observed = self.observed.join(new)
 
     # -- the solution ------------------------------------------------------------------------
 
@@ -257,7 +242,7 @@ class Window:
         )
 
     def _corner_of(
-        self, pose: IntArray, rows: Rows, n: int, r: int
+        self, pose: IntArray, rows: LinearRows, n: int, r: int
     ) -> tuple[FloatArray, FloatArray]:
         """What observations say of poses alone: (r + 6n, r + 6n) and (r + 6n,)."""
         turned = np.swapaxes(rows.by_pose, 1, 2)
@@ -313,9 +298,9 @@ class Window:
 
     def _into_prior(self, look: Look, factors: Any, leaving: int) -> None:
         """Adds what the first poses said to the prior, and hides them there."""
-        said = look.rows.by_point.any(axis=(1, 2))
+        said: BoolArray = np.asarray(look.rows.by_point.any(axis=(1, 2)))
         pose, point = look.pose[said], look.point[said]
-        rows = Rows(*(column[said] for column in _columns(look.rows)))
+        rows = look.rows.select(said)
         variables, points = self.landmarks.variables, self.landmarks.points
         new = np.setdiff1d(variables[point], self.prior.variables)
         prior = self.prior.with_landmarks(new, points[np.searchsorted(variables, new)])
@@ -373,7 +358,3 @@ class Window:
         self.prior, self._least_hidden = WindowPrior.none(len(self.frames)), 0
         self._anchors, self._shift = {}, np.zeros((len(self.frames), 6))
         self.factors.add(prior)
-
-
-def _columns(rows: Observed | Landmarks | Rows) -> list[Any]:
-    return [getattr(rows, field.name) for field in dataclasses.fields(rows)]

@@ -19,7 +19,7 @@ from scipy.linalg import solve_triangular
 from fgslam.backend.smoothers.marginals import scaled_cholesky
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.geometry import inverse_spd3
-from fgslam.factors.stacked import Rows, products, summed
+from fgslam.factors.stacked import LinearRows, products, summed
 
 _UNCOUPLED = 1e-9  # of a landmark's own information: a coupling that changes it by less is none
 
@@ -78,7 +78,7 @@ class WindowPrior:
         coupling = np.pad(self.coupling, ((0, 0), (0, 0), (0, 6 * poses)))
         return self._with_corner(self.corner + corner, self.corner_gradient + gradient, coupling)
 
-    def with_rows(self, landmark: IntArray, columns: IntArray, rows: Rows) -> WindowPrior:
+    def with_rows(self, landmark: IntArray, columns: IntArray, rows: LinearRows) -> WindowPrior:
         """With what observations (k,) said of landmarks, by row, and of hidden poses.
 
         Args:
