@@ -136,18 +136,30 @@ def read_camera_info_pair(left: Path, right: Path) -> Rectifier:
         CalibrationError: a file is missing or malformed, its distortion model is another one, the
             files are not of one rectified pair, or left and right are swapped.
     """
-    cameras = {path: read_calibration_yaml(path) for path in (right, left)}
-    raw = [_camera_info(path, values) for path, values in cameras.items()]
-    rotations = [_info_matrix(p, v, "rectification_matrix", 3, 3) for p, v in cameras.items()]
-    of_right, of_left = (_info_matrix(p, v, "projection_matrix", 3, 4) for p, v in cameras.items())
+    of_right, of_left = (read_calibration_yaml(path) for path in (right, left))
+    return camera_info_pair((left, of_left), (right, of_right))
+
+
+def camera_info_pair(
+    left: tuple[Path, Mapping[str, Any]], right: tuple[Path, Mapping[str, Any]]
+) -> Rectifier:
+    """As :func:`read_camera_info_pair`, of camera_info that is read already.
+
+    Args:
+        left: what messages call it, and its keys and values as in a camera_info file.
+        right: the same of the right camera.
+    """
+    raw = [_camera_info(path, values) for path, values in (right, left)]
+    rotations = [_info_matrix(p, v, "rectification_matrix", 3, 3) for p, v in (right, left)]
+    of_right, of_left = (_info_matrix(p, v, "projection_matrix", 3, 4) for p, v in (right, left))
     if not np.allclose(of_left[:, :3], of_right[:, :3]):
         raise CalibrationError(
-            f"{left}: its projection_matrix differs from that of {right.name}, so the two are not "
-            "of one rectified pair; calibrate them as a stereo pair"
+            f"{left[0]}: its projection_matrix differs from that of {right[0].name}, so the two "
+            "are not of one rectified pair; calibrate them as a stereo pair"
         )
     if of_right[0, 0] <= 0.0 or not of_right[0, 3] < 0.0:
         raise CalibrationError(
-            f"{right}: projection_matrix states no baseline (its fourth number is "
+            f"{right[0]}: projection_matrix states no baseline (its fourth number is "
             f"{of_right[0, 3]:g}, must be negative); calibrate a stereo pair, or swap the files"
         )
     found = rectified_by(raw[0], raw[1], (rotations[0], rotations[1]), of_right)
