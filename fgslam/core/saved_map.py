@@ -26,12 +26,13 @@ from fgslam.core.sensors import CameraRig
 
 FILE = ArrayFile(
     name="fgslam map",
-    versions=(1,),
+    versions=(1, 2),  # version 1 did not say which frames are in the map
     error=MapError,
     give="give a file that fgslam run --map-out wrote",
     again="make the map again",
 )
 _SESSION = "session/"
+_EVIDENCE = "evidence_frame"
 _UPPER = np.triu_indices(3)
 _LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the zip format's first moment: equal maps give equal bytes
 _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
@@ -56,6 +57,7 @@ _ITEMS: dict[str, Items] = {
         "view_direction": ("f", (3,)),
     },
     "poses": {"pose_time": ("f", ()), "pose": ("f", (4, 4))},
+    "evidence": {_EVIDENCE: ("i", ())},
 }
 
 
@@ -74,6 +76,8 @@ class SavedMap:
         trajectory: the drive that made the map.
         about: where it comes from: names, versions, the recording's identity (plain JSON values).
         session: state of the run that made it, for continuing it to the bit; may be empty.
+        evidence: (f,) the frames whose measurements are in it (``Frame.digest``), ascending; None
+            where the file is older and does not say.
     """
 
     rig: CameraRig
@@ -86,6 +90,7 @@ class SavedMap:
     trajectory: Trajectory
     about: dict[str, Any]
     session: StateArrays
+    evidence: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.landmarks)
@@ -177,6 +182,7 @@ def _to_arrays(saved: SavedMap) -> StateArrays:
         "view_direction": views.direction,
         "pose_time": saved.trajectory.timestamps,
         "pose": saved.trajectory.poses,
+        **({} if saved.evidence is None else {_EVIDENCE: saved.evidence}),
         **{f"{_SESSION}{name}": array for name, array in sorted(saved.session.items())},
     }
 
@@ -204,6 +210,7 @@ def _from_arrays(header: dict[str, Any], arrays: StateArrays, where: str) -> Sav
             for name, array in arrays.items()
             if name.startswith(_SESSION)
         },
+        evidence=arrays.get(_EVIDENCE),
     )
 
 
@@ -266,12 +273,13 @@ def _with_repeats(arrays: StateArrays, header: dict[str, Any], where: str) -> St
 def _header(saved: SavedMap, where: str) -> dict[str, Any]:
     header = {
         "format": FILE.name,
-        "version": FILE.versions[-1],
+        "version": 1 if saved.evidence is None else 2,
         "counts": {
             "landmarks": len(saved),
             "views": len(saved.appearances),
             "poses": len(saved.trajectory),
-        },
+        }
+        | ({} if saved.evidence is None else {"evidence": len(saved.evidence)}),
         "rig": {name: getattr(saved.rig, name) for name in _RIG},
         "about": saved.about,
     }
@@ -311,7 +319,8 @@ def _require_consistent(header: dict[str, Any], arrays: StateArrays, where: str)
     """Raises MapError unless all arrays are there, of the right type and size, and fit."""
     expected = of_rows(4, {"rig_bTc": ("f", (4,))})
     for counted, items in _ITEMS.items():
-        expected |= of_rows(header["counts"].get(counted), items)
+        if counted != "evidence" or header["version"] > 1:
+            expected |= of_rows(header["counts"].get(counted), items)
     FILE.require(arrays, expected, where)
     ids, views = arrays["landmark_id"], arrays["view_landmark"]
     finite = ("rig_bTc", "landmark_position", "landmark_covariance", "pose", "pose_time")
@@ -319,6 +328,7 @@ def _require_consistent(header: dict[str, Any], arrays: StateArrays, where: str)
         "landmark_id": bool((np.diff(ids) > 0).all()),
         "view_landmark": bool((np.diff(views) >= 0).all() and np.isin(views, ids).all()),
         "pose_time": bool((np.diff(arrays["pose_time"]) > 0).all()),
+        _EVIDENCE: bool((np.diff(arrays.get(_EVIDENCE, ids[:0])) > 0).all()),
     }.items():
         if not sound:
             raise MapError(f"{where}: array {name} is out of order; make the map again")

@@ -23,7 +23,7 @@ from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.maps import Map, drives_of, map_points
 from fgslam.runs.named_experiments import find_experiment
 from fgslam.runs.opening import open_sequence
-from fgslam.slam.arrival import MapStart, saved_map
+from fgslam.slam.arrival import MapStart, evidence_of, saved_map
 from fgslam.slam.feature_stream import FeatureExtractor
 from fgslam.slam.map_settings import MapSettings
 from fgslam.slam.results import SessionResult
@@ -181,7 +181,8 @@ class Slam(Session):
         points = map_points(found.estimate.landmarks, self.pipeline.tracker.database)
         drives = [] if self._before is None else drives_of(self._before)
         about = {"drives": [*drives, self._drive(found)]}
-        saved = saved_map(self.pipeline, self.rig, found.estimate, about)
+        evidence = evidence_of(self.pipeline, self.recorder, self._before)
+        saved = saved_map(self.pipeline, self.rig, found.estimate, about, evidence=evidence)
         values = {name: getattr(found, name) for name in found.__dataclass_fields__}
         return Result(**values, map=Map(saved, points, self._remark))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +30,9 @@ from fgslam.slam.factory import (
     make_stereo_matcher,
 )
 from fgslam.slam.inputs import checked_images
+
+if TYPE_CHECKING:
+    from fgslam.frontend.places.map_alignment import Alignment
 
 _VALID_HITS = 3  # where the map does not say how many its run asked for (Se et al. 6.1)
 _SUFFIX = ".fgmap"
@@ -209,6 +212,8 @@ _SEED = 0  # the same maps give the same bytes
 def merge_files(first: Path, second: Path, out: Path, overwrite: bool = False) -> list[str]:
     """Lays the second map onto the first and writes both as one; lines about what was found.
 
+    Where every frame of the second is in the first already, that one is written as it is.
+
     Raises:
         MapError: one is no map, another rig made it, they do not overlap or that is ambiguous, or
             ``out`` is there already.
@@ -216,16 +221,31 @@ def merge_files(first: Path, second: Path, out: Path, overwrite: bool = False) -
     """
     # Not before: no run merges maps, and these load much of SciPy.
     from fgslam.frontend.places.map_alignment import align_maps
-    from fgslam.frontend.places.map_fusion import merge_maps
+    from fgslam.frontend.places.map_fusion import adds_nothing, merge_maps
 
     if out.exists() and not overwrite:
         raise MapError(f"{out}: is there already; choose another --out, or add --overwrite")
     a, b = load_map(first), load_map(second)
     require_rig_of_map(b, a.rig, str(second))
-    rng = np.random.default_rng(_SEED)
-    found = align_maps(a, b, rng, f"{first} and {second}")
+    if adds_nothing(b, a):
+        size = save_map(a, out)
+        every = 0 if b.evidence is None else len(b.evidence)
+        return [
+            f"all {every} frames of {second} are in {first} already, and count once: nothing to "
+            "merge",
+            f"{out}: {first} as it is, {len(a)} landmarks, {size / 1e6:.2f} MB",
+        ]
+    found = align_maps(a, b, np.random.default_rng(_SEED), f"{first} and {second}")
     merged = merge_maps(a, b, found)
     size = save_map(merged, out)
+    return [
+        *_about_alignment(found, str(first), str(second)),
+        *_in_common(a, b, str(first), str(second)),
+        f"{out}: {len(merged)} landmarks of {len(a)} and {len(b)}, {size / 1e6:.2f} MB",
+    ]
+
+
+def _about_alignment(found: Alignment, first: str, second: str) -> list[str]:
     x, y, z = found.aTb[:3, 3]
     turn = np.degrees(np.linalg.norm(so3_log(found.aTb[:3, :3])))
     return [
@@ -235,5 +255,21 @@ def merge_files(first: Path, second: Path, out: Path, overwrite: bool = False) -
         f"{len(found.pairs)} landmarks fused, residual {100.0 * found.residual_m:.2f} cm rms "
         f"({found.residual_sigmas:.2f} sigma); {found.found} of the {found.among} that lie among "
         "the first map's were found there",
-        f"{out}: {len(merged)} landmarks of {len(a)} and {len(b)}, {size / 1e6:.2f} MB",
+    ]
+
+
+def _in_common(a: SavedMap, b: SavedMap, first: str, second: str) -> list[str]:
+    """A line about the evidence that both maps hold; none where there is none."""
+    if a.evidence is None or b.evidence is None:
+        older = first if a.evidence is None else second
+        return [
+            f"{older} does not say which frames are in it (an older fgslam's): what both hold may "
+            "be the same evidence, so no covariance shrinks; make the map again"
+        ]
+    common = len(np.intersect1d(a.evidence, b.evidence))
+    if not common:
+        return []
+    return [
+        f"{common} of the {len(b.evidence)} frames of {second} are in {first}, too: they count "
+        "once (covariance intersection)"
     ]

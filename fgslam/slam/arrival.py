@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fgslam.backend.protocol import Estimator, MapUser
-from fgslam.core.arrays import FloatArray, StateArrays
+from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import ConfigError, MapError
 from fgslam.core.estimates import Estimate, LandmarkMap, Prediction
 from fgslam.core.features import LandmarkAppearances
@@ -16,6 +16,7 @@ from fgslam.core.saved_map import SavedMap, require_rig
 from fgslam.core.sensors import CameraRig
 from fgslam.slam.map_settings import MapSettings
 from fgslam.slam.pipeline import SlamPipeline
+from fgslam.slam.results import RunRecorder
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,6 +122,7 @@ def saved_map(
     estimate: Estimate,
     about: dict[str, Any],
     session: StateArrays | None = None,
+    evidence: IntArray | None = None,
 ) -> SavedMap:
     """The estimator's geometry joined with the database's appearances and counts.
 
@@ -130,6 +132,7 @@ def saved_map(
         estimate: the estimator's.
         about: where the map comes from; plain JSON values.
         session: what its run needs to go on; None for nothing.
+        evidence: the frames that are in it (:func:`evidence_of`); None where that is not known.
     """
     database, places = pipeline.tracker.database, pipeline.places
     landmarks = estimate.landmarks
@@ -147,4 +150,20 @@ def saved_map(
         trajectory=estimate.trajectory,
         about=about,
         session=session or {},
+        evidence=evidence,
     )
+
+
+def evidence_of(
+    pipeline: SlamPipeline, recorder: RunRecorder, before: SavedMap | None
+) -> IntArray | None:
+    """Frames (f,) whose measurements are in a session's map, ascending; None where not known.
+
+    Those of the map that it began in count, too; a map that is only localised in takes in nothing.
+    """
+    own = np.array([d for d in recorder.frame_digests if d], np.int64)
+    if pipeline.tracker.keeps_map:
+        own = own[:0]
+    if before is None:
+        return np.unique(own)
+    return None if before.evidence is None else np.union1d(before.evidence, own)

@@ -49,6 +49,7 @@ class RunRecorder:
     online_poses: list[FloatArray] = field(default_factory=list)
     online_covariances: list[FloatArray] = field(default_factory=list)
     stage_ms: list[FloatArray] = field(default_factory=list)
+    frame_digests: list[int] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -64,6 +65,8 @@ class RunRecorder:
         self.online_poses.append(report.stats.wTc)
         self.online_covariances.append(report.stats.covariance)
         self.log.append(report.increment)
+        frame = report.found.frame
+        self.frame_digests.append(0 if frame is None else frame.digest())
         self.rows.append(row)
 
     def column(self, name: str) -> npt.NDArray[Any]:
@@ -82,6 +85,7 @@ class RunRecorder:
         out["online_poses"] = np.array(self.online_poses).reshape(-1, 4, 4)
         out["online_covariances"] = np.array(self.online_covariances).reshape(-1, 6, 6)
         out["stage_ms"] = np.array(self.stage_ms).reshape(-1, len(STAGES))
+        out["frame_digests"] = np.array(self.frame_digests, np.int64)
         return out
 
     def restore(self, state: StateArrays, log: MeasurementLog) -> None:
@@ -92,6 +96,7 @@ class RunRecorder:
         self.online_poses = list(state["online_poses"])
         self.online_covariances = list(state["online_covariances"])
         self.stage_ms = list(state["stage_ms"])
+        self.frame_digests = state["frame_digests"].tolist()
         self.log.increments = log.increments[: len(self.rows)]
 
 

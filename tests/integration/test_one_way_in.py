@@ -128,6 +128,9 @@ def test_frames_that_cannot_be_located_have_no_pose_and_are_left_out(tmp_path: P
     assert [drive["name"] for drive in result.map.saved.about["drives"]] == ["session"] * 2
     np.testing.assert_array_equal(place.saved.hits, hits)
     np.testing.assert_array_equal(place.positions, positions)
+    # Frames 3, 4 and 5 of the recording are in both: they are the same evidence.
+    assert len(place.saved.evidence) == 8
+    np.testing.assert_array_equal(result.map.saved.evidence, place.saved.evidence)
     with pytest.raises(MeasurementLogError, match="begins in a saved map, which it does not hold"):
         fg.replay(back.log, "ekf")
 

@@ -22,7 +22,7 @@ from fgslam.runs.config import ExperimentConfig, make_config
 from fgslam.runs.folder import LOG_FILE, STATE_FILE
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, entry_of
 from fgslam.runs.tasks.slam_outputs import RunOutputs
-from fgslam.slam.arrival import saved_map
+from fgslam.slam.arrival import evidence_of, saved_map
 from fgslam.slam.map_settings import MapSettings
 from fgslam.slam.pipeline import SlamPipeline
 from fgslam.slam.results import RunRecorder
@@ -289,7 +289,9 @@ def _saved_map(outputs: RunOutputs) -> SavedMap:
     estimate = outputs.pipeline.estimator.estimate()
     about = {"drives": [*_drives_before(outputs), _drive(outputs, estimate)]}
     session = _session(outputs) if outputs.config.map.session else None
-    return saved_map(outputs.pipeline, outputs.sequence.rig, estimate, about, session)
+    before = None if outputs.given is None else outputs.given.saved
+    evidence = evidence_of(outputs.pipeline, outputs.recorder, before)
+    return saved_map(outputs.pipeline, outputs.sequence.rig, estimate, about, session, evidence)
 
 
 def _drives_before(outputs: RunOutputs) -> list[Any]:

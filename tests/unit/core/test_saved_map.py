@@ -192,11 +192,19 @@ def test_contents_swapped_under_a_valid_archive_are_noticed(file: Path) -> None:
         load_map(file)
 
 
+def test_the_frames_that_are_in_a_map_come_back(saved: SavedMap, tmp_path: Path) -> None:
+    frames = np.array([-5, 0, 2**62])
+    save_map(replace(saved, evidence=frames), tmp_path / "b.fgmap")
+    np.testing.assert_array_equal(load_map(tmp_path / "b.fgmap").evidence, frames)
+    with pytest.raises(MapError, match="evidence_frame is out of order"):
+        save_map(replace(saved, evidence=frames[::-1]), tmp_path / "c.fgmap")
+
+
 def test_a_newer_file_is_refused(file: Path) -> None:
     def change(header: dict[str, Any], arrays: dict[str, Any]) -> None:
         header["version"] = 99
 
-    with pytest.raises(MapError, match="map of version 99, this fgslam reads version 1"):
+    with pytest.raises(MapError, match="map of version 99, this fgslam reads versions 1 to 2"):
         load_map(rewritten(file, change))
 
 

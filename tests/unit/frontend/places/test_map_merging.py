@@ -55,6 +55,7 @@ class World:
             trajectory=Trajectory(stamp + np.arange(5.0), np.tile(np.eye(4), (5, 1, 1))),
             about={"drives": [{"name": "drive", "frames": 5}]},
             session={"a": np.zeros(3)},
+            evidence=np.sort(rng.integers(1, 2**60, 5)),
         )
 
 
@@ -185,10 +186,11 @@ def test_what_both_hold_is_fused_by_covariance_and_the_rest_kept(world: World) -
     assert np.mean(error[fused] ** 2) < 0.75 * np.mean(before[fused] ** 2)
     covariance = merged.landmarks.covariances[fused]
     assert (np.linalg.eigvalsh(a.landmarks.covariances[fused] - covariance) > 0.0).all()
-    # Twice as well known, but for what the alignment itself is uncertain.
+    # Twice as well known, but for what the alignment itself is uncertain, and for what the maps'
+    # errors seem to share: a share that a hundred pairs tell to a tenth.
     trace = np.trace(covariance, axis1=1, axis2=2)
     assert (trace > 1.5 * SIGMA_M**2).all()
-    assert (trace < 1.8 * SIGMA_M**2).all()
+    assert (trace < 1.95 * SIGMA_M**2).all()
     assert merged.hits.sum() == a.hits.sum() + b.hits.sum()
     assert merged.misses.sum() == a.misses.sum() + b.misses.sum()
     assert merged.permanent.sum() >= max(a.permanent.sum(), b.permanent.sum())
