@@ -199,9 +199,12 @@ class Estimate(Brief):
         covariances: (n, 6, 6) their marginals; NaN where one cannot be had.
         landmarks: the map, with marginal covariances.
         remarks: what the estimator had to correct or leave out, in words.
+        noise_factor: what the stated deviations of landmark measurements were multiplied by when
+            they were weighed; None where none was.
     """
 
     trajectory: Trajectory
     covariances: FloatArray
     landmarks: LandmarkMap
     remarks: tuple[str, ...] = ()
+    noise_factor: float | None = None

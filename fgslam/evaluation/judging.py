@@ -178,6 +178,7 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
             "update_growth": _growth(answer.update_ms),
             "last_pose_sigma": _last_pose_sigma(answer.estimate),
             "end_against_start": _end_against_start(final),
+            "noise_factor": answer.estimate.noise_factor,
             "remarks": list(answer.estimate.remarks),
         },
     )

@@ -111,6 +111,7 @@ def choose(config: Experiment, choice: Choice) -> tuple[Any, ...]:
     variants: dict[str, Any] = dict(
         HOMING_VARIANTS if isinstance(config, HomingExperiment) else all_kinds()
     )
+    variants = _of_one_noise(variants, config)
     known = variants | {settings.title: settings for settings in config.estimators}
     if choice.names is None:
         own = [settings.title for settings in config.estimators]
@@ -133,6 +134,22 @@ def choose(config: Experiment, choice: Choice) -> tuple[Any, ...]:
                 f"{', '.join(chosen)}"
             )
     return tuple(_with(known[title], config, choice.overrides) for title in chosen)
+
+
+def _of_one_noise(variants: dict[str, Any], config: Experiment) -> dict[str, Any]:
+    """Estimators that the configuration does not name, with the noise model of those that it does.
+
+    Else a graph that weighs a log as its configuration says would be set beside one that does not.
+    """
+    stated = [s.noise_factor for s in config.estimators if hasattr(s, "noise_factor")]
+    if not stated:
+        return variants
+    return {
+        title: dataclasses.replace(settings, noise_factor=stated[0])
+        if hasattr(settings, "noise_factor")
+        else settings
+        for title, settings in variants.items()
+    }
 
 
 def _addresses(override: str, title: str) -> bool:

@@ -244,6 +244,12 @@ _CONSISTENCY = (
         _judged,
         _NO_LANDMARKS,
     ),
+    MetricColumn(
+        "noise\nfactor",
+        ("noise_factor",),
+        _number(".2f"),
+        "no landmark measurement is weighed: by it the stated deviations were multiplied",
+    ),
     MetricColumn("NIS", ("nis_per_dof",), _ratio, "the estimator forms no innovation"),
     MetricColumn(
         "sigma of last\npose cm deg",

@@ -126,6 +126,20 @@ def test_a_finished_run_on_measurements_is_neither_resumed_nor_replaced(
 
 
 @pytest.mark.usefixtures("in_this_process")
+def test_the_table_states_by_which_noise_each_estimator_weighed(
+    plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    out = tmp_path / "out"
+    chosen = ("--estimators", f"{KIND},batch,odometry", "--set", "estimators.batch.noise_factor=3")
+    assert main(monkeypatch, "compare", plain, "--out", out, *chosen) == 0
+    shown = capsys.readouterr().out
+    assert "noise" in shown
+    assert "3.00" in shown
+    found = {title: one["noise_factor"] for title, one in metrics_of(out)["estimators"].items()}
+    assert found == {KIND: 1.0, "batch": 3.0, "odometry": None}
+
+
+@pytest.mark.usefixtures("in_this_process")
 def test_a_run_replays_its_own_log_to_the_bit(recording: Path, tmp_path: Path) -> None:
     values = experiment(recording) | {
         "estimator": {"kind": KIND, "label": "live"},

@@ -155,6 +155,7 @@ class FullEkf:
             self._past.pose_covariances(),
             self.landmarks(),
             (*remarks, *self._remarks),
+            noise_factor=1.0,
         )
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:

@@ -224,6 +224,7 @@ class LandmarkKalman:
             self._past.pose_covariances(),
             LandmarkMap(rows.ids.copy(), rows.positions.copy(), rows.covariances.copy()),
             tuple(self._drive.remarks),
+            noise_factor=1.0,
         )
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:

@@ -125,6 +125,11 @@ class GraphBuilder:
         self.frames: list[int] = []
 
     @property
+    def noise_factor(self) -> float:
+        """By which the factors' deviations exceed those by which wrong matches are judged."""
+        return float(np.sqrt(self._noise))
+
+    @property
     def variables(self) -> int:
         """Number of landmark variables made so far."""
         return len(self._id_of)

@@ -56,6 +56,16 @@ def config(**more: Any) -> ExperimentConfig:
 # Which estimators
 
 
+def test_one_log_has_one_noise_model() -> None:
+    """An estimator that the configuration does not name weighs the log as those that it does."""
+    weighed = config(compare=[{"kind": "isam2", "noise_factor": 2.5}])
+    chosen = choose(weighed, Choice(("isam2", "batch", "fixed_lag", "ekf")))
+    assert [getattr(s, "noise_factor", None) for s in chosen] == [2.5, 2.5, 2.5, None]
+    asked = Choice(("isam2", "batch"), ("estimators.batch.noise_factor=4",))
+    assert [s.noise_factor for s in choose(weighed, asked)] == [2.5, 4.0]
+    assert choose(config(), Choice(("batch",))) == (all_kinds()["batch"],)
+
+
 def test_the_configurations_estimators_are_the_default() -> None:
     named = {"kind": "isam2", "label": "often", "update_every": 1}
     chosen = choose(config(compare=["landmark_kalman", "batch", named]), Choice())
