@@ -258,10 +258,17 @@ def export(
     map_file: Annotated[
         Path | None, typer.Option("--map", help="landmarks as .ply, .pcd or .off (Geomview)")
     ] = None,
-    trajectory: Annotated[Path | None, typer.Option(help="camera poses as .tum or .kitti")] = None,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(help="camera poses as .tum, .kitti, .csv (EuRoC) or .mcap (ROS 2)"),
+    ] = None,
     graph: Annotated[
         Path | None,
         typer.Option(help="measurements, poses and landmarks as .g2o, for other solvers"),
+    ] = None,
+    images: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="images, poses and points, for COLMAP and nerfstudio"),
     ] = None,
     estimator: Annotated[
         str | None, typer.Option(help="which estimator's; default the one that steered")
@@ -269,14 +276,26 @@ def export(
     valid_only: Annotated[
         bool, typer.Option("--valid-only", help="landmarks seen in at least three frames")
     ] = False,
+    colour: Annotated[
+        bool, typer.Option("--colour", help="--map in the images' colours, with normals")
+    ] = False,
 ) -> None:
     """Hand a run's map, trajectory and measurements to other tools; or those of a saved map.
 
     Of a saved map alone it says what is in it.
     """
-    from fgslam.runs.exporting import export_run
+    from fgslam.runs.exporting import Wanted, export_run
 
-    for line in export_run(run_folder, map_file, trajectory, estimator, valid_only, graph):
+    wanted = Wanted(
+        map=map_file,
+        trajectory=trajectory,
+        graph=graph,
+        images=images,
+        estimator=estimator,
+        valid_only=valid_only,
+        colour=colour,
+    )
+    for line in export_run(run_folder, wanted):
         typer.echo(line)
 
 

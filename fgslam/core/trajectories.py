@@ -19,6 +19,11 @@ from fgslam.core.files import read_text, write_text
 from fgslam.core.geometry import pose, quaternion_from_rotation, rotation_from_quaternion
 
 _TUM_FORMAT = "%.9f" + 7 * " %.12f"
+_EUROC_FORMAT = ",".join(7 * ["%.12f"])
+_EUROC_HEADER = (
+    "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],"
+    "q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"
+)
 _KITTI_FORMAT = " ".join(12 * ["%.12e"])
 _COVARIANCE_FORMAT = "%.9f" + 21 * ",%.9e"
 _TUM_COLUMNS = 8
@@ -50,21 +55,21 @@ class Trajectory(Brief):
         return len(self.timestamps)
 
     def save(self, path: str | Path, remark: str = "") -> None:
-        """Writes the poses in the format that the suffix names: `.tum` or `.kitti`.
+        """Writes the poses in the format that the suffix names: `.tum`, `.kitti` or `.csv` (EuRoC).
 
         Args:
             path: the file, written whole or not at all.
-            remark: put into a comment line of `.tum`; `.kitti` knows neither times nor comments.
+            remark: put into a comment line; `.kitti` knows neither times nor comments.
 
         Raises:
             OutputError: the suffix is another one, a pose is not finite, or writing failed.
         """
         path = Path(path)
-        texts = {".tum": _tum_text, ".kitti": _kitti_text}
+        texts = {".tum": _tum_text, ".kitti": _kitti_text, ".csv": _euroc_text}
         if path.suffix.lower() not in texts:
             raise OutputError(
-                f"cannot write {path}: unknown trajectory format '{path.suffix}'; use .tum or "
-                ".kitti"
+                f"cannot write {path}: unknown trajectory format '{path.suffix}'; use .tum, .kitti "
+                "or .csv"
             )
         _require_finite(path, self)
         write_text(path, texts[path.suffix.lower()](self, remark))
@@ -98,13 +103,26 @@ class Trajectory(Brief):
 
 def _tum_text(trajectory: Trajectory, remark: str) -> str:
     """Lines of `timestamp tx ty tz qx qy qz qw` (seconds, metres), as evo reads them."""
-    rows = np.empty((len(trajectory), _TUM_COLUMNS))
-    rows[:, 0] = trajectory.timestamps
-    rows[:, 1:4] = trajectory.poses[:, :3, 3]
-    for row, wTc in zip(rows, trajectory.poses, strict=True):
-        row[4:] = _canonical(quaternion_from_rotation(wTc[:3, :3]))
-    rows[:, 1:] = _without_negative_zeros(rows[:, 1:], decimals=12)
+    rows = np.column_stack([trajectory.timestamps, _sevens(trajectory)])
     return _comment(remark) + _format_rows(rows, _TUM_FORMAT)
+
+
+def _euroc_text(trajectory: Trajectory, remark: str) -> str:
+    """EuRoC's ground-truth columns: nanoseconds, position, quaternion w first; of ``wTc``."""
+    sevens = _sevens(trajectory)[:, [0, 1, 2, 6, 3, 4, 5]]
+    lines = _format_rows(sevens, _EUROC_FORMAT).splitlines()
+    stamps = np.rint(trajectory.timestamps * 1e9).astype(np.int64).tolist()
+    rows = (f"{stamp},{line}\n" for stamp, line in zip(stamps, lines, strict=True))
+    return _comment(remark) + _EUROC_HEADER + "".join(rows)
+
+
+def _sevens(trajectory: Trajectory) -> FloatArray:
+    """(n, 7) x y z qx qy qz qw, rounded, without negative zeros."""
+    rows = np.empty((len(trajectory), _TUM_COLUMNS - 1))
+    rows[:, :3] = trajectory.poses[:, :3, 3]
+    for row, wTc in zip(rows, trajectory.poses, strict=True):
+        row[3:] = _canonical(quaternion_from_rotation(wTc[:3, :3]))
+    return _without_negative_zeros(rows, decimals=12)
 
 
 def _kitti_text(trajectory: Trajectory, _: str) -> str:

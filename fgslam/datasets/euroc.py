@@ -65,6 +65,7 @@ def open_euroc(settings: EurocSettings) -> Recording:
         notes=notes + missing_notes(files, stamps),
         indices=chosen,
         load_images=RawPairs(files, raw).load,
+        load_colour=RawPairs(files, raw).load_colour,
     )
 
 

@@ -71,6 +71,7 @@ def open_image_folder(
     chosen = select_frames(len(stamps), settings)
     files = _files(folders, listed, numbers, rig)
     check_sizes(files, root)
+    images = files if raw is None else RawPairs(files, raw)
     truth = _read_truth(root, rig.baseline)
     odometry_file = _find_odometry(root, settings.odometry_file)
     defining = [
@@ -90,7 +91,8 @@ def open_image_folder(
             + (_missing_top(root, settings.use_top) if settings.camera_file is None else ())
         ),
         indices=chosen,
-        load_images=files.load if raw is None else RawPairs(files, raw).load,
+        load_images=images.load,
+        load_colour=images.load_colour,
         odometry_source=_odometry_source(odometry_file, odometry),
     )
 

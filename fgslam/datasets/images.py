@@ -54,8 +54,11 @@ def read_grey_image(path: Path) -> Image:
 
 def read_sized_image(path: Path, width: int, height: int) -> Image:
     """The image in grey, as :func:`read_grey_image`. Raises FrameError if of another size, too."""
-    image = read_grey_image(path)
-    if image.shape != (height, width):
+    return _of_size(read_grey_image(path), path, width, height)
+
+
+def _of_size(image: Image, path: Path, width: int, height: int) -> Image:
+    if image.shape[:2] != (height, width):
         raise FrameError(
             f"image {path} is {size(image)} but the calibration says {width}x{height}; restore the "
             "right file"
@@ -135,6 +138,13 @@ class StereoFiles:
         """Images of a frame. Raises FrameError when one is missing, damaged or of another size."""
         return tuple(read_sized_image(path, self.width, self.height) for path in self.paths[index])
 
+    def load_colour(self, index: int) -> tuple[Image, ...]:
+        """The same in red, green, blue."""
+        return tuple(
+            _of_size(read_colour_image(path), path, self.width, self.height)
+            for path in self.paths[index]
+        )
+
     def first_images(self) -> tuple[Image, ...] | None:
         """Images of the first frame that can be read, whatever their size; None without any."""
         for paths in self.paths:
@@ -154,7 +164,13 @@ class RawPairs:
 
     def load(self, index: int) -> tuple[Image, ...]:
         """Rectified (right, left) images of a pair. Raises FrameError as StereoFiles does."""
-        raw = self.files.load(index)
+        return self._rectified(self.files.load(index))
+
+    def load_colour(self, index: int) -> tuple[Image, ...]:
+        """The same in red, green, blue."""
+        return self._rectified(self.files.load_colour(index))
+
+    def _rectified(self, raw: tuple[Image, ...]) -> tuple[Image, ...]:
         return tuple(self.rectifier.rectify(k, image) for k, image in enumerate(raw))
 
 

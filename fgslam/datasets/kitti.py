@@ -62,6 +62,7 @@ def open_kitti(settings: KittiSettings) -> Recording:
         notes=missing_notes(files, stamps),
         indices=chosen,
         load_images=files.load,
+        load_colour=files.load_colour,
     )
 
 

@@ -43,6 +43,7 @@ class Recording(Brief):
         notes: what was tolerated when opening.
         indices: (n,) the recording's own numbers of the selected frames.
         load_images: reads the images of one of the recording's own frames.
+        load_colour: reads them in red, green, blue; None where they are grey anyway.
         odometry_source: where the body's motions come from, or None. Asked once, when first
             needed, so that a bad odometry file hurts only who uses it.
     """
@@ -56,6 +57,7 @@ class Recording(Brief):
     indices: IntArray
     load_images: ImageLoader
     odometry_source: OdometrySource | None = None
+    load_colour: ImageLoader | None = None
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -65,6 +67,11 @@ class Recording(Brief):
         self._check_index(i, 0)
         index = int(self.indices[i])
         return Frame(index, float(self.timestamps[i]), self.load_images(index))
+
+    def colour(self, i: int) -> tuple[Image, ...]:
+        """Images of frame ``i`` in red, green, blue, or grey where the recording is. FrameError."""
+        self._check_index(i, 0)
+        return (self.load_colour or self.load_images)(int(self.indices[i]))
 
     def odometry(self, i: int) -> Odometry | None:
         """Body motion from frame ``i - 1`` to ``i``, 1 <= i < len; None where none was recorded.

@@ -60,6 +60,7 @@ _PLY_SYNONYMS = {
     "int8": "i1",
     "uint8": "u1",
 } | {name: code for code, name in _PLY_TYPES.items()}
+_NORMALS = {".ply": ("nx", "ny", "nz"), ".pcd": ("normal_x", "normal_y", "normal_z")}
 _PLY_COMMENTS = (
     "comment fgslam landmark map 1",
     "comment world = first reference camera: x right, y down, z forward, metres",
@@ -80,6 +81,7 @@ class MapPoints(Rows):
         misses: (n,) frames that expected and did not find it.
         valid: (n,) seen often enough to be trusted (Se et al. 6.1).
         permanent: (n,) never pruned (Se et al. 6.2).
+        normals: (n, 3) world, unit vectors out of the surface towards the camera, or None.
     """
 
     ids: IntArray
@@ -90,6 +92,7 @@ class MapPoints(Rows):
     misses: IntArray
     valid: BoolArray
     permanent: BoolArray
+    normals: FloatArray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.ids)
@@ -101,7 +104,7 @@ class MapPoints(Rows):
             "misses": (n,),
             "valid": (n,),
             "permanent": (n,),
-        }
+        } | ({} if self.normals is None else {"normals": (n, 3)})
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}, not {shape}")
@@ -143,7 +146,7 @@ def write_ply(path: Path, points: MapPoints, remark: str = "") -> None:
         OutputError: a landmark is not finite, an id needs more than 31 bits, or writing failed.
     """
     _require_writable(path, points)
-    records = np.empty(len(points), _PLY_DTYPE)
+    records = np.empty(len(points), _with_normals(_PLY_DTYPE, points, ".ply"))
     for column, name in enumerate("xyz"):
         records[name] = points.positions[:, column]
     for column, name in enumerate(("red", "green", "blue")):
@@ -153,7 +156,8 @@ def write_ply(path: Path, points: MapPoints, remark: str = "") -> None:
     header += [f"comment {remark}"] if remark else []
     header += [f"element vertex {len(points)}"]
     header += [
-        f"property {_PLY_TYPES[_PLY_DTYPE[name].str[1:]]} {name}" for name in _PLY_DTYPE.names or ()
+        f"property {_PLY_TYPES[records.dtype[name].str[1:]]} {name}"
+        for name in records.dtype.names or ()
     ]
     header += ["end_header\n"]
     write_bytes(path, "\n".join(header).encode("ascii") + records.tobytes())
@@ -225,7 +229,15 @@ def _from_records(records: Records) -> MapPoints:
         misses=records["misses"].astype(np.int64),
         valid=records["valid"] != 0,
         permanent=records["permanent"] != 0,
+        normals=_normals_in(records),
     )
+
+
+def _normals_in(records: Records) -> FloatArray | None:
+    names = _NORMALS[".ply"]
+    if not set(names) <= set(records.dtype.names or ()):
+        return None
+    return np.column_stack([records[name] for name in names]).astype(np.float64)
 
 
 # --------------------------------------------------------------------------------------------
@@ -244,14 +256,14 @@ def write_pcd(path: Path, points: MapPoints, remark: str = "") -> None:
         OutputError: as :func:`write_ply`.
     """
     _require_writable(path, points)
-    records = np.empty(len(points), _PCD_DTYPE)
+    records = np.empty(len(points), _with_normals(_PCD_DTYPE, points, ".pcd"))
     for column, name in enumerate("xyz"):
         records[name] = points.positions[:, column]
     red, green, blue = points.colours.astype(np.uint32).T
     records["rgb"] = (red << 16) | (green << 8) | blue
     _fill_bookkeeping(records, points)
-    names = _PCD_DTYPE.names or ()
-    kinds = [_PCD_DTYPE[name] for name in names]
+    names = records.dtype.names or ()
+    kinds = [records.dtype[name] for name in names]
     header = [
         "# .PCD v0.7 - Point Cloud Data file format",
         *([f"# {remark}"] if remark else []),
@@ -293,6 +305,13 @@ def write_off(path: Path, points: MapPoints, remark: str = "") -> None:
     write_bytes(path, buffer.getvalue().encode("ascii"))
 
 
+def _with_normals(dtype: np.dtype[Any], points: MapPoints, suffix: str) -> np.dtype[Any]:
+    """The type of a landmark, with a normal at its end where there are normals."""
+    if points.normals is None:
+        return dtype
+    return np.dtype([*dtype.descr, *((name, "<f4") for name in _NORMALS[suffix])])
+
+
 def _fill_bookkeeping(records: Records, points: MapPoints) -> None:
     records["landmark_id"] = points.ids
     records["hits"] = points.hits
@@ -302,6 +321,9 @@ def _fill_bookkeeping(records: Records, points: MapPoints) -> None:
     upper = points.covariances[:, _UPPER[0], _UPPER[1]]
     for column, name in enumerate(_COVARIANCE_NAMES):
         records[name] = upper[:, column]
+    if points.normals is not None:
+        for column, name in enumerate((records.dtype.names or ())[-3:]):
+            records[name] = points.normals[:, column]
 
 
 def _require_writable(path: Path, points: MapPoints) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,23 +16,53 @@ from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment
 from fgslam.core.saved_map import SavedMap, load_map
+from fgslam.core.trajectories import read_covariances
 from fgslam.report.graph_file import PoseLandmarkGraph, require_graph_suffix, write_g2o
 from fgslam.report.point_cloud import read_ply, write_map
+from fgslam.report.ros_bag import SUFFIX as MCAP
+from fgslam.report.ros_bag import write_mcap
 from fgslam.report.tables import read_metrics
 from fgslam.runs.config import load_config
 from fgslam.runs.config_reading import read_mapping
+from fgslam.runs.exporting_images import export_images, pose_rows
 from fgslam.runs.folder import LOG_FILE, RUN_MARKER, is_run_folder
 from fgslam.runs.maps import drives_of, points_of, remark_of_map, valid_of
 
 
-def export_run(
-    run: Path,
-    map_file: Path | None,
-    trajectory_file: Path | None,
-    estimator: str | None,
-    valid_only: bool,
-    graph_file: Path | None = None,
-) -> list[str]:
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What to export: files and folders to write, None where not asked for.
+
+    Attributes:
+        map: landmarks, `.ply`, `.pcd` or `.off`.
+        trajectory: poses, `.tum`, `.kitti`, `.csv` (EuRoC) or `.mcap` (ROS 2).
+        graph: measurements, poses and landmarks, `.g2o`.
+        images: folder for images with poses and points, for COLMAP and nerfstudio.
+        estimator: whose; None for the one that steered.
+        valid_only: only landmarks that were seen often enough to be trusted.
+        colour: the map in the images' colours, with normals.
+    """
+
+    map: Path | None = None
+    trajectory: Path | None = None
+    graph: Path | None = None
+    images: Path | None = None
+    estimator: str | None = None
+    valid_only: bool = False
+    colour: bool = False
+
+    @property
+    def targets(self) -> tuple[Path | None, ...]:
+        """All that may be written."""
+        return self.map, self.trajectory, self.graph, self.images
+
+    @property
+    def needs_run(self) -> bool:
+        """Whether something is asked for that a saved map does not hold."""
+        return self.colour or (self.graph, self.images, self.estimator) != (None, None, None)
+
+
+def export_run(run: Path, wanted: Wanted) -> list[str]:
     """Writes what was asked for; returns a line about each file.
 
     Of a saved map in place of a run, it says what is in it where nothing is asked for.
@@ -39,34 +71,50 @@ def export_run(
         FgslamError: nothing asked for, no run there, or an ending that is not known.
     """
     if run.is_file():
-        if estimator is not None or graph_file is not None:
+        if wanted.needs_run:
             raise ConfigError(
-                f"{run}: a saved map has landmarks and a trajectory, no other estimators and no "
-                "graph; give --map or --trajectory, or a run folder"
+                f"{run}: a saved map has landmarks and a trajectory, no other estimators, graph or "
+                "images; give --map or --trajectory, or a run folder"
             )
-        return export_map(run, map_file, trajectory_file, valid_only)
-    targets = (map_file, trajectory_file, graph_file)
-    folder = run / _estimator_of(run, estimator)
-    if targets == (None, None, None):
+        return export_map(run, wanted.map, wanted.trajectory, wanted.valid_only)
+    folder = run / _estimator_of(run, wanted.estimator)
+    if not any(wanted.targets):
         raise ConfigError(
-            "nothing to export; give --map FILE.ply, --trajectory FILE.tum or --graph FILE.g2o"
+            "nothing to export; give --map FILE.ply, --trajectory FILE.tum, --graph FILE.g2o or "
+            "--images FOLDER"
         )
-    _require_elsewhere(run, targets)
+    _require_elsewhere(run, wanted.targets)
+    if wanted.graph is not None:
+        require_graph_suffix(wanted.graph)  # now, not after seconds of reading
     remark = read_metrics(run / "metrics.json").get("remark") or ""
     lines = [f"note: {remark}"] if remark else []
-    if map_file is not None:
-        points = read_ply(folder / "map.ply")
-        if valid_only:
-            points = points.select(points.valid)
-        write_map(map_file, points, remark)
-        lines.append(f"{map_file}: {len(points)} landmarks")
-    if trajectory_file is not None:
-        trajectory = Trajectory.load(folder / "final.tum")
-        trajectory.save(trajectory_file, remark)
-        lines.append(f"{trajectory_file}: {len(trajectory)} poses")
-    if graph_file is not None:
-        lines.append(export_graph(graph_file, _log_of(run), folder, remark))
-    return lines
+    return [*lines, *_export(run, folder, wanted, remark)]
+
+
+def _export(run: Path, folder: Path, wanted: Wanted, remark: str) -> Iterator[str]:
+    trajectory = Trajectory.load(folder / "final.tum")
+    points = read_ply(folder / "map.ply")
+    points = points.select(points.valid) if wanted.valid_only else points
+    if wanted.trajectory is not None:
+        covariances = read_covariances(folder / "covariance.csv")[1]
+        _save(wanted.trajectory, trajectory, covariances, remark)
+        yield f"{wanted.trajectory}: {len(trajectory)} poses"
+    if wanted.graph is not None:
+        yield export_graph(wanted.graph, _log_of(run), folder, remark)
+    if wanted.colour or wanted.images:
+        log, config = MeasurementLog.load(_log_of(run)), load_config(run / RUN_MARKER)
+        points, line = export_images(wanted.images, config, log, trajectory, points)
+        yield from filter(None, [line])
+    if wanted.map is not None:
+        write_map(wanted.map, points, remark)
+        yield f"{wanted.map}: {len(points)} landmarks"
+
+
+def _save(path: Path, trajectory: Trajectory, covariances: FloatArray | None, remark: str) -> None:
+    if path.suffix.lower() == MCAP:
+        write_mcap(path, trajectory, covariances)
+    else:
+        trajectory.save(path, remark)
 
 
 def _log_of(run: Path) -> Path:
@@ -134,7 +182,7 @@ def export_map(
         write_map(map_file, points, remark)
         lines.append(f"{map_file}: {len(points)} landmarks")
     if trajectory_file is not None:
-        saved.trajectory.save(trajectory_file, remark)
+        _save(trajectory_file, saved.trajectory, None, remark)
         lines.append(f"{trajectory_file}: {len(saved.trajectory)} poses")
     return lines
 
@@ -196,7 +244,6 @@ def export_graph(path: Path, log_file: Path, folder: Path, remark: str = "") -> 
     Raises:
         FgslamError: another ending, or a file that is missing or damaged.
     """
-    require_graph_suffix(path)  # now, not after seconds of reading
     log = MeasurementLog.load(log_file)
     trajectory = Trajectory.load(folder / "final.tum")
     points = read_ply(folder / "map.ply")
@@ -222,8 +269,7 @@ def build_graph(
             not in the map start where their first observation puts them.
         positions: (m, 3) world, metres.
     """
-    row_of = {round(t, 9): row for row, t in enumerate(trajectory.timestamps.tolist())}
-    rows = np.array([row_of.get(round(s.timestamp, 9), -1) for s in log], np.int64)
+    rows = pose_rows(log, trajectory)
     kept = [_usable(increment) & (row >= 0) for increment, row in zip(log, rows, strict=True)]
     seen = [s.observations.select(keep) for s, keep in zip(log, kept, strict=True)]
     measurement = np.concatenate([np.empty((0, 3)), *(o.measurement for o in seen)])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -10,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from evo.tools import file_interface
 from recordings import experiment
 from running import (
     HANGS_AFTER_S,
@@ -60,7 +63,20 @@ def test_help_of_the_whole(monkeypatch: Patch, capfd: Capture) -> None:
     ("verb", "words"),
     [
         ("run", ("e.g. lab_loop", "--out", "--set", "--overwrite", "--resume")),
-        ("export", ("--map", ".ply", ".pcd", ".off", "--trajectory", ".tum", ".kitti")),
+        (
+            "export",
+            (
+                "--map",
+                ".ply",
+                ".pcd",
+                ".off",
+                "--trajectory",
+                ".tum",
+                ".kitti",
+                ".mcap",
+                "--images",
+            ),
+        ),
         ("export", ("--graph", ".g2o", "--estimator")),
         ("view", ("rerun viewer", "--save", ".rrd")),
         ("inspect", ("recording's folder", "--frames")),
@@ -244,12 +260,17 @@ def test_export_of_valid_landmarks_only(
 
 
 def test_export_of_the_trajectory(finished: Finished, tmp_path: Path, monkeypatch: Patch) -> None:
-    tum, kitti = tmp_path / "t.tum", tmp_path / "t.kitti"
+    tum, kitti, euroc = (tmp_path / f"t.{suffix}" for suffix in ("tum", "kitti", "csv"))
     assert main(monkeypatch, "export", finished.folder, "--trajectory", tum) == 0
+    assert main(monkeypatch, "export", finished.folder, "--trajectory", euroc) == 0
+    assert main(monkeypatch, "export", finished.folder, "--trajectory", tmp_path / "t.mcap") == 0
     assert main(monkeypatch, "export", finished.folder, "--trajectory", kitti) == 0
     truth = Trajectory.load(finished.folder / KIND / "final.tum")
     np.testing.assert_allclose(Trajectory.load(tum).poses, truth.poses, atol=1e-11)
     np.testing.assert_allclose(np.loadtxt(kitti).reshape(-1, 3, 4), truth.poses[:, :3], atol=1e-11)
+    read = file_interface.read_euroc_csv_trajectory(euroc)  # evo's own
+    np.testing.assert_allclose(read.timestamps, truth.timestamps, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(read.poses_se3, truth.poses, rtol=0, atol=1e-11)
 
 
 def test_export_of_the_graph(
@@ -265,6 +286,34 @@ def test_export_of_the_graph(
         shutil.copy(run / name, run / "compare")
     assert main(monkeypatch, "export", run / "compare", "--graph", again) == 0
     assert graph.read_bytes() == again.read_bytes()
+
+
+def test_export_of_images_for_photogrammetry_and_of_a_coloured_map(
+    finished: Finished, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    folder, file = tmp_path / "model", tmp_path / "map.ply"
+    arguments = ("--images", folder, "--map", file, "--colour")
+    assert main(monkeypatch, "export", finished.folder, *arguments) == 0
+    assert "36 images" in capfd.readouterr().out
+    names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
+    assert "images/left/000011.png" in names
+    assert "sparse/0/images.bin" in names
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    assert all((folder / frame["file_path"]).is_file() for frame in frames)
+    points = read_ply(file)
+    assert points.normals is not None
+    np.testing.assert_allclose(np.linalg.norm(points.normals, axis=1), 1.0, rtol=0, atol=1e-6)
+
+
+def test_export_of_images_says_where_the_recording_is_gone(
+    finished: Finished, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    run = Path(shutil.copytree(finished.folder, tmp_path / "run"))
+    config = run / "config.yaml"
+    text = config.read_text()
+    config.write_text(re.sub(r"path: .*", "path: /gone", text))
+    text = mistake(capfd, monkeypatch, "export", run, "--images", tmp_path / "model")
+    assert "/gone" in text
 
 
 def test_an_export_never_replaces_the_run_itself(
