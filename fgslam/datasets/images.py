@@ -71,6 +71,12 @@ def read_colour_image(path: Path) -> Image:
     return np.asarray(cv2.cvtColor(_decoded(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), np.uint8)
 
 
+def encoded_png(image: Image) -> bytes:
+    """A grey image, or one in red, green, blue, as a PNG file."""
+    shown = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    return bytes(cv2.imencode(".png", shown)[1])
+
+
 def _decoded(path: Path, mode: int) -> Image:
     try:
         data = path.read_bytes()

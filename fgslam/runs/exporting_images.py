@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
-import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -19,6 +18,7 @@ from fgslam.core.geometry import pose
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Observations
 from fgslam.core.sensors import CameraRig, pixel_model, vertical_to_horizontal
+from fgslam.datasets.images import encoded_png
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
 from fgslam.report.image_model import ImageModel, write_colmap, write_nerfstudio
@@ -202,14 +202,9 @@ def _take(
     if folder is not None:
         for name, image in zip(model.names[first:], shown, strict=False):
             path = folder / "images" / name
-            write_bytes(_made(path.parent) / path.name, _png(image))
+            write_bytes(_made(path.parent) / path.name, encoded_png(image))
     tints.sample(model, first, shown[0])
     return True
-
-
-def _png(image: Image) -> bytes:
-    shown = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    return bytes(cv2.imencode(".png", shown)[1])
 
 
 class Tints:

@@ -341,9 +341,9 @@ def test_mistakes_of_export(
         return mistake(capfd, monkeypatch, "export", *arguments)
 
     run = finished.folder
-    nothing = "nothing to export; give --map FILE.ply, --trajectory FILE.tum or --graph"
+    nothing = "nothing to export; give --map FILE.ply, --trajectory FILE.tum, --graph FILE.g2o or"
     assert nothing in reported(run)
-    assert "use .tum or .kitti" in reported(run, "--trajectory", tmp_path / "t.csv")
+    assert "use .tum, .kitti or .csv" in reported(run, "--trajectory", tmp_path / "t.txt")
     assert "use .g2o" in reported(run, "--graph", tmp_path / "t.graph")
     line = reported(run, "--map", tmp_path / "map.xyz")
     assert all(suffix in line for suffix in (".ply", ".pcd", ".off", "xyz"))
