@@ -22,6 +22,7 @@ from fgslam.report.page import write_html
 from fgslam.report.tables import read_metrics, write_json
 from fgslam.runs.config import load_experiment
 from fgslam.runs.config_models import Experiment
+from fgslam.runs.crews import Crew
 from fgslam.runs.folder import (
     METRICS_FILE,
     REPORT_FILE,
@@ -97,6 +98,7 @@ class Context:
         jobs: processes at a time.
         progress, stopped: as of :func:`run_task`.
         workers: processes that small units share, whichever their stage; None: there are none.
+        crew: does the units in place of processes of this machine; None: these do.
     """
 
     folder: Path
@@ -106,11 +108,12 @@ class Context:
     progress: Progress
     stopped: Stopped
     workers: Workers | None = None
+    crew: Crew | None = None
 
     def perform(self, stage: Stage[Argument, Result], single_threaded: bool = True) -> Done[Result]:
         """Does what is missing of a stage; as :func:`fgslam.runs.units.perform`."""
         loop = (self.jobs, self.progress, self.stopped)
-        return perform(stage, self.store, *loop, single_threaded, self.workers)
+        return perform(stage, self.store, *loop, single_threaded, self.workers, self.crew)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,6 +178,7 @@ def run_task(
     progress: Progress = lambda what, done, total: None,
     stopped: Stopped = lambda: False,
     jobs: int | None = None,
+    crew: Crew | None = None,
 ) -> R_co:
     """Runs a configuration into a run folder by the task that ``opener`` opens.
 
@@ -186,6 +190,7 @@ def run_task(
         progress: called after each step of the work.
         stopped: asked after each step; True ends the run early, resumable, with all files valid.
         jobs: processes at a time; None: as the configuration says, else one.
+        crew: does the units in place of processes of this machine; None: these do.
 
     Raises:
         FgslamError: of any kind, with a message for the user.
@@ -206,7 +211,8 @@ def run_task(
     jobs = jobs or getattr(config, "jobs", 1) or os.cpu_count() or 1
     resumed = existing == "resume"
     with Workers() as workers:
-        result = task.run(Context(folder, resumed, store, jobs, progress, stopped, workers))
+        loop = (jobs, progress, stopped, workers, crew)
+        result = task.run(Context(folder, resumed, store, *loop))
     if result.status == "finished":
         store.remove()
     return result

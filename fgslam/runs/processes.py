@@ -22,13 +22,14 @@ Result = TypeVar("Result")
 
 _POLL_S = 0.2
 _GRACE_S = 3.0
-_THREADS = (
+ONE_THREAD = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
     "MKL_NUM_THREADS",
     "NUMEXPR_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS",
 )
+"""Variables that keep linear algebra on one thread in a process that is started with them at 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,8 +250,8 @@ def _threads_limited(limited: bool) -> Iterator[None]:
     if not limited:
         yield
         return
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
         yield
     finally:

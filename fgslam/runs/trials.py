@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
@@ -16,19 +14,17 @@ import numpy as np
 from fgslam.backend.settings import EstimatorSettings, family_of
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, OutputError
-from fgslam.core.measurement_log import MeasurementLog
 from fgslam.datasets.settings import RenderedLabSettings, SimulatedMeasurementsSettings
 from fgslam.evaluation.comparing import MeanInterval, PairedTest, mean_interval, paired_test
-from fgslam.evaluation.consistency import Consistency, Nees, judge
-from fgslam.evaluation.judging import judge_replay
+from fgslam.evaluation.consistency import Consistency, judge
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, value_at
 from fgslam.report.tables import RESULT_COLUMNS, TIME_COLUMNS, write_comparison_csv, write_metrics
 from fgslam.runs.compare import EVERY, Choice, choose, require_room
 from fgslam.runs.config import load_experiment
 from fgslam.runs.config_models import Experiment, ExperimentConfig, HomingTrialsConfig
+from fgslam.runs.dask_crew import LocalCrew
 from fgslam.runs.engine import Context, Opener, Opening, RunResult, Status, Task, run_task
 from fgslam.runs.folder import (
-    LOG_FILE,
     METRICS_FILE,
     RUN_MARKER,
     TIMING_FILE,
@@ -38,17 +34,11 @@ from fgslam.runs.folder import (
 )
 from fgslam.runs.metric_tables import TRIAL_COLUMNS, metrics_table
 from fgslam.runs.opening import open_sequence
-from fgslam.runs.settings import OutputSettings
-from fgslam.runs.slam_comparison import load_truth
 from fgslam.runs.tasks.homing_trials import open_trials
-from fgslam.runs.tasks.slam import open_slam
-from fgslam.runs.tasks.slam_map_entry import arrival_of
-from fgslam.runs.tasks.slam_measurements import open_measured, write_recording
+from fgslam.runs.trial import Trial, TrialTask, perform_trial
 from fgslam.runs.units import Progress, Stopped, each_apart
-from fgslam.slam.replay import replay
 
 DEFAULT_FOLDER = "trials"
-_OUTPUT = OutputSettings(pictures=False, report=False, checkpoint_seconds=1e9)
 _SIGNIFICANT = 0.05
 _AVERAGED = (
     "ate_rmse_m",
@@ -76,24 +66,6 @@ class Seeds:
     first: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class TrialTask:
-    """One world of noise for one process."""
-
-    config: ExperimentConfig
-    seed: int
-    estimators: tuple[EstimatorSettings, ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Trial:
-    """What one world gave: metrics and normalised errors by title of the estimator."""
-
-    seed: int
-    metrics: dict[str, EstimatorMetrics]
-    nees: dict[str, dict[str, Nees]]
-
-
 def run_trials(
     source: Path,
     seeds: Seeds,
@@ -112,7 +84,7 @@ def run_trials(
         choice: which estimators, and overrides of theirs and of the experiment.
         out: folder of the results; None: `trials` in the run folder, or `runs/NAME_trials`.
         existing: what to do where results are already; `resume` goes on with the trials left.
-        jobs: processes at a time, each with linear algebra on one thread.
+        jobs: workers at a time, each with linear algebra on one thread.
         progress: called after each trial that is done.
         stopped: True ends the trials; those finished are kept.
 
@@ -133,7 +105,8 @@ def run_trials(
         changes: dict[str, Any] = {"trials": seeds.count, "seed": first}
         changes |= {"estimator": estimators[0], "compare": estimators[1:]}
         chosen = config.model_copy(update=changes)
-    return run_task(opener, chosen, folder, existing, progress, stopped, jobs)
+    with LocalCrew(jobs) as crew:
+        return run_task(opener, chosen, folder, existing, progress, stopped, jobs, crew)
 
 
 def _open(
@@ -186,31 +159,6 @@ def _result(
         particulars=(*failed, ("results", str(folder))),
         failed=bool(failures),
     )
-
-
-def perform_trial(task: TrialTask) -> Trial:
-    """One trial, start to end, in a folder that is gone afterwards."""
-    with tempfile.TemporaryDirectory(prefix="fgslam-trial-") as scratch:
-        run = Path(scratch) / "run"
-        maps = dataclasses.replace(task.config.map, save=None)
-        config = task.config.model_copy(
-            update={"seed": task.seed, "compare": (), "map": maps, "output": _OUTPUT}
-        )
-        if config.on_measurements:
-            run.mkdir()
-            write_recording(run, config, open_measured(config))
-        else:
-            run_task(open_slam, config, run)
-        log = MeasurementLog.load(run / LOG_FILE)
-        truth, arrival = load_truth(run, log), arrival_of(run)
-    metrics, nees = {}, {}
-    for settings in task.estimators:
-        answer = replay(log, settings, config.frontend.ego_motion, arrival=arrival)
-        judged = judge_replay(answer, truth)
-        # A process of several estimators has no memory of each.
-        metrics[settings.title] = dataclasses.replace(judged.metrics, peak_memory_mb=None)
-        nees[settings.title] = judged.nees
-    return Trial(task.seed, metrics, nees)
 
 
 def _experiment(source: Path, overrides: tuple[str, ...]) -> ExperimentConfig | HomingTrialsConfig:

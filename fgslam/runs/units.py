@@ -25,6 +25,7 @@ from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import MeasurementLogError, OutputError
 from fgslam.core.files import clear_output_errors, is_unfinished_file, make_subfolder
+from fgslam.runs.crews import Crew
 from fgslam.runs.processes import WorkerEnded, Workers, run_apart
 
 Argument = TypeVar("Argument")
@@ -172,6 +173,7 @@ def perform(
     stopped: Stopped,
     single_threaded: bool = True,
     workers: Workers | None = None,
+    crew: Crew | None = None,
 ) -> Done[Result]:
     """Does what is missing of a stage, in processes.
 
@@ -183,6 +185,7 @@ def perform(
         stopped: True ends it; what was done until then is kept.
         single_threaded: linear algebra on one thread a process.
         workers: processes for the blocks of small units; None: each block has one of its own.
+        crew: does the blocks in place of processes of this machine; None: these do.
 
     Raises:
         FgslamError: what a unit raised, or a unit's file cannot be written or read.
@@ -194,7 +197,11 @@ def perform(
     progress(stage.label, len(found), stage.count)
     arguments = [stage.argument(block) for block in blocks]
     kept = workers if stage.small else None
-    for index, result in run_apart(stage.work, arguments, jobs, stopped, single_threaded, kept):
+    if crew is not None:
+        pieces = crew.do(stage.work, arguments, stopped)
+    else:
+        pieces = run_apart(stage.work, arguments, jobs, stopped, single_threaded, kept)
+    for index, result in pieces:
         block = blocks[index]
         if isinstance(result, WorkerEnded):
             ended.append((block, result.why))

@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.trajectories import Trajectory, read_covariances
 from fgslam.report.point_cloud import read_ply
 from fgslam.runs.config import make_config
+from fgslam.runs.crews import Here
 from fgslam.runs.engine import run_task
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.tasks.slam import SlamResult, open_slam
@@ -83,6 +84,7 @@ def units_in_this_process() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fgslam.runs.units.run_apart", here)
+        patch.setattr("fgslam.runs.trials.LocalCrew", lambda jobs: nullcontext(Here()))
         yield
 
 

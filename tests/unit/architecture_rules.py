@@ -57,9 +57,12 @@ THIRD_PARTY_HOMES: dict[str, frozenset[str]] = {
     "open3d": frozenset({"worlds", "report"}),
     "gtsam": frozenset({"factors", "backend"}),
     "gtsam_unstable": frozenset({"factors", "backend"}),
+    "distributed": frozenset({"runs"}),
+    "dask": frozenset({"runs"}),
+    "pyarrow": frozenset({"report"}),
 }
-LAZY_LIBRARIES = frozenset({"open3d"})
-"""Imported inside functions only: their import is slow and needs system libraries."""
+LAZY_LIBRARIES = frozenset({"open3d", "distributed", "dask", "pyarrow"})
+"""Imported inside functions only: their import is slow, and few commands need them."""
 
 FORBIDDEN_LIBRARIES = frozenset(
     {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "random"}

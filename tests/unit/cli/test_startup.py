@@ -9,7 +9,7 @@ import pytest
 
 HEAVY = frozenset(
     {"cv2", "gtsam", "jinja2", "matplotlib", "numpy", "open3d", "pandas", "PIL", "plotly"}
-    | {"rerun", "scipy", "skimage", "yaml"}
+    | {"dask", "distributed", "pyarrow", "rerun", "scipy", "skimage", "yaml"}
 )
 _RUN = """
 import contextlib, os, sys
