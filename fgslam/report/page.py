@@ -29,10 +29,11 @@ if TYPE_CHECKING:
 
 NOT_KNOWN = "not known"
 
-MAX_WIDTH = 1400
-BUDGET_BYTES = 2_800_000
-_KEPT_AS_IT_IS = 120_000
-_QUALITY = 80
+MAX_WIDTH = 1100
+BUDGET_BYTES = 440_000
+"""Of all pictures together, so that a page with its plots stays below three megabytes."""
+_KEPT_AS_IT_IS = 40_000
+_QUALITY = 55
 
 
 def write_html(path: Path, page: Page) -> None:
@@ -139,7 +140,7 @@ def embed(pictures: Sequence[Picture]) -> tuple[list[Embedded], list[str]]:
         if found is None:
             left_out.append(f"Picture not readable: {picture.caption}")
         elif spent + len(found.uri) > BUDGET_BYTES * 4 / 3:
-            left_out.append(f"Left out to keep this page small: {picture.caption}")
+            left_out.append(f"Left out to keep this page small, see the run folder: {picture.caption}")
         else:
             spent += len(found.uri)
             shown.append(found)

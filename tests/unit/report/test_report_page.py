@@ -365,7 +365,7 @@ def test_long_runs_stay_small() -> None:
     text = render(ReportData("long", "", reports, truth, pictures=(noise,) * 5))
     assert len(text.encode()) < 8e6
     assert "to keep this page small" in text
-    assert text.count("Left out to keep this page small: noise") >= 1  # pictures at their worst
+    assert text.count("Left out to keep this page small, see the run folder: noise") >= 1  # pictures at their worst
 
 
 def test_an_error_of_the_disk_is_reported(tmp_path: Path) -> None:
@@ -399,7 +399,7 @@ def test_small_pictures_are_kept_and_large_ones_shrunk(rng: np.random.Generator)
     assert (kept.width, kept.height) == (64, 48)
     assert shrunk.uri.startswith("data:image/webp;base64,")
     with Image.open(io.BytesIO(base64.b64decode(shrunk.uri.partition(",")[2]))) as opened:
-        assert opened.size == (MAX_WIDTH, 630)
+        assert opened.size == (MAX_WIDTH, 495)
 
 
 def test_pictures_that_cannot_be_shown_are_listed(rng: np.random.Generator) -> None:
@@ -412,4 +412,4 @@ def test_pictures_that_cannot_be_shown_are_listed(rng: np.random.Generator) -> N
     assert 0 < len(shown) < 12
     assert len(shown) + len(left_out) == 12
     assert sum(len(p.uri) for p in shown) < BUDGET_BYTES * 1.34
-    assert left_out[0] == f"Left out to keep this page small: p{len(shown)}"
+    assert left_out[0] == f"Left out to keep this page small, see the run folder: p{len(shown)}"
