@@ -32,6 +32,7 @@ NOT_KNOWN = "not known"
 MAX_WIDTH = 1100
 BUDGET_BYTES = 440_000
 """Of all pictures together, so that a page with its plots stays below three megabytes."""
+_TOO_MUCH = "Left out to keep this page small, see the run folder"
 _KEPT_AS_IT_IS = 40_000
 _QUALITY = 55
 
@@ -140,7 +141,7 @@ def embed(pictures: Sequence[Picture]) -> tuple[list[Embedded], list[str]]:
         if found is None:
             left_out.append(f"Picture not readable: {picture.caption}")
         elif spent + len(found.uri) > BUDGET_BYTES * 4 / 3:
-            left_out.append(f"Left out to keep this page small, see the run folder: {picture.caption}")
+            left_out.append(f"{_TOO_MUCH}: {picture.caption}")
         else:
             spent += len(found.uri)
             shown.append(found)
