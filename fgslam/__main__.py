@@ -1,6 +1,6 @@
 """Runs the command line: ``python -m fgslam`` is ``fgslam``."""
 
-from fgslam.cli.main import main
+from fgslam.cli.start import main
 
 if __name__ == "__main__":
     main()

@@ -5,18 +5,17 @@ from __future__ import annotations
 import json
 import os
 import shlex
-import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fgslam.cli import options
+from fgslam.cli import options, signals
+from fgslam.cli.signals import stop_flag
 from fgslam.core.errors import FgslamError
 from fgslam.runs.named_experiments import experiment_names, find_experiment
 
@@ -29,9 +28,9 @@ Tell = Callable[[str, int, int], None]
 
 EXIT_USER = 2
 EXIT_FAULT = 1
-EXIT_INTERRUPTED = 130  # as a shell reports a process that Ctrl-C ended
 # Typer exports only the child; its parent's home differs from one Typer to the next.
 _UsageError: type[typer.BadParameter] = typer.BadParameter.__bases__[0]
+_OF_TYPER = 130  # what it makes of any KeyboardInterrupt; no command of ours returns it
 _CLOSE_OPTIONS = 0.6  # typer offers --out for --foo
 _NOTHING_TO_SAVE = ("rendering", "reading", "matching")
 
@@ -133,7 +132,7 @@ def _show(results: Sequence[RunResult], resume: str = "") -> None:
 def _exit_as(results: Sequence[RunResult]) -> None:
     """Exits as the results ended: with 0, interrupted, or an estimator was asked in vain."""
     if any(result.status == "interrupted" for result in results):
-        raise typer.Exit(EXIT_INTERRUPTED)
+        raise SystemExit(signals.status())
     if any(result.failed for result in results):
         raise typer.Exit(EXIT_FAULT)
 
@@ -356,13 +355,22 @@ def _keep_close_options(error: Exception) -> None:
         error.possibilities = [names[name] for name in close]  # type: ignore[attr-defined]
 
 
+def _performed(arguments: list[str]) -> int:
+    """Exit status of a command. Raises what it raised, an interruption as KeyboardInterrupt."""
+    status = int(app(arguments, prog_name="fgslam", standalone_mode=False) or 0)
+    if status == _OF_TYPER and signals.was_asked():
+        raise KeyboardInterrupt
+    return status
+
+
 def main() -> None:
     """Entry point: runs a command, turns a user's mistake into one line and exit status 2."""
     # None is used, and the search through all installed packages is a tenth of reading settings.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     arguments = sys.argv[1:] or ["--help"]
+    signals.forget()
     try:
-        raise SystemExit(app(arguments, prog_name="fgslam", standalone_mode=False))
+        raise SystemExit(_performed(arguments))
     except _UsageError as error:
         command = error.ctx.command_path if error.ctx else "fgslam"
         _keep_close_options(error)
@@ -374,33 +382,15 @@ def main() -> None:
         raise SystemExit(EXIT_USER) from None
     except (KeyboardInterrupt, typer.Abort):  # the first becomes the second on its way
         print("fgslam: interrupted", file=sys.stderr)
-        raise SystemExit(EXIT_INTERRUPTED) from None
+        raise SystemExit(signals.status()) from None
     except BrokenPipeError:
         raise SystemExit(EXIT_FAULT) from None
-
-
-@contextmanager
-def stop_flag() -> Iterator[Callable[[], bool]]:
-    """Turns the first Ctrl-C or TERM into a flag; the second Ctrl-C ends at once."""
-    raised = ending = False
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        nonlocal raised, ending
-        if raised:
-            ending = True
-            # A third one would cut short the end of the threads, which aborts the process.
-            for each in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(each, signal.SIG_IGN)
-            raise KeyboardInterrupt
-        raised = True
-
-    before = {n: signal.signal(n, handle) for n in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: raised
-    finally:
-        if not ending:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+    except Exception:
+        if not signals.was_asked():
+            raise
+        # Some library made another error of the signal.
+        print("fgslam: interrupted", file=sys.stderr)
+        raise SystemExit(signals.status()) from None
 
 
 def stoppable(progress: Tell, stopped: Callable[[], bool]) -> Tell:

@@ -11,6 +11,7 @@ import types
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any, Generic, TypeVar
@@ -21,8 +22,8 @@ Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 
 _POLL_S = 0.2
-_GRACE_S = 3.0
 ONE_THREAD = (
+_GRACE_S = 0.7  # a command ends within two seconds, its workers before it
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
     "MKL_NUM_THREADS",
@@ -147,7 +148,7 @@ def _new_worker(single_threaded: bool) -> _Worker:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(theirs,), daemon=True)
-    with _without_main():
+    with _without_main(), _deaf_to_ctrl_c():
         process.start()
     theirs.close()  # so that the end of the process is the end of the pipe
     return _Worker(process, ours, single_threaded)
@@ -159,8 +160,14 @@ def _send(worker: _Worker, function: Callable[[Argument], Result], argument: Arg
     Handed over as arguments of the process, work larger than the pipe's buffer would be waited for
     without end: multiprocessing keeps the reading end open while it writes.
     """
-    with suppress(BrokenPipeError, ConnectionResetError):  # _collect says how it ended
-        worker.connection.send((function, argument))
+
+    def send() -> None:
+        with suppress(OSError):  # _collect says how it ended
+            worker.connection.send((function, argument))
+
+    # In a thread, since a worker reads after its imports only and work may exceed the pipe's
+    # buffer: who waited here would hear of no signal.
+    threading.Thread(target=send, daemon=True).start()
 
 
 @contextmanager
@@ -177,9 +184,23 @@ def _without_main() -> Iterator[None]:
         sys.modules["__main__"] = main
 
 
+@contextmanager
+def _deaf_to_ctrl_c() -> Iterator[None]:
+    """A process that is started inside never hears Ctrl-C, which is the parent's to answer.
+
+    Ignored by the worker itself it would be after its imports only. One that arrives inside reaches
+    this process afterwards.
+    """
+    resource_tracker.ensure_running()  # its start would take the block away
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _work(connection: Connection) -> None:
-    """In the worker: Ctrl-C is the parent's to answer; asked to end, it clears up first."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """In the worker: asked to end, it clears up first."""
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     threading.Thread(target=_end_with_parent, daemon=True).start()
     while (work := _received(connection)) is not None:

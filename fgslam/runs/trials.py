@@ -130,12 +130,21 @@ def _run(config: ExperimentConfig, tasks: Sequence[TrialTask], context: Context)
     done = context.perform(each_apart(("trials", "trials"), perform_trial, tasks, Trial))
     failures = sorted(f"trial with seed {tasks[k].seed}: {why}" for (k,), why in done.ended)
     if not done.results:
-        raise OutputError(f"no trial was finished; {failures[0] if failures else 'interrupted'}")
+        return _none(config, context, failures)
     kinds = {settings.title: settings.kind for settings in tasks[0].estimators}
     summary = summarise(list(done.results.values()), kinds)
-    write_trials(context.folder, config.name, summary, failures)
     status: Status = "interrupted" if context.stopped() else "finished"
+    write_trials(context.folder, config.name, summary, failures, status)
     return _result(config, context.folder, status, summary, failures)
+
+
+def _none(config: ExperimentConfig, context: Context, failures: Sequence[str]) -> RunResult:
+    """Stopped before the first trial was finished. Raises OutputError where each one failed."""
+    if not context.stopped():
+        raise OutputError(f"no trial was finished; {failures[0]}")
+    about: dict[str, JsonValue] = {"name": config.name, "status": "interrupted", "trials": 0}
+    write_metrics(context.folder / METRICS_FILE, 0, {}, about)
+    return RunResult(config, context.folder, "interrupted", ("No trial was finished.",))
 
 
 def _result(
@@ -267,7 +276,13 @@ def summarise(trials: Sequence[Trial], kinds: Mapping[str, str]) -> TrialSummary
     return TrialSummary(tuple(trials), means, pooled, tuple(_pairs(ate, kinds)), dict(kinds))
 
 
-def write_trials(folder: Path, name: str, summary: TrialSummary, failures: Sequence[str]) -> None:
+def write_trials(
+    folder: Path,
+    name: str,
+    summary: TrialSummary,
+    failures: Sequence[str],
+    status: Status,
+) -> None:
     """trials.csv (the same bytes for the same seeds), trials_timing.csv and metrics.json."""
     rows = [
         (str(one.seed), {title: metrics.as_json() for title, metrics in one.metrics.items()})
@@ -277,6 +292,7 @@ def write_trials(folder: Path, name: str, summary: TrialSummary, failures: Seque
     write_comparison_csv(folder / TIMING_FILE, rows, TIME_COLUMNS, "seed")
     about: dict[str, JsonValue] = {
         "name": name,
+        "status": status,
         "trials": len(rows),
         "seeds": [one.seed for one in summary.trials],
         "failures": list(failures),

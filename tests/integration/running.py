@@ -143,7 +143,7 @@ def main(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
 
 
 def command(*arguments: object) -> list[str]:
-    return [sys.executable, "-c", "from fgslam.cli.main import main; main()", *map(str, arguments)]
+    return [sys.executable, "-c", "from fgslam.cli.start import main; main()", *map(str, arguments)]
 
 
 def start(*arguments: object, **environment: str) -> subprocess.Popen[str]:

@@ -1,0 +1,67 @@
+"""Ctrl-C and SIGTERM end a command from its first moment on, whatever it is at."""
+
+from __future__ import annotations
+
+import functools
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from fgslam.cli.signals import WITHIN_S
+from fgslam.runs.processes import run_apart
+
+_WHILE_IMPORTING = """
+import os, sys
+from fgslam.cli.start import main
+number, module = int(sys.argv.pop(1)), sys.argv.pop(1)
+
+class Signalling:
+    def find_spec(self, name, *rest):
+        if name == module:
+            os.kill(os.getpid(), number)
+
+sys.meta_path.insert(0, Signalling())
+main()
+"""
+_STUCK = """
+import os, sys, time
+from fgslam.cli import signals
+signals.watch()
+with signals.stop_flag():
+    os.kill(os.getpid(), int(sys.argv[1]))
+    time.sleep(600.0)
+"""
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+def ended(code: str, *arguments: object) -> tuple[int, str]:
+    given = [sys.executable, "-c", code, *map(str, arguments)]
+    done = subprocess.run(given, capture_output=True, text=True, timeout=60.0)  # noqa: S603
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize("number", _SIGNALS)
+@pytest.mark.parametrize("module", ["typer", "pydantic", "yaml"])
+def test_while_a_command_imports_a_signal_ends_it_with_one_line(
+    number: signal.Signals, module: str
+) -> None:
+    status, said = ended(_WHILE_IMPORTING, int(number), module, "run", "lab_loop")
+    assert (status, said) == (128 + number, "fgslam: interrupted\n")
+
+
+@pytest.mark.parametrize("number", _SIGNALS)
+def test_a_command_that_does_not_end_by_itself_is_ended(number: signal.Signals) -> None:
+    status, said = ended(_STUCK, int(number))
+    assert status == 128 + number
+    assert said == "fgslam: interrupted; what was saved until then is in valid files\n"
+    assert WITHIN_S < 2.0
+
+
+def test_a_worker_hears_no_ctrl_c_from_its_first_moment_on() -> None:
+    """Ctrl-C reaches every process of a terminal; a worker still imports then."""
+    blocked = functools.partial(signal.pthread_sigmask, signal.SIG_BLOCK)
+    [(_, inherited)] = run_apart(blocked, [()])
+    assert signal.SIGINT in inherited
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
