@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
+from multiprocessing.reduction import ForkingPickler
 from typing import Any, Generic, TypeVar
 
 from fgslam.core.errors import FgslamError
@@ -163,8 +164,9 @@ def _send(worker: _Worker, function: Callable[[Argument], Result], argument: Arg
 
     def send() -> None:
         with suppress(OSError):  # _collect says how it ended
-            worker.connection.send((function, argument))
+            worker.connection.send_bytes(work)
 
+    work = ForkingPickler.dumps((function, argument))
     # In a thread, since a worker reads after its imports only and work may exceed the pipe's
     # buffer: who waited here would hear of no signal.
     threading.Thread(target=send, daemon=True).start()
