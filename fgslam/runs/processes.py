@@ -23,8 +23,8 @@ Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 
 _POLL_S = 0.2
-ONE_THREAD = (
 _GRACE_S = 0.7  # a command ends within two seconds, its workers before it
+ONE_THREAD = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
     "MKL_NUM_THREADS",
