@@ -385,7 +385,7 @@ def main() -> None:
         raise SystemExit(signals.status()) from None
     except BrokenPipeError:
         raise SystemExit(EXIT_FAULT) from None
-    except Exception:
+    except (ImportError, RuntimeError, SystemError, AttributeError, TypeError):
         if not signals.was_asked():
             raise
         # Some library made another error of the signal.
