@@ -299,6 +299,23 @@ def export(
 
 
 @app.command()
+def film(
+    run_folder: options.RunToView,
+    out: Annotated[Path, typer.Argument(metavar="FILE", help="the film, .mp4 or .gif")],
+    estimator: Annotated[
+        str | None, typer.Option(help="whose path and map; default the one that steered")
+    ] = None,
+) -> None:
+    """Make a film of a run: images with their matches, beside the map as it grows."""
+    from fgslam.cli.console import progress_bar
+    from fgslam.runs.film import film_of_run
+
+    with progress_bar() as progress:
+        line = film_of_run(run_folder, out, estimator, progress)
+    typer.echo(line)
+
+
+@app.command()
 def merge(
     first: options.FirstMap,
     second: options.SecondMap,

@@ -77,7 +77,7 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
                 "images; give --map or --trajectory, or a run folder"
             )
         return export_map(run, wanted.map, wanted.trajectory, wanted.valid_only)
-    folder = run / _estimator_of(run, wanted.estimator)
+    folder = run / results_folder(run, wanted.estimator)
     if not any(wanted.targets):
         raise ConfigError(
             "nothing to export; give --map FILE.ply, --trajectory FILE.tum, --graph FILE.g2o or "
@@ -100,9 +100,9 @@ def _export(run: Path, folder: Path, wanted: Wanted, remark: str) -> Iterator[st
         _save(wanted.trajectory, trajectory, covariances, remark)
         yield f"{wanted.trajectory}: {len(trajectory)} poses"
     if wanted.graph is not None:
-        yield export_graph(wanted.graph, _log_of(run), folder, remark)
+        yield export_graph(wanted.graph, log_of(run), folder, remark)
     if wanted.colour or wanted.images:
-        log, config = MeasurementLog.load(_log_of(run)), load_config(run / RUN_MARKER)
+        log, config = MeasurementLog.load(log_of(run)), load_config(run / RUN_MARKER)
         points, line = export_images(wanted.images, config, log, trajectory, points)
         yield from filter(None, [line])
     if wanted.map is not None:
@@ -117,7 +117,7 @@ def _save(path: Path, trajectory: Trajectory, covariances: FloatArray | None, re
         trajectory.save(path, remark)
 
 
-def _log_of(run: Path) -> Path:
+def log_of(run: Path) -> Path:
     """The measurements: of a comparison, which has none of its own, those of the run above it."""
     own, above = run / LOG_FILE, run.resolve().parent / LOG_FILE
     return above if above.is_file() and not own.is_file() else own
@@ -131,7 +131,12 @@ def _require_elsewhere(run: Path, targets: tuple[Path | None, ...]) -> None:
             raise ConfigError(f"{target}: is one of the run's own files; export to another name")
 
 
-def _estimator_of(run: Path, wanted: str | None) -> str:
+def results_folder(run: Path, wanted: str | None) -> str:
+    """Name of the folder with an estimator's results in a run; None is the one that steered.
+
+    Raises:
+        FgslamError: no run of SLAM there, no results yet, or another estimator.
+    """
     if not is_run_folder(run):
         raise DatasetError(f"{run}: not a run folder (no config.yaml); give what fgslam run wrote")
     if (task := read_mapping(run / RUN_MARKER).get("task")) is not None:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from evo.tools import file_interface
@@ -303,6 +304,33 @@ def test_export_of_images_for_photogrammetry_and_of_a_coloured_map(
     points = read_ply(file)
     assert points.normals is not None
     np.testing.assert_allclose(np.linalg.norm(points.normals, axis=1), 1.0, rtol=0, atol=1e-6)
+
+
+def test_film_of_a_run_shows_every_frame(
+    finished: Finished, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    film = tmp_path / "run.mp4"
+    assert main(monkeypatch, "film", finished.folder, film) == 0
+    assert "12 frames" in capfd.readouterr().out
+    shown = cv2.VideoCapture(str(film))
+    frames = [frame for ok, frame in iter(shown.read, (False, None)) if ok]
+    assert len(frames) == 12
+    moved = np.abs(frames[-1].astype(int) - frames[0]).max(axis=2) > 60
+    half = moved.shape[1] // 2
+    assert moved[:, :half].any()  # the image on the left
+    assert moved[:, half:].any()  # the map on the right
+
+
+def test_mistakes_of_film(
+    finished: Finished, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    assert "use .mp4 or .gif" in mistake(
+        capfd, monkeypatch, "film", finished.folder, tmp_path / "run.avi"
+    )
+    assert "no estimator 'x'" in mistake(
+        capfd, monkeypatch, "film", finished.folder, tmp_path / "a.gif", "--estimator", "x"
+    )
+    assert not list(tmp_path.iterdir())
 
 
 def test_export_of_images_says_where_the_recording_is_gone(

@@ -36,7 +36,7 @@ _NO_METADATA: dict[str, Any] = {"Software": None}
 # On the screen whites become this grey, so that bright marks stand out on windows and posters.
 _WHITE = 0.78
 
-_STYLE: dict[str, Any] = {
+PICTURE_STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 12.0,
     "axes.titlesize": 14.0,
@@ -76,7 +76,7 @@ def picture(path: Path, width: float, height: float) -> Iterator[Figure]:
     Raises:
         OutputError: the file cannot be written.
     """
-    with matplotlib.style.context(_STYLE, after_reset=True):
+    with matplotlib.style.context(PICTURE_STYLE, after_reset=True):
         figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
         FigureCanvasAgg(figure)
         yield figure
@@ -87,8 +87,8 @@ def picture(path: Path, width: float, height: float) -> Iterator[Figure]:
 
 
 def show_image(axes: Axes, image: Image, title: str, note: str = "") -> None:
-    """A grey image, dimmed so that bright marks stand out, without axes."""
-    height, width = image.shape
+    """An image, dimmed so that bright marks stand out (in colour: as it is), without axes."""
+    height, width = image.shape[:2]
     darkest, brightest = np.percentile(image, [0.5, 99.5])
     span = max(float(brightest - darkest), 32.0) / _WHITE
     axes.imshow(

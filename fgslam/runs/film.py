@@ -1,0 +1,110 @@
+"""A run as a film: the camera's images with the matches, beside the map as it grows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.errors import ConfigError, DatasetError, FrameError
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.measurements import Observations
+from fgslam.core.sensors import CameraRig
+from fgslam.core.trajectories import Trajectory
+from fgslam.datasets.film_files import require_film_suffix, write_film
+from fgslam.report.figures.trajectory import level_axes
+from fgslam.report.pictures.film import FilmCanvas, Moment
+from fgslam.report.point_cloud import MapPoints, read_ply
+from fgslam.runs.config import load_config
+from fgslam.runs.exporting import log_of, results_folder
+from fgslam.runs.exporting_images import Pictures, frames_of, pose_rows
+from fgslam.runs.folder import RUN_MARKER
+from fgslam.runs.report import load_report
+
+_MOST_FPS = 30.0
+Progress = Callable[[str, int, int], None]
+
+
+def film_of_run(run: Path, out: Path, estimator: str | None, progress: Progress) -> str:
+    """Writes the film of a run; a line about it.
+
+    Path and landmarks are those known at the end; a landmark appears with the frame that saw it
+    first. The film runs as fast as the recording, at most 30 frames a second.
+
+    Args:
+        run: what ``fgslam run`` wrote.
+        out: the file, .mp4 or .gif.
+        estimator: whose path and map; None for the one that steered.
+        progress: called with what is done, how far, of how much.
+
+    Raises:
+        FgslamError: no run of cameras there, its recording is gone, or the film cannot be written.
+    """
+    require_film_suffix(out)
+    folder = run / results_folder(run, estimator)
+    trajectory, points = Trajectory.load(folder / "final.tum"), read_ply(folder / "map.ply")
+    log = MeasurementLog.load(log_of(run))
+    if not isinstance(log.rig, CameraRig):
+        raise DatasetError(f"{run}: its sensor has no images, so that there is nothing to film")
+    if len(trajectory) < 2:
+        raise ConfigError(f"{run}: has {len(trajectory)} poses; a film needs two at least")
+    fps = min(_MOST_FPS, 1.0 / float(np.median(np.diff(trajectory.timestamps))))
+    rows, pictures = frames_of(load_config(run / RUN_MARKER), trajectory)
+    moments = _moments(log, pose_rows(log, trajectory), points, rows, pictures)
+    data = load_report(run)
+    plane = level_axes(data.up)[:2]
+    truth = None if data.truth is None else data.truth.poses[:, :3, 3] @ plane.T
+    above = points.positions @ plane.T
+    canvas = FilmCanvas(trajectory.poses[:, :3, 3] @ plane.T, above, truth, data.title)
+    total = len(trajectory)
+
+    def frames() -> Iterator[Image]:
+        for done, (row, moment, known) in enumerate(moments):
+            progress("film", done, total)
+            yield canvas.draw(moment, above[known], row)
+
+    count = write_film(out, frames(), fps)
+    progress("film", total, total)
+    return f"{out}: {count} frames"
+
+
+def _moments(
+    log: MeasurementLog,
+    pose_of: IntArray,
+    points: MapPoints,
+    rows: IntArray,
+    pictures: Pictures,
+) -> Iterator[tuple[int, Moment, IntArray]]:
+    """Pose, what is seen there, and the rows of the map that are known by then."""
+    seen, last = np.zeros(len(points), np.bool_), None
+    for increment, row in zip(log, pose_of.tolist(), strict=True):
+        if row < 0:
+            continue
+        now = increment.observations.select(~increment.rejected)
+        seen |= np.isin(points.ids, now.ids)
+        before, after = _flow(last, now)
+        title = f"{increment.timestamp - log.increments[0].timestamp:.1f} s: {len(after)} matched"
+        new = now.measurement[now.is_new, :2]
+        yield (
+            row,
+            Moment(_image(pictures, int(rows[row])), before, after, new, title),
+            np.flatnonzero(seen),
+        )
+        last = now
+
+
+def _flow(last: Observations | None, now: Observations) -> tuple[FloatArray, FloatArray]:
+    """Pixels (k, 2) before and after of what both frames saw."""
+    if last is None:
+        return np.empty((0, 2)), np.empty((0, 2))
+    _, a, b = np.intersect1d(last.ids, now.ids, return_indices=True)
+    return last.measurement[a, :2], now.measurement[b, :2]
+
+
+def _image(pictures: Pictures, frame: int) -> Image | None:
+    try:
+        return pictures(frame)[0]
+    except FrameError:
+        return None

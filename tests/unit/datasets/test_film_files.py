@@ -1,0 +1,42 @@
+"""Films, written and read back by the libraries that others use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image as Pillow
+
+from fgslam.core.arrays import Image
+from fgslam.core.errors import OutputError
+from fgslam.datasets.film_files import write_film
+
+
+def greys(n: int, width: int = 64) -> list[Image]:
+    return [np.full((48, width, 3), 8 * k, np.uint8) for k in range(n)]
+
+
+def test_mp4_has_every_frame_in_order(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    assert write_film(path, greys(30), 25.0) == 30
+    film = cv2.VideoCapture(str(path))
+    assert film.get(cv2.CAP_PROP_FPS) == pytest.approx(25.0)
+    levels = [frame.mean() for ok, frame in iter(film.read, (False, None)) if ok]
+    np.testing.assert_allclose(levels, 8.0 * np.arange(30), rtol=0, atol=4.0)
+
+
+def test_gif_is_thinned_to_ten_frames_a_second_and_narrowed(tmp_path: Path) -> None:
+    path = tmp_path / "a.gif"
+    assert write_film(path, greys(30, width=1440), 20.0) == 15
+    with Pillow.open(path) as film:
+        assert (film.n_frames, film.size) == (15, (720, 24))  # type: ignore[attr-defined]
+        assert film.info["duration"] == 100
+
+
+@pytest.mark.parametrize(("name", "frames"), [("a.avi", 3), ("a.mp4", 0), ("a.gif", 0)])
+def test_what_cannot_be_written_leaves_no_file(tmp_path: Path, name: str, frames: int) -> None:
+    with pytest.raises(OutputError, match="cannot write"):
+        write_film(tmp_path / name, greys(frames), 10.0)
+    assert not list(tmp_path.iterdir())
