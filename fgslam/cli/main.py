@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 import sys
@@ -51,6 +50,11 @@ def run(  # noqa: PLR0913 - each option is a parameter
     config: options.Experiment,
     out: options.RunFolder = None,
     camera: options.Camera = None,
+    start: options.Start = None,
+    stop: options.Stop = None,
+    stride: options.Stride = None,
+    topics: options.Topics = None,
+    estimator: options.Estimator = None,
     overrides: options.Overrides = None,
     overwrite: options.Overwrite = False,
     resume: options.Resume = False,
@@ -70,9 +74,10 @@ def run(  # noqa: PLR0913 - each option is a parameter
     from fgslam.runs.bare_recording import experiment_of
 
     existing = _existing(overwrite, resume)
-    maps = {"load": map_in, "save": map_out}
-    given = [f"map.{key}={json.dumps(str(path))}" for key, path in maps.items() if path]
-    settings, said = experiment_of(config, camera, [*(overrides or ()), *given])
+    given = {**_frames(start, stop, stride), "estimator.kind": estimator}
+    given |= {"map.load": map_in, "map.save": map_out}
+    chosen = [*options.as_overrides(given), *options.topics_override(topics)]
+    settings, said = experiment_of(config, camera, [*(overrides or ()), *chosen])
     if said:
         typer.echo(said)
     folder = out or Path("runs") / settings.name
@@ -92,12 +97,30 @@ def run(  # noqa: PLR0913 - each option is a parameter
     _exit_as([result])
 
 
+def _frames(
+    start: int | None, stop: int | None, stride: int | None
+) -> dict[str, str | int | Path | None]:
+    """Which frames of a recording, by the keys that say it."""
+    return {"dataset.start": start, "dataset.stop": stop, "dataset.stride": stride}
+
+
 @app.command()
-def init(recording: options.BareRecording, camera: options.Camera = None) -> None:
+def init(
+    recording: options.BareRecording,
+    camera: options.Camera = None,
+    start: options.Start = None,
+    stop: options.Stop = None,
+    stride: options.Stride = None,
+    topics: options.Topics = None,
+    estimator: options.Estimator = None,
+    overrides: options.Overrides = None,
+) -> None:
     """Print the short configuration that repeats `fgslam run RECORDING`, as YAML."""
     from fgslam.runs.bare_recording import short_config
 
-    typer.echo(short_config(recording, camera), nl=False)
+    given = {**_frames(start, stop, stride), "estimator.kind": estimator}
+    chosen = [*options.as_overrides(given), *options.topics_override(topics)]
+    typer.echo(short_config(recording, camera, [*(overrides or ()), *chosen]), nl=False)
 
 
 @app.command()

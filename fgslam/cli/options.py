@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from fgslam.core.errors import ConfigError, DatasetError
-from fgslam.datasets.layouts import fitting_layouts, recognise_layout
+from fgslam.datasets.layouts import fitting_layouts, is_recording, recognise_layout
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
 from fgslam.runs.named_experiments import experiment_names, find_experiment, suggestion
 
@@ -26,9 +28,9 @@ def experiment(given: str) -> Path:
     Raises FgslamError.
     """
     path = find_experiment(Path(given))
-    if path.is_dir():
+    if path.suffix.lower() not in YAML_ENDINGS and (path.exists() or is_recording(path)):
         fitting_layouts(path)
-    if not path.exists():
+    elif not path.exists():
         raise ConfigError(f"{path}: no such file or folder; {suggestion(path)}")
     return path
 
@@ -92,6 +94,22 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
+def as_overrides(given: Mapping[str, str | int | Path | None]) -> list[str]:
+    """``a.b=value`` of the options that were given, by the key that each sets."""
+    return [
+        f"{key}={value if isinstance(value, int) else json.dumps(str(value))}"
+        for key, value in given.items()
+        if value is not None
+    ]
+
+
+def topics_override(topics: str | None) -> list[str]:
+    """The override of the topics of a bag, from their names between commas."""
+    if topics is None:
+        return []
+    return [f"dataset.topics={json.dumps([name.strip() for name in topics.split(',')])}"]
+
+
 # --------------------------------------------------------------------------------------------
 # All commands
 
@@ -115,8 +133,8 @@ Experiment = Annotated[
         metavar="RECORDING|EXPERIMENT",
         parser=experiment,
         autocompletion=names_beginning_with,
-        help="a recording's folder; or an experiment: a .yaml file, or the name of one that comes "
-        "with fgslam, e.g. lab_loop",
+        help="a recording: its folder, file or a pattern of files; or an experiment: a .yaml file, "
+        "or the name of one that comes with fgslam, e.g. lab_loop",
     ),
 ]
 Camera = Annotated[
@@ -124,6 +142,23 @@ Camera = Annotated[
     typer.Option(
         "--camera", metavar="FILE", help="calibration of a recording, in place of its own"
     ),
+]
+Start = Annotated[
+    int | None, typer.Option(min=0, help="first frame used, from 0; sets dataset.start")
+]
+Stop = Annotated[
+    int | None, typer.Option(min=1, help="frame before which to stop; sets dataset.stop")
+]
+Stride = Annotated[int | None, typer.Option(min=1, help="use every n-th; sets dataset.stride")]
+Topics = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LEFT,RIGHT[,ODOMETRY]",
+        help="of a ROS bag: which topics, where their names do not tell; sets dataset.topics",
+    ),
+]
+Estimator = Annotated[
+    str | None, typer.Option(metavar="KIND", help="which estimator steers; sets estimator.kind")
 ]
 RunFolder = Annotated[Path | None, typer.Option(help="the run folder itself; default runs/NAME")]
 Resume = Annotated[
@@ -151,7 +186,9 @@ CameraOut = Annotated[
 
 BareRecording = Annotated[
     Path,
-    typer.Argument(metavar="RECORDING", parser=bare_recording, help="a recording's folder"),
+    typer.Argument(
+        metavar="RECORDING", parser=bare_recording, help="its folder, file or a pattern of files"
+    ),
 ]
 Recording = Annotated[
     Path,
@@ -159,7 +196,8 @@ Recording = Annotated[
         metavar="RECORDING",
         parser=recording,
         autocompletion=names_beginning_with,
-        help="a recording's folder; or an experiment, .yaml or name, for its data set",
+        help="a recording: its folder, file or a pattern of files; or an experiment, .yaml or "
+        "name, for its data set",
     ),
 ]
 

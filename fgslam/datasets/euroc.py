@@ -22,11 +22,11 @@ from fgslam.datasets.images import (
     missing_notes,
     require_folder,
 )
+from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
 from fgslam.datasets.settings import EurocSettings
 from fgslam.datasets.tables import (
     Table,
-    nearest_rows,
     poses_from_quaternions,
     read_table,
     require_increasing,
@@ -82,7 +82,9 @@ def _pairs(
 ) -> tuple[FloatArray, StereoFiles, tuple[str, ...]]:
     """Stamps (n,) in seconds of the right images, files of the pairs, and notes."""
     right, left = read_camera_frames(right_folder), read_camera_frames(left_folder)
-    (rows, partners), notes = pair_frames(right, left, 1e-3 * settings.pairing_tolerance_ms)
+    names = (str(right.paths[0].parent), str(left.paths[0].parent))
+    tolerance = 1e-3 * settings.pairing_tolerance_ms
+    (rows, partners), notes = pair_stamps(right.stamps, left.stamps, tolerance, names)
     paths = tuple((right.paths[i], left.paths[j]) for i, j in zip(rows, partners, strict=True))
     files = StereoFiles(paths, camera.width, camera.height)
     stamps = right.stamps[rows].astype(np.float64) * NANOSECONDS
@@ -108,7 +110,6 @@ def _true_poses(root: Path, rig: CameraRig, frames: FloatArray) -> Trajectory | 
 # Files of the ASL layout: data.csv of a camera, data.csv and sensor.yaml of the truth
 
 
-NANOSECONDS = 1e-9
 _TRUTH_COLUMNS = ("time", "x", "y", "z", "qw", "qx", "qy", "qz")
 
 
@@ -146,41 +147,6 @@ def read_camera_frames(folder: Path) -> CameraFrames:
     if not stamps:
         raise DatasetError(f"{path} lists no image; restore the file")
     return CameraFrames(np.array(stamps, np.int64), tuple(paths))
-
-
-def pair_frames(
-    right: CameraFrames, left: CameraFrames, tolerance: float
-) -> tuple[tuple[IntArray, IntArray], tuple[str, ...]]:
-    """Rows of the right and the left images that are each other's nearest in time.
-
-    Args:
-        right: images of the right camera.
-        left: images of the left camera.
-        tolerance: largest difference in seconds.
-
-    Returns:
-        The paired rows, and notes on images left without a partner.
-
-    Raises:
-        DatasetError: no pair is left.
-    """
-    partner = nearest_rows(left.stamps, right.stamps)
-    rows = np.arange(len(right.stamps))
-    mutual = nearest_rows(right.stamps, left.stamps)[partner] == rows
-    close = np.abs(left.stamps[partner] - right.stamps) <= round(tolerance / NANOSECONDS)
-    kept = rows[mutual & close]
-    if len(kept) == 0:
-        raise DatasetError(
-            f"no image of {right.paths[0].parent} has a partner in {left.paths[0].parent} within "
-            f"{1e3 * tolerance:g} ms; raise dataset.pairing_tolerance_ms or restore the stamps"
-        )
-    alone = (("right", len(rows) - len(kept)), ("left", len(left.stamps) - len(kept)))
-    notes = tuple(
-        f"{n} {camera} images have no partner within {1e3 * tolerance:g} ms and are left out"
-        for camera, n in alone
-        if n
-    )
-    return (kept, partner[kept]), notes
 
 
 def read_body_truth(folder: Path) -> Trajectory | None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.calibration import level_mounting, read_json_object
+from fgslam.cameras.calibration import read_json_object
 from fgslam.cameras.corrected import read_own_format
 from fgslam.cameras.rectification import Rectifier
 from fgslam.cameras.rig import read_rig
@@ -18,6 +18,7 @@ from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import right_from_left_camera
 from fgslam.core.measurements import Odometry
 from fgslam.core.sensors import CameraRig
+from fgslam.datasets.calibrated import rig_and_rectifier
 from fgslam.datasets.images import (
     RawPairs,
     StereoFiles,
@@ -134,21 +135,13 @@ def _cameras(
         found = read_own_format(path, three)
     else:
         found = read_rig(path, first_size(listed[0].values()))
-    raw = found if isinstance(found, Rectifier) else None
-    rig = found.rig if isinstance(found, Rectifier) else found
+    rig, raw = rig_and_rectifier(found, settings)
     if three and rig.vertical_baseline is None:
         raise CalibrationError(
             f"{path} knows two cameras, but {root} has a third one, top/; give a calibration of "
             "all three, or leave it out: --set dataset.use_top=false"
         )
-    return _mounted(rig if three else replace(rig, vertical_baseline=None), settings), raw
-
-
-def _mounted(rig: CameraRig, settings: ImageFolderSettings) -> CameraRig:
-    if settings.camera_yaw_deg is None and settings.lever_arm_m is None:
-        return rig
-    lever_arm = settings.lever_arm_m or (0.0, 0.0, 0.0)
-    return replace(rig, bTc=level_mounting(settings.camera_yaw_deg or 0.0, lever_arm))
+    return rig if three else replace(rig, vertical_baseline=None), raw
 
 
 def _read_times(path: Path) -> tuple[IntArray, FloatArray]:

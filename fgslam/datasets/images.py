@@ -6,9 +6,11 @@ import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from fgslam.cameras.rectification import Rectifier
 from fgslam.core.arrays import FloatArray, Image
@@ -49,18 +51,19 @@ def read_grey_image(path: Path) -> Image:
     Raises:
         FrameError: the file is absent, incomplete or no image.
     """
-    return _decoded(path, cv2.IMREAD_GRAYSCALE)
+    return decode_grey(_bytes_of(path), str(path))
 
 
 def read_sized_image(path: Path, width: int, height: int) -> Image:
     """The image in grey, as :func:`read_grey_image`. Raises FrameError if of another size, too."""
-    return _of_size(read_grey_image(path), path, width, height)
+    return sized(read_grey_image(path), f"image {path}", width, height)
 
 
-def _of_size(image: Image, path: Path, width: int, height: int) -> Image:
+def sized(image: Image, name: str, width: int, height: int) -> Image:
+    """The image itself. Raises FrameError where it has another size than calibrated."""
     if image.shape[:2] != (height, width):
         raise FrameError(
-            f"image {path} is {size(image)} but the calibration says {width}x{height}; restore the "
+            f"{name} is {size(image)} but the calibration says {width}x{height}; restore the "
             "right file"
         )
     return image
@@ -68,7 +71,8 @@ def _of_size(image: Image, path: Path, width: int, height: int) -> Image:
 
 def read_colour_image(path: Path) -> Image:
     """The image (height, width, 3) in red, green, blue, uint8; else as :func:`read_grey_image`."""
-    return np.asarray(cv2.cvtColor(_decoded(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), np.uint8)
+    image = _decoded(_bytes_of(path), str(path), cv2.IMREAD_COLOR)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def encoded_png(image: Image) -> bytes:
@@ -77,22 +81,54 @@ def encoded_png(image: Image) -> bytes:
     return bytes(cv2.imencode(".png", shown)[1])
 
 
-def _decoded(path: Path, mode: int) -> Image:
+def decode_grey(data: bytes, name: str) -> Image:
+    """The image (height, width) in grey, uint8, of an encoded image's bytes.
+
+    Of more than 8 bits the upper 8 are kept (:func:`grey_of_16_bits`).
+
+    Args:
+        data: PNG, JPEG or another known format.
+        name: in messages.
+
+    Raises:
+        FrameError: incomplete, or no image.
+    """
+    image = _decoded(data, name, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if image.dtype == np.uint16:
+        return grey_of_16_bits(np.asarray(image, np.uint16))
+    return np.ascontiguousarray(image, np.uint8)
+
+
+def grey_of_16_bits(image: npt.NDArray[np.uint16]) -> Image:
+    """The upper eight bits, whatever the image holds.
+
+    Stretching each image to its own contrast would change its features from frame to frame.
+    """
+    return np.ascontiguousarray(image >> 8, np.uint8)
+
+
+def _bytes_of(path: Path) -> bytes:
     try:
-        data = path.read_bytes()
+        return path.read_bytes()
     except OSError as cause:
         raise FrameError(
             f"image {path} cannot be read: {cause.strerror}; restore the file, or leave the frame "
             "out with dataset.start/stop/stride"
         ) from cause
-    _require_complete(path, data)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), mode) if data else None
+
+
+def _decoded(data: bytes, name: str, mode: int) -> npt.NDArray[Any]:
+    _require_complete(name, data)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), mode) if data else None
+    except cv2.error:  # absurd sizes in a damaged header
+        image = None
     if image is None:
-        raise FrameError(f"image {path} is not an image that can be decoded; restore the file")
-    return np.ascontiguousarray(image, np.uint8)
+        raise FrameError(f"image {name} is not an image that can be decoded; restore the file")
+    return image
 
 
-def _require_complete(path: Path, data: bytes) -> None:
+def _require_complete(name: str, data: bytes) -> None:
     if data.startswith(_PNG_SIGNATURE):
         fault = _png_fault(data)
     elif data.startswith(_JPEG_START):
@@ -100,7 +136,7 @@ def _require_complete(path: Path, data: bytes) -> None:
     else:
         fault = None if data else "is empty"
     if fault is not None:
-        raise FrameError(f"image {path} {fault}; copy the file again from its source")
+        raise FrameError(f"image {name} {fault}; copy the file again from its source")
 
 
 def _png_fault(data: bytes) -> str | None:
@@ -147,7 +183,7 @@ class StereoFiles:
     def load_colour(self, index: int) -> tuple[Image, ...]:
         """The same in red, green, blue."""
         return tuple(
-            _of_size(read_colour_image(path), path, self.width, self.height)
+            sized(read_colour_image(path), f"image {path}", self.width, self.height)
             for path in self.paths[index]
         )
 

@@ -1,7 +1,8 @@
-"""The layout of a recording's folder, recognised by the files in it."""
+"""The layout of a recording: of a folder by the files in it, of files by their endings."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,11 +21,13 @@ class Layout:
         name: what people call it.
         lacking: the parts that a folder would need to have it and has not.
         begun: whether a folder has parts that no other layout has.
+        endings: of files that are a recording of this layout by themselves.
     """
 
     name: str
     lacking: Callable[[Path], tuple[str, ...]]
     begun: Callable[[Path], bool]
+    endings: tuple[str, ...] = ()
 
 
 def recognise_layout(folder: Path, kind: str | None = None) -> dict[str, str]:
@@ -35,11 +38,11 @@ def recognise_layout(folder: Path, kind: str | None = None) -> dict[str, str]:
     first is taken.
 
     Args:
-        folder: of the recording.
+        folder: of the recording; or its file, or a pattern of file names.
         kind: the layout, where it is known; None: it is recognised.
 
     Raises:
-        DatasetError: there is no such folder, it has none of the known layouts, or several.
+        DatasetError: there is no such recording, it has none of the known layouts, or several.
     """
     fitting = fitting_layouts(folder)
     if kind not in LAYOUTS:
@@ -51,26 +54,67 @@ def recognise_layout(folder: Path, kind: str | None = None) -> dict[str, str]:
     return {"kind": kind, "path": str(folder)}
 
 
-def fitting_layouts(folder: Path) -> tuple[str, ...]:
-    """Kinds of the layouts that the folder has; where it has none, of those it has parts of.
+def fitting_layouts(given: Path) -> tuple[str, ...]:
+    """Kinds of the layouts that a folder has; where it has none, of those it has parts of.
+
+    Of a file, or a pattern of file names, those whose endings they have.
 
     Raises:
-        DatasetError: there is no such folder, or nothing in it belongs to a known layout.
+        DatasetError: there is no such folder or file, or nothing in it belongs to a known layout.
     """
-    if folder.is_file():
-        raise DatasetError(
-            f"{folder} is neither a folder nor an experiment's .yaml; give the recording's folder"
-        )
-    if not folder.is_dir():
-        raise DatasetError(
-            f"{folder}: no such folder or experiment file; give the folder of a recording, or an "
-            "experiment's .yaml"
-        )
-    complete = [kind for kind, layout in LAYOUTS.items() if not layout.lacking(folder)]
-    fitting = complete or [kind for kind, layout in LAYOUTS.items() if layout.begun(folder)]
+    if not given.is_dir():
+        return _fitting_files(given)
+    complete = [kind for kind, layout in LAYOUTS.items() if not layout.lacking(given)]
+    fitting = complete or [kind for kind, layout in LAYOUTS.items() if layout.begun(given)]
     if not fitting:
-        raise DatasetError(_unknown(folder))
+        raise DatasetError(_unknown(given))
     return tuple(fitting)
+
+
+def is_recording(given: Path) -> bool:
+    """Whether this is a folder, or a file or pattern of files of a known layout."""
+    if given.is_dir():
+        return True
+    files = files_of(given)
+    return bool(files) and any(_all_end(files, layout) for layout in LAYOUTS.values())
+
+
+def files_of(given: Path) -> list[Path]:
+    """What a path or a pattern of file names means: the path itself where it is there."""
+    if given.exists() or not any(mark in given.name for mark in "*?["):
+        return [given]
+    return sorted(given.parent.glob(given.name), key=natural)
+
+
+def natural(path: Path) -> tuple[tuple[int, str], ...]:
+    """Sorts names with numbers by their values, so that 10 comes after 9; words as they are."""
+    words = re.split(r"(\d+)", path.name)
+    return tuple((int(w), "") if w.isdecimal() else (-1, w) for w in words)
+
+
+def _fitting_files(given: Path) -> tuple[str, ...]:
+    files = files_of(given)
+    if not files or not all(file.exists() for file in files):
+        raise DatasetError(
+            f"{given}: no such folder or experiment file; give the folder of a recording, its "
+            "file, or an experiment's .yaml"
+        )
+    fitting = tuple(kind for kind, layout in LAYOUTS.items() if _all_end(files, layout))
+    if not fitting:
+        known = "; ".join(
+            f"{layout.name}: {', '.join(layout.endings)}"
+            for layout in LAYOUTS.values()
+            if layout.endings
+        )
+        raise DatasetError(
+            f"{given} is neither a folder nor an experiment's .yaml nor a file of a known kind "
+            f"({known}); give the recording's folder"
+        )
+    return fitting
+
+
+def _all_end(files: list[Path], layout: Layout) -> bool:
+    return all(file.is_file() and file.suffix.lower() in layout.endings for file in files)
 
 
 def layout_hint(folder: Path, kind: str) -> str:
@@ -179,6 +223,14 @@ def _image_folder_begun(folder: Path) -> bool:
     return pair or not _absent(folder, ("calib.json", "times.txt"))
 
 
+BAG_ENDINGS = (".bag", ".db3", ".mcap")
+
+
+def _lacking_of_bag(folder: Path) -> tuple[str, ...]:
+    found = any(file.suffix in BAG_ENDINGS for file in folder.iterdir())
+    return () if found else ("a file *.bag, *.db3 or *.mcap",)
+
+
 LAYOUTS = {
     "image_folder": Layout(
         "image folder",
@@ -187,6 +239,7 @@ LAYOUTS = {
     ),
     "kitti": Layout("KITTI odometry", _lacking_of_kitti, _kitti_begun),
     "euroc": Layout("EuRoC native", _lacking_of_euroc, _euroc_begun),
+    "bag": Layout("ROS bag", _lacking_of_bag, lambda folder: False, BAG_ENDINGS),
     "light_field": Layout(
         "light field",
         lambda folder: _absent(folder, ("positions.csv", "calib.json")),

@@ -22,12 +22,13 @@ from fgslam.core.recordings import Sequence as FrameSequence
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.settings import RecordedOdometrySettings, SyntheticOdometrySettings
 from fgslam.datasets.tables import (
+    TUM_COLUMNS,
     Table,
     interpolate_poses,
     read_table,
-    read_tum_table,
     require_increasing,
     rows_at,
+    trajectory_of,
 )
 
 SPEED_COLUMNS = ("time", "forward speed", "yaw rate")
@@ -51,8 +52,12 @@ def read_speed_log(path: Path, settings: RecordedOdometrySettings) -> SpeedLog:
     Raises:
         OdometryError: a line is malformed, not finite, out of time order, or absurd.
     """
-    table = read_table(path, SPEED_COLUMNS, ",", OdometryError)
-    _require_samples(path, len(table))
+    return checked_speeds(read_table(path, SPEED_COLUMNS, ",", OdometryError), settings)
+
+
+def checked_speeds(table: Table, settings: RecordedOdometrySettings) -> SpeedLog:
+    """Rows (time, forward speed, yaw rate) as a log; raises as :func:`read_speed_log`."""
+    _require_samples(table.path, len(table))
     require_increasing(table, table.column(0), OdometryError)
     _require_sane(table, table.column(1), settings.max_speed_mps, "forward speed", "m/s")
     turn = np.degrees(table.column(2))
@@ -170,15 +175,20 @@ def read_pose_log(path: Path, settings: RecordedOdometrySettings) -> Trajectory:
     Raises:
         OdometryError: a line is malformed, out of time order, or moves absurdly fast.
     """
-    table, log = read_tum_table(path, OdometryError)
-    _require_samples(path, len(table))
+    return checked_poses(read_table(path, TUM_COLUMNS, error=OdometryError), settings)
+
+
+def checked_poses(table: Table, settings: RecordedOdometrySettings) -> Trajectory:
+    """Rows (time, position, quaternion) as a trajectory; raises as :func:`read_pose_log`."""
+    log = trajectory_of(table, OdometryError)
+    _require_samples(table.path, len(table))
     motions = inverse(log.poses[:-1]) @ log.poses[1:]
     duration = np.diff(log.timestamps)
     speed = np.linalg.norm(motions[:, :3, 3], axis=1) / duration
     from scipy.spatial.transform import Rotation
 
     angle = Rotation.from_matrix(motions[:, :3, :3]).magnitude()
-    arrival = Table(path, table.values[1:], table.lines[1:])
+    arrival = Table(table.path, table.values[1:], table.lines[1:])
     _require_sane(arrival, speed, settings.max_speed_mps, "speed", "m/s")
     _require_sane(arrival, np.degrees(angle) / duration, settings.max_turn_dps, "turn", "degrees/s")
     return Trajectory(log.timestamps + settings.time_offset_s, log.poses)

@@ -16,6 +16,7 @@ from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.datasets.images import IMAGE_SUFFIXES
+from fgslam.datasets.layouts import natural
 
 ColourLoader: TypeAlias = Callable[[int], Image]
 """Picture (height, width, 3) in R, G, B by place in the recording; raises FrameError."""
@@ -109,13 +110,7 @@ def pictures_in(folder: Path, pattern: str = "*") -> list[Path]:
             f"{folder} holds no picture named {pattern} ({', '.join(IMAGE_SUFFIXES)}); check "
             "dataset.path"
         )
-    return sorted(found, key=_natural)
-
-
-def _natural(path: Path) -> tuple[tuple[int, str], ...]:
-    # Numbers by value, so that 10 comes after 9; words before and after as they are.
-    words = re.split(r"(\d+)", path.name)
-    return tuple((int(w), "") if w.isdecimal() else (-1, w) for w in words)
+    return sorted(found, key=natural)
 
 
 def ids_of(names: Sequence[str]) -> IntArray:

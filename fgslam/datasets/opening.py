@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from fgslam.core.recordings import MeasurementRecording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import (
+    BagSettings,
     EurocSettings,
     FileRecordingSettings,
     ImageFolderSettings,
@@ -47,6 +48,10 @@ def open_recording(
             from fgslam.datasets.image_folder import open_image_folder
 
             return open_image_folder(settings, odometry or RecordedOdometrySettings())
+        case BagSettings():
+            from fgslam.datasets.bags.reader import open_bag
+
+            return open_bag(settings, odometry or RecordedOdometrySettings())
         case KittiSettings():
             from fgslam.datasets.kitti import open_kitti
 

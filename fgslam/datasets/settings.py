@@ -30,21 +30,41 @@ class RecordingSettings(FrameSelection):
     path: Annotated[str, Field(min_length=1, description="folder of the recording")]
 
 
+@dataclass(frozen=True, config=STRICT, kw_only=True)
+class CalibratedSettings(RecordingSettings):
+    """What a recording has whose calibration may be another file than its own."""
+
+    camera_file: Annotated[
+        str | None,
+        Field(
+            description="calibration in place of the recording's own, in any format of "
+            "docs/howto/your_camera.md; images of a rig that is not rectified are rectified by it"
+        ),
+    ] = None
+    camera_yaw_deg: Annotated[
+        float | None,
+        Field(
+            description="heading of the reference camera in the body, degrees to the left; given, "
+            "it replaces the mounting (bTc) of the calibration; null: as there, or straight ahead"
+        ),
+    ] = None
+    lever_arm_m: Annotated[
+        Vector3 | None,
+        Field(
+            description="position of the reference (right) camera in the body, metres forward, "
+            "left, up; given, it replaces bTc of the calibration; null: as there, or none"
+        ),
+    ] = None
+
+
 @dataclass(frozen=True, config=STRICT)
-class ImageFolderSettings(RecordingSettings):
+class ImageFolderSettings(CalibratedSettings):
     """Our own layout, left/ right/ [top/] calib.json times.txt: docs/datasets/image_folder.md."""
 
     kind: Literal["image_folder"] = "image_folder"
     use_top: Annotated[bool, Field(description="use the third camera where the folder has one")] = (
         True
     )
-    camera_file: Annotated[
-        str | None,
-        Field(
-            description="calibration in place of the folder's calib.json, in any format of "
-            "docs/howto/your_camera.md; images of a rig that is not rectified are rectified by it"
-        ),
-    ] = None
     odometry_file: Annotated[
         str | None,
         Field(
@@ -52,20 +72,27 @@ class ImageFolderSettings(RecordingSettings):
             "of the body; null: odometry.txt or the only odom*.csv, where there is one"
         ),
     ] = None
-    camera_yaw_deg: Annotated[
-        float | None,
+
+
+@dataclass(frozen=True, config=STRICT, kw_only=True)
+class BagSettings(CalibratedSettings):
+    """ROS 1 and ROS 2 bags: .bag, .db3, .mcap (docs/datasets/bags.md)."""
+
+    path: Annotated[
+        str, Field(min_length=1, description="the bag, its folder, or a pattern of file names")
+    ]
+    kind: Literal["bag"] = "bag"
+    topics: Annotated[
+        tuple[str, ...],
         Field(
-            description="heading of the reference camera in the body, degrees to the left; given, "
-            "it replaces the mounting (bTc) of calib.json; null: as calib.json, or straight ahead"
+            description="topics to use: the left camera's images, the right one's, then perhaps "
+            "one of odometry; empty: chosen by type and name"
         ),
-    ] = None
-    lever_arm_m: Annotated[
-        Vector3 | None,
-        Field(
-            description="position of the reference (right) camera in the body, metres forward, "
-            "left, up; given, it replaces bTc of calib.json; null: as calib.json, or none"
-        ),
-    ] = None
+    ] = ()
+    pairing_tolerance_ms: Annotated[
+        float,
+        Field(gt=0.0, le=1000.0, description="largest time between the two images of a pair, ms"),
+    ] = 20.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -178,7 +205,7 @@ class UtiasRangeBearingSettings(RecordingSettings):
 
 
 FileRecordingSettings: TypeAlias = (
-    ImageFolderSettings | KittiSettings | EurocSettings | LightFieldSettings
+    ImageFolderSettings | BagSettings | KittiSettings | EurocSettings | LightFieldSettings
 )
 MeasurementDatasetSettings: TypeAlias = (
     StereoTracksSettings

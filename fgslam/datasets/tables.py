@@ -142,10 +142,15 @@ def read_tum_table(
             not of unit length.
     """
     table = read_table(path, TUM_COLUMNS, error=error)
+    return table, trajectory_of(table, error)
+
+
+def trajectory_of(table: Table, error: type[DatasetError] = DatasetError) -> Trajectory:
+    """The poses of a table with the columns of a TUM file; raises as :func:`read_tum_table`."""
     require_increasing(table, table.column(0), error)
     require_unit_quaternions(table, table.values[:, 4:8], error)
     poses = poses_from_quaternions(table.values[:, 1:4], table.values[:, 4:8])
-    return table, Trajectory(table.column(0), poses)
+    return Trajectory(table.column(0), poses)
 
 
 def nearest_rows(stamps: AnyStamps, at: AnyStamps) -> IntArray:

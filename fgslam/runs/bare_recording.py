@@ -7,20 +7,28 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import yaml
 
 from fgslam.backend.settings import DEFAULT_ESTIMATOR
 from fgslam.core.errors import ConfigError, DatasetError
-from fgslam.datasets.layouts import LAYOUTS, recognise_layout
+from fgslam.datasets.layouts import LAYOUTS, is_recording, recognise_layout
+from fgslam.datasets.settings import CalibratedSettings, FileRecordingSettings
 from fgslam.runs.config import Experiment, ExperimentConfig, load_experiment, make_config
+from fgslam.runs.config_reading import apply_overrides
 from fgslam.runs.named_experiments import find_experiment, suggestion
 
 if TYPE_CHECKING:
     from fgslam.core.recordings import Sequence
+
+_CALIBRATED = {
+    each.kind for each in get_args(FileRecordingSettings) if issubclass(each, CalibratedSettings)
+}
+"""Layouts whose calibration may be another file."""
 
 _NOT_IN_NAMES = re.compile(r"[^\w.-]+")
 
@@ -32,7 +40,8 @@ class Bare:
     Attributes:
         values: the short configuration.
         config: the same, checked, with overrides.
-        said: what the recording is and how it is taken, in one line.
+        said: what the recording is and how it is taken, in one line; then a line for each thing
+            that was tolerated.
     """
 
     values: dict[str, Any]
@@ -59,7 +68,7 @@ def bare_experiment(
 
     overrides = tuple(overrides)
     values: dict[str, Any] = {
-        "name": _NOT_IN_NAMES.sub("_", folder.resolve().name).strip("_") or "recording",
+        "name": _name(folder),
         "dataset": _dataset(folder, camera, overrides),
         "odometry": {"kind": "recorded"},
         "estimator": {"kind": DEFAULT_ESTIMATOR},
@@ -75,7 +84,7 @@ def bare_experiment(
 def experiment_of(
     given: Path, camera: Path | None = None, overrides: Iterable[str] = ()
 ) -> tuple[Experiment, str]:
-    """The experiment that is meant, and, for a recording, what it is in one line.
+    """The experiment that is meant, and, for a recording, what it is in a line or a few.
 
     Args:
         given: a configuration, the name of a shipped one, or else a recording's folder.
@@ -86,7 +95,7 @@ def experiment_of(
         FgslamError: it is none of these, or cannot be used.
     """
     path = find_experiment(given)
-    if path.is_dir():
+    if is_recording(path):
         bare = bare_experiment(path, camera, overrides)
         return bare.config, bare.said
     if camera is not None:
@@ -98,10 +107,14 @@ def experiment_of(
     return load_experiment(path, overrides), ""
 
 
-def short_config(folder: Path, camera: Path | None = None) -> str:
+def short_config(folder: Path, camera: Path | None = None, overrides: Iterable[str] = ()) -> str:
     """YAML of the configuration that repeats the run of a bare recording. Raises FgslamError."""
-    bare = bare_experiment(folder, camera)
-    return f"# {bare.said}\n{yaml.safe_dump(bare.values, sort_keys=False)}"
+    overrides = tuple(overrides)
+    bare = bare_experiment(folder, camera, overrides)
+    values = deepcopy(bare.values)
+    apply_overrides(values, overrides)
+    said = bare.said.replace("\n", "\n# ")
+    return f"# {said}\n{yaml.safe_dump(values, sort_keys=False)}"
 
 
 def has_odometry(sequence: Sequence) -> bool:
@@ -109,11 +122,19 @@ def has_odometry(sequence: Sequence) -> bool:
     return any(sequence.odometry(i) is not None for i in range(1, len(sequence)))
 
 
+def _name(recording: Path) -> str:
+    """Of a folder its name, of a file its name without ending."""
+    path = recording.resolve()
+    return (
+        _NOT_IN_NAMES.sub("_", path.name if path.is_dir() else path.stem).strip("_") or "recording"
+    )
+
+
 def _dataset(folder: Path, camera: Path | None, overrides: tuple[str, ...]) -> dict[str, str]:
     dataset = recognise_layout(folder, _asked_kind(overrides))
     if camera is None:
         return dataset
-    if dataset["kind"] != "image_folder":
+    if dataset["kind"] not in _CALIBRATED:
         raise ConfigError(
             f"{folder}: {LAYOUTS[dataset['kind']].name} holds its own calibration; leave --camera "
             "out"
@@ -141,9 +162,10 @@ def _said(config: ExperimentConfig, sequence: Sequence) -> str:
     rate = f" at {(len(stamps) - 1) / duration:.3g} Hz" if duration > 0.0 else ""
     motion = {"recorded": "odometry", "constant_velocity": "no odometry"}
     truth = "" if sequence.ground_truth is None else "; truth, for evaluation only"
-    return (
+    line = (
         f"{sequence.name}: {LAYOUTS[config.dataset.kind].name}, {rig.cameras} cameras "
         f"{rig.width}x{rig.height}; {len(stamps)} frames{rate}; "
         f"{motion.get(config.odometry.kind, config.odometry.kind)}{truth}; estimator "
         f"{config.estimator.kind}"
     )
+    return "\n".join((line, *(f"note: {note}" for note in sequence.notes)))

@@ -16,7 +16,7 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.layouts import recognise_layout
+from fgslam.datasets.layouts import is_recording, recognise_layout
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.runs.bare_recording import experiment_of
 from fgslam.runs.config import ExperimentConfig, make_config
@@ -147,7 +147,7 @@ def rendered_recording(world: str = "lab", frames: int | None = None) -> Recorde
 
 
 def _recording_config(path: Path, overrides: Overrides) -> ExperimentConfig:
-    if not path.is_dir():
+    if not is_recording(path):
         if not find_experiment(path).is_file():
             raise DatasetError(
                 f"{path}: no such folder of a recording; check the path, or {suggestion(path)}"

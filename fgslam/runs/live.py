@@ -16,6 +16,7 @@ from fgslam.core import __version__
 from fgslam.core.errors import ConfigError, MapError
 from fgslam.core.saved_map import load_map
 from fgslam.core.sensors import CameraRig
+from fgslam.datasets.layouts import is_recording
 from fgslam.datasets.settings import OdometrySettings
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.runs.bare_recording import bare_experiment
@@ -222,9 +223,8 @@ def slam_config(
     texts = override_texts(overrides)
     if not isinstance(config, ExperimentConfig):
         path = find_experiment(Path(config))
-        return (
-            bare_experiment(path, None, texts).config if path.is_dir() else load_config(path, texts)
-        )
+        bare = is_recording(path)
+        return bare_experiment(path, None, texts).config if bare else load_config(path, texts)
     if texts:
         raise ConfigError("overrides are for experiments by name or file; change the configuration")
     return config

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import DatasetError
 from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
 from fgslam.datasets.checks.matches import check_epipolar
 from fgslam.datasets.checks.recording import Level
@@ -16,8 +17,11 @@ from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.kitti import open_kitti
 from fgslam.datasets.light_field import open_light_field
 from fgslam.datasets.odometry import SyntheticOdometry
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import (
+    BagSettings,
+    EurocSettings,
     ImageFolderSettings,
     KittiSettings,
     LightFieldSettings,
@@ -206,3 +210,39 @@ def test_light_field_is_a_trinocular_rig(shared_data: Path) -> None:
     assert vertical[agree].min() > 1.0
     assert horizontal[agree].max() < 16.0
     assert np.corrcoef(horizontal[agree], vertical[agree])[0, 1] > 0.95
+
+
+# --------------------------------------------------------------------------------------------
+# ROS bags
+
+
+BAGS = {
+    "ROS 1": "euroc_ros1.bag",
+    "SQLite": "euroc_ros2_sqlite3",
+    "MCAP": "euroc_ros2_mcap/euroc_ros2_mcap.mcap",
+}
+
+
+@pytest.mark.parametrize("name", BAGS)
+def test_bags_hold_the_pictures_and_stamps_of_their_source(shared_data: Path, name: str) -> None:
+    """SOURCE.md: the first pairs of the EuRoC cut, its stamps in the headers, its rig in R, P."""
+    path = shared_data / "bags" / "converted_from_euroc" / BAGS[name]
+    source = open_recording(EurocSettings(path=str(shared_data / "stereo_raw" / "euroc_V1_01_cut")))
+    bag = open_recording(BagSettings(path=str(path)))
+    assert (len(bag), bag.rig.width, bag.rig.height) == (6, 752, 480)
+    assert bag.rig.baseline == pytest.approx(source.rig.baseline, abs=1e-6)
+    for i in (4, 0):
+        same = int(np.argmin(np.abs(source.timestamps - bag.timestamps[i])))
+        assert source.timestamps[same] == pytest.approx(bag.timestamps[i], abs=1e-6)
+        for a, b in zip(source.frame(same).images, bag.frame(i).images, strict=True):
+            # Rotations in the bag are rounded: some pixels differ by a grey level or two.
+            assert np.mean(np.abs(a.astype(int) - b)) < 0.05
+
+
+def test_bags_without_a_stereo_pair_say_so(shared_data: Path) -> None:
+    for name, message in (
+        ("ubiquity_aruco_images.bag", "images of one camera only, /raspicam_node/image/compressed"),
+        ("yihe_odom_only.bag", r"no topic of camera images .*it has /odom \(Odometry\)"),
+    ):
+        with pytest.raises(DatasetError, match=message):
+            open_recording(BagSettings(path=str(shared_data / "bags" / name)))

@@ -81,6 +81,15 @@ def test_overrides_hold_for_a_recording_too(tmp_path: Path) -> None:
     assert (config.dataset.stop, config.estimator.kind) == (3, "isam2")
 
 
+def test_the_printed_configuration_keeps_what_was_asked_for(tmp_path: Path) -> None:
+    asked = ["dataset.stop=3", "estimator.kind=batch", "frontend.sift.max_features=900"]
+    text = short_config(image_folder(tmp_path), None, asked)
+    assert (
+        make_config(yaml.safe_load(text), "printed")
+        == bare_experiment(tmp_path, None, asked).config
+    )
+
+
 def test_a_configuration_of_that_name_goes_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -103,8 +103,8 @@ def test_missing_keys_and_bad_kinds(values: dict[str, Any], expected: str, tmp_p
 
 
 def test_kinds_are_listed(tmp_path: Path) -> None:
-    message = message_of(nested(MINIMAL, "dataset.kind", "bag"), tmp_path)
-    for kind in ("rendered_lab", "image_folder", "kitti", "euroc", "light_field"):
+    message = message_of(nested(MINIMAL, "dataset.kind", "tape"), tmp_path)
+    for kind in ("rendered_lab", "image_folder", "bag", "kitti", "euroc", "light_field"):
         assert kind in message
 
 

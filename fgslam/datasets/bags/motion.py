@@ -1,0 +1,63 @@
+"""The odometry of a bag: poses of nav_msgs/Odometry, or speed and yaw rate of a stamped twist."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import OdometryError
+from fgslam.core.measurements import Odometry
+from fgslam.datasets.bags.files import Topic
+from fgslam.datasets.bags.messages import ODOMETRY
+from fgslam.datasets.odometry import (
+    checked_poses,
+    checked_speeds,
+    motions_from_poses,
+    motions_from_speed,
+)
+from fgslam.datasets.recording import OdometrySource
+from fgslam.datasets.settings import RecordedOdometrySettings
+from fgslam.datasets.tables import Table
+
+
+def odometry_source(
+    topic: Topic | None,
+    recorded: tuple[FloatArray, FloatArray],
+    settings: RecordedOdometrySettings,
+) -> OdometrySource | None:
+    """Body motions by a topic's stamps (n,) in seconds and values; None where there is none."""
+    stamps, values = recorded
+    if topic is None or len(stamps) == 0:
+        return None
+    name = topic.name
+
+    def source(frames: FloatArray) -> tuple[Odometry | None, ...]:
+        table = _table(name, stamps, values)
+        if topic.kind == ODOMETRY:
+            steps = motions_from_poses(checked_poses(table, settings), frames, settings)
+        else:
+            steps = motions_from_speed(checked_speeds(table, settings), frames, settings)
+        if len(frames) > 1 and all(step is None for step in steps):
+            raise OdometryError(
+                f"{name} covers none of the frames ({frames[0]:.3f} to {frames[-1]:.3f} s); check "
+                "that both use one clock, or set odometry.time_offset_s"
+            )
+        return steps
+
+    return source
+
+
+def _table(name: str, stamps: FloatArray, values: FloatArray) -> Table:
+    """Stamps and values as a table by increasing time; of equal stamps the first counts."""
+    order = np.argsort(stamps, kind="stable")
+    kept = order[np.concatenate([[True], np.diff(stamps[order]) > 0.0])]
+    rows = np.column_stack([stamps, values])[kept]
+    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if len(bad):
+        raise OdometryError(
+            f"{name}, message {kept[bad[0]] + 1}: not finite; record it again, or choose another "
+            "odometry.kind"
+        )
+    return Table(Path(name), rows, kept + 1)

@@ -1,0 +1,51 @@
+"""Which names are those of a left and a right camera: of topics, folders, files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+_WORD = re.compile(
+    r"(?:(?<![a-z])|(?<=cam)|(?<=camera)|(?<=img)|(?<=image))(left|right)", re.IGNORECASE
+)
+_LETTER = re.compile(r"(?<![a-z0-9])([lr])(?![a-z0-9])", re.IGNORECASE)
+_CAMERA_NUMBER = re.compile(r"(?<=cam|img)[_-]?(\d+)(?!\d)", re.IGNORECASE)
+_NUMBER = re.compile(r"(\d+)")
+
+
+def camera_pairs(names: Iterable[str], any_number: bool = True) -> tuple[tuple[str, str], ...]:
+    """All pairs (left, right) of names that differ in the side alone, sorted.
+
+    Sides are left and right, l and r, or two numbers that follow each other, of which the lower one
+    is the left (cam0 and cam1, infra1 and infra2).
+
+    Args:
+        names: of topics, folders or files, all different.
+        any_number: whether a number by itself may tell the side; else only one behind ``cam``:
+            numbers of files count frames.
+    """
+    found: set[tuple[str, str]] = set()
+    sides: dict[tuple[str, str], dict[int, str]] = {}
+    for name in names:
+        for key, side in _readings(name, any_number):
+            sides.setdefault(key, {})[side] = name
+    for by_side in sides.values():
+        for side, name in by_side.items():
+            if side + 1 in by_side:
+                found.add((name, by_side[side + 1]))
+    return tuple(sorted(found))
+
+
+def _readings(name: str, any_number: bool) -> Iterable[tuple[tuple[str, str], int]]:
+    """What the name is without its side, and the side as a number, in each way to read it."""
+    for pattern in (_WORD, _LETTER):
+        for match in pattern.finditer(name):
+            side = 0 if match[1][0] in "lL" else 1
+            yield (pattern.pattern, _without(name, match)), side
+    number = _NUMBER if any_number else _CAMERA_NUMBER
+    for match in number.finditer(name):
+        yield (number.pattern, _without(name, match)), int(match[1])
+
+
+def _without(name: str, match: re.Match[str]) -> str:
+    return f"{name[: match.start(1)]}\0{name[match.end(1) :]}"

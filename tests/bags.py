@@ -1,0 +1,182 @@
+"""Small bags with known content, written by rosbags, for the reader's tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import cv2
+import numpy as np
+from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+from fgslam.core.arrays import FloatArray, Image
+
+START_NS = 1_700_000_000_000_000_000
+PERIOD_NS = 100_000_000
+LATE_NS = 3_000_000  # by which the bag's time is later than the stamp
+
+Written: TypeAlias = tuple[str, int, str, dict[str, Any]]
+"""Topic, stamp, message type and fields."""
+
+
+def stereo(
+    frames: int = 4,
+    encode: Callable[[Image], dict[str, Any]] | None = None,
+    names: tuple[str, str] = ("/cam/left", "/cam/right"),
+    skew_ns: int = 0,
+) -> list[Written]:
+    """Frame k has corner pixels 10 + k (right) and 60 + k (left); camera_info of a rectified rig.
+
+    The left image is ``skew_ns`` later.
+    """
+    encode = encode or raw_image
+    out: list[Written] = []
+    for k in range(frames):
+        stamp = START_NS + k * PERIOD_NS
+        for name, code, late in ((names[0], 60, skew_ns), (names[1], 10, 0)):
+            fields = encode(picture(code + k))
+            kind = "CompressedImage" if "format" in fields else "Image"
+            ending = "/image_raw/compressed" if "format" in fields else "/image_raw"
+            out.append((name + ending, stamp + late, f"sensor_msgs/msg/{kind}", fields))
+            shift = 0.0 if code == 60 else -CALIBRATION["fx"] * CALIBRATION["baseline_m"]
+            info = ("sensor_msgs/msg/CameraInfo", camera_info(shift))
+            out.append((f"{name}/camera_info", stamp + late, *info))
+    return out
+
+
+def raw_image(image: Image, encoding: str = "mono8", padding: int = 0) -> dict[str, Any]:
+    """Fields of an Image; the rows end in ``padding`` bytes."""
+    rows = np.ascontiguousarray(image).view(np.uint8).reshape(image.shape[0], -1)
+    rows = np.pad(rows, ((0, 0), (0, padding)))
+    return {
+        "height": image.shape[0],
+        "width": image.shape[1],
+        "encoding": encoding,
+        "is_bigendian": 0,
+        "step": rows.shape[1],
+        "data": rows.ravel(),
+    }
+
+
+def compressed_image(image: Image, ending: str = ".png") -> dict[str, Any]:
+    """Fields of a CompressedImage."""
+    return {"format": ending[1:], "data": cv2.imencode(ending, image)[1].ravel()}
+
+
+def camera_info(shift: float) -> dict[str, Any]:
+    """Of images that are rectified already; ``shift`` is -fx times the baseline."""
+    fx, fy, cx, cy = (CALIBRATION[name] for name in ("fx", "fy", "cx", "cy"))
+    return {
+        "height": HEIGHT,
+        "width": WIDTH,
+        "distortion_model": "plumb_bob",
+        "d": np.zeros(5),
+        "k": np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0]),
+        "r": np.eye(3).ravel(),
+        "p": np.array([fx, 0, cx, shift, 0, fy, cy, 0, 0, 0, 1, 0.0]),
+        "binning_x": 0,
+        "binning_y": 0,
+    }
+
+
+def odometry(stamps_ns: Iterable[int], poses: FloatArray, topic: str = "/odom") -> list[Written]:
+    """nav_msgs/Odometry of positions and yaw (n, 4)."""
+    out: list[Written] = []
+    for stamp, (x, y, z, yaw) in zip(stamps_ns, poses, strict=True):
+        pose = (x, y, z, 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
+        out.append((topic, stamp, "nav_msgs/msg/Odometry", {"pose": pose}))
+    return out
+
+
+def twists(stamps_ns: Iterable[int], speed: float, yaw_rate: float) -> list[Written]:
+    """geometry_msgs/TwistStamped of one speed and turn."""
+    fields = {"twist": (speed, yaw_rate)}
+    return [("/twist", stamp, "geometry_msgs/msg/TwistStamped", fields) for stamp in stamps_ns]
+
+
+def write_bag(path: Path, written: Iterable[Written], packed: bool = False) -> Path:
+    """The bag; its ending says which kind. Of ROS 2 the file inside its folder.
+
+    ``packed``: with compressed chunks, lz4 in ROS 1 and zstd in ROS 2.
+    """
+    ros1 = path.suffix == ".bag"
+    made = _Maker(get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE), ros1)
+    messages = sorted(written, key=lambda each: each[1])
+    if ros1:
+        bag = Writer1(path)
+        if packed:
+            bag.set_compression(Writer1.CompressionFormat.LZ4)
+        with bag as writer:
+            made.write(writer, messages)
+        return path
+    plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
+    folder = path.with_suffix("")
+    bag2 = Writer2(folder, version=9, storage_plugin=plugin)
+    if packed:
+        bag2.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with bag2 as writer:
+        made.write(writer, messages)
+    return folder / path.name
+
+
+@dataclass
+class _Maker:
+    store: Any
+    ros1: bool
+    connections: dict[str, Any] = field(default_factory=dict)
+
+    def write(self, writer: Any, messages: Iterable[Written]) -> None:
+        for topic, stamp, kind, fields in messages:
+            if topic not in self.connections:
+                made = writer.add_connection(topic, kind, typestore=self.store)
+                self.connections[topic] = made
+            message = self._message(kind, stamp, fields)
+            serialize = self.store.serialize_ros1 if self.ros1 else self.store.serialize_cdr
+            writer.write(self.connections[topic], stamp + LATE_NS, serialize(message, kind))
+
+    def _message(self, kind: str, stamp: int, fields: dict[str, Any]) -> Any:
+        values = dict(fields)
+        if kind.endswith("CameraInfo"):
+            roi = self._make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+            values |= {"roi": roi}
+            if self.ros1:
+                values = {k.upper() if len(k) == 1 else k: v for k, v in values.items()}
+        elif kind.endswith("Odometry"):
+            x, y, z, qx, qy, qz, qw = fields["pose"]
+            pose = self._make(
+                "geometry_msgs/msg/Pose",
+                self._make("geometry_msgs/msg/Point", x, y, z),
+                self._make("geometry_msgs/msg/Quaternion", qx, qy, qz, qw),
+            )
+            values = {
+                "child_frame_id": "base_link",
+                "pose": self._make("geometry_msgs/msg/PoseWithCovariance", pose, np.zeros(36)),
+                "twist": self._make(
+                    "geometry_msgs/msg/TwistWithCovariance", self._twist(0.0, 0.0), np.zeros(36)
+                ),
+            }
+        elif kind.endswith("TwistStamped"):
+            values = {"twist": self._twist(*fields["twist"])}
+        return self.store.types[kind](header=self._header(stamp), **values)
+
+    def _make(self, kind: str, *values: Any) -> Any:
+        return self.store.types[kind](*values)
+
+    def _twist(self, speed: float, yaw_rate: float) -> Any:
+        vector = "geometry_msgs/msg/Vector3"
+        linear, angular = (
+            self._make(vector, speed, 0.0, 0.0),
+            self._make(vector, 0.0, 0.0, yaw_rate),
+        )
+        return self._make("geometry_msgs/msg/Twist", linear, angular)
+
+    def _header(self, stamp: int) -> Any:
+        time = self._make("builtin_interfaces/msg/Time", *divmod(stamp, 1_000_000_000))
+        values = {"stamp": time, "frame_id": "camera", **({"seq": 0} if self.ros1 else {})}
+        return self.store.types["std_msgs/msg/Header"](**values)

@@ -1,0 +1,290 @@
+"""ROS bags: every format, encoding and fault, against bags that rosbags has written."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bags import (
+    PERIOD_NS,
+    START_NS,
+    camera_info,
+    compressed_image,
+    odometry,
+    raw_image,
+    stereo,
+    twists,
+    write_bag,
+)
+from dataset_builders import WIDTH, picture, write_calibration
+
+from fgslam.core.arrays import Image
+from fgslam.core.errors import CalibrationError, DatasetError, FrameError, OdometryError
+from fgslam.datasets.bags.reader import open_bag
+from fgslam.datasets.layouts import recognise_layout
+from fgslam.datasets.recording import Recording
+from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
+from fgslam.runs.bare_recording import bare_experiment
+
+KINDS = (".bag", ".db3", ".mcap")
+
+
+def opened(path: Path, **settings: Any) -> Recording:
+    return open_bag(BagSettings(path=str(path), **settings), RecordedOdometrySettings())
+
+
+def codes(recording: Recording, i: int) -> tuple[int, ...]:
+    return tuple(int(image[0, 0]) for image in recording.frame(i).images)
+
+
+@pytest.fixture(params=KINDS)
+def ending(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+# --------------------------------------------------------------------------------------------
+# What is read
+
+
+def test_every_format_gives_the_same_pixels_stamps_and_rig(tmp_path: Path, ending: str) -> None:
+    recording = opened(write_bag(tmp_path / f"walk{ending}", stereo()))
+    assert len(recording) == 4
+    assert recording.rig.baseline == pytest.approx(0.2, abs=1e-12)
+    assert [codes(recording, i) for i in (0, 3, 1, 2)] == [(10, 60), (13, 63), (11, 61), (12, 62)]
+    assert np.array_equal(recording.frame(2).images[1], picture(62))
+    expected = 1e-9 * (START_NS + PERIOD_NS * np.arange(4))
+    assert np.allclose(recording.timestamps, expected, rtol=0.0, atol=1e-6)
+    assert recording.notes == ()
+
+
+def test_a_folder_and_a_pattern_are_bags_too(tmp_path: Path, ending: str) -> None:
+    file = write_bag(tmp_path / f"walk{ending}", stereo())
+    for given in (file, file.parent, file.parent / f"w*{ending}"):
+        assert recognise_layout(given)["kind"] == "bag"
+        assert len(opened(given)) == 4
+    (file.parent / "metadata.yaml").unlink(missing_ok=True)
+    assert len(opened(file.parent)) == 4
+
+
+def test_a_bag_is_a_bare_recording(tmp_path: Path) -> None:
+    found = bare_experiment(write_bag(tmp_path / "walk.bag", stereo()))
+    assert found.said.startswith("walk: ROS bag, 2 cameras 32x24; 4 frames at 10 Hz; no odometry")
+    assert found.values["name"] == "walk"
+
+
+def colour(image: Image) -> Image:
+    return np.dstack([image, image, image])
+
+
+ENCODINGS: dict[str, Any] = {
+    "bgr8": lambda image: raw_image(colour(image), "bgr8"),
+    "rgb8, rows padded": lambda image: raw_image(colour(image), "rgb8", padding=7),
+    "bgra8": lambda image: raw_image(np.dstack([colour(image), image]), "bgra8"),
+    "mono16": lambda image: raw_image(image.astype(np.uint16) << 8 | 0x7F, "mono16"),
+    "png": compressed_image,
+    "png of 16 bits": lambda image: compressed_image(image.astype(np.uint16) << 8),
+    "yuv422": lambda image: raw_image(np.dstack([np.full_like(image, 128), image]), "yuv422"),
+}
+
+
+@pytest.mark.parametrize("name", ENCODINGS)
+def test_encodings_become_the_same_grey(tmp_path: Path, name: str) -> None:
+    recording = opened(write_bag(tmp_path / "walk.mcap", stereo(1, ENCODINGS[name])))
+    assert np.array_equal(recording.frame(0).images[0], picture(10))
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_mosaics_are_read_in_the_right_order(tmp_path: Path, pattern: str) -> None:
+    """A red image: grey of pure red, 0.299 * 200, wherever the mosaic has its red pixels."""
+    rows, columns = np.indices((24, WIDTH))
+    letters = np.array(list(pattern)).reshape(2, 2)[rows % 2, columns % 2]
+    mosaic = np.where(letters == "r", 200, 0).astype(np.uint8)
+    encode = lambda image: raw_image(mosaic, f"bayer_{pattern}8")  # noqa: E731 - one line
+    grey = opened(write_bag(tmp_path / "a.bag", stereo(1, encode))).frame(0).images[0]
+    assert np.abs(grey[4:-4, 4:-4].astype(float) - 59.8).max() <= 1.0
+
+
+def test_what_is_not_read_is_named(tmp_path: Path) -> None:
+    encode = partial(raw_image, encoding="32FC7")
+    recording_path = write_bag(tmp_path / "a.bag", stereo(1, encode))
+    with pytest.raises(FrameError, match=r"encoding '32FC7' is not read; known: .*bgr8.*bayer"):
+        opened(recording_path).frame(0)
+
+
+# --------------------------------------------------------------------------------------------
+# Pairs and topics
+
+
+def test_pairs_within_the_tolerance_and_what_was_dropped(tmp_path: Path) -> None:
+    messages = stereo(5, skew_ns=4_000_000)
+    lonely = [m for m in messages if not (m[0] == "/cam/left/image_raw" and m[3]["data"][0] == 62)]
+    recording = opened(write_bag(tmp_path / "a.bag", lonely))
+    assert [codes(recording, i) for i in range(4)] == [(10, 60), (11, 61), (13, 63), (14, 64)]
+    assert "1 right images have no partner within 20 ms" in recording.notes[0]
+    assert "differ in time by 4 ms" in recording.notes[1]
+    with pytest.raises(DatasetError, match=r"within 1 ms, the nearest differ by 4 ms; raise"):
+        opened(tmp_path / "a.bag", pairing_tolerance_ms=1.0)
+
+
+def test_topics_may_be_named_and_depth_is_no_view(tmp_path: Path) -> None:
+    messages = stereo(2) + stereo(2, names=("/rear/cam0", "/rear/cam1"))
+    messages += [(m[0].replace("cam/left", "depth/left"), *m[1:]) for m in stereo(2)]
+    path = write_bag(tmp_path / "a.mcap", messages)
+    assert "also there: /rear/cam0/image_raw with /rear/cam1/image_raw" in opened(path).notes[0]
+    named = opened(path, topics=("/rear/cam0/image_raw", "/rear/cam1/image_raw"))
+    assert named.notes == ()
+    for topics, message in (
+        (("/nothing",), r"has no topic /nothing with messages; it has /cam/left/camera_info"),
+        (("/cam/left/image_raw",), "1 topics of images are named; name the left camera's and"),
+        (("/cam/left/camera_info",), "is sensor_msgs/msg/CameraInfo, which is no image"),
+    ):
+        with pytest.raises(DatasetError, match=message):
+            opened(path, topics=topics)
+
+
+def test_headers_without_stamps(tmp_path: Path) -> None:
+    messages = [(topic, 0, kind, fields) for topic, _, kind, fields in stereo(1)]
+    recording = opened(write_bag(tmp_path / "a.db3", messages))
+    assert len(recording) == 1
+
+
+# --------------------------------------------------------------------------------------------
+# Calibration
+
+
+def test_swapped_names_are_told_by_the_calibration(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "a.bag", stereo(2, names=("/cam/right", "/cam/left")))
+    recording = opened(path)
+    assert codes(recording, 0) == (10, 60)
+    assert "by their camera_info /cam/left/image_raw is the right camera" in recording.notes[0]
+
+
+def test_one_camera_info_is_not_enough_but_a_file_is(tmp_path: Path) -> None:
+    messages = [m for m in stereo(2) if m[0] != "/cam/right/camera_info"]
+    path = write_bag(tmp_path / "a.bag", messages)
+    with pytest.raises(CalibrationError, match=r"no camera_info belongs to /cam/right/image_raw, "):
+        opened(path)
+    write_calibration(tmp_path)
+    assert opened(path, camera_file=str(tmp_path / "calib.json")).rig.baseline == 0.2
+
+
+def test_a_camera_info_without_baseline(tmp_path: Path) -> None:
+    messages = [
+        (t, s, k, camera_info(0.0) if k.endswith("CameraInfo") else f) for t, s, k, f in stereo(2)
+    ]
+    with pytest.raises(CalibrationError, match="states no baseline"):
+        opened(write_bag(tmp_path / "a.bag", messages))
+
+
+def test_rectified_topics_are_not_rectified_again(tmp_path: Path) -> None:
+    info = {"d": np.array([-0.3, 0.1, 0.0, 0.0, 0.0])}
+    messages = [
+        (
+            t.replace("image_raw", "image_rect"),
+            s,
+            k,
+            {**f, **(info if k.endswith("CameraInfo") else {})},
+        )
+        for t, s, k, f in stereo(1)
+    ]
+    rectified = opened(write_bag(tmp_path / "a.bag", messages))
+    assert np.array_equal(rectified.frame(0).images[0], picture(10))
+
+
+def test_an_image_of_another_size_is_one_lost_frame(tmp_path: Path) -> None:
+    messages = stereo(3)
+    k = next(i for i, m in enumerate(messages) if m[0] == "/cam/left/image_raw" and i > 3)
+    messages[k] = (*messages[k][:3], raw_image(picture(1, 16, 12)))
+    recording = opened(write_bag(tmp_path / "a.bag", messages))
+    with pytest.raises(FrameError, match="is 16x12 but the calibration says 32x24"):
+        recording.frame(1)
+    assert codes(recording, 2) == (12, 62)
+
+
+# --------------------------------------------------------------------------------------------
+# Odometry
+
+
+def test_poses_of_odometry(tmp_path: Path, ending: str) -> None:
+    stamps = [START_NS + k * PERIOD_NS // 2 for k in range(9)]
+    poses = np.column_stack([0.05 * np.arange(9.0), np.zeros((9, 2)), np.zeros(9)])
+    path = write_bag(tmp_path / f"a{ending}", stereo(4) + odometry(stamps, poses))
+    recording = opened(path)
+    step = recording.odometry(2)
+    assert step is not None
+    assert np.allclose(step.motion[:3, 3], [0.1, 0.0, 0.0], rtol=0.0, atol=1e-6)
+    # The body looks along x, the camera along z.
+    assert np.array_equal(recording.rig.bTc[:3, 2], [1.0, 0.0, 0.0])
+    assert "taken to look straight ahead" in recording.notes[-1]
+    assert "; odometry; " in bare_experiment(path).said
+
+
+def test_a_twist_is_speed_and_yaw_rate(tmp_path: Path) -> None:
+    stamps = [START_NS + k * PERIOD_NS // 4 for k in range(20)]
+    recording = opened(write_bag(tmp_path / "a.mcap", stereo(4) + twists(stamps, 1.0, 0.5)))
+    step = recording.odometry(1)
+    assert step is not None
+    assert np.arctan2(step.motion[1, 0], step.motion[0, 0]) == pytest.approx(0.05, abs=1e-6)
+
+
+def test_truth_is_no_odometry_and_another_clock_is_said(tmp_path: Path) -> None:
+    poses = np.zeros((4, 4))
+    stamps = [START_NS + k * PERIOD_NS for k in range(4)]
+    truth = odometry(stamps, poses, "/ground_truth/state")
+    assert opened(write_bag(tmp_path / "a.bag", stereo(4) + truth)).odometry_source is None
+    late = odometry([stamp + 10**12 for stamp in stamps], poses)
+    other = opened(write_bag(tmp_path / "b.bag", stereo(4) + late))
+    with pytest.raises(OdometryError, match="/odom covers none of the frames"):
+        other.odometry(1)
+
+
+# --------------------------------------------------------------------------------------------
+# Damage
+
+
+@pytest.mark.parametrize("share", [0.5, 0.8])
+@pytest.mark.parametrize("kind", [*KINDS, "packed.bag", "packed.mcap"])
+def test_of_a_bag_that_is_cut_off_the_beginning_is_used(
+    tmp_path: Path, kind: str, share: float
+) -> None:
+    ending = Path(f"a{kind}").suffix
+    packed = "packed" in kind
+    frames = 300 if packed else 60  # zstd gives back whole blocks of 128 kB
+    file = write_bag(tmp_path / f"walk{ending}", stereo(frames), packed=packed)
+    content = file.read_bytes()
+    cut = tmp_path / f"cut{ending}"
+    cut.write_bytes(content[: int(share * len(content))])
+    recording = opened(cut)
+    assert 0.5 * share * frames < len(recording) < frames
+    last = len(recording) - 1
+    assert codes(recording, last) == ((10 + last) % 256, (60 + last) % 256)
+    assert "the bag is cut off or damaged" in recording.notes[0]
+
+
+def test_a_folder_whose_only_file_is_cut_off(tmp_path: Path) -> None:
+    file = write_bag(tmp_path / "walk.mcap", stereo(60))
+    file.write_bytes(file.read_bytes()[:-5000])
+    assert len(opened(file.parent)) > 30
+
+
+def test_what_is_no_bag_is_refused_in_one_line(tmp_path: Path, ending: str) -> None:
+    for content in (b"", b"nonsense" * 1000, b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n"):
+        path = tmp_path / f"a{ending}"
+        path.write_bytes(content)
+        with pytest.raises(DatasetError, match="no message can be read from it as a ROS bag") as e:
+            opened(path)
+        assert "\n" not in str(e.value)
+
+
+def test_bags_without_a_pair(tmp_path: Path) -> None:
+    for messages, line in (
+        ([m for m in stereo(2) if "left" in m[0]], "has images of one camera only, /cam/left/ima"),
+        ([m for m in stereo(2) if "info" in m[0]], "has no topic of camera images .*; it has /cam"),
+        (stereo(2, names=("/front", "/back")), "cannot be told by their names; say it: --topics"),
+    ):
+        path = write_bag(tmp_path / f"{len(line)}.bag", messages)
+        with pytest.raises(DatasetError, match=line):
+            opened(path)
