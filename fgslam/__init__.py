@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from fgslam.runs.live import Result, Slam
     from fgslam.runs.maps import Map
     from fgslam.slam.feature_stream import FeatureExtractor
+    from fgslam.slam.newest_frame import NewestFrame
     from fgslam.slam.results import Step
 
 __all__ = [
@@ -50,6 +51,7 @@ __all__ = [
     "HomingVector",
     "Map",
     "MeasurementLog",
+    "NewestFrame",
     "Odometry",
     "PathFollower",
     "PathMemory",
@@ -80,6 +82,7 @@ _HOMES = {
     "HomingVector": "fgslam.homing.api",
     "Map": "fgslam.runs.maps",
     "MeasurementLog": "fgslam.core.measurement_log",
+    "NewestFrame": "fgslam.slam.newest_frame",
     "Odometry": "fgslam.core.measurements",
     "PathFollower": "fgslam.homing.api",
     "PathMemory": "fgslam.homing.path_memory",
