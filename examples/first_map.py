@@ -14,7 +14,7 @@ recording = fg.rendered_recording("lab", frames=12)  # for your own: a list of (
 # %% [markdown]
 # ## The cameras
 #
-# Rectified images need seven numbers; `fg.StereoRig.load("camchain.yaml")` reads calibration files.
+# Rectified images need seven numbers; `fg.load_rig("camchain.yaml")` reads calibration files.
 
 # %%
 rig = fg.StereoRig(

@@ -25,7 +25,7 @@ from fgslam.core import __version__, errors
 if TYPE_CHECKING:
     from fgslam.backend.protocol import Estimator
     from fgslam.cameras.omni.camera_files import load_camera
-    from fgslam.cameras.rig import StereoRig
+    from fgslam.cameras.rig import StereoRig, load_rig
     from fgslam.core.features import Features
     from fgslam.core.homing import Refusal, TwoViewVector
     from fgslam.core.measurement_log import MeasurementLog
@@ -66,6 +66,7 @@ __all__ = [
     "compare",
     "errors",
     "load_camera",
+    "load_rig",
     "open_recording",
     "plot",
     "rendered_recording",
@@ -95,6 +96,7 @@ _HOMES = {
     "TwoViewVector": "fgslam.core.homing",
     "compare": "fgslam.evaluation.comparing",
     "load_camera": "fgslam.cameras.omni.camera_files",
+    "load_rig": "fgslam.cameras.rig",
     "open_recording": "fgslam.runs.library",
     "plot": "fgslam.report.plotting",
     "rendered_recording": "fgslam.runs.library",

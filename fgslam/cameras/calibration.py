@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.checks import is_finite_number
@@ -125,33 +124,3 @@ def level_mounting(camera_yaw_deg: float, lever_arm_m: tuple[float, float, float
     heading = so3_exp(np.array([0.0, 0.0, np.radians(camera_yaw_deg)]))
     ahead = BODY_FORWARD_LEFT_UP_FROM_CAMERA[:3, :3]
     return pose(heading @ ahead, np.array(lever_arm_m, np.float64))
-
-
-# --------------------------------------------------------------------------------------------
-# YAML files: keys with lists of finite numbers
-
-
-def read_calibration_yaml(path: Path) -> Mapping[str, Any]:
-    """Keys and values of a YAML file. Raises CalibrationError where there are none."""
-    text = read_text(path, CalibrationError)
-    # OpenCV writes a directive that is no YAML: "%YAML:1.0".
-    lines = [line for line in text.splitlines() if not line.startswith("%YAML:")]
-    try:
-        values = yaml.safe_load("\n".join(lines))
-    except yaml.YAMLError as cause:
-        reason = " ".join(str(cause).split())
-        raise CalibrationError(f"{path} is not YAML: {reason}; correct the file") from cause
-    if not isinstance(values, dict):
-        raise CalibrationError(f"{path} must hold keys and values; restore the file")
-    return values
-
-
-def numbers(path: Path, values: Mapping[str, Any], key: str, count: int) -> FloatArray:
-    """A list of ``count`` finite numbers of the file. Raises CalibrationError otherwise."""
-    given = values.get(key)
-    good = isinstance(given, list) and len(given) == count and all(map(is_finite_number, given))
-    if not good:
-        raise CalibrationError(
-            f"{path}: {key} is {given!r}, expected {count} finite numbers; correct the file"
-        )
-    return np.array(given, np.float64)

@@ -1,168 +1,202 @@
-"""Rectification of raw stereo pairs: one image plane, equal rows (Bouguet's method, OpenCV)."""
+"""Rectification: one orientation and one image plane for all cameras, so that rows agree.
+
+The view is perspective. Its x axis lies along the baseline, its z axis as near to the mean of the
+optical axes as that allows; of three cameras in an L the image plane holds both baselines.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.cameras.raw_cameras import RawCamera
 from fgslam.core.arrays import Brief, FloatArray, Image
-from fgslam.core.errors import CalibrationError
-from fgslam.core.geometry import inverse
+from fgslam.core.geometry import pose
 from fgslam.core.sensors import CameraRig
 
 MapArray: TypeAlias = npt.NDArray[np.float32]
 
-_LEAST_BASELINE_M = 1e-3  # below it two cameras are one, up to rounding
-# Cosine of 45 degrees: beyond, a common image plane would stretch the views out of use.
-_LEAST_COMMON_VIEW = 0.707
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RawCamera:
-    """A camera as calibrated, before rectification.
-
-    Attributes:
-        width, height: pixels.
-        matrix: (3, 3) intrinsics in pixels.
-        distortion: (4,), (5,), (8,), (12,) or (14,) radial-tangential, in OpenCV's order.
-        bTc: (4, 4) pose of the camera in the body.
-        name: in messages.
-    """
-
-    width: int
-    height: int
-    matrix: FloatArray
-    distortion: FloatArray
-    bTc: FloatArray
-    name: str = "camera"
+_OUTSIDE = -1e4  # coordinate that is outside of any image, so that it stays black
+# A perspective view stretches its rim by 1 / cos^2: at 60 degrees off the axis by 4.
+_WIDEST_DEG = 120.0
+# The middle of the view keeps at least this share of the raw image's resolution.
+_LEAST_RESOLUTION = 0.9
+_BORDER_STEPS = 200
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rectifier(Brief):
-    """Remaps raw images of a stereo pair to rectified ones; maps are computed once.
+    """Remaps raw images to rectified ones; maps are computed once.
 
     Attributes:
         rig: the rectified rig, reference = right camera.
-        maps: per camera (right, left) the columns and rows (h, w) to sample, float32.
+        maps: per camera (right, left[, top]) the columns and rows (h, w) to sample, float32.
+        order: per camera, which of the images given as (right, left[, top]) is its own; another
+            order than 0, 1, 2 where the calibration says that what is called left is on the right.
+        size: width and height of the raw images, pixels; None: those of the rig.
     """
 
     rig: CameraRig
     maps: tuple[tuple[MapArray, MapArray], ...]
+    order: tuple[int, ...] = (0, 1, 2)
+    size: tuple[int, int] | None = None
 
     def rectify(self, camera: int, image: Image) -> Image:
-        """Rectified image (h, w) of camera 0 (right) or 1 (left), bilinear."""
+        """Rectified image (h, w) of camera 0 (right), 1 (left) or 2 (top), bilinear."""
         columns, rows = self.maps[camera]
         return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_LINEAR), np.uint8)
 
+    def images(self, raw: Sequence[Image]) -> tuple[Image, ...]:
+        """Rectified (right, left[, top]) of raw images given in that order."""
+        return tuple(self.rectify(k, raw[self.order[k]]) for k in range(self.rig.cameras))
 
-def right_and_left(first: RawCamera, second: RawCamera) -> tuple[RawCamera, RawCamera]:
-    """The two cameras, right first: the left one is that which sees the other at +x.
+    @cached_property
+    def raw_size(self) -> tuple[int, int]:
+        """Width and height of the images that it takes."""
+        return self.size or (self.rig.width, self.rig.height)
 
-    Raises:
-        CalibrationError: their images differ in size.
-    """
-    if (first.width, first.height) != (second.width, second.height):
-        raise CalibrationError(
-            f"{first.name} is {first.width}x{first.height} but {second.name} is "
-            f"{second.width}x{second.height}; both must have one resolution"
+    @cached_property
+    def masks(self) -> tuple[npt.NDArray[np.bool_], ...]:
+        """Per camera, which pixels (h, w) of its rectified image show something."""
+        width, height = self.raw_size
+        return tuple(
+            (columns >= 0) & (columns <= width - 1) & (rows >= 0) & (rows <= height - 1)
+            for columns, rows in self.maps
         )
-    if (inverse(first.bTc) @ second.bTc)[0, 3] > 0.0:
-        return second, first
-    return first, second
 
 
-def rectifier(right: RawCamera, left: RawCamera, alpha: float = 0.0) -> Rectifier:
-    """Rectify a pair (Bouguet's method as in OpenCV; ``alpha`` 0 crops to valid pixels).
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A perspective image plane: (3, 3) intrinsics in pixels, and width and height."""
 
-    Raises:
-        CalibrationError: the cameras lie above each other, or look in different directions.
-    """
-    _require_side_by_side(inverse(left.bTc) @ right.bTc)
-    rTl = inverse(right.bTc) @ left.bTc
-    size = (right.width, right.height)
-    r_left, r_right, _, p_right, *_ = cv2.stereoRectify(
-        left.matrix,
-        left.distortion,
-        right.matrix,
-        right.distortion,
-        size,
-        rTl[:3, :3],
-        rTl[:3, 3:],
-        flags=cv2.CALIB_ZERO_DISPARITY,
-        alpha=alpha,
-    )
-    projection = np.asarray(p_right, np.float64)
-    rotations = (np.asarray(r_right, np.float64), np.asarray(r_left, np.float64))
-    return rectified_by(right, left, rotations, projection)
+    matrix: FloatArray
+    size: tuple[int, int]
+
+    @property
+    def angles(self) -> FloatArray:
+        """Horizontal and vertical angle of view (2,) in radians."""
+        ends = np.array([[-0.5, -0.5], [self.size[0] - 0.5, self.size[1] - 0.5]])
+        focal = np.diag(self.matrix)[:2]
+        low, high = np.arctan((ends - self.matrix[:2, 2]) / focal)
+        return np.asarray(high - low)
 
 
-def rectified_by(
-    right: RawCamera,
-    left: RawCamera,
-    rotations: tuple[FloatArray, FloatArray],
-    projection: FloatArray,
-) -> Rectifier:
-    """The rectifier that a calibration states.
+def orientation(positions: Sequence[FloatArray], axes: FloatArray) -> FloatArray:
+    """Rotation (3, 3) from the body's axes to the view's.
 
     Args:
-        right: the reference camera.
-        left: the other one.
-        rotations: (3, 3) each, of right and left camera: from raw to rectified axes.
-        projection: (3, 4) of the rectified right camera, whose last column holds the baseline,
-            ``-fx * baseline``.
+        positions: of right, left[, top] camera (3,) in the body.
+        axes: (n, 3) optical axes in the body.
     """
-    new_matrix = projection[:, :3]
-    maps = tuple(
-        _sampling_maps(camera, rotation, new_matrix)
-        for camera, rotation in zip((right, left), rotations, strict=True)
-    )
-    fx, fy, cx, cy = (float(projection[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    raw_from_rectified = np.eye(4)
-    raw_from_rectified[:3, :3] = rotations[0].T
+    right, left, *top = positions
+    x = (right - left) / np.linalg.norm(right - left)
+    z = axes.mean(axis=0)
+    if top:
+        z = np.cross(x, right - top[0])
+    y = np.cross(z, x)
+    y = y / np.linalg.norm(y)
+    return np.stack([x, y, np.cross(x, y)])
+
+
+def chosen_view(
+    cameras: Sequence[RawCamera],
+    rotations: Sequence[FloatArray],
+    size: tuple[int, int],
+    fov_deg: float | None = None,
+) -> View:
+    """The largest view that all cameras fill, as far as a perspective view reaches.
+
+    Args:
+        cameras: as calibrated.
+        rotations: (3, 3) of each, from raw to the view's axes.
+        size: width and height of the view in pixels.
+        fov_deg: wanted horizontal angle of view; what is black then stays so. None: no border is
+            black, at most 120 degrees, and the middle keeps nine tenths of the resolution.
+    """
+    limit = np.tan(np.radians(0.5 * (fov_deg or _WIDEST_DEG)))
+    low, high = np.full(2, -limit), np.full(2, limit)
+    if fov_deg is None:
+        for camera, rotation in zip(cameras, rotations, strict=True):
+            inner = _inner(camera, rotation)
+            low, high = np.maximum(low, inner[0]), np.minimum(high, inner[1])
+    width, height = size
+    if fov_deg is None:
+        natural = _LEAST_RESOLUTION * float(np.mean([camera.focal_px for camera in cameras]))
+        focal = max(width / (high[0] - low[0]), height / (high[1] - low[1]), natural)
+    else:
+        focal = width / (high[0] - low[0])
+    middle = 0.5 * (low + high)
+    column, row = (0.5 * (np.array(size) - 1.0) - focal * middle).tolist()
+    return View(np.array([[focal, 0.0, column], [0.0, focal, row], [0.0, 0.0, 1.0]]), size)
+
+
+def _inner(camera: RawCamera, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest (x, y) of the plane at z = 1 that the camera sees all over."""
+    width, height = camera.width - 1.0, camera.height - 1.0
+    along = np.linspace(0.0, 1.0, _BORDER_STEPS)
+    start = np.zeros(_BORDER_STEPS)
+    left = _on_plane(camera, rotation, np.column_stack([start, along * height]))
+    right = _on_plane(camera, rotation, np.column_stack([start + width, along * height]))
+    top = _on_plane(camera, rotation, np.column_stack([along * width, start]))
+    bottom = _on_plane(camera, rotation, np.column_stack([along * width, start + height]))
+    low = np.array([left[:, 0].max(initial=-np.inf), top[:, 1].max(initial=-np.inf)])
+    high = np.array([right[:, 0].min(initial=np.inf), bottom[:, 1].min(initial=np.inf)])
+    return low, high
+
+
+def _on_plane(camera: RawCamera, rotation: FloatArray, pixels: FloatArray) -> FloatArray:
+    """(k, 2) where rays of pixels meet the plane at z = 1, of those that do."""
+    rays = camera.unproject(pixels) @ rotation.T
+    rays = rays[rays[:, 2] > 0.0]  # NaN is not
+    return np.asarray(rays[:, :2] / rays[:, 2:])
+
+
+def sampling_maps(camera: RawCamera, rotation: FloatArray, view: View) -> tuple[MapArray, MapArray]:
+    """Columns and rows (h, w) of the raw image at which each pixel of the view looks."""
+    width, height = view.size
+    columns, rows = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+    plane = np.column_stack([columns.ravel(), rows.ravel(), np.ones(width * height)])
+    rays = plane @ np.linalg.inv(view.matrix).T @ rotation
+    pixels = camera.project(rays)
+    pixels = np.where(np.isfinite(pixels), pixels, _OUTSIDE).clip(_OUTSIDE, -_OUTSIDE)
+    found = pixels.reshape(height, width, 2).astype(np.float32)
+    return np.ascontiguousarray(found[..., 0]), np.ascontiguousarray(found[..., 1])
+
+
+def rectifier(
+    cameras: Sequence[RawCamera], rotations: Sequence[FloatArray], view: View
+) -> Rectifier:
+    """What rectifies images of right, left[, top] camera into one view.
+
+    Args:
+        cameras: right, left[, top].
+        rotations: (3, 3) of each, from raw to the view's axes.
+        view: the common image plane.
+    """
+    right = cameras[0]
+    focal = np.diag(view.matrix)[:2]
+    # The axes of the view in the body, by the reference camera.
+    axes = right.bTc[:3, :3] @ rotations[0].T
+    away = [axes.T @ (right.bTc[:3, 3] - camera.bTc[:3, 3]) for camera in cameras[1:]]
     rig = CameraRig(
-        width=right.width,
-        height=right.height,
-        fx=fx,
-        fy=fy,
-        cx=cx,
-        cy=cy,
-        baseline=-float(projection[0, 3]) / fx,
-        vertical_baseline=None,
-        bTc=right.bTc @ raw_from_rectified,
+        width=view.size[0],
+        height=view.size[1],
+        fx=float(focal[0]),
+        fy=float(focal[1]),
+        cx=float(view.matrix[0, 2]),
+        cy=float(view.matrix[1, 2]),
+        baseline=float(away[0][0]),
+        vertical_baseline=float(away[1][1]) if len(away) > 1 else None,
+        bTc=pose(axes, right.bTc[:3, 3]),
     )
-    return Rectifier(rig, maps)
-
-
-def _sampling_maps(
-    camera: RawCamera, rotation: FloatArray, new_matrix: FloatArray
-) -> tuple[MapArray, MapArray]:
-    """Columns and rows (h, w) of the raw image at which each rectified pixel looks."""
-    columns, rows = cv2.initUndistortRectifyMap(
-        camera.matrix,
-        camera.distortion,
-        rotation,
-        new_matrix,
-        (camera.width, camera.height),
-        cv2.CV_32FC1,
+    maps = tuple(
+        sampling_maps(camera, rotation, view)
+        for camera, rotation in zip(cameras, rotations, strict=True)
     )
-    return np.asarray(columns, np.float32), np.asarray(rows, np.float32)
-
-
-def _require_side_by_side(lTr: FloatArray) -> None:
-    """Raises CalibrationError unless the right camera, at ``lTr``, is to the left one's right."""
-    offset = lTr[:3, 3]
-    if np.abs(offset[0]) < max(2.0 * np.hypot(offset[1], offset[2]), _LEAST_BASELINE_M):
-        x, y, z = offset
-        raise CalibrationError(
-            f"cam0 and cam1 are not side by side (offset {x:.3f}, {y:.3f}, {z:.3f} m along x, y, z)"
-            "; a horizontal stereo pair is needed, check T_BS (or R and T) in the calibration"
-        )
-    if lTr[2, 2] < _LEAST_COMMON_VIEW:
-        raise CalibrationError(
-            "cam0 and cam1 look more than 45 degrees apart; check T_BS (or R and T) in the "
-            "calibration"
-        )
+    return Rectifier(rig, maps, (0, 1, 2), right.size)

@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 
+from fgslam.cameras.assembly import assembled, at_size, in_metres
 from fgslam.cameras.calibration import read_json_object
-from fgslam.cameras.calibration_formats import (
-    read_asl_camera,
-    read_camchain,
-    read_camera_info_pair,
-    read_opencv_pair,
-    read_projections,
-)
+from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.corrected import read_own_format
-from fgslam.cameras.rectification import Rectifier, rectifier, right_and_left
+from fgslam.cameras.formats.own import is_rectified
+from fgslam.cameras.raw_cameras import Calibration
+from fgslam.cameras.rectification import Rectifier
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
-from fgslam.core.files import read_lines, read_text
 from fgslam.core.geometry import is_rigid
 from fgslam.core.sensors import CameraRig
 
@@ -50,6 +45,8 @@ class StereoRig(CameraRig):
             The identity where odometry is the camera's own motion, or there is none.
 
         rectifier: how raw images become rectified ones; None where they are rectified already.
+        sources: which of a calibration file's cameras are right, left[, top].
+        remarks: what the calibration gives rise to say, a line each.
 
     Raises:
         CalibrationError: a size, focal length or baseline is not positive and finite, the
@@ -60,34 +57,25 @@ class StereoRig(CameraRig):
     vertical_baseline: float | None = None
     bTc: FloatArray = field(default_factory=_identity)
     rectifier: Rectifier | None = None
+    sources: tuple[int, ...] = (1, 0, 2)
+    remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         require_rig(self)
 
     @staticmethod
     def load(path: str | Path, size: tuple[int, int] | None = None) -> StereoRig:
-        """The rig of a calibration file or folder; its format is recognised by its content.
+        """The rig of a calibration file or folder: :func:`fgslam.load_rig`."""
+        return load_rig(path, size=size)
 
-        Known are our calib.json; Kalibr's camchain (pinhole, radtan); the files of OpenCV's stereo
-        calibration (M1, D1, M2, D2, R, T); a folder with left.yaml and right.yaml of ROS
-        camera_info; KITTI's calib.txt and calib_cam_to_cam.txt; a EuRoC folder with
-        cam0/sensor.yaml. Where the cameras are not rectified, the rig holds the maps that rectify
-        them, and a session applies them to the raw images that it is given.
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height in pixels of the images that the cameras give."""
+        return (self.width, self.height) if self.rectifier is None else self.rectifier.raw_size
 
-        Args:
-            path: the file, or a folder that holds one.
-            size: width and height of the images in pixels, for KITTI's calib.txt and OpenCV's
-                files, which do not state it.
-
-        Raises:
-            CalibrationError: the format or a camera model is not known, a value is missing or
-                impossible, or the cameras are no horizontal pair.
-        """
-        found = read_rig(Path(path), size)
-        raw = found if isinstance(found, Rectifier) else None
-        rig = found.rig if isinstance(found, Rectifier) else found
-        values = {name: getattr(rig, name) for name in CameraRig.__dataclass_fields__}
-        return StereoRig(**values, rectifier=raw)
+    def plain(self) -> CameraRig:
+        """The rectified rig alone, without what makes images its own."""
+        return CameraRig(**{name: getattr(self, name) for name in CameraRig.__dataclass_fields__})
 
     def rectified(self, images: tuple[Image, ...]) -> tuple[Image, ...]:
         """Rectified (right, left[, top]) of grey images (height, width) uint8 as the camera gives.
@@ -96,7 +84,7 @@ class StereoRig(CameraRig):
         """
         if self.rectifier is None:
             return images
-        return tuple(self.rectifier.rectify(k, image) for k, image in enumerate(images))
+        return self.rectifier.images(images)
 
 
 def require_rig(rig: CameraRig) -> None:
@@ -142,116 +130,96 @@ def _require_length(rig: CameraRig, name: str) -> None:
 
 
 # --------------------------------------------------------------------------------------------
-# Which format a calibration has, and its rig
+# Calibration files
 
 
-Size: TypeAlias = tuple[int, int]
-_KITTI_RAW = ("P_rect_00", "P_rect_01")
+def load_rig(
+    path: str | Path,
+    path2: str | Path | None = None,
+    *,
+    size: tuple[int, int] | None = None,
+    scale: bool = False,
+    unit_m: float = 1.0,
+    fov_deg: float | None = None,
+    cameras: Sequence[int] | None = None,
+) -> StereoRig:
+    """The rig of calibration files; the format is recognised by the content.
 
-
-def read_rig(path: Path, size: Size | None = None) -> CameraRig | Rectifier:
-    """The rectified rig of a calibration file or folder, or what rectifies its raw images.
-
-    The format is recognised by the content.
+    Where the cameras are not rectified, the rig holds the maps that rectify them, and a session
+    applies them to the raw images that it is given. ``remarks`` of the rig say what was noticed.
+    docs/howto/your_camera.md lists the formats.
 
     Args:
-        path: see :meth:`fgslam.cameras.rig.StereoRig.load`.
-        size: width and height of the images, for formats that do not state it.
+        path: the file, or a folder that holds one.
+        path2: the second of two files: the right camera's, or OpenCV's extrinsics.
+        size: width and height of the images in pixels, where the file does not state them, or the
+            images were resized.
+        scale: the images were resized as a whole: scale the calibration to ``size``.
+        unit_m: metres of one unit of length of the file: 0.001 for millimetres, the side of a
+            square for a calibration in squares.
+        fov_deg: wanted horizontal angle of the rectified view in degrees, below 180; None: as much
+            as all cameras fill, at most 120.
+        cameras: which of the file's cameras form the rig, two or three; None: all.
 
     Raises:
-        CalibrationError: the format is unknown, of one camera only, or a value is impossible.
+        CalibrationError: the format or a camera model is not known, a value is missing or
+            impossible, the size is another one, or the cameras are no stereo rig.
     """
-    if size is not None and not (isinstance(size, Sequence) and len(size) == 2):
-        raise CalibrationError(f"size is {size!r}; give (width, height) of the images in pixels")
-    if path.is_dir():
-        return _of_folder(path, size)
-    text = read_text(path, CalibrationError, _KNOWN)
-    for mark, read in _MARKS:
-        if mark in text:
-            return read(path, size)
-    raise CalibrationError(f"{path}: not a calibration of a stereo rig that is known; {_KNOWN}")
+    _require_options(size, unit_m, fov_deg)
+    own = _own_rectified(Path(path), cameras) if path2 is None else None
+    if own is not None and (size is None or size == (own.width, own.height)):
+        return own
+    found = read_calibration_file(Path(path), None if path2 is None else Path(path2), size)
+    return rig_of(at_size(in_metres(_chosen(found, cameras), unit_m), size, scale), fov_deg)
 
 
-_KNOWN = (
-    "known: calib.json of fgslam, Kalibr's camchain.yaml, OpenCV's stereo files (M1, D1, M2, D2, "
-    "R, T), a folder with left.yaml and right.yaml of ROS camera_info, KITTI's calib.txt, a EuRoC "
-    "folder with cam0/sensor.yaml"
-)
+def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
+    """The rig of a calibration that is read; see :func:`load_rig`."""
+    made = assembled(calibration, fov_deg)
+    return _stereo_rig(made.rig, made.rectifier, made.sources, made.remarks)
 
 
-def _of_folder(folder: Path, size: Size | None) -> CameraRig | Rectifier:
-    root = folder / "mav0" if (folder / "mav0").is_dir() else folder
-    if (root / "cam0" / "sensor.yaml").is_file():
-        pair = (read_asl_camera(root / name / "sensor.yaml") for name in ("cam0", "cam1"))
-        return rectifier(*right_and_left(*pair))
-    if (folder / "left.yaml").is_file():
-        return read_camera_info_pair(folder / "left.yaml", folder / "right.yaml")
-    for pattern in ("calib.json", "*camchain.yaml", "calib.txt", "intrinsics.yml"):
-        found = sorted(folder.glob(pattern))
-        if len(found) == 1:
-            return read_rig(found[0], size)
-    raise CalibrationError(f"{folder}: holds no calibration of a stereo rig; {_KNOWN}")
+def _own_rectified(path: Path, cameras: Sequence[int] | None) -> StereoRig | None:
+    """The rig of a ``calib.json`` of rectified cameras, number by number; None for other files."""
+    path = path / "calib.json" if path.is_dir() else path
+    if not path.is_file() or path.suffix.lower() != ".json":
+        return None
+    values = read_json_object(path)
+    # A file of that name is ours, if it is nobody else's: what it lacks is then named.
+    if not is_rectified(values) and not (path.name == "calib.json" and "width" in values):
+        return None
+    three = "vertical_baseline_m" in values if cameras is None else len(cameras) == 3
+    found = read_own_format(path, three)
+    rig, raw = (found.rig, found) if isinstance(found, Rectifier) else (found, None)
+    return _stereo_rig(rig, raw, (1, 0, 2)[: rig.cameras], ())
 
 
-def _own_format(path: Path, _: Size | None) -> CameraRig | Rectifier:
-    three = "vertical_baseline_m" in read_json_object(path)
-    return read_own_format(path, three)
+def _stereo_rig(
+    rig: CameraRig, raw: Rectifier | None, sources: tuple[int, ...], remarks: tuple[str, ...]
+) -> StereoRig:
+    values = {name: getattr(rig, name) for name in CameraRig.__dataclass_fields__}
+    return StereoRig(**values, rectifier=raw, sources=sources, remarks=remarks)
 
 
-def _of_camera_info(path: Path, _: Size | None) -> CameraRig | Rectifier:
-    left, right = path.with_name("left.yaml"), path.with_name("right.yaml")
-    if path.name not in (left.name, right.name):
+def _chosen(calibration: Calibration, cameras: Sequence[int] | None) -> Calibration:
+    if cameras is None:
+        return calibration
+    count = len(calibration.cameras)
+    good = len(set(cameras)) == len(cameras) in (2, 3)
+    if not good or not all(isinstance(k, int) and 0 <= k < count for k in cameras):
         raise CalibrationError(
-            f"{path}: one camera_info alone knows one camera; give the folder that holds left.yaml "
-            "and right.yaml"
+            f"{calibration.source}: cameras is {cameras!r}; give two or three of 0 to {count - 1}"
         )
-    return read_camera_info_pair(left, right)
+    chosen = tuple(calibration.cameras[k] for k in cameras)
+    return replace(calibration, cameras=chosen, view=None)
 
 
-def _kitti(path: Path, size: Size | None) -> CameraRig | Rectifier:
-    return read_projections(path).rig(*_known_size(path, size))
-
-
-def _kitti_raw(path: Path, size: Size | None) -> CameraRig | Rectifier:
-    size = _stated_size(path) if size is None else size
-    return read_projections(path, _KITTI_RAW).rig(*_known_size(path, size))
-
-
-def _stated_size(path: Path) -> Size | None:
-    """Width and height by the line S_rect_00, if there is one."""
-    for number, text in read_lines(path):
-        if text.startswith("S_rect_00:"):
-            try:
-                width, height = map(float, text.split()[1:])
-                return round(width), round(height)
-            except (ValueError, OverflowError):
-                raise CalibrationError(
-                    f"{path}, line {number}: S_rect_00 must be width and height; restore the file"
-                ) from None
-    return None
-
-
-def _kalibr(path: Path, _: Size | None) -> CameraRig | Rectifier:
-    return rectifier(*right_and_left(*read_camchain(path)))
-
-
-def _opencv(path: Path, size: Size | None) -> CameraRig | Rectifier:
-    pair = read_opencv_pair(path, size)
-    return rectifier(*right_and_left(*pair))
-
-
-def _known_size(path: Path, size: Size | None) -> Size:
-    if size is None:
-        raise CalibrationError(f"{path} does not state the images' size; give size=(width, height)")
-    return size
-
-
-_MARKS: tuple[tuple[str, Callable[[Path, Size | None], CameraRig | Rectifier]], ...] = (
-    ('"baseline_m"', _own_format),
-    ("opencv-matrix", _opencv),
-    ("projection_matrix:", _of_camera_info),
-    ("P_rect_00:", _kitti_raw),
-    ("P0:", _kitti),
-    ("camera_model:", _kalibr),
-)
-"""Texts by which a format is recognised, and its reader; the first that is found counts."""
+def _require_options(size: object, unit_m: object, fov_deg: object) -> None:
+    pair = size if isinstance(size, list | tuple) and len(size) == 2 else ()
+    whole = pair and all(isinstance(n, int | np.integer) and n > 0 for n in pair)
+    if size is not None and not whole:
+        raise CalibrationError(f"size is {size!r}; give (width, height) of the images in pixels")
+    if not is_finite_number(unit_m) or not float(unit_m) > 0.0:  # type: ignore[arg-type]
+        raise CalibrationError(f"unit_m is {unit_m!r}; give metres, 0.001 for millimetres")
+    if fov_deg is not None and not (is_finite_number(fov_deg) and 0.0 < float(fov_deg) < 170.0):  # type: ignore[arg-type]
+        raise CalibrationError(f"fov_deg is {fov_deg!r}; a perspective view takes 0 to 170 degrees")

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.calibration_formats import read_asl_camera, read_asl_mounting
-from fgslam.cameras.rectification import RawCamera, rectifier, right_and_left
+from fgslam.cameras.formats.kalibr import read_asl_mounting
+from fgslam.cameras.rig import StereoRig, load_rig
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory
@@ -16,7 +16,7 @@ from fgslam.core.files import read_lines
 from fgslam.core.geometry import inverse
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.images import (
-    RawPairs,
+    RawImages,
     StereoFiles,
     check_sizes,
     missing_notes,
@@ -36,7 +36,6 @@ from fgslam.datasets.tables import (
 
 CAMERA_FOLDERS = ("cam0", "cam1")
 _MAX_TRUTH_GAP_S = 0.1
-_RECTIFY_ALPHA = 0.0  # crops to valid pixels: black borders would be matched
 
 
 def open_euroc(settings: EurocSettings) -> Recording:
@@ -51,34 +50,26 @@ def open_euroc(settings: EurocSettings) -> Recording:
     folders = [root / name for name in CAMERA_FOLDERS]
     for folder in folders:
         require_folder(folder, "a stereo pair needs two cameras, but the folder")
-    right, left, right_folder, left_folder = _right_and_left(folders)
-    raw = rectifier(right, left, _RECTIFY_ALPHA)
-    stamps, files, notes = _pairs(right_folder, left_folder, right, settings)
+    rig = load_rig(*(folder / "sensor.yaml" for folder in folders))
+    right_folder, left_folder = (folders[k] for k in rig.sources)
+    stamps, files, notes = _pairs(right_folder, left_folder, rig, settings)
     chosen = select_frames(len(stamps), settings)
     check_sizes(files, root)
     return Recording(
         name=root.resolve().parent.name if root.name == "mav0" else root.resolve().name,
-        rig=raw.rig,
+        rig=rig.plain(),
         timestamps=stamps[chosen],
         identity=_identity(folders, files),
-        ground_truth=_true_poses(root, raw.rig, stamps[chosen]),
-        notes=notes + missing_notes(files, stamps),
+        ground_truth=_true_poses(root, rig, stamps[chosen]),
+        notes=rig.remarks + notes + missing_notes(files, stamps),
         indices=chosen,
-        load_images=RawPairs(files, raw).load,
-        load_colour=RawPairs(files, raw).load_colour,
+        load_images=RawImages(files, rig).load,
+        load_colour=RawImages(files, rig).load_colour,
     )
 
 
-def _right_and_left(folders: list[Path]) -> tuple[RawCamera, RawCamera, Path, Path]:
-    """Cameras and folders, right first."""
-    first, second = (read_asl_camera(folder / "sensor.yaml") for folder in folders)
-    right, left = right_and_left(first, second)
-    swapped = right is second
-    return right, left, folders[swapped], folders[not swapped]
-
-
 def _pairs(
-    right_folder: Path, left_folder: Path, camera: RawCamera, settings: EurocSettings
+    right_folder: Path, left_folder: Path, rig: StereoRig, settings: EurocSettings
 ) -> tuple[FloatArray, StereoFiles, tuple[str, ...]]:
     """Stamps (n,) in seconds of the right images, files of the pairs, and notes."""
     right, left = read_camera_frames(right_folder), read_camera_frames(left_folder)
@@ -86,7 +77,7 @@ def _pairs(
     tolerance = 1e-3 * settings.pairing_tolerance_ms
     (rows, partners), notes = pair_stamps(right.stamps, left.stamps, tolerance, names)
     paths = tuple((right.paths[i], left.paths[j]) for i, j in zip(rows, partners, strict=True))
-    files = StereoFiles(paths, camera.width, camera.height)
+    files = StereoFiles(paths, *rig.image_size)
     stamps = right.stamps[rows].astype(np.float64) * NANOSECONDS
     return stamps, files, notes
 

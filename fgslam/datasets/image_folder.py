@@ -9,18 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.cameras.calibration import read_json_object
-from fgslam.cameras.corrected import read_own_format
-from fgslam.cameras.rectification import Rectifier
-from fgslam.cameras.rig import read_rig
+from fgslam.cameras.rig import StereoRig, load_rig
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError, OdometryError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import right_from_left_camera
 from fgslam.core.measurements import Odometry
-from fgslam.core.sensors import CameraRig
-from fgslam.datasets.calibrated import rig_and_rectifier
+from fgslam.datasets.calibrated import mounted
 from fgslam.datasets.images import (
-    RawPairs,
+    RawImages,
     StereoFiles,
     check_sizes,
     first_size,
@@ -67,12 +64,12 @@ def open_image_folder(
     require_folder(root, "the recording")
     folders = _camera_folders(root, settings.use_top)
     listed = [list_numbered_images(folder) for folder in folders]
-    rig, raw = _cameras(root, settings, listed)
+    rig = _cameras(root, settings, listed)
     numbers, stamps = _read_times(root / "times.txt")
     chosen = select_frames(len(stamps), settings)
     files = _files(folders, listed, numbers, rig)
     check_sizes(files, root)
-    images = files if raw is None else RawPairs(files, raw)
+    images = RawImages(files, rig)
     truth = _read_truth(root, rig.baseline)
     odometry_file = _find_odometry(root, settings.odometry_file)
     defining = [
@@ -82,12 +79,13 @@ def open_image_folder(
     ]
     return Recording(
         name=root.resolve().name,
-        rig=rig,
+        rig=rig.plain(),
         timestamps=stamps[chosen],
         identity=recording_identity(defining, (p for images in listed for p in images.values())),
         ground_truth=None if truth is None else trajectory_at_frames(truth, stamps[chosen]),
         notes=(
-            missing_notes(files, stamps)
+            rig.remarks
+            + missing_notes(files, stamps)
             + _unlisted(folders, listed, numbers)
             + (_missing_top(root, settings.use_top) if settings.camera_file is None else ())
         ),
@@ -126,22 +124,19 @@ def _camera_file(root: Path, settings: ImageFolderSettings) -> Path:
     return root / "calib.json" if settings.camera_file is None else Path(settings.camera_file)
 
 
-def _cameras(
-    root: Path, settings: ImageFolderSettings, listed: list[dict[int, Path]]
-) -> tuple[CameraRig, Rectifier | None]:
-    """The rectified rig, and what rectifies the images where they are raw."""
+def _cameras(root: Path, settings: ImageFolderSettings, listed: list[dict[int, Path]]) -> StereoRig:
+    """The rectified rig, with what rectifies the images where they are raw."""
     path, three = _camera_file(root, settings), len(listed) == 3
     if settings.camera_file is None:
-        found = read_own_format(path, three)
+        rig = load_rig(path, cameras=(0, 1, 2) if three else (0, 1))
     else:
-        found = read_rig(path, first_size(listed[0].values()))
-    rig, raw = rig_and_rectifier(found, settings)
+        rig = load_rig(path, size=first_size(listed[0].values()))
     if three and rig.vertical_baseline is None:
         raise CalibrationError(
             f"{path} knows two cameras, but {root} has a third one, top/; give a calibration of "
             "all three, or leave it out: --set dataset.use_top=false"
         )
-    return rig if three else replace(rig, vertical_baseline=None), raw
+    return mounted(rig if three else replace(rig, vertical_baseline=None), settings)
 
 
 def _read_times(path: Path) -> tuple[IntArray, FloatArray]:
@@ -172,7 +167,7 @@ def _require_unique(table: Table, numbers: IntArray) -> None:
 
 
 def _files(
-    folders: list[Path], listed: list[dict[int, Path]], numbers: IntArray, rig: CameraRig
+    folders: list[Path], listed: list[dict[int, Path]], numbers: IntArray, rig: StereoRig
 ) -> StereoFiles:
     """Files of all frames; an absent one gets the name that it should have."""
     suffixes = [next(iter(images.values())).suffix for images in listed]
@@ -181,7 +176,7 @@ def _files(
         tuple(images.get(n, folder / f"{n:06d}{suffix}") for folder, images, suffix in cameras)
         for n in numbers.tolist()
     )
-    return StereoFiles(paths, rig.width, rig.height)
+    return StereoFiles(paths, *rig.image_size)
 
 
 def _unlisted(

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.rectification import Rectifier
+from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 
@@ -198,22 +198,19 @@ class StereoFiles:
 
 
 @dataclass(frozen=True, eq=False)
-class RawPairs:
-    """Pairs of raw images, rectified when read."""
+class RawImages:
+    """Raw images of a rig, rectified when read."""
 
     files: StereoFiles
-    rectifier: Rectifier
+    rig: StereoRig
 
     def load(self, index: int) -> tuple[Image, ...]:
-        """Rectified (right, left) images of a pair. Raises FrameError as StereoFiles does."""
-        return self._rectified(self.files.load(index))
+        """Rectified (right, left[, top]) images. Raises FrameError as StereoFiles does."""
+        return self.rig.rectified(self.files.load(index))
 
     def load_colour(self, index: int) -> tuple[Image, ...]:
         """The same in red, green, blue."""
-        return self._rectified(self.files.load_colour(index))
-
-    def _rectified(self, raw: tuple[Image, ...]) -> tuple[Image, ...]:
-        return tuple(self.rectifier.rectify(k, image) for k, image in enumerate(raw))
+        return self.rig.rectified(self.files.load_colour(index))
 
 
 def first_size(paths: Iterable[Path]) -> tuple[int, int] | None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.calibration_formats import read_projections
+from fgslam.cameras.rig import load_rig
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory
@@ -90,7 +90,6 @@ def _files(folder: Path, cameras: list[dict[int, Path]], frames: int) -> StereoF
 
 def _read_rig(path: Path, files: StereoFiles) -> CameraRig:
     """The rig of calib.txt; the image size, which it does not state, is the first frame's."""
-    pair = read_projections(path)
     images = files.first_images()
     if images is None:
         raise DatasetError(
@@ -98,7 +97,7 @@ def _read_rig(path: Path, files: StereoFiles) -> CameraRig:
             "image_1/; check the unpacked files"
         )
     height, width = images[0].shape
-    return pair.rig(width, height)
+    return load_rig(path, size=(width, height)).plain()
 
 
 def _read_poses(path: Path, frames: int) -> FloatArray | None:

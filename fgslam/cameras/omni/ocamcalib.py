@@ -19,7 +19,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.files import read_text
 
-_MAX_TERMS = 32
+_MAX_TERMS = 64
 # The file's two polynomials are fits of one another: further apart, one of them is damaged.
 _MAX_DISAGREEMENT_PX = 3.0
 

@@ -8,19 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.cameras.calibration_formats import camera_info_pair
-from fgslam.cameras.rectification import Rectifier
-from fgslam.cameras.rig import read_rig
+from fgslam.cameras.formats.ros import read_camera_info_pair
+from fgslam.cameras.rig import StereoRig, load_rig, rig_of
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
-from fgslam.core.sensors import CameraRig
 from fgslam.datasets.bags import messages
 from fgslam.datasets.bags.cut import Message
 from fgslam.datasets.bags.files import BagFiles, MessagesByPlace, bag_files, paths_of
 from fgslam.datasets.bags.motion import odometry_source
 from fgslam.datasets.bags.topics import Chosen, choose_topics
-from fgslam.datasets.calibrated import rig_and_rectifier
+from fgslam.datasets.calibrated import mounted
 from fgslam.datasets.images import sized
 from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
@@ -41,7 +39,7 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
     index = _indexed(files, chosen)
     source = _Images(files, index, chosen)
     found, chosen, notes = _calibration(settings, index, chosen, source)
-    rig, raw = rig_and_rectifier(found, settings)
+    rig = mounted(found, settings)
     (rows, partners), unpaired = _pairs(index, chosen, settings)
     stamps = NANOSECONDS * index.stamps[chosen.right][rows].astype(np.float64)
     used = select_frames(len(rows), settings)
@@ -54,13 +52,13 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
         notes += (_LOOKS_AHEAD,)
     return Recording(
         name=where.resolve().stem,
-        rig=rig,
+        rig=rig.plain(),
         timestamps=stamps[used],
         identity=recording_identity([], [f for path in paths for f in bag_files(path)]),
         ground_truth=None,
         notes=(*files.notes, *chosen.notes, *index.notes, *unpaired, *notes),
         indices=used,
-        load_images=_Pairs(source, places, rig, raw).load,
+        load_images=_Pairs(source, places, rig).load,
         odometry_source=motions,
     )
 
@@ -158,11 +156,12 @@ def _pairs(
 
 def _calibration(
     settings: BagSettings, index: _Index, chosen: Chosen, source: _Images
-) -> tuple[CameraRig | Rectifier, Chosen, tuple[str, ...]]:
-    """The rig or what rectifies, the topics with sides as calibrated, and what was noticed."""
+) -> tuple[StereoRig, Chosen, tuple[str, ...]]:
+    """The rig, the topics with sides as calibrated, and what was noticed."""
     if settings.camera_file is not None:
         height, width = source.first(chosen.right).shape
-        return read_rig(Path(settings.camera_file), (width, height)), chosen, ()
+        rig = load_rig(settings.camera_file, size=(width, height))
+        return rig, chosen, rig.remarks
     left, right = (index.calibrations.get(t or "") for t in (chosen.left_info, chosen.right_info))
     if left is None or right is None:
         raise CalibrationError(_lacking(settings.path, chosen, left is None, right is None))
@@ -181,8 +180,8 @@ def _calibration(
     if all(rectified):
         left, right = (_without_distortion(values) for values in (left, right))
     named = [Path(f"{settings.path}:{name}") for name in (chosen.left_info, chosen.right_info)]
-    found = camera_info_pair((named[0], left), (named[1], right))
-    return found.rig if all(rectified) else found, chosen, notes
+    rig = rig_of(read_camera_info_pair((named[0], named[1]), (left, right)))
+    return rig, chosen, (*notes, *rig.remarks)
 
 
 def _lacking(path: str, chosen: Chosen, no_left: bool, no_right: bool) -> str:
@@ -244,14 +243,12 @@ class _Pairs:
 
     images: _Images
     places: IntArray
-    rig: CameraRig
-    rectifier: Rectifier | None
+    rig: StereoRig
 
     def load(self, index: int) -> tuple[Image, ...]:
         """Rectified (right, left). Raises FrameError: damaged or of another size."""
         found = []
-        for camera, place in enumerate(self.places[index]):
+        for place in self.places[index]:
             name = f"message {place}"
-            image = sized(self.images.load(int(place)), name, self.rig.width, self.rig.height)
-            found.append(self.rectifier.rectify(camera, image) if self.rectifier else image)
-        return tuple(found)
+            found.append(sized(self.images.load(int(place)), name, *self.rig.image_size))
+        return self.rig.rectified(tuple(found))

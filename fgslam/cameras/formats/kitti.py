@@ -1,0 +1,114 @@
+"""KITTI: projections of the rectified grey pair, camera 0 on the left."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.cameras.raw_cameras import Calibration, RawCamera, checked_camera
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import CalibrationError
+from fgslam.core.files import read_lines
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose
+
+ODOMETRY = ("P0", "P1")
+RAW = ("P_rect_00", "P_rect_01")
+Size = tuple[int, int]
+
+
+def is_kitti(text: str) -> bool:
+    """Whether a text is a calib.txt or a calib_cam_to_cam.txt."""
+    return text.startswith("P0:") or "\nP0:" in text or "P_rect_00:" in text
+
+
+def read_kitti(path: Path, size: Size | None) -> Calibration:
+    """The rectified grey pair; the body is the left camera, looking ahead.
+
+    Raises:
+        CalibrationError: a line is missing or malformed, or the pair is not rectified.
+    """
+    lines = _lines(path)
+    raw = RAW[0] in lines
+    keys = RAW if raw else ODOMETRY
+    left, right = (_projection(path, lines, key) for key in keys)
+    if not np.allclose(left[:, :3], right[:, :3]):
+        raise CalibrationError(
+            f"{path}: {keys[0]} and {keys[1]} differ in their intrinsics, so the pair is not "
+            "rectified; use the calibration that came with the sequence"
+        )
+    offset = _baseline(path, left, right, keys)
+    width, height = (_stated_size(path, lines) if raw else None) or size or (0, 0)
+    ahead = BODY_FORWARD_LEFT_UP_FROM_CAMERA
+    cameras = tuple(
+        checked_camera(
+            RawCamera(
+                width,
+                height,
+                left[:, :3],
+                np.zeros(4),
+                ahead @ pose(np.eye(3), np.array([x, 0.0, 0.0])),
+                f"{path.name}: {key}",
+            )
+        )
+        for key, x in zip(keys, (-offset, 0.0), strict=True)
+    )
+    return Calibration(str(path), "KITTI", cameras, sided=True)
+
+
+def _baseline(path: Path, left: FloatArray, right: FloatArray, keys: tuple[str, str]) -> float:
+    fx, fy = float(right[0, 0]), float(right[1, 1])
+    if fx <= 0.0 or fy <= 0.0:
+        raise CalibrationError(f"{path}: focal lengths {fx:g}, {fy:g} must be positive")
+    baseline = float(left[0, 3] - right[0, 3]) / fx
+    if baseline <= 0.0:
+        raise CalibrationError(
+            f"{path}: the baseline is {baseline:g} m, must be positive; {keys[0]} belongs to the "
+            f"left camera (image_0), {keys[1]} to the right one (image_1): are they swapped?"
+        )
+    return baseline
+
+
+def _lines(path: Path) -> Mapping[str, tuple[int, list[str]]]:
+    """Number and words of each line ``name: words``."""
+    found: dict[str, tuple[int, list[str]]] = {}
+    for number, text in read_lines(path, CalibrationError):
+        name, _, rest = text.partition(":")
+        found.setdefault(name.strip(), (number, rest.split()))
+    return found
+
+
+def _projection(path: Path, lines: Mapping[str, tuple[int, list[str]]], key: str) -> FloatArray:
+    """Projection matrix (3, 4) of a line such as ``P1: 12 numbers``."""
+    if key not in lines:
+        raise CalibrationError(
+            f"{path} has no line {key!r}; restore the file of the odometry data set"
+        )
+    number, words = lines[key]
+    values = _floats(words)
+    if len(values) != 12 or not np.isfinite(values).all():
+        raise CalibrationError(
+            f"{path}, line {number}: {key} must be 12 finite numbers; restore the file"
+        )
+    return values.reshape(3, 4)
+
+
+def _stated_size(path: Path, lines: Mapping[str, tuple[int, list[str]]]) -> Size | None:
+    """Width and height by the line S_rect_00, if there is one."""
+    if "S_rect_00" not in lines:
+        return None
+    number, words = lines["S_rect_00"]
+    values = _floats(words)
+    if len(values) != 2 or not np.isfinite(values).all():
+        raise CalibrationError(
+            f"{path}, line {number}: S_rect_00 must be width and height; restore the file"
+        )
+    return round(values[0]), round(values[1])
+
+
+def _floats(words: list[str]) -> FloatArray:
+    try:
+        return np.array([float(word) for word in words])
+    except ValueError:
+        return np.empty(0)

@@ -1,0 +1,320 @@
+"""Camera models: rays to pixels and back, one function of each for every model.
+
+A model takes a ray to its *plane*, (n, 2) without unit; the camera's matrix takes the plane to
+pixels. Axes are a camera's: x right, y down, z forward. What a model cannot see is NaN, also where
+its distortion turns back, so that no place of the world is seen twice.
+
+========== ============================ ====================================================
+model      parameters                   source
+========== ============================ ====================================================
+radtan     k1 k2 p1 p2 [k3 [k4 k5 k6    Brown; OpenCV's order, of 4, 5, 8 (rational), 12 or
+           [s1 s2 s3 s4 [tx ty]]]]      14 numbers
+equidistant k1 k2 k3 k4                 Kannala and Brandt (2006); cv2.fisheye
+fov        w                            Devernay and Faugeras (2001)
+ds         xi alpha                     Usenko, Demmel and Cremers (2018), double sphere
+eucm       alpha beta                   Khomutenko, Garcia and Martinet (2016)
+omni       xi k1 k2 p1 p2               Mei and Rives (2007); cv2.omnidir, camodocal's MEI
+ocam       a0 a1 a2 ...                 Scaramuzza, Martinelli and Siegwart (2006), OCamCalib
+========== ============================ ====================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.polynomial import polynomial
+
+from fgslam.core.arrays import BoolArray, FloatArray
+
+_NEWTON_STEPS = 20
+_STEP = 1e-6  # of the numerical derivative of a distortion, which is of order 1
+_CONVERGED = 1e-10  # of the plane: a millionth of a pixel at any focal length
+# Radii whose slope is looked at for where a distortion turns back: every 0.05 degrees to 89.5.
+_RADII = np.tan(np.radians(np.linspace(0.0, 89.5, 1791)))
+_ANGLES = np.linspace(0.0, np.pi, 3601)
+_AHEAD = 1e-9  # least z of a ray of length 1 that a perspective model takes
+
+
+class Lens(NamedTuple):
+    """A camera model.
+
+    Attributes:
+        sizes: how many parameters it may have.
+        project: parameters (k,) and unit rays (n, 3) to the plane (n, 2).
+        unproject: parameters (k,) and the plane (n, 2) to rays (n, 3) of any length.
+    """
+
+    sizes: tuple[int, ...]
+    project: Callable[[FloatArray, FloatArray], FloatArray]
+    unproject: Callable[[FloatArray, FloatArray], FloatArray]
+
+
+def _seen(values: FloatArray, seen: BoolArray) -> FloatArray:
+    return np.where(np.asarray(seen)[:, None], values, np.nan)
+
+
+# --------------------------------------------------------------------------------------------
+# Radial-tangential
+
+
+def _radtan_project(parameters: FloatArray, rays: FloatArray) -> FloatArray:
+    z = rays[:, 2]
+    ahead = z > _AHEAD
+    plane = rays[:, :2] / np.where(ahead, z, 1.0)[:, None]
+    return _seen(_distorted(parameters, plane), ahead)
+
+
+def _radtan_unproject(parameters: FloatArray, plane: FloatArray) -> FloatArray:
+    flat = _undistorted(parameters, plane)
+    return np.column_stack([flat, np.ones(len(flat))])
+
+
+def _distorted(parameters: FloatArray, plane: FloatArray) -> FloatArray:
+    """Points of the plane (n, 2) as the lens shows them; NaN beyond where it turns back."""
+    if not len(plane) or not parameters.any():
+        return plane
+    within = np.hypot(*plane.T) <= _turning_radius(parameters)
+    if len(parameters) == 14 and parameters[12:].any():
+        return _seen(_tilted(parameters, np.where(within[:, None], plane, 0.0)), within)
+    k = np.concatenate([parameters, np.zeros(12)])[:12] if len(parameters) < 12 else parameters
+    x, y = np.where(within, plane[:, 0], 0.0), np.where(within, plane[:, 1], 0.0)
+    r2, xy = x * x + y * y, x * y
+    above = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+    radial = above / (1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
+    u = x * radial + 2.0 * k[2] * xy + k[3] * (r2 + 2.0 * x * x) + r2 * (k[8] + r2 * k[9])
+    v = y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * xy + r2 * (k[10] + r2 * k[11])
+    return _seen(np.column_stack([u, v]), within)
+
+
+def _tilted(parameters: FloatArray, plane: FloatArray) -> FloatArray:
+    """With a sensor that is tilted against the lens (Scheimpflug), by OpenCV."""
+    points = np.column_stack([plane, np.ones(len(plane))])
+    seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), parameters)[0]
+    return np.asarray(seen, np.float64).reshape(-1, 2)
+
+
+def _radial(parameters: FloatArray) -> FloatArray:
+    """Radii as the lens shows the radii ``_RADII``."""
+    k1, k2, k3, k4, k5, k6 = np.concatenate([parameters, np.zeros(8)])[[0, 1, 4, 5, 6, 7]]
+    r2 = _RADII**2
+    below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shown = _RADII * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / below
+    return np.where(below > 0.0, shown, np.nan)
+
+
+def _rising(values: FloatArray) -> int:
+    """How many of the values (n,) rise before the first that does not."""
+    stops = np.flatnonzero(~(np.diff(values) > 0.0))
+    return int(stops[0]) + 1 if len(stops) else len(values)
+
+
+def _turning_radius(parameters: FloatArray) -> float:
+    return float(_RADII[_rising(_radial(parameters)) - 1])
+
+
+def _undistorted(parameters: FloatArray, plane: FloatArray) -> FloatArray:
+    """Inverse of :func:`_distorted`: started by the radius alone, ended by Newton's method."""
+    if not len(plane) or not parameters.any():
+        return plane
+    shown = _radial(parameters)
+    rising = _rising(shown)
+    radius = np.hypot(*plane.T)
+    start = np.interp(radius, shown[:rising], _RADII[:rising])
+    found = plane * (start / np.maximum(radius, 1e-12))[:, None]
+    left = np.full_like(found, np.nan)
+    for _ in range(_NEWTON_STEPS):
+        left = _distorted(parameters, found) - plane
+        if not np.abs(left).max(initial=0.0, where=np.isfinite(left)) > 0.01 * _CONVERGED:
+            break
+        found = found - _solved(parameters, found, left)
+    good = np.abs(left).max(axis=1) < _CONVERGED
+    return _seen(found, good)
+
+
+def _solved(parameters: FloatArray, at: FloatArray, left: FloatArray) -> FloatArray:
+    """Newton steps (n, 2) at points (n, 2) that are ``left`` off."""
+    columns = [
+        (_distorted(parameters, at + _STEP * e) - _distorted(parameters, at - _STEP * e))
+        / (2.0 * _STEP)
+        for e in np.eye(2)
+    ]
+    (a, c), (b, d) = (column.T for column in columns)
+    determinant = a * d - b * c
+    determinant = np.where(np.abs(determinant) < 1e-12, np.nan, determinant)
+    step = np.column_stack([d * left[:, 0] - b * left[:, 1], a * left[:, 1] - c * left[:, 0]])
+    return step / determinant[:, None]
+
+
+# --------------------------------------------------------------------------------------------
+# Fisheyes: the radius is a function of the angle to the axis
+
+
+def _on_radius(rays: FloatArray, radius: FloatArray) -> FloatArray:
+    across = np.hypot(rays[:, 0], rays[:, 1])
+    factor = np.where(across > 0.0, radius / np.maximum(across, 1e-300), 0.0)
+    return rays[:, :2] * factor[:, None]
+
+
+def _at_angle(plane: FloatArray, angle: FloatArray) -> FloatArray:
+    radius = np.hypot(*plane.T)
+    factor = np.where(radius > 0.0, np.sin(angle) / np.maximum(radius, 1e-300), 1.0)
+    return np.column_stack([plane * factor[:, None], np.cos(angle)])
+
+
+def _angle(rays: FloatArray) -> FloatArray:
+    return np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+
+
+def _kannala(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Coefficients of the radius as a polynomial of the angle, and of its derivative."""
+    coefficients = np.zeros(10)
+    coefficients[1::2] = 1.0, *parameters
+    return coefficients, np.asarray(polynomial.polyder(coefficients))
+
+
+def _polynomial(x: FloatArray, coefficients: FloatArray) -> FloatArray:
+    return np.asarray(polynomial.polyval(x, coefficients), np.float64)
+
+
+def _equidistant_project(parameters: FloatArray, rays: FloatArray) -> FloatArray:
+    coefficients, _ = _kannala(parameters)
+    shown = _polynomial(_ANGLES, coefficients)
+    angle = _angle(rays)
+    radius = _polynomial(angle, coefficients)
+    return _seen(_on_radius(rays, radius), angle <= _ANGLES[_rising(shown) - 1])
+
+
+def _equidistant_unproject(parameters: FloatArray, plane: FloatArray) -> FloatArray:
+    coefficients, slopes = _kannala(parameters)
+    shown = _polynomial(_ANGLES, coefficients)
+    rising = _rising(shown)
+    radius = np.hypot(*plane.T)
+    angle: FloatArray = np.asarray(
+        np.interp(radius, shown[:rising], _ANGLES[:rising], right=np.nan), np.float64
+    )
+    for _ in range(4):  # the table is within 1e-7 already
+        slope = np.maximum(_polynomial(angle, slopes), 1e-6)
+        angle = angle - (_polynomial(angle, coefficients) - radius) / slope
+    return _at_angle(plane, angle)
+
+
+def _fov_project(parameters: FloatArray, rays: FloatArray) -> FloatArray:
+    (w,) = parameters
+    ahead = rays[:, 2] > _AHEAD
+    tangent = np.hypot(rays[:, 0], rays[:, 1]) / np.where(ahead, rays[:, 2], 1.0)
+    radius = np.arctan(2.0 * tangent * np.tan(0.5 * w)) / w
+    return _seen(_on_radius(rays, radius), ahead)
+
+
+def _fov_unproject(parameters: FloatArray, plane: FloatArray) -> FloatArray:
+    (w,) = parameters
+    turned = np.hypot(*plane.T) * w
+    angle = np.arctan(np.tan(turned) / (2.0 * np.tan(0.5 * w)))
+    return _seen(_at_angle(plane, angle), turned < 0.5 * np.pi)
+
+
+# --------------------------------------------------------------------------------------------
+# Spheres: double sphere, extended unified, unified with radial-tangential distortion
+
+
+def _ds_project(parameters: FloatArray, rays: FloatArray) -> FloatArray:
+    xi, alpha = parameters
+    z = rays[:, 2]
+    shifted = xi + z
+    below = alpha * np.hypot(np.hypot(rays[:, 0], rays[:, 1]), shifted) + (1.0 - alpha) * shifted
+    w1 = _edge(alpha)
+    w2 = (w1 + xi) / np.sqrt(2.0 * w1 * xi + xi**2 + 1.0)
+    return _over(rays, below, z > -w2)
+
+
+def _edge(alpha: float) -> float:
+    return alpha / (1.0 - alpha) if alpha <= 0.5 else (1.0 - alpha) / alpha
+
+
+def _over(rays: FloatArray, below: FloatArray, seen: BoolArray) -> FloatArray:
+    seen = seen & (below > _AHEAD)
+    return _seen(rays[:, :2] / np.where(seen, below, 1.0)[:, None], seen)
+
+
+def _ds_unproject(parameters: FloatArray, plane: FloatArray) -> FloatArray:
+    xi, alpha = parameters
+    r2 = (plane**2).sum(axis=1)
+    root = 1.0 - (2.0 * alpha - 1.0) * r2
+    mz = (1.0 - alpha**2 * r2) / (alpha * np.sqrt(np.maximum(root, 0.0)) + 1.0 - alpha)
+    inner = mz**2 + (1.0 - xi**2) * r2
+    scale = (mz * xi + np.sqrt(np.maximum(inner, 0.0))) / (mz**2 + r2)
+    rays = np.column_stack([plane * scale[:, None], scale * mz - xi])
+    return _seen(rays, (root >= 0.0) & (inner >= 0.0))
+
+
+def _eucm_project(parameters: FloatArray, rays: FloatArray) -> FloatArray:
+    alpha, beta = parameters
+    z = rays[:, 2]
+    distance = np.sqrt(beta * (rays[:, 0] ** 2 + rays[:, 1] ** 2) + z**2)
+    return _over(rays, alpha * distance + (1.0 - alpha) * z, z > -_edge(alpha) * distance)
+
+
+def _eucm_unproject(parameters: FloatArray, plane: FloatArray) -> FloatArray:
+    alpha, beta = parameters
+    r2 = beta * (plane**2).sum(axis=1)
+    root = 1.0 - (2.0 * alpha - 1.0) * r2
+    below = alpha * np.sqrt(np.maximum(root, 0.0)) + 1.0 - alpha
+    rays = np.column_stack([plane, (1.0 - alpha**2 * r2) / below])
+    return _seen(rays, root >= 0.0)
+
+
+def _omni_project(parameters: FloatArray, rays: FloatArray) -> FloatArray:
+    xi = parameters[0]
+    z = rays[:, 2]
+    # Of a sphere that is looked at from outside only the near side is seen.
+    seen = z > -(1.0 / xi if xi > 1.0 else xi)
+    return _distorted(parameters[1:], _over(rays, z + xi, seen))
+
+
+def _omni_unproject(parameters: FloatArray, plane: FloatArray) -> FloatArray:
+    xi = parameters[0]
+    flat = _undistorted(parameters[1:], plane)
+    r2 = (flat**2).sum(axis=1)
+    root = 1.0 + (1.0 - xi**2) * r2
+    scale = (xi + np.sqrt(np.maximum(root, 0.0))) / (1.0 + r2)
+    return _seen(np.column_stack([flat * scale[:, None], scale - xi]), root >= 0.0)
+
+
+# --------------------------------------------------------------------------------------------
+# OCamCalib: the ray's depth is a polynomial of the radius in pixels
+
+
+def _ocam_unproject(parameters: FloatArray, plane: FloatArray) -> FloatArray:
+    # OCamCalib's axes are rows, columns and backward.
+    return np.column_stack([plane, -polynomial.polyval(np.hypot(*plane.T), parameters)])
+
+
+def _ocam_project(parameters: FloatArray, rays: FloatArray) -> FloatArray:
+    # No picture is wider than 20 times the polynomial's first coefficient, a focal length.
+    radii = np.linspace(0.0, 20.0 * abs(float(parameters[0])), 20001)
+    angles = np.arctan2(radii, -polynomial.polyval(radii, parameters))
+    rising = _rising(angles)
+    angle = _angle(rays)
+    radius = np.interp(angle, angles[:rising], radii[:rising], right=np.nan)
+    slope_of = polynomial.polyder(parameters)
+    for _ in range(3):  # Newton on radius cos(angle) + depth(radius) sin(angle)
+        left = radius * np.cos(angle) + polynomial.polyval(radius, parameters) * np.sin(angle)
+        slope = np.cos(angle) + polynomial.polyval(radius, slope_of) * np.sin(angle)
+        radius = radius - np.where(np.abs(slope) > 1e-9, left / slope, 0.0)
+    return _on_radius(rays, radius)
+
+
+LENSES = {
+    "radtan": Lens((4, 5, 8, 12, 14), _radtan_project, _radtan_unproject),
+    "equidistant": Lens((4,), _equidistant_project, _equidistant_unproject),
+    "fov": Lens((1,), _fov_project, _fov_unproject),
+    "ds": Lens((2,), _ds_project, _ds_unproject),
+    "eucm": Lens((2,), _eucm_project, _eucm_unproject),
+    "omni": Lens((5,), _omni_project, _omni_unproject),
+    "ocam": Lens(tuple(range(2, 33)), _ocam_project, _ocam_unproject),
+}
+"""Every model by the name that files and messages use."""
