@@ -7,7 +7,9 @@ interrupted run leaves the previous version or none, never half a file.
 from __future__ import annotations
 
 import errno
+import itertools
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,6 +28,11 @@ _REMEDIES = {
     errno.EFBIG: "the file grew beyond the allowed size; raise the limit (ulimit -f)",
     errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
 }
+
+
+_KEPT = 100  # characters of a name, which may be as long as the system allows already
+_COUNT = itertools.count()
+_WRITER = re.compile(r"\.(\d+)-\d+\.partial")
 
 
 @contextmanager
@@ -52,7 +59,7 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises:
         OutputError: the folder cannot be written to, or the disk is full.
     """
-    partial = path.with_name(f".{path.name}.partial{path.suffix}")
+    partial = _beside(path)
     with clear_output_errors(path):
         try:
             yield partial
@@ -62,9 +69,36 @@ def replacing(path: Path) -> Iterator[Path]:
             _remove_quietly(partial)
 
 
+def _beside(path: Path) -> Path:
+    """A name of this process and moment alone: two that write one file shall not share it."""
+    own = f"{os.getpid()}-{next(_COUNT)}"
+    return path.with_name(f".{path.name[:_KEPT]}.{own}.partial{path.suffix[:_KEPT]}")
+
+
 def is_unfinished_file(path: Path) -> bool:
     """Whether a process that was killed while writing left this file beside its place."""
     return path.name.startswith(".") and ".partial" in path.name and path.is_file()
+
+
+def remove_unfinished_files(folder: Path) -> None:
+    """Removes what processes that were killed while writing left in a folder and below."""
+    for path in folder.rglob(".*.partial*"):
+        if is_unfinished_file(path) and not _is_being_written(path):
+            _remove_quietly(path)
+
+
+def _is_being_written(path: Path) -> bool:
+    """Whether the file belongs to another process that is alive."""
+    found = _WRITER.search(path.name)
+    if found is None or int(found[1]) == os.getpid():
+        return False
+    try:
+        os.kill(int(found[1]), 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -80,7 +114,7 @@ def write_text(path: Path, content: str) -> None:
 
 def require_writable(folder: Path) -> None:
     """Tries *now* whether files can be written into a folder. Raises OutputError."""
-    probe = folder / ".writable.partial"
+    probe = _beside(folder / "writable")
     with clear_output_errors(folder):
         try:
             probe.write_bytes(b"\0")

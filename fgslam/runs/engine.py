@@ -7,6 +7,7 @@ kept until the run has finished. What a task does is its own module in :mod:`fgs
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import shlex
 from collections.abc import Callable, Mapping
@@ -29,10 +30,14 @@ from fgslam.runs.folder import (
     RUN_MARKER,
     STATE_FILE,
     ExistingFolder,
+    begin_run_folder,
     create_run_folder,
+    is_empty,
+    is_run_folder,
     versions,
     write_config,
 )
+from fgslam.runs.owner import OWNER_NAME, Owner
 from fgslam.runs.processes import Workers
 from fgslam.runs.units import (
     Argument,
@@ -50,6 +55,7 @@ _GROUND = ("log", "trials", "first_seed")
 """What a resumed run must find as it was, of its provenance, beside the data set's identity."""
 
 Status: TypeAlias = Literal["finished", "interrupted"]
+R = TypeVar("R", bound="RunResult")
 R_co = TypeVar("R_co", bound="RunResult", covariant=True)
 
 
@@ -196,32 +202,56 @@ def run_task(
         FgslamError: of any kind, with a message for the user.
     """
     config = config.resolved()
+    with Owner(folder) as owner:
+        existing = _claim(folder, existing, config, owner)
+        resumed = existing == "resume"
+        task = opener(config, Opening(folder, resumed, progress))
+        begin_run_folder(folder, existing, owner)
+        if resumed:
+            require_same_ground(task.provenance, folder)
+        else:
+            write_config(folder, config, dict(task.provenance))
+        store = UnitStore(folder)
+        jobs = jobs or getattr(config, "jobs", 1) or os.cpu_count() or 1
+        with Workers() as workers:
+            loop = (jobs, progress, stopped, workers, crew)
+            result = task.run(Context(folder, resumed, store, *loop))
+        if result.status == "finished":
+            store.remove()
+    return _with_owner_before(result, owner)
+
+
+def _claim(
+    folder: Path, existing: ExistingFolder, config: Experiment, owner: Owner
+) -> ExistingFolder:
+    """Refuses now what would be refused after minutes of rendering; what to do then.
+
+    A run that was killed before its first file is begun anew.
+    """
+    if existing == "resume" and folder.is_dir() and is_empty(folder):
+        existing = "refuse"
     if existing == "resume" or (existing == "refuse" and folder.exists()):
-        create_run_folder(folder, existing)  # refuses now, not after minutes of rendering
+        create_run_folder(folder, existing)
     if existing == "resume":
         require_unfinished(folder)
         require_same(config, folder)
-    task = opener(config, Opening(folder, existing == "resume", progress))
-    create_run_folder(folder, existing)
-    if existing == "resume":
-        require_same_ground(task.provenance, folder)
-    else:
-        write_config(folder, config, dict(task.provenance))
-    store = UnitStore(folder)
-    jobs = jobs or getattr(config, "jobs", 1) or os.cpu_count() or 1
-    resumed = existing == "resume"
-    with Workers() as workers:
-        loop = (jobs, progress, stopped, workers, crew)
-        result = task.run(Context(folder, resumed, store, *loop))
-    if result.status == "finished":
-        store.remove()
-    return result
+    if is_run_folder(folder):
+        owner.take()
+    return existing
+
+
+def _with_owner_before(result: R, owner: Owner) -> R:
+    if not owner.before:
+        return result
+    note = ("taken over", f"from {owner.before}, which had ended without finishing")
+    return dataclasses.replace(result, particulars=(note, *result.particulars))
 
 
 def is_finished(folder: Path) -> bool:
     """Whether a run folder has nothing left to do."""
     path = folder / METRICS_FILE
-    begun = holds_units(folder) or (folder / STATE_FILE).is_file()
+    left = [folder / STATE_FILE, folder / OWNER_NAME]  # the second by a process that was killed
+    begun = holds_units(folder) or any(file.is_file() for file in left)
     return not begun and path.is_file() and read_metrics(path).get("status") != "interrupted"
 
 

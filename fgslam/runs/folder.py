@@ -20,6 +20,7 @@ from fgslam.core.files import (
     require_writable,
     write_text,
 )
+from fgslam.runs.owner import OWNER_NAME, Owner
 
 if TYPE_CHECKING:
     from fgslam.runs.config_models import Experiment
@@ -112,9 +113,28 @@ def create_run_folder(path: Path, existing: ExistingFolder = "refuse") -> Path:
     return path
 
 
+def begin_run_folder(path: Path, existing: ExistingFolder, owner: Owner) -> None:
+    """As :func:`create_run_folder`; from then on no other process writes into it.
+
+    Raises:
+        OutputError: as there, or another process writes into it.
+    """
+    if not owner.holds:
+        if not is_run_folder(path):
+            create_run_folder(path, existing)
+        owner.take()
+    create_run_folder(path, existing)  # another run may have begun there before it was taken
+
+
 def is_run_folder(path: Path) -> bool:
     """Whether ``path`` holds a run, whole or interrupted."""
     return (path / RUN_MARKER).is_file()
+
+
+def is_empty(path: Path) -> bool:
+    """Whether a folder holds nothing, or what a run left that was killed before its first file."""
+    with clear_output_errors(path):
+        return all(file.name == OWNER_NAME or is_unfinished_file(file) for file in path.iterdir())
 
 
 def _require_run(path: Path) -> None:
@@ -128,9 +148,7 @@ def _require_run(path: Path) -> None:
 def _make_room(path: Path, *, overwrite: bool) -> None:
     if not path.is_dir():
         raise OutputError(f"cannot write {path}: it is not a folder; choose another name")
-    with clear_output_errors(path):
-        empty = not any(file for file in path.iterdir() if not is_unfinished_file(file))
-    if empty:  # a run that was killed before its first file is none
+    if is_empty(path):
         return
     if not is_run_folder(path):
         raise OutputError(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +30,9 @@ from fgslam.runs.config import (
 )
 from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.engine import Context, Opening, Task, provenance_of
-from fgslam.runs.folder import ExistingFolder, create_run_folder, is_run_folder, write_config
+from fgslam.runs.folder import ExistingFolder, begin_run_folder, is_run_folder, write_config
 from fgslam.runs.opening import open_sequence
+from fgslam.runs.owner import Owner
 from fgslam.runs.tasks.localisation_queries import Attempt, ask_all, nothing_asked
 from fgslam.runs.tasks.localisation_results import (
     LocalisationResult,
@@ -131,16 +133,17 @@ def localize(wanted: Wanted, progress: Progress, stopped: Callable[[], bool]) ->
     config = _config(wanted, given.saved)
     sequence = _open(wanted, config, progress)
     require_rig(given.saved, sequence.rig, str(given.path))
-    if out is not None:
-        create_run_folder(out, wanted.existing)
-        write_config(out, config, _provenance(given, sequence))
-    context = Context(out or Path(), False, UnitStore(None), 1, progress, stopped)
-    asked = ask_all(config, given, sequence, context)
-    result = result_of(config, out, asked, sequence.notes)
-    notes = (*_other_frontend(config, given), *result.notes)
-    result = dataclasses.replace(result, notes=notes)
-    write_results(result, given, f"{sequence.name}, in the map {given.path}")
-    return _one_by_one(result)
+    with ExitStack() as stack:
+        if out is not None:
+            begin_run_folder(out, wanted.existing, stack.enter_context(Owner(out)))
+            write_config(out, config, _provenance(given, sequence))
+        context = Context(out or Path(), False, UnitStore(None), 1, progress, stopped)
+        asked = ask_all(config, given, sequence, context)
+        result = result_of(config, out, asked, sequence.notes)
+        notes = (*_other_frontend(config, given), *result.notes)
+        result = dataclasses.replace(result, notes=notes)
+        write_results(result, given, f"{sequence.name}, in the map {given.path}")
+        return _one_by_one(result)
 
 
 def _one_by_one(result: LocalisationResult) -> LocalisationResult:

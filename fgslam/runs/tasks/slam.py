@@ -23,6 +23,7 @@ from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, proven
 from fgslam.runs.folder import COMPARISON_FILE, ExistingFolder, is_run_folder, write_config
 from fgslam.runs.metric_tables import comparison_particulars, comparison_tables
 from fgslam.runs.opening import open_sequence
+from fgslam.runs.owner import give_back
 from fgslam.runs.report import report_from_folder
 from fgslam.runs.slam_comparison import replay_apart
 from fgslam.runs.tasks import slam_map_entry as map_entry
@@ -218,6 +219,7 @@ def drive_first(config: ExperimentConfig, context: Context) -> SlamResult | None
     made = context.resumed and (folder / map_entry.MAP_FILE).is_file()
     # Killed after writing the map, the drive has yet to draw, to report and to tidy up.
     if first is None or (made and not state.has_checkpoint(folder)):
+        give_back(folder)
         return None
     existing: ExistingFolder = "overwrite"
     if context.resumed and is_run_folder(folder):
