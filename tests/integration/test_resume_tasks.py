@@ -9,6 +9,7 @@ makes a run fast. The last test sends SIGKILL to the command itself, with its wo
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import os
 import re
@@ -17,6 +18,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -24,6 +26,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import pytest
 import yaml
+from killing import REFUSED, Server, server
 from PIL import Image as PictureFile
 from recordings import experiment
 
@@ -509,3 +512,92 @@ def test_of_several_comparisons_a_finished_failure_stays_one_when_resumed(
     results = compare_runs(runs, choice, out, "resume")
     assert [one.failed for one in results] == [True, True]
     assert [one.failed for one in compare_runs(runs, choice, out, "resume")] == [True, True]
+
+
+# --------------------------------------------------------------------------------------------
+# SIGKILL at random moments, whatever the run is at
+
+
+class Kills:
+    """Runs of all tasks that are killed at random moments, and resumed."""
+
+    def __init__(
+        self, values_of: Callable[[str], dict[str, Any]], server: Server, folder: Path
+    ) -> None:
+        self._values_of, self._server, self._folder = values_of, server, folder
+        self._straight: dict[str, tuple[dict[str, object], float]] = {}
+
+    def of(self, task: str, share: float) -> str:
+        """How a run ended that was killed after such a share of its time, and then resumed."""
+        expected, seconds = self._of_straight(task)
+        folder = self._folder / "run"
+        os.kill(self._start(task, folder, "refuse", share * seconds), signal.SIGKILL)
+        self._server.ended()
+        if not folder.exists():
+            return "nothing was begun"
+        self._start(task, folder, "resume")
+        status, said = self._server.ended()
+        if status == REFUSED and "the run has finished" not in said:
+            return f"LOST: {said}"
+        found = content_of(folder)
+        other = [n for n in found.keys() | expected.keys() if found.get(n) != expected.get(n)]
+        shutil.rmtree(folder)
+        return f"OTHER: {other}" if other else "the same bytes"
+
+    def _start(self, task: str, folder: Path, existing: str, wait: float = 0.0) -> int:
+        do, source = "", ""
+        values = {} if task in ("compare", "compare_homing", "trials") else self._values_of(task)
+        if task.startswith("compare"):
+            do, logged = "compare", "measurements" if task == "compare" else "homing_trials"
+            names = ["odometry", "landmark_kalman", "ekf"]
+            values = {"names": names if task == "compare" else ["homing_ekf", "alv"]}
+            source = str(self._logged(logged))
+        if task == "trials":
+            do, source = "trials", str(self._folder / "trials.yaml")
+            Path(source).write_text(yaml.safe_dump(self._values_of("measurements")))
+        request = {"values": values, "folder": str(folder), "existing": existing}
+        number = self._server.start(**request, do=do, source=source)
+        time.sleep(wait)
+        return number
+
+    def _logged(self, task: str) -> Path:
+        folder = self._folder / f"logged_{task}"
+        if not folder.exists():
+            self._start(task, folder, "refuse")
+            assert self._server.ended() == (0, "")
+        return folder
+
+    def _of_straight(self, task: str) -> tuple[dict[str, object], float]:
+        if task not in self._straight:
+            folder = self._folder / "run"
+            began = time.monotonic()
+            self._start(task, folder, "refuse")
+            assert self._server.ended() == (0, "")
+            self._straight[task] = content_of(folder), time.monotonic() - began
+            shutil.rmtree(folder)
+        return self._straight[task]
+
+
+@pytest.mark.parametrize(
+    ("tasks", "count"),
+    [
+        (("measurements",), 2),
+        pytest.param(TASKS, 200, marks=pytest.mark.slow),
+    ],
+)
+def test_killed_at_random_moments_no_run_is_lost(
+    tasks: tuple[str, ...],
+    count: int,
+    values_of: Callable[[str], dict[str, Any]],
+    tmp_path: Path,
+) -> None:
+    shares = np.random.default_rng(16).uniform(0.0, 1.0, count)
+    experiments = [values_of(t) for t in tasks if not t.startswith(("compare", "trials"))]
+    with server(experiments, tmp_path) as forked:
+        kills = Kills(values_of, forked, tmp_path)
+        found = [
+            (task, round(share, 3), kills.of(task, share))
+            for task, share in zip(itertools.cycle(tasks), shares, strict=False)
+        ]
+    print(Counter(how for *_, how in found))
+    assert [one for one in found if one[2].startswith(("LOST", "OTHER"))] == []
