@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fgslam.cli import options, signals
-from fgslam.cli.signals import stop_flag
+from fgslam.cli.signals import Tell, stop_flag, stoppable
 from fgslam.core.errors import FgslamError
 from fgslam.runs.named_experiments import experiment_names, find_experiment
 
@@ -23,15 +23,14 @@ if TYPE_CHECKING:
     from fgslam.runs.engine import RunResult
     from fgslam.runs.folder import ExistingFolder
 
-Tell = Callable[[str, int, int], None]
 
 EXIT_USER = 2
 EXIT_FAULT = 1
 # Typer exports only the child; its parent's home differs from one Typer to the next.
 _UsageError: type[typer.BadParameter] = typer.BadParameter.__bases__[0]
 _OF_TYPER = 130  # what it makes of any KeyboardInterrupt; no command of ours returns it
+_NO_MEMORY = "not enough memory; free some, raise the limit (ulimit -v), or take fewer frames"
 _CLOSE_OPTIONS = 0.6  # typer offers --out for --foo
-_NOTHING_TO_SAVE = ("rendering", "reading", "matching")
 
 app = typer.Typer(
     name="fgslam",
@@ -425,20 +424,17 @@ def main() -> None:
         raise SystemExit(signals.status()) from None
     except BrokenPipeError:
         raise SystemExit(EXIT_FAULT) from None
+    except MemoryError:
+        print(f"fgslam: {_NO_MEMORY}", file=sys.stderr)
+        raise SystemExit(EXIT_USER) from None
+    except OSError as error:
+        # Of files of this program FgslamErrors tell; this is the terminal's, or a library's own.
+        where = error.filename or "standard output"
+        print(f"fgslam: {where}: {error.strerror or error}; mend that and repeat", file=sys.stderr)
+        raise SystemExit(EXIT_USER) from None
     except (ImportError, RuntimeError, SystemError, AttributeError, TypeError):
         if not signals.was_asked():
             raise
         # Some library made another error of the signal.
         print("fgslam: interrupted", file=sys.stderr)
         raise SystemExit(signals.status()) from None
-
-
-def stoppable(progress: Tell, stopped: Callable[[], bool]) -> Tell:
-    """While frames are rendered there is nothing to save yet: stopping just ends it."""
-
-    def tell(what: str, done: int, total: int) -> None:
-        if what in _NOTHING_TO_SAVE and stopped():
-            raise KeyboardInterrupt
-        progress(what, done, total)
-
-    return tell

@@ -21,6 +21,11 @@ WITHIN_S = 1.3
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _SHOW_CURSOR = b"\x1b[?25h"  # a progress bar hides it
 
+_NOTHING_TO_SAVE = ("rendering", "reading", "matching")
+
+Tell = Callable[[str, int, int], None]
+"""Told what is under way, how much is done, and of how much."""
+
 _received: list[int] = []
 """Numbers of the signals of this command, in their order."""
 
@@ -113,3 +118,14 @@ def stop_flag() -> Iterator[Callable[[], bool]]:
         if not ending:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+
+def stoppable(progress: Tell, stopped: Callable[[], bool]) -> Tell:
+    """While frames are rendered there is nothing to save yet: stopping just ends it."""
+
+    def tell(what: str, done: int, total: int) -> None:
+        if what in _NOTHING_TO_SAVE and stopped():
+            raise KeyboardInterrupt
+        progress(what, done, total)
+
+    return tell

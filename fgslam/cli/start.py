@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 from fgslam.cli import signals
@@ -20,4 +21,15 @@ def main() -> None:
     except SystemExit as ended:
         if signals.was_asked() and ended.code == signals.status():
             signals.end()
+        _flush()
         raise
+
+
+def _flush() -> None:
+    """Says now what could not be written: the interpreter would with a traceback."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        if not isinstance(error, BrokenPipeError):
+            print(f"fgslam: standard output: {error.strerror}", file=sys.stderr)
+        os._exit(1)

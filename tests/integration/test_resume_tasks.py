@@ -20,6 +20,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -531,7 +532,9 @@ class Kills:
         """How a run ended that was killed after such a share of its time, and then resumed."""
         expected, seconds = self._of_straight(task)
         folder = self._folder / "run"
-        os.kill(self._start(task, folder, "refuse", share * seconds), signal.SIGKILL)
+        number = self._start(task, folder, "refuse", share * seconds)
+        with suppress(ProcessLookupError):  # it was faster than the signal
+            os.kill(number, signal.SIGKILL)
         self._server.ended()
         if not folder.exists():
             return "nothing was begun"
