@@ -9,6 +9,7 @@ makes a run fast. The last test sends SIGKILL to the command itself, with its wo
 from __future__ import annotations
 
 import csv
+import errno
 import itertools
 import json
 import os
@@ -513,6 +514,32 @@ def test_of_several_comparisons_a_finished_failure_stays_one_when_resumed(
     results = compare_runs(runs, choice, out, "resume")
     assert [one.failed for one in results] == [True, True]
     assert [one.failed for one in compare_runs(runs, choice, out, "resume")] == [True, True]
+
+
+@pytest.mark.parametrize(
+    "share", [0.5, *(pytest.param(k / 12, marks=pytest.mark.slow) for k in range(12))]
+)
+def test_on_a_disk_that_fills_up_a_run_ends_with_one_line_and_goes_on_later(
+    share: float, straight: Straight, doing: Callable[[str], Doing], tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    expected, count = straight.of("measurements", folder)
+    renamed, real = 0, os.replace
+
+    def replace(source: Path, target: Path) -> None:
+        nonlocal renamed
+        renamed += 1
+        if renamed > share * count:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        real(source, target)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fgslam.core.files.os.replace", replace)
+        with pytest.raises(OutputError, match=r"^cannot write [^\n]*: the disk is full; [^\n]*$"):
+            doing("measurements")(folder, "refuse")
+    assert not list(folder.rglob("*partial*"))
+    assert doing("measurements")(folder, "resume").status == "finished"
+    assert content_of(folder) == expected
 
 
 # --------------------------------------------------------------------------------------------

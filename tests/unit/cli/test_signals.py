@@ -6,6 +6,7 @@ import functools
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -65,3 +66,13 @@ def test_a_worker_hears_no_ctrl_c_from_its_first_moment_on() -> None:
     [(_, inherited)] = run_apart(blocked, [()])
     assert signal.SIGINT in inherited
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
+def test_an_output_that_is_full_is_said_in_one_line() -> None:
+    code = "from fgslam.cli.start import main; main()"
+    with Path("/dev/full").open("w") as full:
+        given = [sys.executable, "-c", code, "--version"]
+        done = subprocess.run(given, stdout=full, stderr=subprocess.PIPE, text=True)  # noqa: S603
+    assert done.returncode
+    assert done.stderr.startswith("fgslam: standard output: No space left on device")
+    assert done.stderr.count("\n") == 1
