@@ -52,6 +52,7 @@ def run(  # noqa: PLR0913 - each option is a parameter
     start: options.Start = None,
     stop: options.Stop = None,
     stride: options.Stride = None,
+    fps: options.Fps = None,
     topics: options.Topics = None,
     estimator: options.Estimator = None,
     overrides: options.Overrides = None,
@@ -73,7 +74,7 @@ def run(  # noqa: PLR0913 - each option is a parameter
     from fgslam.runs.bare_recording import experiment_of
 
     existing = _existing(overwrite, resume)
-    given = {**_frames(start, stop, stride), "estimator.kind": estimator}
+    given = {**_frames(start, stop, stride, fps), "estimator.kind": estimator}
     given |= {"map.load": map_in, "map.save": map_out}
     chosen = [*options.as_overrides(given), *options.topics_override(topics)]
     settings, said = experiment_of(config, camera, [*(overrides or ()), *chosen])
@@ -97,19 +98,21 @@ def run(  # noqa: PLR0913 - each option is a parameter
 
 
 def _frames(
-    start: int | None, stop: int | None, stride: int | None
-) -> dict[str, str | int | Path | None]:
-    """Which frames of a recording, by the keys that say it."""
-    return {"dataset.start": start, "dataset.stop": stop, "dataset.stride": stride}
+    start: int | None, stop: int | None, stride: int | None, fps: float | None
+) -> dict[str, str | float | Path | None]:
+    """Which frames of a recording, and how fast they follow, by the keys that say it."""
+    names = ("start", "stop", "stride", "fps")
+    return {f"dataset.{k}": v for k, v in zip(names, (start, stop, stride, fps), strict=True)}
 
 
 @app.command()
-def init(
+def init(  # noqa: PLR0913 - each option is a parameter
     recording: options.BareRecording,
     camera: options.Camera = None,
     start: options.Start = None,
     stop: options.Stop = None,
     stride: options.Stride = None,
+    fps: options.Fps = None,
     topics: options.Topics = None,
     estimator: options.Estimator = None,
     overrides: options.Overrides = None,
@@ -117,7 +120,7 @@ def init(
     """Print the short configuration that repeats `fgslam run RECORDING`, as YAML."""
     from fgslam.runs.bare_recording import short_config
 
-    given = {**_frames(start, stop, stride), "estimator.kind": estimator}
+    given = {**_frames(start, stop, stride, fps), "estimator.kind": estimator}
     chosen = [*options.as_overrides(given), *options.topics_override(topics)]
     typer.echo(short_config(recording, camera, [*(overrides or ()), *chosen]), nl=False)
 

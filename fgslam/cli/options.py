@@ -94,10 +94,10 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
-def as_overrides(given: Mapping[str, str | int | Path | None]) -> list[str]:
+def as_overrides(given: Mapping[str, str | float | Path | None]) -> list[str]:
     """``a.b=value`` of the options that were given, by the key that each sets."""
     return [
-        f"{key}={value if isinstance(value, int) else json.dumps(str(value))}"
+        f"{key}={value if isinstance(value, int | float) else json.dumps(str(value))}"
         for key, value in given.items()
         if value is not None
     ]
@@ -150,6 +150,13 @@ Stop = Annotated[
     int | None, typer.Option(min=1, help="frame before which to stop; sets dataset.stop")
 ]
 Stride = Annotated[int | None, typer.Option(min=1, help="use every n-th; sets dataset.stride")]
+Fps = Annotated[
+    float | None,
+    typer.Option(
+        metavar="RATE",
+        help="frames a second of images or a film that state no times; sets dataset.fps",
+    ),
+]
 Topics = Annotated[
     str | None,
     typer.Option(

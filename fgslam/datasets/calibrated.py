@@ -1,12 +1,39 @@
-"""The rig of a recording at another place in the body than its calibration says."""
+"""The rig of a recording: its own calibration or the one that is given in its place, mounted."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 from fgslam.cameras.calibration import level_mounting
-from fgslam.cameras.rig import StereoRig
+from fgslam.cameras.rig import StereoRig, load_rig
+from fgslam.core.errors import CalibrationError
 from fgslam.datasets.settings import CalibratedSettings
+
+
+def calibrated_rig(
+    settings: CalibratedSettings, own: Path, size: tuple[int, int] | None
+) -> StereoRig:
+    """The rig by the file that the settings name, else by the recording's own file or folder.
+
+    Args:
+        settings: of the recording.
+        own: the recording's file or folder of calibration.
+        size: width and height of the images, for formats that do not state it.
+
+    Raises:
+        CalibrationError: there is no calibration, or it cannot be used.
+    """
+    if settings.camera_file is not None:
+        return mounted(load_rig(settings.camera_file, size=size), settings)
+    try:
+        return mounted(load_rig(own, size=size), settings)
+    except CalibrationError as fault:
+        if not str(fault).startswith(f"{own}:"):  # of a file in it: that is there, and at fault
+            raise
+        raise CalibrationError(
+            f"{fault}; give a calibration: {own / 'calib.json'}, or another one by --camera FILE"
+        ) from None
 
 
 def mounted(rig: StereoRig, settings: CalibratedSettings) -> StereoRig:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,10 +10,9 @@ import numpy as np
 from fgslam.cameras.calibration import read_json_object
 from fgslam.cameras.rig import StereoRig, load_rig
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.errors import CalibrationError, DatasetError, OdometryError
+from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import right_from_left_camera
-from fgslam.core.measurements import Odometry
 from fgslam.datasets.calibrated import mounted
 from fgslam.datasets.images import (
     RawImages,
@@ -26,13 +24,8 @@ from fgslam.datasets.images import (
     require_folder,
 )
 from fgslam.datasets.layouts import layout_hint
-from fgslam.datasets.odometry import (
-    motions_from_poses,
-    motions_from_speed,
-    read_pose_log,
-    read_speed_log,
-)
-from fgslam.datasets.recording import OdometrySource, Recording, recording_identity, select_frames
+from fgslam.datasets.odometry_files import file_odometry, find_odometry
+from fgslam.datasets.recording import Recording, recording_identity, select_frames
 from fgslam.datasets.settings import ImageFolderSettings, RecordedOdometrySettings
 from fgslam.datasets.tables import (
     Table,
@@ -71,7 +64,7 @@ def open_image_folder(
     check_sizes(files, root)
     images = RawImages(files, rig)
     truth = _read_truth(root, rig.baseline)
-    odometry_file = _find_odometry(root, settings.odometry_file)
+    odometry_file = find_odometry(root, settings.odometry_file)
     defining = [
         *([_camera_file(root, settings)] if _camera_file(root, settings).is_file() else []),
         root / "times.txt",
@@ -92,7 +85,7 @@ def open_image_folder(
         indices=chosen,
         load_images=images.load,
         load_colour=images.load_colour,
-        odometry_source=_odometry_source(odometry_file, odometry),
+        odometry_source=file_odometry(odometry_file, odometry),
     )
 
 
@@ -205,42 +198,3 @@ def _read_truth(root: Path, baseline: float) -> Trajectory | None:
         left = read_tum_table(root / TRUTH_LEFT)[1]
         return Trajectory(left.timestamps, right_from_left_camera(left.poses, baseline))
     return None
-
-
-def _find_odometry(root: Path, name: str | None) -> Path | None:
-    if name is not None:
-        if not (root / name).is_file():
-            raise DatasetError(
-                f"dataset.odometry_file {root / name} does not exist; correct the name, or leave "
-                "it out"
-            )
-        return root / name
-    found: Iterable[Path] = [root / "odometry.txt", *sorted(root.glob("odom*.csv"))]
-    candidates = [path for path in found if path.is_file()]
-    if len(candidates) > 1:
-        raise DatasetError(
-            f"{root} has several odometry files ({', '.join(p.name for p in candidates)}); name "
-            "one in dataset.odometry_file"
-        )
-    return candidates[0] if candidates else None
-
-
-def _odometry_source(
-    path: Path | None, settings: RecordedOdometrySettings
-) -> OdometrySource | None:
-    if path is None:
-        return None
-
-    def source(frames: FloatArray) -> tuple[Odometry | None, ...]:
-        if path.suffix == ".csv":
-            steps = motions_from_speed(read_speed_log(path, settings), frames, settings)
-        else:
-            steps = motions_from_poses(read_pose_log(path, settings), frames, settings)
-        if len(frames) > 1 and all(step is None for step in steps):
-            raise OdometryError(
-                f"{path} covers none of the frames ({frames[0]:.3f} to {frames[-1]:.3f} s); check "
-                "that both use one clock, or set odometry.time_offset_s"
-            )
-        return steps
-
-    return source

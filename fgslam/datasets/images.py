@@ -15,8 +15,8 @@ import numpy.typing as npt
 from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
+from fgslam.datasets.loose_files import IMAGE_SUFFIXES
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 # Some writers pad a JPEG after its end marker.

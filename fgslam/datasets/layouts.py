@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from fgslam.core.errors import DatasetError
+from fgslam.datasets.loose_files import IMAGE_SUFFIXES, find_cameras, natural
 
 _DRIVE = ("image_0", "image_1", "calib.txt", "times.txt")
 _RUN_CONFIG = "config.yaml"
@@ -22,12 +22,14 @@ class Layout:
         lacking: the parts that a folder would need to have it and has not.
         begun: whether a folder has parts that no other layout has.
         endings: of files that are a recording of this layout by themselves.
+        last: counts where no other layout is complete.
     """
 
     name: str
     lacking: Callable[[Path], tuple[str, ...]]
     begun: Callable[[Path], bool]
     endings: tuple[str, ...] = ()
+    last: bool = False
 
 
 def recognise_layout(folder: Path, kind: str | None = None) -> dict[str, str]:
@@ -65,6 +67,7 @@ def fitting_layouts(given: Path) -> tuple[str, ...]:
     if not given.is_dir():
         return _fitting_files(given)
     complete = [kind for kind, layout in LAYOUTS.items() if not layout.lacking(given)]
+    complete = [kind for kind in complete if not LAYOUTS[kind].last] or complete
     fitting = complete or [kind for kind, layout in LAYOUTS.items() if layout.begun(given)]
     if not fitting:
         raise DatasetError(_unknown(given))
@@ -84,12 +87,6 @@ def files_of(given: Path) -> list[Path]:
     if given.exists() or not any(mark in given.name for mark in "*?["):
         return [given]
     return sorted(given.parent.glob(given.name), key=natural)
-
-
-def natural(path: Path) -> tuple[tuple[int, str], ...]:
-    """Sorts names with numbers by their values, so that 10 comes after 9; words as they are."""
-    words = re.split(r"(\d+)", path.name)
-    return tuple((int(w), "") if w.isdecimal() else (-1, w) for w in words)
 
 
 def _fitting_files(given: Path) -> tuple[str, ...]:
@@ -114,6 +111,8 @@ def _fitting_files(given: Path) -> tuple[str, ...]:
 
 
 def _all_end(files: list[Path], layout: Layout) -> bool:
+    if layout.last and len(files) < 2:
+        return False
     return all(file.is_file() and file.suffix.lower() in layout.endings for file in files)
 
 
@@ -194,7 +193,9 @@ def _absent(folder: Path, parts: tuple[str, ...]) -> tuple[str, ...]:
 
 def _lacking_of_euroc(folder: Path) -> tuple[str, ...]:
     inside = folder / "mav0" if (folder / "mav0").is_dir() else folder
-    return tuple(f"mav0/{part}" for part in _absent(inside, ("cam0", "cam1")))
+    cameras = _absent(inside, ("cam0", "cam1"))
+    lists = () if cameras else _absent(inside, ("cam0/data.csv", "cam1/data.csv"))
+    return tuple(f"mav0/{part}" for part in (*cameras, *lists))
 
 
 def _euroc_begun(folder: Path) -> bool:
@@ -231,6 +232,28 @@ def _lacking_of_bag(folder: Path) -> tuple[str, ...]:
     return () if found else ("a file *.bag, *.db3 or *.mcap",)
 
 
+def _lacking_of_kitti_raw(folder: Path) -> tuple[str, ...]:
+    drive = kitti_raw_drive(folder)
+    if drive is None:
+        return ("image_00/data and image_01/data, or image_02 and image_03", "timestamps.txt")
+    return ()
+
+
+def kitti_raw_drive(folder: Path) -> Path | None:
+    """The folder of a KITTI raw drive: this one, or the only one in the folder of a date."""
+    if (folder / "image_00" / "timestamps.txt").is_file() or (
+        folder / "image_02" / "timestamps.txt"
+    ).is_file():
+        return folder
+    inside = [path for path in folder.glob("*_drive_*") if path.is_dir()]
+    return kitti_raw_drive(inside[0]) if len(inside) == 1 else None
+
+
+def _lacking_of_loose_images(folder: Path) -> tuple[str, ...]:
+    found = find_cameras(folder)
+    return () if found else ("images of a left and a right camera, by their names",)
+
+
 LAYOUTS = {
     "image_folder": Layout(
         "image folder",
@@ -239,11 +262,19 @@ LAYOUTS = {
     ),
     "kitti": Layout("KITTI odometry", _lacking_of_kitti, _kitti_begun),
     "euroc": Layout("EuRoC native", _lacking_of_euroc, _euroc_begun),
+    "kitti_raw": Layout("KITTI raw", _lacking_of_kitti_raw, lambda folder: False),
     "bag": Layout("ROS bag", _lacking_of_bag, lambda folder: False, BAG_ENDINGS),
     "light_field": Layout(
         "light field",
         lambda folder: _absent(folder, ("positions.csv", "calib.json")),
         lambda folder: (folder / "positions.csv").is_file(),
+    ),
+    "loose_images": Layout(
+        "folder of images",
+        _lacking_of_loose_images,
+        lambda folder: False,
+        IMAGE_SUFFIXES,
+        last=True,
     ),
 }
 """By the value of ``dataset.kind`` that opens it."""

@@ -15,8 +15,7 @@ import numpy as np
 from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
-from fgslam.datasets.images import IMAGE_SUFFIXES
-from fgslam.datasets.layouts import natural
+from fgslam.datasets.loose_files import IMAGE_SUFFIXES, natural
 
 ColourLoader: TypeAlias = Callable[[int], Image]
 """Picture (height, width, 3) in R, G, B by place in the recording; raises FrameError."""

@@ -5,7 +5,7 @@ A reader is imported when its kind is opened: what one needs takes others a seco
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from fgslam.core.recordings import MeasurementRecording
 from fgslam.datasets.recording import Recording
@@ -14,8 +14,10 @@ from fgslam.datasets.settings import (
     EurocSettings,
     FileRecordingSettings,
     ImageFolderSettings,
+    KittiRawSettings,
     KittiSettings,
     LightFieldSettings,
+    LooseImagesSettings,
     MeasurementDatasetSettings,
     OdometrySettings,
     RecordedOdometrySettings,
@@ -43,19 +45,17 @@ def open_recording(
         DatasetError: the recording is missing, malformed or empty.
         CalibrationError: its calibration is missing or impossible.
     """
+    if isinstance(settings, _WithOdometry):
+        return _open_with_odometry(settings, odometry or RecordedOdometrySettings())
     match settings:
-        case ImageFolderSettings():
-            from fgslam.datasets.image_folder import open_image_folder
-
-            return open_image_folder(settings, odometry or RecordedOdometrySettings())
-        case BagSettings():
-            from fgslam.datasets.bags.reader import open_bag
-
-            return open_bag(settings, odometry or RecordedOdometrySettings())
         case KittiSettings():
             from fgslam.datasets.kitti import open_kitti
 
             return open_kitti(settings)
+        case KittiRawSettings():
+            from fgslam.datasets.kitti_raw import open_kitti_raw
+
+            return open_kitti_raw(settings)
         case EurocSettings():
             from fgslam.datasets.euroc import open_euroc
 
@@ -64,6 +64,25 @@ def open_recording(
             from fgslam.datasets.light_field import open_light_field
 
             return open_light_field(settings)
+
+
+_WithOdometry: TypeAlias = ImageFolderSettings | LooseImagesSettings | BagSettings
+
+
+def _open_with_odometry(settings: _WithOdometry, odometry: RecordedOdometrySettings) -> Recording:
+    match settings:
+        case ImageFolderSettings():
+            from fgslam.datasets.image_folder import open_image_folder
+
+            return open_image_folder(settings, odometry)
+        case LooseImagesSettings():
+            from fgslam.datasets.loose_images import open_loose_images
+
+            return open_loose_images(settings, odometry)
+        case BagSettings():
+            from fgslam.datasets.bags.reader import open_bag
+
+            return open_bag(settings, odometry)
 
 
 def open_measurements(

@@ -16,7 +16,8 @@ from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.files import read_text
 from fgslam.core.planar import wrap
-from fgslam.datasets.images import IMAGE_SUFFIXES, read_colour_image, require_folder
+from fgslam.datasets.images import read_colour_image, require_folder
+from fgslam.datasets.loose_files import IMAGE_SUFFIXES
 from fgslam.datasets.omni_recording import (
     ColourLoader,
     OmniRecording,

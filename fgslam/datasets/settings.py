@@ -75,6 +75,39 @@ class ImageFolderSettings(CalibratedSettings):
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
+class LooseImagesSettings(CalibratedSettings):
+    """Folders of images with any names, with or without times (docs/datasets/loose_images.md)."""
+
+    path: Annotated[
+        str, Field(min_length=1, description="the folder, or a pattern of file names in it")
+    ]
+    kind: Literal["loose_images"] = "loose_images"
+    fps: Annotated[
+        float | None,
+        Field(
+            gt=0.0,
+            le=1e4,
+            description="frames a second, in place of a list of times; null: by the list, by names "
+            "that are times, else 10",
+        ),
+    ] = None
+    odometry_file: Annotated[
+        str | None,
+        Field(
+            description="odometry inside the folder; null: odometry.txt or the only odom*.csv, "
+            "where there is one"
+        ),
+    ] = None
+
+
+@dataclass(frozen=True, config=STRICT)
+class KittiRawSettings(CalibratedSettings):
+    """A synchronised and rectified drive of KITTI raw (docs/datasets/kitti.md)."""
+
+    kind: Literal["kitti_raw"] = "kitti_raw"
+
+
+@dataclass(frozen=True, config=STRICT, kw_only=True)
 class BagSettings(CalibratedSettings):
     """ROS 1 and ROS 2 bags: .bag, .db3, .mcap (docs/datasets/bags.md)."""
 
@@ -205,7 +238,13 @@ class UtiasRangeBearingSettings(RecordingSettings):
 
 
 FileRecordingSettings: TypeAlias = (
-    ImageFolderSettings | BagSettings | KittiSettings | EurocSettings | LightFieldSettings
+    ImageFolderSettings
+    | LooseImagesSettings
+    | BagSettings
+    | KittiSettings
+    | KittiRawSettings
+    | EurocSettings
+    | LightFieldSettings
 )
 MeasurementDatasetSettings: TypeAlias = (
     StereoTracksSettings

@@ -9,7 +9,7 @@ _WORD = re.compile(
     r"(?:(?<![a-z])|(?<=cam)|(?<=camera)|(?<=img)|(?<=image))(left|right)", re.IGNORECASE
 )
 _LETTER = re.compile(r"(?<![a-z0-9])([lr])(?![a-z0-9])", re.IGNORECASE)
-_CAMERA_NUMBER = re.compile(r"(?<=cam|img)[_-]?(\d+)(?!\d)", re.IGNORECASE)
+_CAMERA_NUMBER = re.compile(r"(?<=cam)[_-]?(\d+)(?!\d)", re.IGNORECASE)
 _NUMBER = re.compile(r"(\d+)")
 
 
@@ -49,3 +49,10 @@ def _readings(name: str, any_number: bool) -> Iterable[tuple[tuple[str, str], in
 
 def _without(name: str, match: re.Match[str]) -> str:
     return f"{name[: match.start(1)]}\0{name[match.end(1) :]}"
+
+
+def without_side(name: str, camera_number: bool = False) -> str:
+    """A file's name without what tells its camera's side: words, letters, or a camera's number."""
+    for pattern in (_WORD, _LETTER, *([_CAMERA_NUMBER] if camera_number else [])):
+        name = pattern.sub("", name)
+    return name

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -25,10 +25,7 @@ from fgslam.runs.named_experiments import find_experiment, suggestion
 if TYPE_CHECKING:
     from fgslam.core.recordings import Sequence
 
-_CALIBRATED = {
-    each.kind for each in get_args(FileRecordingSettings) if issubclass(each, CalibratedSettings)
-}
-"""Layouts whose calibration may be another file."""
+_SETTINGS = {each.kind: each for each in get_args(FileRecordingSettings)}
 
 _NOT_IN_NAMES = re.compile(r"[^\w.-]+")
 
@@ -132,9 +129,14 @@ def _name(recording: Path) -> str:
 
 def _dataset(folder: Path, camera: Path | None, overrides: tuple[str, ...]) -> dict[str, str]:
     dataset = recognise_layout(folder, _asked_kind(overrides))
+    if _asked(overrides, "dataset.fps") and "fps" not in _fields(dataset["kind"]):
+        raise ConfigError(
+            f"{folder}: {LAYOUTS[dataset['kind']].name} states its own times; leave --fps out, "
+            "--stride uses fewer frames"
+        )
     if camera is None:
         return dataset
-    if dataset["kind"] not in _CALIBRATED:
+    if not issubclass(_SETTINGS[dataset["kind"]], CalibratedSettings):
         raise ConfigError(
             f"{folder}: {LAYOUTS[dataset['kind']].name} holds its own calibration; leave --camera "
             "out"
@@ -146,14 +148,23 @@ def _dataset(folder: Path, camera: Path | None, overrides: tuple[str, ...]) -> d
 
 def _asked_kind(overrides: tuple[str, ...]) -> str | None:
     """The layout that an override names; None where none does."""
-    pairs = [override.partition("=") for override in overrides]
-    asked = [value.strip() for key, _, value in pairs if key.strip() == "dataset.kind"]
+    asked = _asked(overrides, "dataset.kind")
     if asked and asked[-1] not in LAYOUTS:
         raise ConfigError(
             f"dataset.kind={asked[-1]} is no layout of a folder of images; use one of "
             f"{', '.join(LAYOUTS)}"
         )
     return asked[-1] if asked else None
+
+
+def _fields(kind: str) -> set[str]:
+    return {field.name for field in fields(_SETTINGS[kind])}
+
+
+def _asked(overrides: tuple[str, ...], key: str) -> list[str]:
+    """Values that overrides give to a key."""
+    pairs = [override.partition("=") for override in overrides]
+    return [value.strip() for name, _, value in pairs if name.strip() == key]
 
 
 def _said(config: ExperimentConfig, sequence: Sequence) -> str:

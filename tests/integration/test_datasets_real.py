@@ -25,6 +25,7 @@ from fgslam.datasets.settings import (
     ImageFolderSettings,
     KittiSettings,
     LightFieldSettings,
+    LooseImagesSettings,
     RecordedOdometrySettings,
     SyntheticOdometrySettings,
 )
@@ -246,3 +247,9 @@ def test_bags_without_a_stereo_pair_say_so(shared_data: Path) -> None:
     ):
         with pytest.raises(DatasetError, match=message):
             open_recording(BagSettings(path=str(shared_data / "bags" / name)))
+
+
+def test_pairs_in_one_folder_with_the_side_in_their_names(shared_data: Path) -> None:
+    pairs = open_recording(LooseImagesSettings(path=str(shared_data / "bumblebee2_pairs")))
+    assert (len(pairs), pairs.rig.width) == (8, 320)
+    assert all(np.std(image) > 10.0 for image in pairs.frame(7).images)

@@ -15,6 +15,7 @@ from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose
 
 ODOMETRY = ("P0", "P1")
 RAW = ("P_rect_00", "P_rect_01")
+RAW_COLOUR = ("P_rect_02", "P_rect_03")
 Size = tuple[int, int]
 
 
@@ -23,15 +24,17 @@ def is_kitti(text: str) -> bool:
     return text.startswith("P0:") or "\nP0:" in text or "P_rect_00:" in text
 
 
-def read_kitti(path: Path, size: Size | None) -> Calibration:
+def read_kitti(path: Path, size: Size | None, keys: tuple[str, str] | None = None) -> Calibration:
     """The rectified grey pair; the body is the left camera, looking ahead.
+
+    ``keys`` are the lines of left and right camera where it is another pair, `RAW_COLOUR`.
 
     Raises:
         CalibrationError: a line is missing or malformed, or the pair is not rectified.
     """
     lines = _lines(path)
-    raw = RAW[0] in lines
-    keys = RAW if raw else ODOMETRY
+    raw = RAW[0] in lines or RAW_COLOUR[0] in lines
+    keys = keys or (RAW if raw else ODOMETRY)
     left, right = (_projection(path, lines, key) for key in keys)
     if not np.allclose(left[:, :3], right[:, :3]):
         raise CalibrationError(
@@ -39,7 +42,7 @@ def read_kitti(path: Path, size: Size | None) -> Calibration:
             "rectified; use the calibration that came with the sequence"
         )
     offset = _baseline(path, left, right, keys)
-    width, height = (_stated_size(path, lines) if raw else None) or size or (0, 0)
+    width, height = (_stated_size(path, lines, keys[0][-2:]) if raw else None) or size or (0, 0)
     ahead = BODY_FORWARD_LEFT_UP_FROM_CAMERA
     cameras = tuple(
         checked_camera(
@@ -94,15 +97,18 @@ def _projection(path: Path, lines: Mapping[str, tuple[int, list[str]]], key: str
     return values.reshape(3, 4)
 
 
-def _stated_size(path: Path, lines: Mapping[str, tuple[int, list[str]]]) -> Size | None:
-    """Width and height by the line S_rect_00, if there is one."""
-    if "S_rect_00" not in lines:
+def _stated_size(
+    path: Path, lines: Mapping[str, tuple[int, list[str]]], camera: str
+) -> Size | None:
+    """Width and height by the line S_rect_00 of a camera, if there is one."""
+    key = f"S_rect_{camera}"
+    if key not in lines:
         return None
-    number, words = lines["S_rect_00"]
+    number, words = lines[key]
     values = _floats(words)
     if len(values) != 2 or not np.isfinite(values).all():
         raise CalibrationError(
-            f"{path}, line {number}: S_rect_00 must be width and height; restore the file"
+            f"{path}, line {number}: {key} must be width and height; restore the file"
         )
     return round(values[0]), round(values[1])
 

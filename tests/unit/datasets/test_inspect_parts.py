@@ -74,10 +74,13 @@ def test_report_on_kitti_names_the_drive_and_the_others(tmp_path: Path) -> None:
     assert f"other drives 07: inspect {root}/sequences/NN" in report
 
 
-def test_kitti_drive_without_its_root_names_the_layout_needed(tmp_path: Path) -> None:
+def test_a_kitti_drive_without_its_root_is_a_folder_of_images(tmp_path: Path) -> None:
     root, _ = kitti(tmp_path / "a", 3)
     moved = tmp_path / "drive"
     (root / "sequences" / "06").rename(moved)
+    assert recognise_layout(moved) == {"kind": "loose_images", "path": str(moved)}
+    assert "frames                  3 over 0.2 s" in inspect_recording(moved)
+    (moved / "image_1").rename(tmp_path / "elsewhere")
     with pytest.raises(DatasetError, match="move it to ROOT/sequences/00"):
         recognise_layout(moved)
 

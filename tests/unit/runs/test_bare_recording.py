@@ -168,6 +168,11 @@ def test_two_layouts_that_fit_equally_are_both_named_and_one_can_be_chosen(tmp_p
     assert "is no layout of a folder of images" in refused(root, "dataset.kind=rendered_lab")
 
 
+def test_a_rate_is_for_what_has_no_times(tmp_path: Path) -> None:
+    line = refused(image_folder(tmp_path), "dataset.fps=5")
+    assert "image folder states its own times; leave --fps out" in line
+
+
 def test_two_layouts_that_are_begun_say_what_each_lacks(tmp_path: Path) -> None:
     (tmp_path / "left").mkdir()
     (tmp_path / "mav0" / "cam0").mkdir(parents=True)
@@ -197,7 +202,7 @@ def test_a_missing_calibration(tmp_path: Path) -> None:
     (root / "calib.json").unlink()
     line = refused(root)
     assert f"{root / 'calib.json'}" in line
-    assert "give a calibration: this file" in line
+    assert "give a calibration: " in line
     assert "by --camera FILE" in line
 
 

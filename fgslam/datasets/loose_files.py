@@ -1,0 +1,123 @@
+"""Images of two cameras in folders with any names: which files they are, and which are pairs.
+
+Needs no image library: layouts are recognised by it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from fgslam.core.errors import DatasetError
+from fgslam.datasets.sides import camera_pairs, without_side
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
+_INSIDE = "data"  # where EuRoC and KITTI keep a camera's images
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFiles:
+    """Image files of both cameras, each in natural order.
+
+    Attributes:
+        left, right: the files.
+        folder: that of all.
+        interleaved: both cameras' files lie in one folder, and their names say which is which.
+    """
+
+    left: tuple[Path, ...]
+    right: tuple[Path, ...]
+    folder: Path
+    interleaved: bool
+
+
+def natural(path: Path) -> tuple[tuple[int, str], ...]:
+    """Sorts names with numbers by their values, so that 10 comes after 9; words as they are."""
+    words = re.split(r"(\d+)", path.name)
+    return tuple((int(w), "") if w.isdecimal() else (-1, w) for w in words)
+
+
+def images_in(folder: Path) -> list[Path]:
+    """Image files of a folder, in natural order."""
+    found = (p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+    return sorted(found, key=natural)
+
+
+def find_cameras(root: Path, files: Sequence[Path] | None = None) -> CameraFiles | None:
+    """The files of a left and a right camera; None where there is no such pair.
+
+    Two folders side by side (left and right, image_0 and image_1, cam0 and cam1), or one folder in
+    which names differ in the side alone.
+
+    Args:
+        root: the folder.
+        files: of it, only these; None for all.
+    """
+    if files is None:
+        folders = _two_folders(root)
+        if folders is not None:
+            left, right = (tuple(images_in(folder)) for folder in folders)
+            return CameraFiles(left, right, root, interleaved=False)
+        files = images_in(root)
+    named = {path.name: path for path in files}
+    pairs = camera_pairs(named, any_number=False)
+    if not pairs:
+        return None
+    left, right = (tuple(sorted({named[p[k]] for p in pairs}, key=natural)) for k in (0, 1))
+    return CameraFiles(left, right, root, interleaved=True)
+
+
+def _two_folders(root: Path) -> tuple[Path, Path] | None:
+    """Folders of images whose names differ in the side; of several pairs the first."""
+    with_images = {}
+    for folder in sorted(path for path in root.iterdir() if path.is_dir()):
+        for place in (folder, folder / _INSIDE):
+            if place.is_dir() and images_in(place):
+                with_images[folder.name] = place
+                break
+    pairs = camera_pairs(with_images)
+    if not pairs:
+        return None
+    words = [pair for pair in pairs if not re.search(r"\d", pair[0])]
+    left, right = (words or list(pairs))[0]
+    return with_images[left], with_images[right]
+
+
+def pair_files(found: CameraFiles) -> tuple[tuple[tuple[Path, Path], ...], tuple[str, ...]]:
+    """Pairs (right, left) in natural order, and notes on what is left out.
+
+    Files are paired by their names without the side; where those do not match, by their order.
+
+    Raises:
+        DatasetError: names do not match, and the cameras have different numbers of images.
+    """
+    for key in _KEYS:
+        right, left = ({key(path.stem): path for path in f} for f in (found.right, found.left))
+        common = [name for name in right if name in left]
+        unique = len(right) == len(found.right) and len(left) == len(found.left)
+        if unique and len(common) >= max(1, min(len(right), len(left)) // 2):
+            alone = (("right", len(right) - len(common)), ("left", len(left) - len(common)))
+            notes = tuple(
+                f"{n} {camera} images have no partner of their name and are left out"
+                for camera, n in alone
+                if n
+            )
+            return tuple((right[name], left[name]) for name in common), notes
+    if len(found.right) != len(found.left):
+        raise DatasetError(
+            f"{found.folder}: {len(found.left)} images of the left camera and {len(found.right)} "
+            f"of the right one, and their names ({found.left[0].name}, {found.right[0].name}) do "
+            "not match: which belong together cannot be told; name both of a pair alike"
+        )
+    note = "left and right images are paired by their order: their names do not match"
+    return tuple(zip(found.right, found.left, strict=True)), (note,)
+
+
+_KEYS: tuple[Callable[[str], object], ...] = (
+    lambda stem: natural(Path(stem)),
+    lambda stem: natural(Path(without_side(stem))),
+    lambda stem: natural(Path(without_side(stem, camera_number=True))),
+)
+"""What two names of a pair have in common; the first that most of them have counts."""

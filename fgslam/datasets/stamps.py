@@ -1,0 +1,148 @@
+"""Time stamps of images: a list beside them, or their own names, in whatever unit of time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import DatasetError
+from fgslam.core.files import read_lines
+
+LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv", "data.csv")
+"""Names of lists of times, the first that is there counts."""
+
+_ASSUMED_FPS = 10.0
+_UNITS = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+_SLOWEST_S = 10.0  # between two images: what makes a unit plausible
+_NAME = re.compile(r"^\d{10,19}(\.\d+)?$")
+_DATE = re.compile(r"^\d{4}-\d{2}-\d{2}[ T]\d{2}:\d{2}:\d{2}")
+
+
+def stamps_of(
+    images: Sequence[Path], folders: Sequence[Path], fps: float | None
+) -> tuple[FloatArray, tuple[str, ...], tuple[Path, ...]]:
+    """Seconds (n,) of images in their order, notes, and the list they were read from, if any.
+
+    Taken from a list of times in one of the folders, from names that are times, or by the rate.
+
+    Args:
+        images: one file a frame.
+        folders: where a list may be.
+        fps: the rate at which they were taken; None where nobody knows: 10 is assumed.
+
+    Raises:
+        DatasetError: the list is malformed, or lacks an image.
+    """
+    if fps is None:
+        for folder in folders:
+            for path in (folder / name for name in LISTS):
+                if path.is_file():
+                    found, unit = _in_seconds(_listed(path, images), str(path))
+                    return found, unit, (path,)
+        if len(images) > 1 and all(_NAME.match(image.stem) for image in images):
+            found, unit = _in_seconds(_numbers([p.stem for p in images]), "names of the images")
+            return found, unit, ()
+    rate = fps or _ASSUMED_FPS
+    note = (
+        ()
+        if fps
+        else (f"no list of times: taken as {rate:g} frames a second (--fps says otherwise)",)
+    )
+    return np.arange(len(images)) / rate, note, ()
+
+
+def _numbers(texts: Sequence[str]) -> tuple[FloatArray, float]:
+    """The numbers less the first's whole part, which doubles could not hold, and that part."""
+    if any("e" in text.lower() for text in texts):
+        return np.array([float(text) for text in texts]), 0.0
+    whole = [int(text.partition(".")[0]) for text in texts]
+    parts = [float(f"0.{text.partition('.')[2] or 0}") for text in texts]
+    return np.array([w - whole[0] for w in whole], np.float64) + parts, float(whole[0])
+
+
+def _in_seconds(
+    numbers: tuple[FloatArray, float], where: str
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Times in seconds by the unit that makes the rate of a camera, and a note where not seconds.
+
+    Raises:
+        DatasetError: times do not increase.
+    """
+    values, first = numbers
+    steps = np.diff(values)
+    if len(steps) and steps.min() <= 0.0:
+        k = int(np.argmax(steps <= 0.0))
+        raise DatasetError(
+            f"{where}: the time of image {k + 2} does not come after that of image {k + 1}; put "
+            "the lines in time order and remove duplicates"
+        )
+    step = float(np.median(steps)) if len(steps) else 0.0
+    name = next((n for n, unit in _UNITS.items() if step * unit <= _SLOWEST_S), "seconds")
+    note = () if name == "seconds" else (f"times of {where} are taken as {name}",)
+    return _UNITS[name] * (first + values), note
+
+
+def _listed(path: Path, images: Sequence[Path]) -> tuple[FloatArray, float]:
+    """Times of the images by a list: a time a line, or name or number and time in either order."""
+    lines = read_lines(path)
+    if lines and _DATE.match(lines[0][1]):
+        rows = [[_seconds_of_date(path, number, text)] for number, text in lines]
+    else:
+        rows = [[w for w in re.split(r"[,;\s]+", text) if w] for _, text in lines]
+        if rows and not any(_is_number(word) for word in rows[0]):
+            rows, lines = rows[1:], lines[1:]  # names of columns
+    if rows and all(len(row) >= 2 for row in rows):
+        return _by_name(path, rows, images)
+    if len(rows) < len(images):
+        raise DatasetError(
+            f"{path} has {len(rows)} times for {len(images)} images; restore the list, or leave it "
+            "out and say --fps"
+        )
+    for row, (number, _) in zip(rows, lines, strict=True):
+        _require_number(path, number, row[0])
+    return _numbers([row[0] for row in rows[: len(images)]])
+
+
+def _by_name(
+    path: Path, rows: Sequence[Sequence[str]], images: Sequence[Path]
+) -> tuple[FloatArray, float]:
+    """By the column that names the images, which is the first one or the second."""
+    for names, times in ((0, 1), (1, 0)):
+        known = {_stem(row[names]): row[times] for row in rows}
+        keys = [image.stem if image.stem in known else _stem(image.stem) for image in images]
+        if all(key in known and _is_number(known[key]) for key in keys):
+            return _numbers([known[key] for key in keys])
+    raise DatasetError(
+        f"{path}: neither column names all images ({images[0].name} to {images[-1].name}); each "
+        "line must be: name or number of the image, seconds"
+    )
+
+
+def _stem(word: str) -> str:
+    """A file's name without folder and ending; of a number its value."""
+    name = re.sub(r"\.(png|jpe?g|pgm|bmp|tiff?)$", "", word.rpartition("/")[2], flags=re.I)
+    return str(int(name)) if name.isdecimal() else name
+
+
+def _is_number(word: str) -> bool:
+    return re.fullmatch(r"\d+(\.\d*)?([eE][-+]?\d+)?", word) is not None
+
+
+def _require_number(path: Path, line: int, word: str) -> None:
+    if not _is_number(word):
+        raise DatasetError(f"{path}, line {line}: {word!r} is no time; correct the line")
+
+
+def _seconds_of_date(path: Path, line: int, text: str) -> str:
+    """``2011-09-26 13:02:25.964389445`` in seconds since 1970, as text with all its digits."""
+    whole, _, part = text.strip().partition(".")
+    try:
+        moment = datetime.fromisoformat(whole.strip()).replace(tzinfo=UTC)
+    except ValueError:
+        raise DatasetError(f"{path}, line {line}: {text!r} is no time; correct it") from None
+    return f"{int(moment.timestamp())}.{part or 0}"

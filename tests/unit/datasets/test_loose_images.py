@@ -1,0 +1,261 @@
+"""Folders of images with any names; drives of KITTI raw."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture, save, write_calibration, write_tum
+
+from fgslam.core.errors import CalibrationError, DatasetError, FrameError
+from fgslam.core.geometry import pose
+from fgslam.datasets.kitti_raw import open_kitti_raw
+from fgslam.datasets.layouts import recognise_layout
+from fgslam.datasets.loose_images import open_loose_images
+from fgslam.datasets.recording import Recording
+from fgslam.datasets.settings import (
+    KittiRawSettings,
+    LooseImagesSettings,
+    RecordedOdometrySettings,
+)
+from fgslam.datasets.sides import camera_pairs
+from fgslam.runs.bare_recording import bare_experiment
+
+STAMP = 1_403_715_273_262_142_976
+NAMES: dict[str, Callable[[int], tuple[str, str]]] = {
+    "left, right": lambda k: (f"left/{k}.png", f"right/{k}.png"),
+    "L, R": lambda k: (f"L/img{k}.png", f"R/img{k}.png"),
+    "image_0, image_1": lambda k: (f"image_0/{k:04d}.png", f"image_1/{k:04d}.png"),
+    "cam0/data, cam1/data": lambda k: (f"cam0/data/{k}.png", f"cam1/data/{k}.png"),
+    "side in both": lambda k: (f"left/left_{k}.png", f"right/right_{k}.png"),
+    "side behind": lambda k: (f"{k}_left.png", f"{k}_right.png"),
+    "side before": lambda k: (f"left{k}.png", f"right{k}.png"),
+    "letters": lambda k: (f"frame{k}-L.png", f"frame{k}-R.png"),
+    "cam0, cam1 in one": lambda k: (f"cam0_{k}.png", f"cam1_{k}.png"),
+    "other names": lambda k: (f"left/a{k}.png", f"right/b{k}.png"),
+}
+
+
+def loose(root: Path, names: Callable[[int], tuple[str, str]], numbers: list[int]) -> Path:
+    """Frame i of the numbers has corner pixels 10 + i (right) and 60 + i (left)."""
+    for i, k in enumerate(numbers):
+        left, right = names(k)
+        save(root / left, picture(60 + i))
+        save(root / right, picture(10 + i))
+    write_calibration(root)
+    return root
+
+
+def opened(root: Path, **settings: Any) -> Recording:
+    return open_loose_images(
+        LooseImagesSettings(path=str(root), **settings), RecordedOdometrySettings()
+    )
+
+
+def codes(recording: Recording) -> list[tuple[int, ...]]:
+    frames = [recording.frame(i).images for i in range(len(recording))]
+    return [tuple(int(image[0, 0]) for image in images) for images in frames]
+
+
+# --------------------------------------------------------------------------------------------
+# Names and pairs
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_any_names_in_natural_order(tmp_path: Path, name: str) -> None:
+    root = loose(tmp_path / "walk", NAMES[name], [2, 9, 10, 100])
+    assert recognise_layout(root) == {"kind": "loose_images", "path": str(root)}
+    recording = opened(root)
+    assert codes(recording) == [(10, 60), (11, 61), (12, 62), (13, 63)]
+    by_order = name == "other names"
+    assert any("paired by their order" in note for note in recording.notes) == by_order
+
+
+def test_a_pattern_of_files(tmp_path: Path) -> None:
+    root = loose(tmp_path, lambda k: (f"{k}_left.png", f"{k}_right.png"), [1, 2, 30])
+    assert len(opened(root / "?_*.png")) == 2
+    assert "2 frames at 10 Hz" in bare_experiment(root / "?_*.png").said
+
+
+def test_what_has_no_partner_is_counted_or_refused(tmp_path: Path) -> None:
+    root = loose(tmp_path, NAMES["left, right"], [1, 2, 3, 4])
+    (root / "left" / "2.png").unlink()
+    recording = opened(root)
+    assert codes(recording) == [(10, 60), (12, 62), (13, 63)]
+    assert "1 right images have no partner of their name" in recording.notes[0]
+    for k in (1, 3, 4):
+        (root / "left" / f"{k}.png").rename(root / "left" / f"a{k}.png")
+    with pytest.raises(DatasetError, match="3 images of the left camera and 4 of the right one, a"):
+        opened(root)
+
+
+def test_words_that_hold_a_side_are_none() -> None:
+    assert camera_pairs(["bright", "bleft"]) == ()
+    assert camera_pairs(["camera_left", "camera_right", "imu"]) == (
+        ("camera_left", "camera_right"),
+    )
+    assert camera_pairs(["0001.png", "0002.png"], any_number=False) == ()
+
+
+# --------------------------------------------------------------------------------------------
+# Times
+
+
+LISTS: dict[str, tuple[str, list[str], str]] = {
+    "seconds": ("times.txt", ["0.0", "0.2", "0.4"], ""),
+    "name and time": ("times.txt", ["3 0.4", "1 0.0", "2 0.2"], ""),
+    "time and file": ("times.csv", ["time,file", "5.0,1.png", "5.2,2.png", "5.4,right/3.png"], ""),
+    "nanoseconds": ("timestamps.txt", [str(STAMP + k * 200_000_000) for k in range(3)], "nano"),
+    "milliseconds": ("times.txt", ["0", "200", "400"], "milli"),
+    "dates": ("timestamps.txt", [f"2011-09-26 13:02:25.{k}00000001" for k in (1, 3, 5)], ""),
+}
+
+
+@pytest.mark.parametrize("name", LISTS)
+def test_lists_of_times(tmp_path: Path, name: str) -> None:
+    file, lines, unit = LISTS[name]
+    root = loose(tmp_path, NAMES["left, right"], [1, 2, 3])
+    (root / file).write_text("\n".join(lines), encoding="utf-8")
+    recording = opened(root)
+    steps = recording.timestamps - recording.timestamps[0]
+    assert np.allclose(steps, [0.0, 0.2, 0.4], rtol=0.0, atol=1e-6)
+    assert any(f"taken as {unit}" in note for note in recording.notes) == bool(unit)
+
+
+def test_names_that_are_times_and_no_times_at_all(tmp_path: Path) -> None:
+    numbers = [STAMP + k * 50_000_000 for k in range(3)]
+    named = opened(loose(tmp_path / "a", NAMES["left, right"], numbers))
+    assert np.allclose(np.diff(named.timestamps), 0.05, rtol=0.0, atol=1e-6)
+    root = loose(tmp_path / "b", NAMES["left, right"], [1, 2, 3])
+    assert "no list of times: taken as 10 frames a second" in opened(root).notes[0]
+    assert np.allclose(opened(root, fps=25.0).timestamps, [0.0, 0.04, 0.08], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (["0.0", "0.1"], "has 2 times for 3 images"),
+        (["0.0", "x", "0.2"], "line 2: 'x' is no time"),
+        (["0.0", "0.2", "0.2"], "the time of image 3 does not come after that of image 2"),
+        (["1 0.0", "2 0.1", "7 0.2"], "neither column names all images"),
+    ],
+)
+def test_bad_lists_of_times(tmp_path: Path, lines: list[str], message: str) -> None:
+    root = loose(tmp_path, NAMES["left, right"], [1, 2, 3])
+    (root / "times.txt").write_text("\n".join(lines), encoding="utf-8")
+    with pytest.raises(DatasetError, match=message) as caught:
+        opened(root)
+    assert "\n" not in str(caught.value)
+
+
+# --------------------------------------------------------------------------------------------
+# Pictures
+
+
+def test_colour_16_bits_and_grey_are_the_same_picture(tmp_path: Path) -> None:
+    root = loose(tmp_path, NAMES["left, right"], [1, 2, 3])
+    image = picture(11)
+    save(root / "right" / "2.png", np.dstack([image, image, image]))
+    save(root / "right" / "3.png", image.astype(np.uint16) << 8)
+    recording = opened(root)
+    for i in (1, 2):
+        assert np.array_equal(recording.frame(i).images[0], image)
+
+
+def test_a_phone_that_was_turned_is_turned_back(tmp_path: Path) -> None:
+    """EXIF orientation 6: the camera was turned to the right, the picture is stored lying."""
+    root = loose(tmp_path, NAMES["left, right"], [1])
+    upright = cv2.resize(picture(3)[:6, :8], (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+    stored = cv2.rotate(upright, cv2.ROTATE_90_COUNTERCLOCKWISE)
+    for side in ("left", "right"):
+        (root / side / "1.png").unlink()
+        (root / side / "1.jpg").write_bytes(turned_jpeg(stored, 6))
+    shown = opened(root).frame(0).images[0]
+    assert np.abs(shown.astype(int) - upright).max() < 12
+
+
+def turned_jpeg(image: np.ndarray, orientation: int) -> bytes:
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+    entry = struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0)
+    exif = b"Exif\0\0II*\0" + struct.pack("<IH", 8, 1) + entry + struct.pack("<I", 0)
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:]
+
+
+def test_a_damaged_image_is_one_lost_frame(tmp_path: Path) -> None:
+    root = loose(tmp_path, NAMES["left, right"], [1, 2, 3])
+    file = root / "left" / "2.png"
+    file.write_bytes(file.read_bytes()[:-30])
+    recording = opened(root)
+    with pytest.raises(FrameError, match=r"2\.png is truncated"):
+        recording.frame(1)
+    assert recording.frame(2).images[1][0, 0] == 62
+
+
+def test_a_calibration_of_another_size_and_none(tmp_path: Path) -> None:
+    root = loose(tmp_path, NAMES["left, right"], [1])
+    write_calibration(root, width=64, height=48)
+    with pytest.raises(CalibrationError, match="is for images of 64x48 pixels, the images have 32x24"):
+        opened(root)
+    (root / "calib.json").unlink()
+    with pytest.raises(
+        CalibrationError, match=r"give a calibration: .*calib\.json.* --camera FILE"
+    ):
+        opened(root)
+
+
+def test_odometry_beside_the_images(tmp_path: Path) -> None:
+    root = loose(tmp_path, NAMES["left, right"], [1, 2, 3])
+    poses = np.stack([pose(np.eye(3), np.array([0.1 * k, 0.0, 0.0])) for k in range(3)])
+    write_tum(root / "odometry.txt", 0.1 * np.arange(3), poses)
+    step = opened(root).odometry(1)
+    assert step is not None
+    assert step.motion[0, 3] == pytest.approx(0.1, abs=1e-9)
+
+
+# --------------------------------------------------------------------------------------------
+# KITTI raw
+
+
+def kitti_raw(root: Path, cameras: tuple[str, str] = ("00", "01")) -> Path:
+    """A drive of three frames, 0.1 s apart; baseline 0.4 m at fx 30."""
+    drive = root / "2011_09_26" / "2011_09_26_drive_0001_sync"
+    for number, code in zip(cameras, (60, 10), strict=True):
+        folder = drive / f"image_{number}"
+        for k in range(3):
+            save(folder / "data" / f"{k:010d}.png", picture(code + k))
+        times = "".join(f"2011-09-26 13:02:25.{k}00000000\n" for k in range(3))
+        (folder / "timestamps.txt").write_text(times, encoding="utf-8")
+    focal, row = CALIBRATION["fx"], "0 0 0 1 0"
+    lines = ["calib_time: 09-Jan-2012 13:57:47"]
+    for number, shift in zip(cameras, (0.0, -12.0), strict=True):
+        lines.append(f"S_rect_{number}: {WIDTH:.6e} {HEIGHT:.6e}")
+        lines.append(f"P_rect_{number}: {focal} 0 15.5 {shift} 0 {focal} 11.5 {row}")
+    (drive.parent / "calib_cam_to_cam.txt").write_text("\n".join(lines), encoding="utf-8")
+    return drive
+
+
+@pytest.mark.parametrize("cameras", [("00", "01"), ("02", "03")])
+def test_a_drive_of_kitti_raw(tmp_path: Path, cameras: tuple[str, str]) -> None:
+    drive = kitti_raw(tmp_path, cameras)
+    for given in (drive, drive.parent):
+        assert recognise_layout(given) == {"kind": "kitti_raw", "path": str(given)}
+        recording = open_kitti_raw(KittiRawSettings(path=str(given)))
+        assert recording.rig.baseline == pytest.approx(0.4, abs=1e-12)
+        assert codes(recording) == [(10, 60), (11, 61), (12, 62)]
+        assert np.allclose(np.diff(recording.timestamps), 0.1, rtol=0.0, atol=1e-6)
+    assert recording.name == "2011_09_26_drive_0001_sync"
+
+
+def test_kitti_raw_that_lacks_a_part(tmp_path: Path) -> None:
+    drive = kitti_raw(tmp_path)
+    (drive.parent / "calib_cam_to_cam.txt").rename(drive.parent / "elsewhere.txt")
+    with pytest.raises(CalibrationError, match=r"no calib_cam_to_cam\.txt in it or beside it"):
+        open_kitti_raw(KittiRawSettings(path=str(drive)))
+    (drive / "image_01").rename(drive / "image_07")
+    with pytest.raises(DatasetError, match="has no two cameras' images"):
+        open_kitti_raw(KittiRawSettings(path=str(drive)))
