@@ -199,7 +199,7 @@ def test_a_damaged_image_is_one_lost_frame(tmp_path: Path) -> None:
 def test_a_calibration_of_another_size_and_none(tmp_path: Path) -> None:
     root = loose(tmp_path, NAMES["left, right"], [1])
     write_calibration(root, width=64, height=48)
-    with pytest.raises(CalibrationError, match="is for images of 64x48 pixels, the images have 32x24"):
+    with pytest.raises(CalibrationError, match="for images of 64x48 pixels, the images have 32x24"):
         opened(root)
     (root / "calib.json").unlink()
     with pytest.raises(
