@@ -68,6 +68,7 @@ class EgoMotionStatus(str, Enum):
     TOO_FEW_MATCHES = "too_few_matches"
     DIVERGED = "diverged"
     NO_IMAGE = "no_image"
+    CAMERA_FAULT = "camera_fault"
     NOT_LOCATED = "not_located"
 
     @property

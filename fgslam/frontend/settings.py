@@ -375,6 +375,13 @@ class FrontendSettings:
         LostSettings | None,
         Field(description="search the whole map when lost; null goes on by odometry alone"),
     ] = None
+    watch_cameras: Annotated[
+        bool,
+        Field(
+            description="leave out frames in which a camera delivers old images, or cameras are "
+            "swapped, and say where one is darker; false uses every frame"
+        ),
+    ] = True
     self_calibration: Annotated[
         bool,
         Field(

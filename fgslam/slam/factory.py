@@ -37,6 +37,7 @@ from fgslam.datasets.settings import (
     OdometrySettings,
     RecordedOdometrySettings,
 )
+from fgslam.frontend.camera_watch import CameraWatch
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
 from fgslam.frontend.stereo import StereoMatcher
@@ -215,6 +216,7 @@ def make_pipeline(
         places=make_places(rig, frontend, tracker, seed),
         calibration=make_calibration(rig, frontend),
         key_frames=make_key_frames(rig, frontend, tracker),
+        watch=CameraWatch(rig) if frontend.watch_cameras else None,
         located=prior if arrival is not None and arrival.relocalised else None,
     )
 

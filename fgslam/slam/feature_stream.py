@@ -36,6 +36,7 @@ class FeatureFrame:
         problem: what was wrong with the frame, in words; empty when nothing was.
         load_ms: time spent reading, in its own thread.
         sift_ms: the images' SIFT times, added up over threads.
+        refused: it had images, but a camera's were not of this moment.
     """
 
     i: int
@@ -44,6 +45,7 @@ class FeatureFrame:
     problem: str
     load_ms: float
     sift_ms: float
+    refused: bool = False
 
 
 class FeatureExtractor(Protocol):

@@ -16,6 +16,7 @@ from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Predi
 from fgslam.core.features import StereoFeatures
 from fgslam.core.measurements import Increment, LoopClosure, Odometry
 from fgslam.core.rig_correction import RigCorrection
+from fgslam.frontend.camera_watch import CameraWatch
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.ego_motion import unmeasured
 from fgslam.frontend.tracking.key_frames import CarriedFrame, KeyFrameTracker
@@ -63,6 +64,7 @@ class SlamPipeline:
         places: None where none are recognised.
         calibration: of the rig, from the drive; None where the calibration is taken as stated.
         key_frames: tracking between key frames; None where every frame is one.
+        watch: says which frames' images cannot be used; None uses all.
         describe: finds the features of a key frame that came without.
         located: pose of the first frame, found in a saved map without a prior; None where it was
             not.
@@ -75,6 +77,7 @@ class SlamPipeline:
     places: PlaceRecognition | None = None
     calibration: SelfCalibration | None = None
     key_frames: KeyFrameTracker | None = None
+    watch: CameraWatch | None = None
     located: Prediction | None = None
     describe: Callable[[FeatureFrame], FeatureFrame] | None = None
 
@@ -90,6 +93,8 @@ class SlamPipeline:
             body: the robot's motion since the last frame; None where none was measured.
         """
         watch = Stopwatch()
+        found = self._watched(found)
+        watch.lap("watch")
         odometry = self.motion.between(timestamp, body)
         prediction = predicted(self.estimator, odometry)
         watch.lap("predict")
@@ -119,6 +124,15 @@ class SlamPipeline:
             self.calibration.observe(increment, stats.wTc)
         watch.lap("calibrate")
         return FrameReport(found, stereo, increment, seen.tracking, stats, watch.ms)
+
+    def _watched(self, found: FeatureFrame) -> FeatureFrame:
+        """The frame, without its images where these are not of one moment and this one."""
+        if self.watch is None or found.frame is None:
+            return found
+        fault = self.watch.look(found.frame.images)
+        if not fault:
+            return found
+        return dataclasses.replace(found, frame=None, features=(), problem=fault, refused=True)
 
     def _carried(
         self, prediction: Prediction, found: FeatureFrame, landmarks: LandmarkMap
@@ -179,7 +193,9 @@ class SlamPipeline:
     ) -> tuple[StereoFeatures, _Seen]:
         """A key frame by all its features, those carried among them."""
         if found.frame is None:
-            return stereo, _Seen(self.tracker.track_blind(prediction), Association.nothing())
+            status = EgoMotionStatus.CAMERA_FAULT if found.refused else EgoMotionStatus.NO_IMAGE
+            blind = self.tracker.track_blind(prediction, status)
+            return stereo, _Seen(blind, Association.nothing())
         if self.key_frames is None:
             tracked = self.tracker.track(prediction, landmarks, stereo)
         else:

@@ -19,7 +19,18 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Observations
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 
-STAGES = ("load", "sift", "wait", "predict", "stereo", "track", "places", "update", "calibrate")
+STAGES = (
+    "load",
+    "sift",
+    "wait",
+    "watch",
+    "predict",
+    "stereo",
+    "track",
+    "places",
+    "update",
+    "calibrate",
+)
 """Per frame: `load` and `sift` run in threads beside the loop, `wait` is what they held it up."""
 
 
@@ -141,8 +152,8 @@ class Step(Brief):
         covariance: (6, 6) of it, [rotation, translation], radians and metres, in the tangent space
             at ``wTc``: ``T = wTc * Exp(xi)``.
         status: how the pose was found: `first`, `ok`, `capped`, `relocalised`; or, by odometry
-            alone, `too_few_matches`, `diverged`, `no_image`; or not at all, `not_located` in the
-            map that the session is to begin in: pose and covariance are NaN.
+            alone, `too_few_matches`, `diverged`, `no_image`, `camera_fault`; or not at all,
+            `not_located` in the map that the session is to begin in: pose and covariance are NaN.
         matches: the k landmarks of the map that the frame sees again: ids (k,), (column, row,
             disparity) (k, 3) in pixels with covariance, raw pixels (k, 3, 2) in right, left, top.
         inliers: (k,) which of the matches agree with the pose.

@@ -24,6 +24,7 @@ from fgslam.core.threads import one_blas_thread
 from fgslam.datasets.settings import OdometrySettings
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.slam.arrival import Arrival, MapStart
+from fgslam.slam.camera_remarks import camera_remarks
 from fgslam.slam.factory import (
     chosen_estimator,
     chosen_frontend,
@@ -277,6 +278,7 @@ class Session:
         if not len(self.recorder):
             raise SessionError(self._why_empty())
         notes = stereo_remarks(self.recorder, self._seen)
+        notes = (*camera_remarks(self.recorder, self.pipeline.watch), *notes)
         if left_out.count:
             notes = (*notes, f"the first {left_out.count} frames could not be located: left out")
         with one_blas_thread():

@@ -54,6 +54,25 @@ def refusal(
     return refused
 
 
+def test_a_frozen_camera_is_said_in_console_status_and_report(
+    own_recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    images = sorted((own_recording / "left").glob("*.png"))
+    for image in images[5:]:
+        shutil.copyfile(images[4], image)
+    output = {"pictures": False, "report": True, "checkpoint_seconds": 0.0}
+    config = write_config(tmp_path / "frozen.yaml", experiment(own_recording, output=output))
+    main(monkeypatch, "run", config, "--out", tmp_path / "run")
+    said = " ".join(capsys.readouterr().out.split())
+    words = "image of the frame before once more: 7 of 12 frames, from 5 to 11, are not used"
+    assert words in said
+    assert metrics_of(tmp_path / "run")["status_counts"]["camera_fault"] == 7
+    assert words in (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+
+
 def replace_line(path: Path, number: int, line: str) -> None:
     lines = path.read_text(encoding="utf-8").splitlines()
     lines[number - 1] = line

@@ -149,11 +149,11 @@ class LandmarkTracker:
         problem = PoseProblem.of(landmarks, _matched(*matched))
         return Tracked(expected, matches, self._ego_motion.solve(prediction, problem))
 
-    def track_blind(self, prediction: Prediction) -> EgoMotion:
+    def track_blind(self, prediction: Prediction, status: EgoMotionStatus) -> EgoMotion:
         """The odometry's pose, for a frame without images; the same that its replay will find."""
         nothing = PoseProblem.empty()
         found = self._ego_motion.solve(prediction, nothing)
-        return replace(found, status=EgoMotionStatus.NO_IMAGE)
+        return replace(found, status=status)
 
     def _attempt(
         self,

@@ -23,7 +23,7 @@ from fgslam.slam.replay import peak_memory_mb
 from fgslam.slam.results import STAGES, RunRecorder
 
 _ESTIMATOR_STAGES = ("predict", "update")
-_LOOP_STAGES = ("predict", "stereo", "track", "places", "update", "calibrate")
+_LOOP_STAGES = ("watch", "predict", "stereo", "track", "places", "update", "calibrate")
 
 
 def estimator_metrics(estimate: Estimate, truth: Truth, recorder: RunRecorder) -> EstimatorMetrics:
@@ -66,6 +66,8 @@ def frame_problems(recorder: RunRecorder) -> list[str]:
     lines = []
     for increment, row in zip(recorder.log, recorder.rows, strict=True):
         status = EgoMotionStatus(row.status)
+        if status is EgoMotionStatus.CAMERA_FAULT:  # said of all of them together
+            continue
         if row.problem:
             lines.append(f"frame {increment.index}: {row.problem}")
         elif not status.measured and status is not EgoMotionStatus.FIRST:

@@ -48,6 +48,7 @@ from fgslam.runs.tasks.slam_metrics import (
     write_closures,
 )
 from fgslam.runs.tasks.truth import rendered_landmark_truth
+from fgslam.slam.camera_remarks import camera_remarks
 from fgslam.slam.first_images import stereo_remarks
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.results import STAGES, RunRecorder
@@ -162,6 +163,12 @@ class RunOutputs:
             ],
         )
 
+    def remarks(self) -> tuple[str, ...]:
+        """Notes on the recording, its cameras and its first images."""
+        of_cameras = camera_remarks(self.recorder, self.pipeline.watch)
+        of_images = stereo_remarks(self.recorder)
+        return (*self.sequence.notes, *self.notes, *of_cameras, *of_images)
+
     def _about(self, status: str) -> dict[str, JsonValue]:
         return {
             "name": self.config.name,
@@ -170,7 +177,7 @@ class RunOutputs:
             "odometry": self.config.odometry.kind,
             "landmarks_permanent": int(self.pipeline.tracker.database.permanent.sum()),
             "remark": self.remark or None,
-            "notes": [*self.sequence.notes, *self.notes, *stereo_remarks(self.recorder)],
+            "notes": list(self.remarks()),
         }
 
 
@@ -203,7 +210,7 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
 def run_notes(outputs: RunOutputs, metrics: EstimatorMetrics) -> tuple[str, ...]:
     """What was tolerated: notes on the recording, and frames that could not be used."""
     problems = frame_problems(outputs.recorder)
-    lines = [*outputs.sequence.notes, *outputs.notes, *stereo_remarks(outputs.recorder)]
+    lines = [*outputs.remarks()]
     lines += problems[:_PROBLEMS_SHOWN]
     if len(problems) > _PROBLEMS_SHOWN:
         lines.append(f"and {len(problems) - _PROBLEMS_SHOWN} more such frames, see metrics.json")

@@ -47,6 +47,8 @@ def state_of(pipeline: SlamPipeline, recorder: RunRecorder) -> StateArrays:
         parts["calibration"] = pipeline.calibration.state()
     if pipeline.key_frames is not None:
         parts["key_frames"] = pipeline.key_frames.state()
+    if pipeline.watch is not None:
+        parts["watch"] = pipeline.watch.state()
     return {
         f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()
     }
@@ -71,6 +73,8 @@ def restore(
         pipeline.calibration.restore(part, frames, recorder.online_poses)
     if pipeline.key_frames is not None:
         pipeline.key_frames.restore(_part(state, "key_frames"))
+    if pipeline.watch is not None:
+        pipeline.watch.restore(_part(state, "watch"))
 
 
 def has_checkpoint(folder: Path) -> bool:

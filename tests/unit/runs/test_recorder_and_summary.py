@@ -112,6 +112,7 @@ def test_stage_times_stand_in_their_columns() -> None:
         "load": 2.0,
         "sift": 10.0,
         "wait": 5.0,
+        "watch": 0.0,
         "predict": 1.0,
         "stereo": 2.0,
         "track": 2.5,

@@ -1,0 +1,228 @@
+"""Watches the cameras of a rig: one that delivers old images, swapped ones, one that is darker.
+
+Each frame's images are compared with each other and with those of the frame before, whatever the
+front-end makes of them. docs/derivations/camera_faults.md.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.core.arrays import FloatArray, Image, StateArrays
+from fgslam.core.rig_correction import EXPECTED_PX
+from fgslam.core.sensors import CameraRig
+from fgslam.frontend.image_lag import Lag, LagModel, LineRows, Shrunk, followed, spread_of
+
+CAMERAS = ("right", "left", "top")
+_WIDE_PX = 400  # wider images are made smaller
+_SURE = 5.0  # deviations: by chance once in three million frames
+_CALIBRATED = 3.0  # times what a calibration leaves: by so much may disparities be off zero
+_WINDOW = 5  # frames that are judged together where one alone does not tell
+_ALIKE = 0.25  # frames of lag: nearer to none than this, the other direction need not be asked
+_KNOWN = 0.1  # nor where it is known so well
+_STOP = 2.0 ** (1.0 / 3.0)
+"""Ratio of grey values: a third of a stop, the step in which exposures are set. Two cameras of one
+rig that differ by it do not have the same exposure."""
+_DARKEST = 8.0  # grey value below which a ratio is noise
+_FEWEST = 20  # points
+
+
+@dataclass(slots=True)
+class _Pair:
+    """What is kept of the reference and one other camera.
+
+    ``rows[0]``: the last frames' points by the reference's own motion, which tell a late other
+    camera; ``rows[1]``: by the other's, which tell a late reference.
+    """
+
+    model: LagModel
+    rows: tuple[list[LineRows], list[LineRows]]
+    ratios: list[float]
+    unequal: int = 0
+    swapped: bool = False
+
+
+class CameraWatch:
+    """Says of each frame whether its images can be used."""
+
+    def __init__(self, rig: CameraRig) -> None:
+        """Nothing seen yet."""
+        self._rig = rig
+        self._factor = max(1, math.ceil(rig.width / _WIDE_PX))
+        self._spread = spread_of(self._factor)
+        self._pairs = [_Pair(LagModel(rig, c), ([], []), []) for c in range(1, rig.cameras)]
+        self._late = [False] * rig.cameras
+        self._before: list[Image] = []
+        self._sums = [-1] * rig.cameras
+        self._frames = 0
+
+    def look(self, images: tuple[Image, ...]) -> str:
+        """Takes in a frame; what is wrong with its images, in words; empty where nothing is."""
+        now = Shrunk(images, self._factor)
+        repeated = self._repeated(images)
+        swapped = ""
+        points = now.corners()
+        for camera, pair in enumerate(self._pairs, 1):
+            found, kept = followed(now.images[0], now.images[camera], points)
+            here, there = points[kept], found[kept]
+            self._order(pair, self._factor * (there - here)[:, camera - 1])
+            if pair.swapped and not swapped:
+                swapped = f"the images of the right and the {CAMERAS[camera]} camera are swapped"
+            self._weigh(pair, now.grey[0], now.grey[camera], here, there)
+            if self._before and not repeated and not swapped:
+                self._judge(camera, now, here, there)
+        self._before, self._frames = now.images, self._frames + 1
+        return repeated or swapped or self._old()
+
+    def remarks(self) -> tuple[str, ...]:
+        """What is to be said of images that are used all the same."""
+        out = []
+        for camera, pair in enumerate(self._pairs, 1):
+            if pair.unequal:
+                out.append(
+                    f"the {CAMERAS[camera]} images were darker or brighter than the right ones by "
+                    f"more than a third of a stop in {pair.unequal} of {self._frames} frames; "
+                    "give all cameras one exposure time and gain"
+                )
+        return tuple(out)
+
+    # ----------------------------------------------------------------------------------------
+
+    def _repeated(self, images: tuple[Image, ...]) -> str:
+        """That one camera's image is the last one's to the bit, while another's is not."""
+        before = self._sums
+        self._sums = [zlib.crc32(image.tobytes()) for image in images]
+        same = [a == b for a, b in zip(before, self._sums, strict=True)]
+        if not any(same) or all(same):
+            return ""
+        return f"{_named(same)} the image of the frame before once more"
+
+    def _order(self, pair: _Pair, disparity: FloatArray) -> None:
+        """Whether disparities (n,) have the wrong sign, beyond what a calibration explains."""
+        if len(disparity) < _FEWEST:
+            return
+        middle = float(np.median(disparity))
+        spread = 1.4826 * float(np.median(np.abs(disparity - middle)))
+        allowed = _SURE * 1.2533 * spread / math.sqrt(len(disparity))  # 1.25: of a median
+        if abs(middle) > allowed + _CALIBRATED * EXPECTED_PX:
+            pair.swapped = middle < 0.0
+
+    def _weigh(
+        self, pair: _Pair, right: Image, other: Image, here: FloatArray, there: FloatArray
+    ) -> None:
+        """Compares the grey values of the same points (n, 2); a few frames tell."""
+        a, b = _grey(right, here), _grey(other, there)
+        bright = np.minimum(a, b) >= _DARKEST
+        if bright.sum() >= _FEWEST:
+            ratio = float(np.median(np.log(b[bright] / a[bright])))
+            pair.ratios = [*pair.ratios, ratio][-_WINDOW:]
+        settled = len(pair.ratios) == _WINDOW
+        pair.unequal += settled and abs(float(np.median(pair.ratios))) > math.log(_STOP)
+
+    def _judge(self, camera: int, now: Shrunk, here: FloatArray, there: FloatArray) -> None:
+        """Whether the other camera, or the reference, shows an earlier moment than the other."""
+        pair = self._pairs[camera - 1]
+        offset = (there - here)[:, pair.model.across]
+        rows = self._shifted(now, 0, here, offset, there, pair)
+        newest = self._take(pair, camera, 0, rows)
+        sure = newest.sigma < _KNOWN and abs(newest.frames) < _ALIKE
+        if not sure or any(self._late):
+            rows = self._shifted(now, camera, there, -offset, there, pair)
+            self._take(pair, 0, 1, rows)
+        else:
+            pair.rows[1].clear()
+
+    def _shifted(
+        self,
+        now: Shrunk,
+        camera: int,
+        points: FloatArray,
+        offset: FloatArray,
+        place: FloatArray,
+        pair: _Pair,
+    ) -> LineRows:
+        """Offsets of the points that one camera's last image shows, too, and their shift since."""
+        then, kept = followed(now.images[camera], self._before[camera], points)
+        shift = (then - points)[:, pair.model.across]
+        size = float(self._factor)
+        return LineRows(size * offset[kept], size * shift[kept], size * place[kept])
+
+    def _take(self, pair: _Pair, suspect: int, way: int, rows: LineRows) -> Lag:
+        """Books a frame's points; alone or with those before they may find the suspect late."""
+        newest = pair.model.lag(self._signed(rows, way), self._spread)
+        late, window = newest.late, pair.rows[way]
+        if math.isnan(late):
+            return newest
+        window.append(rows)
+        del window[:-_WINDOW]
+        if not abs(late) > _SURE and len(window) > 1:
+            together = LineRows.none()
+            for one in window:
+                together = together.join(one)
+            late = pair.model.lag(self._signed(together, way), self._spread).late
+        if abs(late) > _SURE and self._late[suspect] != (late > 0.0):
+            self._late[suspect] = late > 0.0
+            window.clear()
+        return newest
+
+    def _signed(self, rows: LineRows, way: int) -> LineRows:
+        """The calibration displaces the other camera's points, from whichever it is looked at."""
+        if way == 0:
+            return rows
+        return LineRows(-rows.offset, -rows.shift, rows.place)
+
+    def _old(self) -> str:
+        return f"{_named(self._late)} old images" if any(self._late) else ""
+
+    # ----------------------------------------------------------------------------------------
+
+    def state(self) -> StateArrays:
+        """All that is needed to continue to the bit."""
+        out: StateArrays = {
+            "late": np.array(self._late),
+            "sums": np.array(self._sums, np.int64),
+            "frames": np.array(self._frames),
+            "swapped": np.array([pair.swapped for pair in self._pairs]),
+            "before": np.array(self._before, np.uint8),
+        }
+        for k, pair in enumerate(self._pairs):
+            out[f"{k}/ratios"] = np.array(pair.ratios, np.float64)
+            out[f"{k}/unequal"] = np.array(pair.unequal)
+            for way, window in enumerate(pair.rows):
+                table = [np.column_stack([r.offset, r.shift, r.place]) for r in window]
+                out[f"{k}/rows{way}"] = np.concatenate([np.empty((0, 4)), *table])
+                out[f"{k}/sizes{way}"] = np.array([len(r) for r in window], np.int64)
+        return out
+
+    def restore(self, state: StateArrays) -> None:
+        """Continues from :meth:`state`."""
+        self._late = [bool(one) for one in state["late"]]
+        self._sums = state["sums"].tolist()
+        self._frames = int(state["frames"])
+        self._before = list(state["before"])
+        for k, pair in enumerate(self._pairs):
+            pair.swapped = bool(state["swapped"][k])
+            pair.ratios = state[f"{k}/ratios"].tolist()
+            pair.unequal = int(state[f"{k}/unequal"])
+            for way, window in enumerate(pair.rows):
+                ends = np.cumsum(state[f"{k}/sizes{way}"])[:-1]
+                table = state[f"{k}/rows{way}"]
+                parts = np.split(table, ends) if len(state[f"{k}/sizes{way}"]) else []
+                window[:] = [LineRows(p[:, 0], p[:, 1], p[:, 2:]) for p in parts]
+
+
+def _named(which: list[bool]) -> str:
+    names = [CAMERAS[k] for k, one in enumerate(which) if one]
+    verb = "camera delivers" if len(names) == 1 else "cameras deliver"
+    return f"the {' and '.join(names)} {verb}"
+
+
+def _grey(image: Image, points: FloatArray) -> FloatArray:
+    """Grey values (n,) at the points (n, 2)."""
+    at = np.rint(points).astype(np.int64)
+    rows = np.clip(at[:, 1], 0, image.shape[0] - 1)
+    return image[rows, np.clip(at[:, 0], 0, image.shape[1] - 1)].astype(np.float64)

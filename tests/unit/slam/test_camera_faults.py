@@ -1,0 +1,62 @@
+"""A session leaves out the frames of a faulty camera, and is as uncertain as that makes it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import fgslam as fg
+
+BEGINS, FRAMES = 14, 22
+
+
+def stale_left(k: int, recording: fg.Recording) -> tuple[object, ...]:
+    """The images of frame k, the left one of the frame before."""
+    images, before = recording[k][1], recording[k - 1][1]
+    assert images is not None
+    assert before is not None
+    return (before[0], *images[1:])
+
+
+@pytest.fixture(scope="module")
+def recording() -> fg.Recording:
+    return fg.rendered_recording("lab", frames=FRAMES)
+
+
+def driven(recording: fg.Recording, frontend: dict[str, object]) -> fg.Slam:
+    slam = fg.Slam(recording.rig, "landmark_kalman", frontend=frontend)
+    for k, (t, images, odometry) in enumerate(recording):
+        slam.track(t, stale_left(k, recording) if k >= BEGINS else images, odometry)
+    slam.close()
+    return slam
+
+
+def test_frames_of_a_late_camera_are_not_used_and_the_covariance_says_so(
+    recording: fg.Recording,
+) -> None:
+    slam = driven(recording, {})
+    result = slam.result()
+    status = result.column("status")
+    assert (status[BEGINS:] == "camera_fault").all()
+    assert not (status[:BEGINS] == "camera_fault").any()
+    assert all(not len(increment.observations) for increment in slam.log.increments[BEGINS:])
+    assert any("the left camera delivers old images" in remark for remark in result.remarks)
+    sigma = np.sqrt(np.trace(result.covariances[:, 3:, 3:], axis1=1, axis2=2))
+    assert (np.diff(sigma[BEGINS - 1 :]) > 0.0).all()
+    assert sigma[-1] > 5.0 * sigma[BEGINS - 1]
+    # Nothing of the fault is taken for the rig's calibration.
+    assert slam.pipeline.calibration is not None
+    sound = fg.Slam(recording.rig, "landmark_kalman")
+    for k in range(BEGINS):
+        sound.track(*recording[k])
+    sound.close()
+    assert sound.pipeline.calibration is not None
+    np.testing.assert_array_equal(
+        slam.pipeline.calibration.found.applied.values,
+        sound.pipeline.calibration.found.applied.values,
+    )
+
+
+def test_the_watch_can_be_switched_off(recording: fg.Recording) -> None:
+    status = driven(recording, {"watch_cameras": False}).result().column("status")
+    assert not (status == "camera_fault").any()
