@@ -8,6 +8,7 @@ from pathlib import Path
 
 from fgslam.core.errors import DatasetError
 from fgslam.datasets.loose_files import IMAGE_SUFFIXES, find_cameras, natural
+from fgslam.datasets.sides import camera_pairs
 
 _DRIVE = ("image_0", "image_1", "calib.txt", "times.txt")
 _RUN_CONFIG = "config.yaml"
@@ -249,6 +250,23 @@ def kitti_raw_drive(folder: Path) -> Path | None:
     return kitti_raw_drive(inside[0]) if len(inside) == 1 else None
 
 
+VIDEO_ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".wmv")
+
+
+def films_in(given: Path) -> list[Path]:
+    """The film or the two that a file, folder or pattern means, left first; none where unclear."""
+    within = sorted(given.iterdir(), key=natural) if given.is_dir() else files_of(given)
+    films = {p.name: p for p in within if p.suffix.lower() in VIDEO_ENDINGS and p.is_file()}
+    pairs = camera_pairs(films)
+    if len(films) == 1:
+        return list(films.values())
+    return [films[name] for name in pairs[0]] if len(pairs) == 1 and len(films) == 2 else []
+
+
+def _lacking_of_video(folder: Path) -> tuple[str, ...]:
+    return () if films_in(folder) else ("one film, or one of a left and one of a right camera",)
+
+
 def _lacking_of_loose_images(folder: Path) -> tuple[str, ...]:
     found = find_cameras(folder)
     return () if found else ("images of a left and a right camera, by their names",)
@@ -264,6 +282,7 @@ LAYOUTS = {
     "euroc": Layout("EuRoC native", _lacking_of_euroc, _euroc_begun),
     "kitti_raw": Layout("KITTI raw", _lacking_of_kitti_raw, lambda folder: False),
     "bag": Layout("ROS bag", _lacking_of_bag, lambda folder: False, BAG_ENDINGS),
+    "video": Layout("film", _lacking_of_video, lambda folder: False, VIDEO_ENDINGS),
     "light_field": Layout(
         "light field",
         lambda folder: _absent(folder, ("positions.csv", "calib.json")),

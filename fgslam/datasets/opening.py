@@ -25,6 +25,7 @@ from fgslam.datasets.settings import (
     StereoTracksSettings,
     UtiasRangeBearingSettings,
     UtiasStereoSettings,
+    VideoSettings,
 )
 
 if TYPE_CHECKING:
@@ -48,6 +49,10 @@ def open_recording(
     if isinstance(settings, _WithOdometry):
         return _open_with_odometry(settings, odometry or RecordedOdometrySettings())
     match settings:
+        case VideoSettings():
+            from fgslam.datasets.stereo_video import open_video
+
+            return open_video(settings)
         case KittiSettings():
             from fgslam.datasets.kitti import open_kitti
 

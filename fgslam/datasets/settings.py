@@ -100,6 +100,28 @@ class LooseImagesSettings(CalibratedSettings):
     ] = None
 
 
+@dataclass(frozen=True, config=STRICT, kw_only=True)
+class VideoSettings(CalibratedSettings):
+    """Stereo films: one of both views, or one a camera (docs/datasets/video.md)."""
+
+    path: Annotated[
+        str,
+        Field(min_length=1, description="the film, a folder of one or two, or a pattern of both"),
+    ]
+    kind: Literal["video"] = "video"
+    views: Annotated[
+        Literal["side_by_side", "over_under"] | None,
+        Field(
+            description="how one film shows both views, left or upper one first; null: by the "
+            "size that the calibration is for, else by their shape"
+        ),
+    ] = None
+    fps: Annotated[
+        float | None,
+        Field(gt=0.0, le=1e4, description="frames a second, in place of the film's own rate"),
+    ] = None
+
+
 @dataclass(frozen=True, config=STRICT)
 class KittiRawSettings(CalibratedSettings):
     """A synchronised and rectified drive of KITTI raw (docs/datasets/kitti.md)."""
@@ -240,6 +262,7 @@ class UtiasRangeBearingSettings(RecordingSettings):
 FileRecordingSettings: TypeAlias = (
     ImageFolderSettings
     | LooseImagesSettings
+    | VideoSettings
     | BagSettings
     | KittiSettings
     | KittiRawSettings

@@ -23,11 +23,11 @@ from fgslam.cameras.omni.settings import (
 )
 from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
-from fgslam.datasets.mirror_images import VideoFrames
 from fgslam.datasets.omni_recording import OmniRecording, ids_of
 from fgslam.datasets.omni_settings import OmniPathSettings, OmniVideoSettings, PanoramasSettings
 from fgslam.datasets.opening import open_omni
 from fgslam.datasets.panoramas import PanoramaReduction
+from fgslam.datasets.video_frames import VideoFrames
 
 HEADER = "id,file,x_m,y_m,heading_deg,room\n"
 ROWS = "3,b.png,1.5,-2,270,kitchen\n12,a.png,0,0.25,-90.5,hall\n"

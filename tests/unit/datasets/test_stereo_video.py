@@ -1,0 +1,157 @@
+"""Stereo films, really encoded: both views in one film, or a film of each camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from dataset_builders import write_calibration
+
+from fgslam.core.arrays import Image
+from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.datasets.layouts import recognise_layout
+from fgslam.datasets.recording import Recording
+from fgslam.datasets.settings import VideoSettings
+from fgslam.datasets.stereo_video import open_video
+from fgslam.datasets.video_frames import VideoFrames
+from fgslam.runs.bare_recording import bare_experiment
+
+SIZE = (64, 48)
+_NEAR = 3  # grey levels that the codec may change in even areas
+
+
+def view(level: int, size: tuple[int, int] = SIZE) -> Image:
+    return np.full((size[1], size[0]), level, np.uint8)
+
+
+def film(path: Path, frames: list[Image], rate: float = 20.0) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    code = "MJPG" if path.suffix == ".avi" else "mp4v"
+    size = (frames[0].shape[1], frames[0].shape[0])
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), rate, size)
+    for image in frames:
+        writer.write(np.dstack([image, image, image]))
+    writer.release()
+    return path
+
+
+def stereo_frames(join: Callable[[list[Image]], Image], count: int = 6) -> list[Image]:
+    """Left views of 40, 50, ... and right ones of 140, 150, ..."""
+    return [join([view(40 + 10 * k), view(140 + 10 * k)]) for k in range(count)]
+
+
+def calibrated(root: Path) -> None:
+    root.mkdir(exist_ok=True, parents=True)
+    write_calibration(root, width=SIZE[0], height=SIZE[1], cx=31.5, cy=23.5)
+
+
+def opened(path: Path, **settings: Any) -> Recording:
+    return open_video(VideoSettings(path=str(path), **settings))
+
+
+def levels(recording: Recording, i: int) -> np.ndarray:
+    return np.array([np.median(image) for image in recording.frame(i).images])
+
+
+@pytest.mark.parametrize("ending", [".avi", ".mp4"])
+@pytest.mark.parametrize(("name", "join"), [("side by side", np.hstack), ("over under", np.vstack)])
+def test_both_views_in_one_film(
+    tmp_path: Path, ending: str, name: str, join: Callable[[list[Image]], Image]
+) -> None:
+    calibrated(tmp_path)
+    path = film(tmp_path / f"walk{ending}", stereo_frames(join))
+    assert recognise_layout(path)["kind"] == recognise_layout(tmp_path)["kind"] == "video"
+    recording = opened(path)
+    assert (len(recording), recording.rig.width, recording.rig.height) == (6, *SIZE)
+    for i in (0, 5, 2):
+        assert np.abs(levels(recording, i) - [140 + 10 * i, 40 + 10 * i]).max() <= _NEAR
+    assert np.allclose(np.diff(recording.timestamps), 0.05, rtol=0.0, atol=1e-9)
+    assert recording.notes == (f"the film is taken as {name}",)
+    assert "walk: film, 2 cameras 64x48; 6 frames at 20 Hz" in bare_experiment(path).said
+    assert recording.colour(1)[0].shape == (SIZE[1], SIZE[0], 3)
+
+
+def test_a_film_of_each_camera(tmp_path: Path) -> None:
+    calibrated(tmp_path / "films")
+    for name, level, count in (("left", 40, 5), ("right", 140, 4)):
+        frames = [view(level + 10 * k) for k in range(count)]
+        film(tmp_path / "films" / f"cam_{name}.avi", frames)
+    for given in (tmp_path / "films", tmp_path / "films" / "cam_*.avi"):
+        recording = opened(given)
+        assert len(recording) == 4
+        assert np.abs(levels(recording, 2) - [160, 60]).max() <= _NEAR
+        assert any("the left film has 5 frames, the right one 4" in n for n in recording.notes)
+
+
+def test_frames_are_chosen_and_the_rate_is_said(tmp_path: Path) -> None:
+    calibrated(tmp_path)
+    path = film(tmp_path / "a.avi", stereo_frames(np.hstack))
+    recording = opened(path, start=1, stride=2, fps=10.0)
+    assert np.allclose(recording.timestamps, [0.1, 0.3, 0.5], rtol=0.0, atol=1e-12)
+    assert np.abs(levels(recording, 1) - [170, 70]).max() <= _NEAR
+
+
+def test_threads_that_ask_ahead_get_their_frames_and_none_is_decoded_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = film(tmp_path / "a.avi", [view(5 * k) for k in range(40)])
+    frames = VideoFrames(path)
+    opens = []
+    whole = VideoFrames._open
+    monkeypatch.setattr(VideoFrames, "_open", lambda self: opens.append(1) or whole(self))
+    found: list[float] = []
+    with ThreadPoolExecutor(4) as pool:
+        for first in range(0, 40, 8):
+            asked = reversed(range(first, first + 8))  # all ahead of each other
+            found += reversed(list(pool.map(lambda k: float(np.median(frames.load(k))), asked)))
+    assert np.abs(np.array(found) - 5.0 * np.arange(40)).max() <= _NEAR
+    assert not opens
+
+
+def test_a_film_that_is_cut_off(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (30, 48, 128), np.uint8)
+    path = film(tmp_path / "a.avi", list(noise))
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    frames = VideoFrames(path)
+    assert 5 < frames.count < 30
+    assert frames.load(frames.count - 1).shape == (48, 128, 3)
+
+
+# --------------------------------------------------------------------------------------------
+# Bad input
+
+
+def test_a_film_of_no_frame_and_what_is_no_film(tmp_path: Path) -> None:
+    calibrated(tmp_path)
+    empty = tmp_path / "empty.avi"
+    cv2.VideoWriter(str(empty), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, SIZE).release()
+    for name, content in (("empty.avi", None), ("b.mp4", b"nonsense" * 99), ("c.avi", b"")):
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+        with pytest.raises(DatasetError, match=r"holds no frame") as caught:
+            opened(tmp_path / name)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_calibration_of_another_size_or_none(tmp_path: Path) -> None:
+    path = film(tmp_path / "a.avi", stereo_frames(np.hstack, 2))
+    with pytest.raises(CalibrationError, match="another one by --camera FILE"):
+        opened(path)
+    write_calibration(tmp_path)
+    with pytest.raises(CalibrationError, match="images of 32x24 pixels, the images have 64x48"):
+        opened(path)
+
+
+def test_films_that_are_no_pair(tmp_path: Path) -> None:
+    for name in ("front", "back"):
+        film(tmp_path / f"{name}.avi", [view(1)])
+    with pytest.raises(DatasetError, match="neither one film nor one of a left and one of a right"):
+        opened(tmp_path)
+    with pytest.raises(DatasetError, match=r"film \(lacks one film, or one of a left and one of"):
+        recognise_layout(tmp_path)
