@@ -64,11 +64,20 @@ def commands_page() -> str:
         raise TypeError("fgslam is a group of commands")
     lines = [_INTRODUCTION, *paragraph(group.help or ""), "", "```sh", "fgslam COMMAND --help"]
     lines += ["fgslam --version", "fgslam --install-completion", "```"]
-    for name, command in group.commands.items():
-        if not isinstance(command, typer.core.TyperCommand):
-            raise TypeError(f"{name} is no command")
+    for name, command in commands_of(group):
         lines += ["", f"## `fgslam {name}`", "", *_described(command)]
     return "\n".join(lines) + "\n" + _STATUS
+
+
+def commands_of(group: typer.core.TyperGroup) -> Iterator[tuple[str, typer.core.TyperCommand]]:
+    """Every command by its whole name, those of groups within as well."""
+    for name, command in group.commands.items():
+        if isinstance(command, typer.core.TyperGroup):
+            yield from ((f"{name} {inner}", found) for inner, found in commands_of(command))
+        elif isinstance(command, typer.core.TyperCommand):
+            yield name, command
+        else:
+            raise TypeError(f"{name} is no command")
 
 
 def _described(command: typer.core.TyperCommand) -> Iterator[str]:

@@ -93,7 +93,8 @@ def _usable(calibration: Calibration) -> tuple[RawCamera, ...]:
     for camera in cameras:
         if camera.width == 0:
             raise CalibrationError(
-                f"{calibration.source} does not state the images' size; give size=(width, height)"
+                f"{calibration.source} does not state the images' size; give size=(width, "
+                "height), on the command line --size WxH"
             )
         if camera.size != cameras[0].size:
             raise CalibrationError(

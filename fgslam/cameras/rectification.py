@@ -139,14 +139,22 @@ def chosen_view(
 def _inner(camera: RawCamera, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Lowest and highest (x, y) of the plane at z = 1 that the camera sees all over."""
     width, height = camera.width - 1.0, camera.height - 1.0
-    along = np.linspace(0.0, 1.0, _BORDER_STEPS)
-    start = np.zeros(_BORDER_STEPS)
-    left = _on_plane(camera, rotation, np.column_stack([start, along * height]))
-    right = _on_plane(camera, rotation, np.column_stack([start + width, along * height]))
-    top = _on_plane(camera, rotation, np.column_stack([along * width, start]))
-    bottom = _on_plane(camera, rotation, np.column_stack([along * width, start + height]))
-    low = np.array([left[:, 0].max(initial=-np.inf), top[:, 1].max(initial=-np.inf)])
-    high = np.array([right[:, 0].min(initial=np.inf), bottom[:, 1].min(initial=np.inf)])
+    along, start = np.linspace(0.0, 1.0, _BORDER_STEPS), np.zeros(_BORDER_STEPS)
+    down, across = along * height, along * width
+    sides = ((start, down), (start + width, down), (across, start), (across, start + height))
+    middle = _on_plane(camera, rotation, camera.matrix[:2, 2][None])
+    low, high = np.full(2, -np.inf), np.full(2, np.inf)
+    for columns, rows in sides:
+        found = _on_plane(camera, rotation, np.column_stack([columns, rows]))
+        if not len(found) or not len(middle):
+            continue
+        # Which side of the view it is: a view may be turned by 90 degrees.
+        away = found.mean(axis=0) - middle[0]
+        axis = int(np.argmax(np.abs(away)))
+        if away[axis] < 0.0:
+            low[axis] = max(low[axis], found[:, axis].max())
+        else:
+            high[axis] = min(high[axis], found[:, axis].min())
     return low, high
 
 

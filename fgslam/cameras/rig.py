@@ -165,12 +165,12 @@ def load_rig(
         CalibrationError: the format or a camera model is not known, a value is missing or
             impossible, the size is another one, or the cameras are no stereo rig.
     """
-    _require_options(size, unit_m, fov_deg)
+    require_options(size, unit_m, fov_deg)
     own = _own_rectified(Path(path), cameras) if path2 is None else None
     if own is not None and (size is None or size == (own.width, own.height)):
         return own
     found = read_calibration_file(Path(path), None if path2 is None else Path(path2), size)
-    return rig_of(at_size(in_metres(_chosen(found, cameras), unit_m), size, scale), fov_deg)
+    return rig_of(at_size(in_metres(chosen_cameras(found, cameras), unit_m), size, scale), fov_deg)
 
 
 def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
@@ -201,7 +201,8 @@ def _stereo_rig(
     return StereoRig(**values, rectifier=raw, sources=sources, remarks=remarks)
 
 
-def _chosen(calibration: Calibration, cameras: Sequence[int] | None) -> Calibration:
+def chosen_cameras(calibration: Calibration, cameras: Sequence[int] | None) -> Calibration:
+    """The calibration of these of its cameras; None: all. Raises CalibrationError."""
     if cameras is None:
         return calibration
     count = len(calibration.cameras)
@@ -214,7 +215,8 @@ def _chosen(calibration: Calibration, cameras: Sequence[int] | None) -> Calibrat
     return replace(calibration, cameras=chosen, view=None)
 
 
-def _require_options(size: object, unit_m: object, fov_deg: object) -> None:
+def require_options(size: object, unit_m: object, fov_deg: object) -> None:
+    """Raises CalibrationError where what is said beside a file cannot be meant."""
     pair = size if isinstance(size, list | tuple) and len(size) == 2 else ()
     whole = pair and all(isinstance(n, int | np.integer) and n > 0 for n in pair)
     if size is not None and not whole:

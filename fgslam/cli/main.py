@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fgslam.cli import options, signals
+from fgslam.cli.camera import app as camera_app
 from fgslam.cli.signals import Tell, stop_flag, stoppable
 from fgslam.core.errors import FgslamError
 from fgslam.runs.named_experiments import experiment_names, find_experiment
@@ -37,6 +38,9 @@ app = typer.Typer(
     help="Stereo, trinocular and omnidirectional SLAM: filters and smoothers on one log.",
     pretty_exceptions_enable=False,
 )
+
+
+app.add_typer(camera_app, name="camera")
 
 
 @app.callback()

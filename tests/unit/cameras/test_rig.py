@@ -298,7 +298,6 @@ def test_a_loaded_rig_is_described_in_one_line(tmp_path: Path) -> None:
     [
         ("kalibr/msckf_vio/camchain-imucam-euroc.yaml", 0.11008),
         ("kalibr/torrescguo_stereo_all_models/pinhole-radtan", 0.08050),
-        ("camera_info/side_x_side_stereo", 0.05489),
         ("camera_info/tp_vision", 0.11184),
         ("calibrations/kitti/calib_cam_to_cam.txt", 0.53715),
     ],

@@ -11,7 +11,7 @@ from fgslam.cli.main import app
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.config_models import HOMING_TASKS, TASKS, LocalisationConfig
 from scripts import reference_experiments, reference_settings
-from scripts.make_reference import DOCS, EXAMPLES, commands_page, pages, tutorial_page
+from scripts.make_reference import DOCS, EXAMPLES, commands_of, commands_page, pages, tutorial_page
 from scripts.reference_experiments import unreasoned
 from scripts.reference_settings import WIDTH, item, settings_page
 
@@ -122,7 +122,9 @@ def test_every_command_and_option_is_on_the_page() -> None:
     page = commands_page()
     group = typer.main.get_command(app)
     assert isinstance(group, typer.core.TyperGroup)
-    for name, command in group.commands.items():
+    found = dict(commands_of(group))
+    assert {"run", "camera show", "camera convert"} <= found.keys()
+    for name, command in found.items():
         section = re.split(r"\n## ", page.split(f"## `fgslam {name}`\n", 1)[1])[0]
         for parameter in command.params:
             if parameter.param_type_name == "option" and parameter.name != "help":

@@ -1,0 +1,79 @@
+"""Commands about calibration files: what one says, and the same in another format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(help="Calibration files: what one says, and the same in another format.")
+
+_FILE = "calibration file, or the folder that holds one"
+File = Annotated[Path, typer.Argument(metavar="FILE", help=_FILE)]
+Second = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="the second of two files: the right camera's, extrinsics"),
+]
+Size = Annotated[
+    str | None, typer.Option(metavar="WxH", help="size of the images, where the file has none")
+]
+Scale = Annotated[
+    bool, typer.Option("--scale", help="the images were resized: scale the calibration to --size")
+]
+Unit = Annotated[
+    float, typer.Option(metavar="METRES", help="one unit of the file's lengths, 0.001: millimetres")
+]
+Fov = Annotated[
+    float | None, typer.Option(metavar="DEGREES", help="horizontal angle of the rectified view")
+]
+Cameras = Annotated[
+    str | None, typer.Option(metavar="N,N", help="which of the file's cameras, as 0,1")
+]
+
+
+@app.command()
+def show(
+    file: File,
+    second: Second = None,
+    size: Size = None,
+    scale: Scale = False,
+    unit: Unit = 1.0,
+    fov: Fov = None,
+    cameras: Cameras = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="the picture; default none")
+    ] = None,
+) -> None:
+    """Say what a calibration file says: cameras, fields of view, baselines, rectified view."""
+    from fgslam.runs.camera_files import Asked, show_calibration
+
+    asked = Asked(file, second, size, scale, unit, fov, cameras)
+    for line in show_calibration(asked, out):
+        typer.echo(line)
+
+
+@app.command()
+def convert(
+    file: File,
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUT",
+            help=".json is fgslam's, .yml or .xml OpenCV's, .yaml Kalibr's, no ending a folder "
+            "with left.yaml and right.yaml of ROS",
+        ),
+    ],
+    second: Second = None,
+    size: Size = None,
+    scale: Scale = False,
+    unit: Unit = 1.0,
+    fov: Fov = None,
+    cameras: Cameras = None,
+) -> None:
+    """Write a calibration in another tool's format, number by number."""
+    from fgslam.runs.camera_files import Asked, convert_calibration
+
+    asked = Asked(file, second, size, scale, unit, fov, cameras)
+    for line in convert_calibration(asked, out):
+        typer.echo(line)

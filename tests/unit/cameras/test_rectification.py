@@ -1,0 +1,242 @@
+"""Rectified views: where points of the world fall in them, whatever the lenses and the rig."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from fgslam.cameras.assembly import at_size
+from fgslam.cameras.calibration_files import read_calibration_file
+from fgslam.cameras.raw_cameras import Calibration, RawCamera
+from fgslam.cameras.rig import StereoRig, load_rig, rig_of
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import CalibrationError
+from fgslam.core.geometry import pose, project, so3_exp, transform_to_camera
+
+SIZE = (160, 120)
+LENSES = {
+    "radtan": (120.0, [-0.28, 0.07, 2e-4, 2e-5]),
+    "equidistant": (60.0, [-0.0138, 0.0217, -0.02, 0.0094]),
+    "ds": (45.0, [-0.2786, 0.5607]),
+}
+
+
+def camera(at: tuple[float, float, float], turn: tuple[float, float, float], lens: str, name: str
+           ) -> RawCamera:  # fmt: skip
+    focal, parameters = LENSES[lens]
+    matrix = np.array([[focal, 0.0, 79.0], [0.0, focal + 0.5, 60.5], [0.0, 0.0, 1.0]])
+    bTc = pose(so3_exp(np.array(turn)), np.array(at))
+    return RawCamera(*SIZE, matrix, np.array(parameters), bTc, name, lens)
+
+
+def scene() -> FloatArray:
+    """Points of the body's surroundings ahead (its z axis), metres."""
+    rng = np.random.default_rng(5)
+    z = rng.uniform(1.5, 6.0, 3000)
+    return np.column_stack([rng.uniform(-1, 1, 3000) * z, rng.uniform(-1, 1, 3000) * z, z])
+
+
+def sampled(rig: StereoRig, camera: int, pixels: FloatArray) -> FloatArray:
+    """Where rectified pixels (n, 2) of a camera look in its raw image, bilinear."""
+    assert rig.rectifier is not None
+    columns, rows = (pixels[:, k].astype(np.float32)[:, None] for k in (0, 1))
+    maps = rig.rectifier.maps[camera]
+    found = [cv2.remap(one, columns, rows, cv2.INTER_LINEAR)[:, 0] for one in maps]
+    return np.column_stack(found).astype(float)
+
+
+def disagreement(rig: StereoRig, cameras: tuple[RawCamera, ...], points: FloatArray) -> FloatArray:
+    """Pixels (n, cameras) between where raw cameras see points and where the maps look for them."""
+    seen = project(rig.plain(), transform_to_camera(rig.bTc, points))
+    views = [seen[:, :2], seen[:, :2] + np.outer(seen[:, 2], [1.0, 0.0])]
+    if rig.vertical_baseline is not None:
+        ratio = rig.fy * rig.vertical_baseline / (rig.fx * rig.baseline)
+        views.append(seen[:, :2] + np.outer(ratio * seen[:, 2], [0.0, 1.0]))
+    inside = np.all(
+        [((v > 1) & (v < np.array([rig.width, rig.height]) - 2)).all(axis=1) for v in views], axis=0
+    )
+    assert inside.sum() > 100
+    found = []
+    for k, view in enumerate(views):
+        one = cameras[rig.sources[k]]
+        raw = one.project(transform_to_camera(one.bTc, points[inside]))
+        found.append(np.linalg.norm(sampled(rig, k, view[inside]) - raw, axis=1))
+    return np.stack(found, axis=1)
+
+
+TURNS = ((0.02, -0.03, 0.01), (-0.03, 0.02, -0.02), (0.01, 0.03, 0.03))
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_points_fall_where_the_rectified_pair_says(lens: str) -> None:
+    cameras = (
+        camera((0.0, 0.0, 0.0), TURNS[0], lens, "a"),
+        camera((0.12, 0.003, -0.004), TURNS[1], lens, "b"),
+    )
+    rig = rig_of(Calibration("made", "made", cameras))
+    assert rig.sources == (1, 0)
+    assert rig.baseline == pytest.approx(np.linalg.norm([0.12, 0.003, -0.004]), abs=1e-12)
+    # The maps are sampled between their pixels, which at a fisheye's rim are far apart.
+    assert disagreement(rig, cameras, scene()).max() < 0.02
+    assert rig.rectifier is not None
+    assert all(mask.all() for mask in rig.rectifier.masks)
+
+
+ARRANGEMENTS = {
+    "left and above": ((-0.12, 0.0), (0.0, -0.1)),
+    "right and above": ((0.12, 0.0), (0.0, -0.1)),
+    "left and below": ((-0.12, 0.0), (0.0, 0.1)),
+    "right and below": ((0.12, 0.0), (0.0, 0.1)),
+}
+
+
+@pytest.mark.parametrize("lens", ["radtan", "equidistant"])
+@pytest.mark.parametrize("kind", ARRANGEMENTS)
+def test_three_cameras_in_an_l_share_one_view(kind: str, lens: str) -> None:
+    """Whichever way the L lies, rows agree along one baseline and columns along the other."""
+    beside, above = ARRANGEMENTS[kind]
+    cameras = tuple(
+        camera((x, y, 0.0), turn, lens, name)
+        for (x, y), turn, name in zip((beside, (0.0, 0.0), above), TURNS, "abc", strict=True)
+    )
+    rig = rig_of(Calibration("made", "made", cameras))
+    assert rig.sources[0] == 1  # the corner
+    assert sorted([rig.baseline, rig.vertical_baseline or 0.0]) == pytest.approx([0.1, 0.12])
+    assert disagreement(rig, cameras, scene()).max() < 0.02
+
+
+def test_baselines_that_are_not_square_are_told() -> None:
+    """What remains across the columns is the skew's share of the vertical disparity, no more."""
+    skew = np.radians(2.0)
+    top = (0.1 * np.sin(skew), -0.1 * np.cos(skew), 0.0)
+    places = ((-0.12, 0.0, 0.0), (0.0, 0.0, 0.0), top)
+    cameras = tuple(
+        camera(at, turn, "radtan", name)
+        for at, turn, name in zip(places, TURNS, "abc", strict=True)
+    )
+    rig = rig_of(Calibration("made", "made", cameras))
+    assert "the two baselines are 2.0 degrees off a right angle" in rig.remarks[0]
+    points = scene()
+    off = disagreement(rig, cameras, points)
+    assert off[:, :2].max() < 0.02
+    largest = rig.fx * 0.1 / points[:, 2].min() * np.sin(skew)
+    assert 0.2 * largest < off[:, 2].max() < 1.3 * largest
+
+
+def test_of_three_in_a_line_the_outer_two_are_used() -> None:
+    cameras = tuple(
+        camera((x, 0.0, 0.0), turn, "radtan", name)
+        for x, turn, name in zip((0.0, 0.24, 0.12), TURNS, "abc", strict=True)
+    )
+    rig = rig_of(Calibration("made", "made", cameras))
+    assert (rig.sources, rig.cameras) == ((1, 0), 2)
+    assert "c, between the others, is not used" in rig.remarks[0]
+    assert disagreement(rig, cameras, scene()).max() < 0.02
+
+
+def test_a_wide_fisheye_is_cut_off_and_that_is_said() -> None:
+    """190 degrees: 60 px a radian over 199 px."""
+    wide = tuple(
+        RawCamera(
+            200, 200, np.array([[60.0, 0, 99.5], [0, 60.0, 99.5], [0, 0, 1.0]]), np.zeros(4),
+            pose(np.eye(3), np.array([0.1 * k, 0.0, 0.0])), f"cam{k}", "equidistant",
+        )
+        for k in (0, 1)
+    )  # fmt: skip
+    rig = rig_of(Calibration("made", "made", wide))
+    assert "of 191 x 191 degrees the rectified view shows 120 x 120" in rig.remarks[0]
+    assert rig.fx == pytest.approx(100.0 / np.tan(np.radians(60.0)))
+    assert disagreement(rig, wide, scene()).max() < 0.05
+    narrow = rig_of(Calibration("made", "made", wide), fov_deg=90.0)
+    assert narrow.fx == pytest.approx(100.0)
+
+
+def test_swapped_names_are_taken_by_geometry() -> None:
+    """The camera called left is on the right: its image becomes the right one."""
+    cameras = (
+        camera((0.12, 0.0, 0.0), TURNS[0], "radtan", "M1"),
+        camera((0.0, 0.0, 0.0), TURNS[1], "radtan", "M2"),
+    )
+    rig = rig_of(Calibration("made", "made", cameras, sided=True))
+    assert "left and right are swapped: M1" in rig.remarks[0]
+    called_left, called_right = (np.full(SIZE[::-1], v, np.uint8) for v in (50, 200))
+    right, left = rig.rectified((called_right, called_left))
+    assert (int(np.median(right)), int(np.median(left))) == (50, 200)
+
+
+@pytest.mark.parametrize(
+    ("places", "words"),
+    [
+        (((0.0, 0.0, 0.0),), "one camera alone"),
+        (((0.0, 0.0, 0.0), (0.0, 0.0, 0.3)), "not side by side"),
+        (((0.0, 0.0, 0.0),) * 4, r"holds 4 cameras; say which .* cameras=\(0, 1\)"),
+    ],
+)
+def test_what_is_no_rig_is_refused(
+    places: tuple[tuple[float, float, float], ...], words: str
+) -> None:
+    cameras = tuple(camera(at, TURNS[0], "radtan", "c") for at in places)
+    with pytest.raises(CalibrationError, match=words):
+        rig_of(Calibration("made", "made", cameras))
+
+
+# --------------------------------------------------------------------------------------------
+# Chessboards: corners found in raw images, on one row when rectified, squares of their size
+
+BOARDS = {
+    # file, images, numbers, size, board, square, rms or median in px, at the focal length in px
+    "opencv": ("stereo_chessboard/opencv/extrinsics.yml", "stereo_chessboard/opencv/{}{:02d}.jpg",
+               (1, 4, 6, 9, 13), (640, 480), (9, 6), 1.0, ("rms", 0.30)),
+    "barry": ("stereo_chessboard/barry/extrinsics.yml", "stereo_chessboard/barry/{}{:02d}.jpg",
+              (2, 7, 11, 16, 21), (640, 512), (9, 6), 24.0, ("rms", 0.25)),
+    "fisheye": ("stereo_fisheye/mystereocalib.yml", "stereo_fisheye/imgs/{}{}.jpg",
+                (1, 3, 6, 8, 12, 13, 15), (960, 600), (9, 6), 0.02423, ("median", 0.50)),
+}  # fmt: skip
+
+
+def corners(path: Path, board: tuple[int, int]) -> FloatArray:
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    found, places = cv2.findChessboardCorners(image, board)
+    assert found, path
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
+    refined = cv2.cornerSubPix(image, places, (5, 5), (-1, -1), criteria)
+    return np.asarray(refined, np.float64).reshape(-1, 2)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("kind", BOARDS)
+def test_corners_lie_on_one_row_and_squares_have_their_size(shared_data: Path, kind: str) -> None:
+    """As OpenCV's own rectification of the same files and images: 0.28, 0.23 px rms, 0.38 px."""
+    file, images, numbers, size, board, square, (statistic, most) = BOARDS[kind]
+    folder = shared_data / "cameras"
+    if not folder.is_dir():
+        pytest.skip(f"no calibrations at {folder}")
+    cameras = at_size(read_calibration_file(folder / file), size, False).cameras
+    rig = load_rig(folder / file, size=size)
+    rows, sides = [], []
+    for number in numbers:
+        seen = [corners(folder / images.format(s, number), board) for s in ("left", "right")]
+        right, left = (rectified_pixels(rig, cameras[k], seen[k]) for k in rig.sources)
+        if np.linalg.norm(right - left[::-1]) < np.linalg.norm(right - left):
+            left = left[::-1]
+        disparity = left[:, 0] - right[:, 0]
+        assert (disparity > 0.0).all()
+        rows.append(left[:, 1] - right[:, 1])
+        depth = rig.fx * rig.baseline / disparity
+        points = np.column_stack([(right - [rig.cx, rig.cy]) / rig.fx, np.ones(len(depth))])
+        grid = (points * depth[:, None]).reshape(board[1], board[0], 3)
+        sides += [np.linalg.norm(np.diff(grid, axis=a), axis=2).ravel() for a in (0, 1)]
+    away = np.concatenate(rows)
+    value = np.sqrt((away**2).mean()) if statistic == "rms" else np.median(np.abs(away))
+    assert value <= most
+    assert np.median(np.concatenate(sides)) == pytest.approx(square, rel=0.01)
+
+
+def rectified_pixels(rig: StereoRig, one: RawCamera, pixels: FloatArray) -> FloatArray:
+    """Raw pixels (n, 2) of a camera in the rectified view."""
+    rays = one.unproject(pixels) @ one.bTc[:3, :3].T @ rig.bTc[:3, :3]
+    return np.asarray(rays[:, :2] / rays[:, 2:] * [rig.fx, rig.fy] + [rig.cx, rig.cy])
