@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from fgslam.homing.command import DriveCommand
     from fgslam.homing.path_memory import PathMemory
     from fgslam.report.plotting import plot
-    from fgslam.runs.library import open_recording, rendered_recording, replay, run
+    from fgslam.runs.library import open_recording, rendered_recording, replay, run, sweep
     from fgslam.runs.live import Result, Slam
     from fgslam.runs.maps import Map
     from fgslam.slam.feature_stream import FeatureExtractor
@@ -72,6 +72,7 @@ __all__ = [
     "rendered_recording",
     "replay",
     "run",
+    "sweep",
     "teach",
 ]
 
@@ -102,6 +103,7 @@ _HOMES = {
     "rendered_recording": "fgslam.runs.library",
     "replay": "fgslam.runs.library",
     "run": "fgslam.runs.library",
+    "sweep": "fgslam.runs.library",
     "teach": "fgslam.homing.api",
 }
 """Module that each public name is imported from, on first use (PEP 562)."""

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from rich.console import Console
+from rich.console import Console, Group
+from rich.live import Live
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -29,31 +31,54 @@ _LABEL_WIDTH = 12
 _WIDTH_OF_FILES = 120
 
 
+class _Bars:
+    """A bar for each stage of the work, with the time left."""
+
+    def __init__(self, console: Console, begin: Callable[[], None] | None = None) -> None:
+        """``begin`` draws them first: not before there is one, as a mistake shall stand alone."""
+        columns = (
+            TextColumn("{task.description:>10}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+        )
+        self.drawn = Progress(*columns, console=console)
+        self.tasks: dict[str, TaskID] = {}
+        self._begin = begin or self.drawn.start
+
+    def tell(self, what: str, done: int, total: int) -> None:
+        if not self.tasks:
+            self._begin()
+        if what not in self.tasks:
+            self.tasks[what] = self.drawn.add_task(what, total=total)
+        self.drawn.update(self.tasks[what], completed=done, total=total)
+
+
 @contextmanager
 def progress_bar() -> Iterator[Tell]:
     """A bar on standard error for each stage of the work."""
-    columns = (
-        TextColumn("{task.description:>10}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    bars = Progress(*columns, console=Console(stderr=True))
-    tasks: dict[str, int] = {}
-
-    def tell(what: str, done: int, total: int) -> None:
-        if not tasks:
-            bars.start()  # not before: a mistake found at once shall be all there is to read
-        if what not in tasks:
-            tasks[what] = int(bars.add_task(what, total=total))
-        bars.update(tasks[what], completed=done, total=total)  # type: ignore[arg-type]
-
+    bars = _Bars(Console(stderr=True))
     try:
-        yield tell
+        yield bars.tell
     finally:
-        if tasks:
-            bars.stop()
+        if bars.tasks:
+            bars.drawn.stop()
+
+
+@contextmanager
+def progress_with_table() -> Iterator[tuple[Tell, Callable[[TextTable], None]]]:
+    """Bars on standard error, and below them a table that changes while there is more to come."""
+    console = Console(stderr=True)
+    live = Live(console=console)
+    bars = _Bars(console, live.start)
+    live.update(bars.drawn)
+    try:
+        yield bars.tell, lambda table: live.update(Group(bars.drawn, rich_table(table)))
+    finally:
+        if bars.tasks:
+            live.update(bars.drawn)
+            live.stop()
 
 
 def show(result: RunResult, resume: str = "") -> None:

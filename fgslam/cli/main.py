@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,18 +13,24 @@ import typer
 
 from fgslam.cli import options, signals
 from fgslam.cli.camera import app as camera_app
-from fgslam.cli.signals import Tell, stop_flag, stoppable
+from fgslam.cli.performing import (
+    EXIT_FAULT,
+    existing_folder,
+    exit_as,
+    same_with_resume,
+    show_all,
+    under_way,
+)
+from fgslam.cli.signals import stop_flag, stoppable
+from fgslam.cli.sweeping import sweep
 from fgslam.core.errors import FgslamError
 from fgslam.runs.named_experiments import experiment_names, find_experiment
 
 if TYPE_CHECKING:
     from fgslam.runs.baseline import Baseline, Results
-    from fgslam.runs.engine import RunResult
-    from fgslam.runs.folder import ExistingFolder
 
 
 EXIT_USER = 2
-EXIT_FAULT = 1
 # Typer exports only the child; its parent's home differs from one Typer to the next.
 _UsageError: type[typer.BadParameter] = typer.BadParameter.__bases__[0]
 _OF_TYPER = 130  # what it makes of any KeyboardInterrupt; no command of ours returns it
@@ -77,7 +81,7 @@ def run(  # noqa: PLR0913 - each option is a parameter
     """
     from fgslam.runs.bare_recording import experiment_of
 
-    existing = _existing(overwrite, resume)
+    existing = existing_folder(overwrite, resume)
     given = {**_frames(start, stop, stride, fps), "estimator.kind": estimator}
     given |= {"map.load": map_in, "map.save": map_out}
     chosen = [*options.as_overrides(given), *options.topics_override(topics)]
@@ -93,12 +97,12 @@ def run(  # noqa: PLR0913 - each option is a parameter
 
     if camera_out is not None:
         require_camera(settings, camera_out)
-    with _under_way() as (progress, stopped):
+    with under_way() as (progress, stopped):
         result = run_experiment(settings, folder, existing, progress, stopped)
-    _show([result], resume_command(folder))
+    show_all([result], resume_command(folder))
     if camera_out is not None:
         typer.echo(corrected_camera(folder, camera_out))
-    _exit_as([result])
+    exit_as([result])
 
 
 def _frames(
@@ -142,30 +146,6 @@ def demo(
     run(find_experiment(Path("lab_loop")), out, overwrite=True)
 
 
-@contextmanager
-def _under_way() -> Iterator[tuple[Tell, Callable[[], bool]]]:
-    """Progress bar and stop flag while something is under way."""
-    from fgslam.cli.console import progress_bar
-
-    with stop_flag() as stopped, progress_bar() as progress:
-        yield stoppable(progress, stopped), stopped
-
-
-def _show(results: Sequence[RunResult], resume: str = "") -> None:
-    from fgslam.cli.console import show
-
-    for result in results:
-        show(result, resume)
-
-
-def _exit_as(results: Sequence[RunResult]) -> None:
-    """Exits as the results ended: with 0, interrupted, or an estimator was asked in vain."""
-    if any(result.status == "interrupted" for result in results):
-        raise SystemExit(signals.status())
-    if any(result.failed for result in results):
-        raise typer.Exit(EXIT_FAULT)
-
-
 @app.command()
 def compare(  # noqa: PLR0913 - each option is a parameter
     runs: options.Runs,
@@ -195,31 +175,25 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     from fgslam.runs.trials import Seeds, run_trials
 
     names = None if estimators is None else tuple(estimators.split(","))
-    choice, existing = Choice(names, tuple(overrides or ())), _existing(overwrite, resume)
+    choice, existing = Choice(names, tuple(overrides or ())), existing_folder(overwrite, resume)
     expected = None if check_baseline is None else read_baseline(check_baseline)
     if trials is None and seed is not None:
         raise ConfigError("--seed means nothing without --trials; give both or none")
     if trials is not None and len(runs) != 1:
         raise ConfigError("--trials takes one run or experiment at a time; give one")
-    with _under_way() as (progress, stopped):
+    with under_way() as (progress, stopped):
         if trials is None:
             results = compare_runs(runs, choice, out, existing, jobs, progress, stopped)
         else:
             seeds = Seeds(trials, seed)
             tried = run_trials(runs[0], seeds, choice, out, existing, jobs, progress, stopped)
             results = [tried]
-    _show(results, _same_with_resume())
+    show_all(results, same_with_resume())
     show_parts((), ate_tables(results))
     regression = _baselines(metrics_of(results), write_baseline, expected)
-    _exit_as(results)
+    exit_as(results)
     if regression:
         raise typer.Exit(EXIT_FAULT)
-
-
-def _same_with_resume() -> str:
-    """This command once more, to go on with what it left."""
-    given = [word for word in sys.argv[1:] if word not in ("--overwrite", "--resume")]
-    return shlex.join(["fgslam", *given, "--resume"])
 
 
 def _baselines(results: Results, written: Path | None, expected: Baseline | None) -> bool:
@@ -237,13 +211,7 @@ def _baselines(results: Results, written: Path | None, expected: Baseline | None
     return any(deviation.regression for deviation in deviations)
 
 
-def _existing(overwrite: bool, resume: bool = False) -> ExistingFolder:
-    """What to do with results that are there. Raises ConfigError where both were asked for."""
-    from fgslam.core.errors import ConfigError
-
-    if overwrite and resume:
-        raise ConfigError("--overwrite and --resume exclude each other; give one of them")
-    return "resume" if resume else "overwrite" if overwrite else "refuse"
+app.command()(sweep)
 
 
 @app.command()
@@ -272,12 +240,12 @@ def localize(
     from fgslam.runs.tasks.localisation import localize as locate
 
     wanted = Wanted(
-        map_file, recording, tuple(overrides or ()), frame, frames, out, _existing(overwrite)
+        map_file, recording, tuple(overrides or ()), frame, frames, out, existing_folder(overwrite)
     )
-    with _under_way() as (progress, stopped):
+    with under_way() as (progress, stopped):
         result = locate(wanted, progress, stopped)
-    _show([result])
-    _exit_as([result])
+    show_all([result])
+    exit_as([result])
 
 
 @app.command()

@@ -276,6 +276,53 @@ TrialCount = Annotated[
 FirstSeed = Annotated[
     int | None, typer.Option(min=0, help="of the first trial; default the configuration's")
 ]
+Sources = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="RECORDING|EXPERIMENT...",
+        parser=experiment,
+        autocompletion=names_beginning_with,
+        help="experiments, .yaml or names, and recordings' folders",
+    ),
+]
+Axes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="A.B=VALUES",
+        help="values of one key, with commas, or FIRST:END[:STEP] without END; every combination "
+        "of several is a case. estimators.NAME.KEY is of one estimator",
+    ),
+]
+SweptEstimators = Annotated[
+    str | None,
+    typer.Option(
+        "--estimators",
+        metavar="A,B,C",
+        help="kinds, or labels of the configuration; default those of the configuration",
+    ),
+]
+Metric = Annotated[
+    str | None,
+    typer.Option(
+        help="column that curves and tests are of; default ate_final_m, where it is known"
+    ),
+]
+Workers = Annotated[
+    int | None, typer.Option("--jobs", min=1, help="workers of this machine; default one a core")
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS", help="of a Dask scheduler whose workers do it, tcp://HOST:PORT"
+    ),
+]
+SweepFolder = Annotated[
+    Path | None, typer.Option(help="folder of the results; default runs/NAME_sweep")
+]
+ResumeSweep = Annotated[
+    bool, typer.Option("--resume", help="do what has no result yet; axes may have become longer")
+]
 WriteBaseline = Annotated[
     Path | None, typer.Option(metavar="FILE", help="write the results as a baseline")
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -217,3 +217,16 @@ def paired_test(a: FloatArray, b: FloatArray, probability: float = 0.95) -> Pair
     ratio = float(a.mean() / b.mean()) if b.mean() != 0.0 else None
     wins, losses = int(np.count_nonzero(a < b)), int(np.count_nonzero(a > b))
     return PairedTest(difference, wins, losses, p_value, ratio)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """P values corrected for testing so many hypotheses at once, in the same order (Holm 1979).
+
+    The k-th smallest of n is multiplied by n - k + 1, and none may be below one that was smaller.
+    """
+    order = np.argsort(p_values, kind="stable")
+    factors = np.arange(len(p_values), 0, -1)
+    raised = np.maximum.accumulate(np.asarray(p_values, np.float64)[order] * factors)
+    corrected = np.empty(len(p_values))
+    corrected[order] = np.minimum(raised, 1.0)
+    return [float(value) for value in corrected]

@@ -15,7 +15,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
-from fgslam.core.files import write_text
+from fgslam.core.files import replacing, write_text
 from fgslam.core.recordings import LandmarkTruth
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, value_at
 
@@ -41,6 +41,27 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Cell]]
             raise ValueError(f"{len(row)} cells in a table of {len(columns)} columns")
         writer.writerow([_text(cell) for cell in row])
     write_text(path, out.getvalue())
+
+
+def write_parquet(
+    path: Path, columns: Mapping[str, Sequence[Cell]], about: Mapping[str, str]
+) -> None:
+    """Writes a table as Parquet, atomically; equal values give equal bytes.
+
+    Args:
+        path: the file; `pandas.read_parquet` opens it.
+        columns: n cells each, of one type; None where a value is not known.
+        about: texts for the file's own metadata.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    import pyarrow
+    from pyarrow import parquet
+
+    table = pyarrow.table({name: pyarrow.array(cells) for name, cells in columns.items()})
+    with replacing(path) as partial:
+        parquet.write_table(table.replace_schema_metadata(about), partial, compression="zstd")
 
 
 def write_json(path: Path, document: Mapping[str, JsonValue]) -> None:

@@ -30,6 +30,11 @@ class Failed:
 class Crew(Protocol):
     """Calls a function on arguments, wherever."""
 
+    @property
+    def lost(self) -> bool:
+        """Whether all its workers have gone for good, and with them what was under way."""
+        ...
+
     def do(
         self,
         function: Callable[[Argument], Result],
@@ -51,6 +56,8 @@ class Crew(Protocol):
 
 class Here:
     """A crew of this process alone: one argument after the other."""
+
+    lost = False
 
     def do(
         self,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import shutil
 import sys
 import threading
 
@@ -17,6 +18,7 @@ def main() -> None:
 def _end_with_parent() -> None:
     """The pipe ends with the process at its other end, however that ends; nothing is lost here."""
     sys.stdin.buffer.read()
+    shutil.rmtree(sys.argv[2], ignore_errors=True)
     os._exit(0)
 
 

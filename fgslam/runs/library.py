@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias, cast
+from typing import Any, TypeAlias, cast
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
@@ -26,6 +26,7 @@ from fgslam.runs.live import Overrides, override_texts, slam_config
 from fgslam.runs.named_experiments import find_experiment, suggestion
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.run import run_experiment
+from fgslam.runs.sweeps.sweep import UNWATCHED, SweepResult, crew_of, make_plan, run_sweep
 from fgslam.slam.factory import chosen_estimator, is_settings
 from fgslam.slam.replay import Replay
 from fgslam.slam.replay import replay as replay_log
@@ -187,6 +188,50 @@ def run(
     config, _ = experiment_of(Path(experiment), calibration, override_texts(overrides))
     folder = Path("runs") / config.name if out is None else Path(out)
     return run_experiment(config, folder, existing, progress)
+
+
+def sweep(  # noqa: PLR0913 - each is an option of the command
+    experiments: str | Path | Iterable[str | Path],
+    settings: Mapping[str, Any] | Iterable[str] = (),
+    out: str | Path | None = None,
+    *,
+    estimators: Iterable[str] | None = None,
+    metric: str | None = None,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    existing: ExistingFolder = "refuse",
+    progress: Progress = lambda what, done, total: None,
+) -> SweepResult:
+    """Runs experiments over settings, recordings, estimators and seeds, as ``fgslam sweep`` does.
+
+    ::
+
+        result = fgslam.sweep("lab_trials", {"seed": range(100), "dataset.stop": [50, 100]}, jobs=2)
+        result.table().groupby("estimator").ate_final_m.mean()
+
+    Args:
+        experiments: names of experiments, YAML files, folders of recordings; one or several.
+        settings: by dotted key a value, or several in a list, a range or an array; or texts as the
+            command takes them: ``["seed=0:100"]``. Every combination is a case.
+        out: folder of the results; None for runs/NAME_sweep.
+        estimators: which; None for those of each configuration.
+        metric: column that curves and tests are of; None for ate_final_m where it is known.
+        jobs: workers of this machine; None for one a core.
+        scheduler: address of a Dask scheduler whose workers do it instead.
+        existing: what to do where the folder holds a sweep: `refuse`, `overwrite` or `resume`.
+        progress: called with what is under way, how much of it is done, and of how much.
+
+    Returns:
+        How it ended: `status`, `table()` as a data frame, `failures` by number of the case.
+
+    Raises:
+        FgslamError: of any kind, with one line that says what to do.
+    """
+    given = [experiments] if isinstance(experiments, str | Path) else list(experiments)
+    plan = make_plan([Path(one) for one in given], settings, estimators)
+    folder = plan.default_folder if out is None else Path(out)
+    watch = (progress, *UNWATCHED[1:])
+    return run_sweep(plan, folder, crew_of(jobs, scheduler), existing, metric, watch)
 
 
 def replay(

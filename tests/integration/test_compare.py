@@ -244,7 +244,7 @@ def test_the_command_that_an_interrupted_comparison_shows_goes_on_with_it(
         yield lambda: True
 
     with monkeypatch.context() as patch:
-        patch.setattr("fgslam.cli.main.stop_flag", ctrl_c_at_once)
+        patch.setattr("fgslam.cli.performing.stop_flag", ctrl_c_at_once)
         if existing:
             assert main(monkeypatch, *given) == 130
         assert main(monkeypatch, *given, *existing) == 130

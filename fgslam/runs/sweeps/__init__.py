@@ -1,0 +1,1 @@
+"""Sweeps: experiments over settings, recordings, estimators and seeds, on many workers."""
