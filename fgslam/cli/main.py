@@ -233,8 +233,8 @@ def localize(
 ) -> None:
     """Where in a map were these frames taken? Without any prior.
 
-    A pose is given only where it is beyond doubt, with the reasons. Exits with 0 whatever the
-    answers are, with 2 where map or recording cannot be used.
+    A pose is given only where it is beyond doubt, with the reasons. Exits with 3 where fewer than
+    half of the queries were answered, with 2 where map or recording cannot be used.
     """
     from fgslam.runs.tasks.localisation import Wanted
     from fgslam.runs.tasks.localisation import localize as locate
