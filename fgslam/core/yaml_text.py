@@ -102,7 +102,7 @@ def _expanded(node: yaml.Node, sizes: dict[int, int]) -> int:
         return sizes[id(node)]
     sizes[id(node)] = 0
     inner: list[yaml.Node] = []
-    if isinstance(node, yaml.MappingNode):
+    if node.id == "mapping":
         _require_single_keys(node)
         inner = [one for pair in node.value for one in pair]
     elif isinstance(node, yaml.SequenceNode):
@@ -115,7 +115,7 @@ def _expanded(node: yaml.Node, sizes: dict[int, int]) -> int:
     return count
 
 
-def _require_single_keys(node: yaml.MappingNode) -> None:
+def _require_single_keys(node: yaml.Node) -> None:
     known: set[str] = set()
     for key, _ in node.value:
         if isinstance(key, yaml.ScalarNode):
