@@ -94,14 +94,14 @@ def problem_of(error: yaml.YAMLError) -> str:
     return f", line {error.problem_mark.line + 1}: not valid YAML ({error.problem})"
 
 
-def _expanded(node: yaml.Node, sizes: dict[int, int]) -> int:
+def _expanded(node: Any, sizes: dict[int, int]) -> int:
     """Values that a node stands for, aliases counted each time. Raises yaml.YAMLError."""
     if id(node) in sizes:
         if sizes[id(node)] == 0:
             raise _marked("an alias of what it stands in", node)
         return sizes[id(node)]
     sizes[id(node)] = 0
-    inner: list[yaml.Node] = []
+    inner: list[Any] = []
     if node.id == "mapping":
         _require_single_keys(node)
         inner = [one for pair in node.value for one in pair]
