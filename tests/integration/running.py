@@ -27,6 +27,8 @@ from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.tasks.slam import SlamResult, open_slam
 from fgslam.slam.results import STAGES
 
+Capture = pytest.CaptureFixture[str]
+Patch = pytest.MonkeyPatch
 KIND = "landmark_kalman"
 SAME_BYTES = (
     "measurements.npz",
@@ -133,13 +135,22 @@ def write_config(path: Path, values: Mapping[str, Any]) -> Path:
     return path
 
 
-def main(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+def main(monkeypatch: Patch, *arguments: object) -> int:
     """Exit status of a command run in this process (subprocesses take seconds to import)."""
     monkeypatch.setattr(sys, "argv", ["fgslam", *map(str, arguments)])
     with pytest.raises(SystemExit) as caught:
         cli.main()
     code = caught.value.code
     return code if isinstance(code, int) else 0
+
+
+def mistake(capfd: Capture, monkeypatch: Patch, *arguments: object) -> str:
+    """The one line that a command prints which must fail."""
+    assert main(monkeypatch, *arguments) == 2
+    said = capfd.readouterr()
+    assert said.out == ""
+    (line,) = said.err.splitlines()
+    return line
 
 
 def command(*arguments: object) -> list[str]:

@@ -18,11 +18,14 @@ from recordings import experiment
 from running import (
     HANGS_AFTER_S,
     KIND,
+    Capture,
     Finished,
+    Patch,
     assert_valid_results,
     call,
     command,
     main,
+    mistake,
     run_values,
     stop_after,
     write_config,
@@ -34,19 +37,6 @@ from fgslam.report.point_cloud import read_ply
 from fgslam.runs.config_models import Experiment
 from fgslam.runs.engine import RunResult
 from fgslam.runs.named_experiments import experiment_names
-
-Capture = pytest.CaptureFixture[str]
-Patch = pytest.MonkeyPatch
-
-
-def mistake(capfd: Capture, monkeypatch: Patch, *arguments: object) -> str:
-    """The one line that a command prints which must fail."""
-    assert main(monkeypatch, *arguments) == 2
-    said = capfd.readouterr()
-    assert said.out == ""
-    (line,) = said.err.splitlines()
-    return line
-
 
 # --------------------------------------------------------------------------------------------
 # Help and usage

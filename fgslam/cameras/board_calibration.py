@@ -1,0 +1,364 @@
+"""Calibration of one to three cameras from images of a board: all parameters in one least squares.
+
+The model is that of Zhang (A flexible new technique for camera calibration, 2000) with OpenCV's
+lenses; corners of all cameras and images are fitted together, so that the poses of the cameras to
+each other and their intrinsics come with one covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.optimize import least_squares
+
+from fgslam.cameras.boards import Board, Corners
+from fgslam.cameras.raw_cameras import RawCamera
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import CalibrationError
+from fgslam.core.geometry import inverse, pose, transform_to_camera, transform_to_world
+
+MODELS = {"radtan": 5, "equidistant": 4}
+"""Lenses that can be calibrated, and how many parameters each has; names as of the lenses."""
+LEAST_VIEWS = 5
+_TURN = 6  # numbers of a pose: rotation vector and translation
+_OUTLIER_SIGMAS = 5.0  # of one coordinate: a right corner is farther off once in 270,000
+_MEDIAN_OF_RAYLEIGH = 1.1774  # median distance in the plane over the deviation of a coordinate
+_TRIMMINGS = 4
+_LEAST_CORNERS = 6  # of an image, for its board's pose to follow with something left
+
+View = tuple[Corners | None, ...]
+"""What the cameras see of the board at one moment, in their order; None where it was not found."""
+
+
+def _projected(
+    model: str, points: FloatArray, turn: FloatArray, intrinsics: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Pixels (n, 2) and derivatives (2n, 6 + p) by the board's pose (6,) and the intrinsics (p,).
+
+    Intrinsics are fx, fy, cx, cy and the model's parameters.
+    """
+    matrix, distortion = _matrix(intrinsics), intrinsics[4:]
+    if model == "equidistant":
+        pixels, by = cv2.fisheye.projectPoints(
+            points[:, None], turn[:3], turn[3:], matrix, distortion
+        )
+        by = np.hstack([by[:, 8:14], by[:, : len(intrinsics)]])
+    else:
+        pixels, by = cv2.projectPoints(points, turn[:3], turn[3:], matrix, distortion)
+        by = by[:, : _TURN + len(intrinsics)]
+    return np.asarray(pixels, np.float64).reshape(-1, 2), np.asarray(by, np.float64)
+
+
+def _first_guess(
+    model: str,
+    points: Sequence[FloatArray],
+    pixels: Sequence[FloatArray],
+    size: tuple[int, int],
+) -> FloatArray:
+    """Intrinsics of one camera to start from.
+
+    Of a perspective camera by OpenCV from its own images; of a fisheye lens one that shows half a
+    turn over the longer side, without distortion.
+    """
+    if model == "equidistant":
+        focal = max(size) / np.pi
+        centre = (size[0] - 1) / 2.0, (size[1] - 1) / 2.0
+        return np.array([focal, focal, *centre, *np.zeros(MODELS[model])])
+    flat = [p.astype(np.float32)[:, None] for p in points]
+    seen = [p.astype(np.float32)[:, None] for p in pixels]
+    try:
+        _, matrix, distortion, *_ = cv2.calibrateCamera(flat, seen, size, np.eye(3), np.zeros(5))
+    except cv2.error as error:
+        raise CalibrationError(
+            f"the board's images do not determine a camera ({error.err}); take more of them, "
+            "tilted and filling the image"
+        ) from error
+    numbers = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+    return np.array([*numbers, *np.ravel(distortion)[: MODELS[model]]])
+
+
+def _matrix(intrinsics: FloatArray) -> FloatArray:
+    """(3, 3) from fx, fy, cx, cy."""
+    fx, fy, cx, cy = intrinsics[:4]
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardCalibration:
+    """Cameras as fitted to a board.
+
+    Attributes:
+        cameras: in their order; the first one is the body.
+        sigmas: (cameras, p) standard deviations of fx, fy, cx, cy and the model's parameters.
+        turn_sigmas: (cameras, 6) of the rotation vectors and translations that take the first
+            camera's coordinates to each camera's, radians and metres; zero for the first.
+        boards: (views, 6) pose of the board in the first camera.
+        off: of each view and camera, how far off each corner (n,) is, pixels; empty where the board
+            was not found, or did not fit.
+        left_out: corners that do not fit the others.
+    """
+
+    cameras: tuple[RawCamera, ...]
+    sigmas: FloatArray
+    turn_sigmas: FloatArray
+    boards: FloatArray
+    off: tuple[tuple[FloatArray, ...], ...]
+    left_out: int
+
+    @property
+    def errors(self) -> FloatArray:
+        """(views, cameras) root mean square distance in each image, pixels; NaN where unseen."""
+        return np.array([[_rms(distances) for distances in view] for view in self.off])
+
+    @property
+    def rms(self) -> float:
+        """Root mean square distance of all corners that were used, pixels."""
+        return _rms(np.concatenate([distances for view in self.off for distances in view]))
+
+
+def _rms(distances: FloatArray) -> float:
+    return float(np.sqrt(np.mean(distances**2))) if len(distances) else float("nan")
+
+
+def _matrix_of_turn(turn: FloatArray) -> FloatArray:
+    """(4, 4) from rotation vector and translation."""
+    return pose(np.asarray(cv2.Rodrigues(turn[:3])[0], np.float64), turn[3:])
+
+
+def _turn_of_matrix(matrix: FloatArray) -> FloatArray:
+    return np.concatenate([np.ravel(cv2.Rodrigues(matrix[:3, :3])[0]), matrix[:3, 3]])
+
+
+def calibrate(
+    board: Board, views: Sequence[View], size: tuple[int, int], model: str
+) -> BoardCalibration:
+    """Cameras from what they saw of a board; images that do not fit the others are left out.
+
+    Args:
+        board: the board.
+        views: of each moment what each camera saw; the first camera is the reference.
+        size: width and height of all images.
+        model: one of :data:`MODELS`, of all cameras.
+
+    Raises:
+        CalibrationError: too few views, or they do not determine the cameras.
+    """
+    given = tuple(views)
+    for _ in range(_TRIMMINGS):
+        found = _fit(board, given, size, model)
+        trimmed = _trimmed(views, _distances(found, board, views))
+        if _count(trimmed) == _count(given):
+            break
+        given = trimmed
+    return replace(found, left_out=_count(views) - _count(given))
+
+
+def _count(views: Sequence[View]) -> int:
+    return sum(len(corners) for view in views for corners in view if corners is not None)
+
+
+def _trimmed(views: Sequence[View], off: Sequence[Sequence[FloatArray]]) -> tuple[View, ...]:
+    """What fits: distances (n,) beyond five robust deviations of all corners are left out.
+
+    What an earlier, worse fit left out comes back where it fits now.
+    """
+    everything = np.concatenate([distance for view in off for distance in view])
+    limit = _OUTLIER_SIGMAS * float(np.nanmedian(everything)) / _MEDIAN_OF_RAYLEIGH
+    out = []
+    for view, distances in zip(views, off, strict=True):
+        kept = (
+            None if corners is None else corners.select(distance <= limit)
+            for corners, distance in zip(view, distances, strict=True)
+        )
+        out.append(tuple(c if c is not None and len(c) >= _LEAST_CORNERS else None for c in kept))
+    return tuple(out)
+
+
+def _distances(
+    found: BoardCalibration, board: Board, views: Sequence[View]
+) -> tuple[tuple[FloatArray, ...], ...]:
+    """Of each view and camera how far off each corner (n,) is, pixels; NaN without a board's pose.
+
+    Empty where the camera does not see the board.
+    """
+    out = []
+    for turn, view in zip(found.boards, views, strict=True):
+        known = np.isfinite(turn).all()
+        fTb = _matrix_of_turn(turn) if known else np.full((4, 4), np.nan)
+        points = transform_to_world(fTb, board.points)
+        seen = zip(found.cameras, view, strict=True)
+        out.append(tuple(_off(camera, points, corners) for camera, corners in seen))
+    return tuple(out)
+
+
+def _off(camera: RawCamera, points: FloatArray, corners: Corners | None) -> FloatArray:
+    if corners is None:
+        return np.empty(0)
+    pixels = camera.project(transform_to_camera(camera.bTc, points[corners.ids]))
+    return np.asarray(np.linalg.norm(pixels - corners.pixels, axis=1))
+
+
+def _fit(
+    board: Board, views: Sequence[View], size: tuple[int, int], model: str
+) -> BoardCalibration:
+    problem = _Problem(board, views, model)
+    start = problem.start(size)
+    fit = least_squares(problem.residuals, start, problem.jacobian, method="lm", x_scale="jac")
+    jacobian = problem.jacobian(fit.x)
+    rows = len(fit.fun)
+    scale = np.linalg.norm(jacobian, axis=0)
+    information = (jacobian / scale).T @ (jacobian / scale)
+    if rows <= len(fit.x) or np.linalg.cond(information) > 1e14:
+        raise CalibrationError(
+            "the board's images do not determine the cameras: take more of them, tilted in "
+            "different directions, some in each corner of the image"
+        )
+    variance = 2.0 * fit.cost / (rows - len(fit.x))
+    sigmas = np.sqrt(variance * np.diag(np.linalg.inv(information))) / scale
+    found = problem.result(size, fit.x, sigmas)
+    return replace(found, off=_distances(found, board, views))
+
+
+class _Problem:
+    """Residuals and derivatives over (intrinsics, turns of the other cameras, boards)."""
+
+    def __init__(self, board: Board, views: Sequence[View], model: str) -> None:
+        self.model, self.views = model, views
+        self.cameras, self._points = len(views[0]), board.points
+        self._own = 4 + MODELS[model]
+        self._turns_at = self.cameras * self._own
+        self._boards_at = self._turns_at + _TURN * (self.cameras - 1)
+        self.seen = [
+            (v, c, corners)
+            for v, view in enumerate(views)
+            for c, corners in enumerate(view)
+            if corners is not None
+        ]
+        for camera in range(self.cameras):
+            count = sum(c == camera for _, c, _ in self.seen)
+            if count < LEAST_VIEWS:
+                raise CalibrationError(
+                    f"camera {camera} shows the board in {count} images that can be used; "
+                    f"{LEAST_VIEWS} are needed at least, twenty are good"
+                )
+        self._row_of = {v: k for k, v in enumerate(sorted({v for v, _, _ in self.seen}))}
+
+    def start(self, size: tuple[int, int]) -> FloatArray:
+        """First values: each camera by itself, then its pose to the first where both see it."""
+        intrinsics, model = [], self.model
+        for camera in range(self.cameras):
+            own = [corners for _, c, corners in self.seen if c == camera]
+            points = [self._points[corners.ids] for corners in own]
+            intrinsics.append(_first_guess(model, points, [o.pixels for o in own], size))
+        cTb = {
+            (v, c): self._board_pose(corners, self._camera(size, intrinsics[c], np.eye(4), c))
+            for v, c, corners in self.seen
+        }
+        turns = [self._relative(cTb, camera) for camera in range(1, self.cameras)]
+        boards = [self._in_first(cTb, turns, v) for v in self._row_of]
+        return np.concatenate([*intrinsics, *map(_turn_of_matrix, turns), *boards])
+
+    def _camera(
+        self, size: tuple[int, int], intrinsics: FloatArray, fTc: FloatArray, number: int
+    ) -> RawCamera:
+        matrix, distortion = _matrix(intrinsics), intrinsics[4:]
+        return RawCamera(*size, matrix, distortion, fTc, f"cam{number}", self.model)
+
+    def _board_pose(self, corners: Corners, camera: RawCamera) -> FloatArray:
+        rays = camera.unproject(corners.pixels)
+        flat, points = rays[:, :2] / rays[:, 2:], self._points[corners.ids]
+        _, turn, shift = cv2.solvePnP(points, flat, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+        return _matrix_of_turn(np.concatenate([turn.ravel(), shift.ravel()]))
+
+    def _relative(self, cTb: dict[tuple[int, int], FloatArray], camera: int) -> FloatArray:
+        """Of the poses that single views give the one nearest to all others."""
+        both = [
+            cTb[v, camera] @ inverse(cTb[v, 0])
+            for v in self._row_of
+            if (v, camera) in cTb and (v, 0) in cTb
+        ]
+        if not both:
+            raise CalibrationError(
+                f"cameras 0 and {camera} never see the board at the same time; are the images "
+                "paired rightly?"
+            )
+        apart = [[np.linalg.norm(a - b) for b in both] for a in both]
+        return both[int(np.argmin(np.sum(apart, axis=1)))]
+
+    def _in_first(
+        self, cTb: dict[tuple[int, int], FloatArray], turns: Sequence[FloatArray], view: int
+    ) -> FloatArray:
+        if (view, 0) in cTb:
+            return _turn_of_matrix(cTb[view, 0])
+        camera = next(c for c in range(1, self.cameras) if (view, c) in cTb)
+        return _turn_of_matrix(inverse(turns[camera - 1]) @ cTb[view, camera])
+
+    def _intrinsics(self, x: FloatArray, camera: int) -> FloatArray:
+        return x[camera * self._own : (camera + 1) * self._own]
+
+    def _turn(self, x: FloatArray, camera: int) -> FloatArray:
+        at = self._turns_at + _TURN * (camera - 1)
+        return x[at : at + _TURN] if camera else np.zeros(_TURN)
+
+    def _board(self, x: FloatArray, view: int) -> FloatArray:
+        at = self._boards_at + _TURN * self._row_of[view]
+        return x[at : at + _TURN]
+
+    def _looked_at(self, x: FloatArray, view: int, camera: int, corners: Corners) -> Any:
+        """Residuals (2n,), derivatives by intrinsics, turn and board of one image."""
+        board, turn = self._board(x, view), self._turn(x, camera)
+        composed = cv2.composeRT(board[:3], board[3:], turn[:3], turn[3:])
+        whole = np.concatenate([composed[0].ravel(), composed[1].ravel()])
+        points = self._points[corners.ids]
+        pixels, by = _projected(self.model, points, whole, self._intrinsics(x, camera))
+        d = [np.asarray(part) for part in composed[2:]]  # dr3 by r1, t1, r2, t2; dt3 by the same
+        by_board = np.block([[d[0], d[1]], [d[4], d[5]]])
+        by_turn = np.block([[d[2], d[3]], [d[6], d[7]]])
+        of_pose = by[:, :_TURN]
+        off = (pixels - corners.pixels).ravel()
+        return off, by[:, _TURN:], of_pose @ by_turn, of_pose @ by_board
+
+    def residuals(self, x: FloatArray) -> FloatArray:
+        """(r,) pixels, predicted minus found."""
+        return np.concatenate([self._looked_at(x, *seen)[0] for seen in self.seen])
+
+    def jacobian(self, x: FloatArray) -> FloatArray:
+        """(r, p) of the residuals."""
+        out = np.zeros((2 * sum(len(corners) for _, _, corners in self.seen), len(x)))
+        row = 0
+        for view, camera, corners in self.seen:
+            _, by_lens, by_turn, by_board = self._looked_at(x, view, camera, corners)
+            rows = slice(row, row + len(by_lens))
+            row = rows.stop
+            out[rows, camera * self._own : (camera + 1) * self._own] = by_lens
+            if camera:
+                at = self._turns_at + _TURN * (camera - 1)
+                out[rows, at : at + _TURN] = by_turn
+            at = self._boards_at + _TURN * self._row_of[view]
+            out[rows, at : at + _TURN] = by_board
+        return out
+
+    def result(self, size: tuple[int, int], x: FloatArray, sigmas: FloatArray) -> BoardCalibration:
+        """The solution in words of cameras."""
+        boards = np.full((len(self.views), _TURN), np.nan)
+        for view in self._row_of:
+            boards[view] = self._board(x, view)
+        own, turns = self._turns_at, slice(self._turns_at, self._boards_at)
+        cameras = tuple(
+            self._camera(
+                size, self._intrinsics(x, c), inverse(_matrix_of_turn(self._turn(x, c))), c
+            )
+            for c in range(self.cameras)
+        )
+        return BoardCalibration(
+            cameras=cameras,
+            sigmas=sigmas[:own].reshape(self.cameras, -1),
+            turn_sigmas=np.vstack([np.zeros((1, _TURN)), sigmas[turns].reshape(-1, _TURN)]),
+            boards=boards,
+            off=(),
+            left_out=0,
+        )

@@ -1,0 +1,116 @@
+"""`fgslam calibrate`: cameras from images of a board, mirrors from one of rings."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fgslam.core.errors import ConfigError
+
+app = typer.Typer(
+    help="Calibrate cameras from images of a board, a mirror from one of rings.",
+    no_args_is_help=True,
+)
+
+Board = Annotated[
+    str,
+    typer.Option(
+        metavar="COLUMNSxROWS",
+        help="inner corners of a chessboard, squares of a ChArUco board, tags of an AprilGrid",
+    ),
+]
+Square = Annotated[float, typer.Option(metavar="M", help="side of a square, or of a tag, metres")]
+Target = Annotated[str, typer.Option(help="chessboard, charuco or aprilgrid (tags 36h11)")]
+Spacing = Annotated[float, typer.Option(help="of an AprilGrid: gap between tags over a tag's side")]
+Dictionary = Annotated[str, typer.Option(help="of a ChArUco board: OpenCV's name of its markers")]
+Lens = Annotated[str, typer.Option(help="radtan (perspective) or equidistant (fisheye)")]
+Out = Annotated[Path, typer.Option(metavar="FILE", help="where to write it, .json, for --camera")]
+MirrorOut = Annotated[Path, typer.Option(metavar="FILE", help="where to write it, .yaml")]
+
+
+@app.command()
+def stereo(
+    images: Annotated[
+        list[Path],
+        typer.Argument(metavar="IMAGES...", help="folder of both cameras, or two: left right"),
+    ],
+    board: Board,
+    square: Square,
+    target: Target = "chessboard",
+    spacing: Spacing = 0.3,
+    dictionary: Dictionary = "DICT_4X4_50",
+    lens: Lens = "radtan",
+    out: Out = Path("rig.json"),
+) -> None:
+    """Calibrate two cameras: intrinsics, pose to each other, and whether that is good enough.
+
+    Left and right images of one moment have the same name but for the side.
+    """
+    if len(images) > 2:
+        raise ConfigError(f"a pair has two cameras; {len(images)} folders were given")
+    _calibrate(images, (target, board, square, spacing, dictionary), lens, out)
+
+
+@app.command()
+def trinocular(  # noqa: PLR0913 - each option is a parameter
+    left: Annotated[Path, typer.Argument(metavar="LEFT", help="folder of the left images")],
+    right: Annotated[Path, typer.Argument(metavar="RIGHT", help="folder of the right images")],
+    top: Annotated[Path, typer.Argument(metavar="TOP", help="folder of the third camera's images")],
+    board: Board,
+    square: Square,
+    target: Target = "chessboard",
+    spacing: Spacing = 0.3,
+    lens: Lens = "radtan",
+    out: Out = Path("rig.json"),
+) -> None:
+    """Calibrate three cameras, in an L or a line; images of one moment in the same order."""
+    _calibrate([left, right, top], (target, board, square, spacing, "DICT_4X4_50"), lens, out)
+
+
+@app.command()
+def omni(
+    image: Annotated[
+        Path, typer.Argument(metavar="IMAGE", help="rings around the camera in its mirror")
+    ],
+    elevations: Annotated[
+        str,
+        typer.Option(metavar="DEG,DEG,...", help="of the rings' borders, the innermost first"),
+    ],
+    inner: Annotated[
+        float, typer.Option(metavar="PX", help="radius that all rings lie outside of")
+    ],
+    out: MirrorOut = Path("mirror.yaml"),
+) -> None:
+    """Calibrate a mirror from one image of an upright cylinder with black and white bands."""
+    from fgslam.runs.calibrating import calibrate_mirror
+
+    try:
+        degrees = [float(number) for number in elevations.split(",")]
+    except ValueError:
+        raise ConfigError(
+            f"--elevations {elevations}: give degrees as --elevations=-15,-5,5,15"
+        ) from None
+    for line in calibrate_mirror(image, degrees, inner, out):
+        typer.echo(line)
+
+
+def _calibrate(
+    folders: list[Path], board: tuple[str, str, float, float, str], lens: str, out: Path
+) -> None:
+    from fgslam.cameras.boards import Board as CalibrationBoard
+    from fgslam.cli.console import progress_bar
+    from fgslam.runs.calibrating import calibrate_cameras
+
+    kind, size, square, spacing, dictionary = board
+    counted = re.fullmatch(r"(\d{1,3})x(\d{1,3})", size)
+    if counted is None:
+        raise ConfigError(f"--board {size}: give columns and rows as 9x6")
+    known = CalibrationBoard(kind, int(counted[1]), int(counted[2]), square, spacing, dictionary)
+    with progress_bar() as progress:
+        found = calibrate_cameras(folders, known, lens, out, progress)
+    for line in found.lines:
+        typer.echo(line)
+    typer.echo(f"calibration {found.file}, picture {found.picture}")
