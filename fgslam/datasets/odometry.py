@@ -78,9 +78,11 @@ def _require_sane(table: Table, values: FloatArray, limit: float, what: str, uni
     bad = np.flatnonzero(np.abs(values) > limit)
     if len(bad):
         k = int(bad[0])
+        hint = ", radians are expected: are these degrees?" if what == "yaw rate" else ""
         raise OdometryError(
             f"{table.path}, line {table.lines[k]}: {what} of {values[k]:.4g} {unit} is absurd "
-            f"(limit {limit:g}); correct the line, or raise the limit in the odometry settings"
+            f"(limit {limit:g}){hint}; correct the line, or raise the limit in the odometry "
+            "settings"
         )
 
 

@@ -7,13 +7,16 @@ from pathlib import Path
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError, OdometryError
+from fgslam.core.estimates import Trajectory
 from fgslam.core.measurements import Odometry
 from fgslam.datasets.odometry import (
+    SpeedLog,
     motions_from_poses,
     motions_from_speed,
     read_pose_log,
     read_speed_log,
 )
+from fgslam.datasets.odometry_columns import has_named_columns, read_named_columns
 from fgslam.datasets.recording import OdometrySource
 from fgslam.datasets.settings import RecordedOdometrySettings
 
@@ -47,10 +50,11 @@ def file_odometry(path: Path | None, settings: RecordedOdometrySettings) -> Odom
         return None
 
     def source(frames: FloatArray) -> tuple[Odometry | None, ...]:
-        if path.suffix == ".csv":
-            steps = motions_from_speed(read_speed_log(path, settings), frames, settings)
+        log = _read(path, settings)
+        if isinstance(log, SpeedLog):
+            steps = motions_from_speed(log, frames, settings)
         else:
-            steps = motions_from_poses(read_pose_log(path, settings), frames, settings)
+            steps = motions_from_poses(log, frames, settings)
         if len(frames) > 1 and all(step is None for step in steps):
             raise OdometryError(
                 f"{path} covers none of the frames ({frames[0]:.3f} to {frames[-1]:.3f} s); check "
@@ -59,3 +63,11 @@ def file_odometry(path: Path | None, settings: RecordedOdometrySettings) -> Odom
         return steps
 
     return source
+
+
+def _read(path: Path, settings: RecordedOdometrySettings) -> SpeedLog | Trajectory:
+    if has_named_columns(path):
+        return read_named_columns(path, settings)
+    if path.suffix == ".csv":
+        return read_speed_log(path, settings)
+    return read_pose_log(path, settings)

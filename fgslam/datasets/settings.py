@@ -357,6 +357,12 @@ class RecordedOdometrySettings:
     max_turn_dps: Annotated[
         float, Field(gt=0.0, description="a faster turn is refused as absurd, degrees/s")
     ] = 720.0
+    track_m: Annotated[
+        float | None, Field(gt=0.0, description="speeds or ticks of two wheels: their distance, m")
+    ] = None
+    metres_per_tick: Annotated[
+        float | None, Field(gt=0.0, description="ticks of two wheels: how far one of them goes, m")
+    ] = None
     speed_sigma_mps: Annotated[
         float, Field(gt=0.0, description="speed and yaw rate: noise of the forward speed, m/s")
     ] = 0.10

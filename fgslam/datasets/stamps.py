@@ -81,10 +81,18 @@ def _in_seconds(
             f"{where}: the time of image {k + 2} does not come after that of image {k + 1}; put "
             "the lines in time order and remove duplicates"
         )
-    step = float(np.median(steps)) if len(steps) else 0.0
-    name = next((n for n, unit in _UNITS.items() if step * unit <= _SLOWEST_S), "seconds")
+    name, unit = time_unit(values)
     note = () if name == "seconds" else (f"times of {where} are taken as {name}",)
-    return _UNITS[name] * (first + values), note
+    return unit * (first + values), note
+
+
+def time_unit(times: FloatArray) -> tuple[str, float]:
+    """The largest unit in which the times (n,) follow each other as a sensor's do, in seconds."""
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    known = _UNITS.items()
+    return next(
+        ((name, unit) for name, unit in known if step * unit <= _SLOWEST_S), ("seconds", 1.0)
+    )
 
 
 def _listed(path: Path, images: Sequence[Path]) -> tuple[FloatArray, float]:
