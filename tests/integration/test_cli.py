@@ -70,7 +70,7 @@ def test_help_of_the_whole(monkeypatch: Patch, capfd: Capture) -> None:
         ),
         ("export", ("--graph", ".g2o", "--estimator")),
         ("view", ("rerun viewer", "--save", ".rrd")),
-        ("inspect", ("recording's folder", "--frames")),
+        ("inspect", ("its folder, file or a pattern", "--frames")),
     ],
 )
 def test_help_of_a_verb(
