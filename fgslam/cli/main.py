@@ -24,7 +24,7 @@ from fgslam.cli.performing import (
 )
 from fgslam.cli.signals import stop_flag, stoppable
 from fgslam.cli.sweeping import sweep
-from fgslam.core.errors import FgslamError
+from fgslam.core.errors import FgslamError, one_line
 from fgslam.runs.named_experiments import experiment_names, find_experiment
 
 if TYPE_CHECKING:
@@ -235,8 +235,8 @@ def localize(
 ) -> None:
     """Where in a map were these frames taken? Without any prior.
 
-    A pose is given only where it is beyond doubt, with the reasons. Exits with 0 whatever the
-    answers are, with 2 where map or recording cannot be used.
+    A pose is given only where it is beyond doubt, with the reasons. Exits with 3 where fewer than
+    half of the queries were answered, with 2 where map or recording cannot be used.
     """
     from fgslam.runs.tasks.localisation import Wanted
     from fgslam.runs.tasks.localisation import localize as locate
@@ -390,7 +390,7 @@ def main() -> None:
     except _UsageError as error:
         command = error.ctx.command_path if error.ctx else "fgslam"
         _keep_close_options(error)
-        message = " ".join(error.format_message().split()).rstrip(".")
+        message = one_line(" ".join(error.format_message().split()).rstrip("."))
         print(f"{command}: {message}; see {command} --help", file=sys.stderr)
         raise SystemExit(EXIT_USER) from None
     except FgslamError as error:
@@ -406,7 +406,7 @@ def main() -> None:
         raise SystemExit(EXIT_USER) from None
     except OSError as error:
         # Of files of this program FgslamErrors tell; this is the terminal's, or a library's own.
-        where = error.filename or "standard output"
+        where = one_line(str(error.filename or "standard output"))
         print(f"fgslam: {where}: {error.strerror or error}; mend that and repeat", file=sys.stderr)
         raise SystemExit(EXIT_USER) from None
     except (ImportError, RuntimeError, SystemError, AttributeError, TypeError):

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from fgslam.runs.folder import ExistingFolder
 
 EXIT_FAULT = 1
+EXIT_NOT_LOCATED = 3
 
 
 @contextmanager
@@ -38,11 +39,13 @@ def show_all(results: Sequence[RunResult], resume: str = "") -> None:
 
 
 def exit_as(results: Sequence[RunResult]) -> None:
-    """Exits as the results ended: with 0, interrupted, or an estimator was asked in vain."""
+    """Exits as the results ended: done, interrupted, an estimator in vain, or hardly located."""
     if any(result.status == "interrupted" for result in results):
         raise SystemExit(signals.status())
     if any(result.failed for result in results):
         raise typer.Exit(EXIT_FAULT)
+    if any(result.located is not None and not result.located.enough for result in results):
+        raise typer.Exit(EXIT_NOT_LOCATED)
 
 
 def same_with_resume() -> str:

@@ -6,9 +6,34 @@ wrong, where, and how to correct it. The command line catches the root once and 
 
 from __future__ import annotations
 
+import re
+
+_ECHOED = 200
+"""Characters of what was given that a message repeats at most."""
+_LONGEST = 1500
+_LONG_WORD = re.compile(rf"\S{{{_ECHOED + 1},}}")
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+
+
+def shortened(text: str, most: int = _ECHOED) -> str:
+    """The start and the end of a text that is longer than ``most`` characters."""
+    if len(text) <= most:
+        return text
+    kept = (most - 5) // 2
+    return f"{text[:kept]} ... {text[-kept:]}"
+
+
+def one_line(message: str) -> str:
+    """A message as it may be shown: long names shortened, nothing that moves the cursor."""
+    plain = _CONTROL.sub(lambda found: repr(found[0])[1:-1], message)
+    return shortened(_LONG_WORD.sub(lambda found: shortened(found[0]), plain), _LONGEST)
+
 
 class FgslamError(Exception):
-    """Root of all errors with a message meant for the user."""
+    """Root of all errors with a message meant for the user: one line of limited length."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class ConfigError(FgslamError):

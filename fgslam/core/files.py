@@ -10,6 +10,7 @@ import errno
 import itertools
 import os
 import re
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -142,14 +143,53 @@ def make_subfolder(run: Path, name: str) -> Path:
 
 
 def read_text(
-    path: Path, error: type[FgslamError] = DatasetError, remedy: str = "restore the file"
+    path: Path,
+    error: type[FgslamError] = DatasetError,
+    remedy: str = "restore the file",
+    most_bytes: int = 1_000_000_000,
 ) -> str:
     """The text of a UTF-8 file. Raises ``error`` with the remedy where it cannot be read."""
+    require_file(path, error, remedy, most_bytes)
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as cause:
-        reason = "it is not text" if isinstance(cause, UnicodeDecodeError) else cause.strerror
+        reason = _not_text(path) if isinstance(cause, UnicodeDecodeError) else cause.strerror
         raise error(f"cannot read {path}: {reason}; {remedy}") from cause
+
+
+def _not_text(path: Path) -> str:
+    with path.open("rb") as file:
+        marked = file.read(2) in (b"\xff\xfe", b"\xfe\xff")
+    return "it is not text in UTF-8, but in UTF-16" if marked else "it is not text in UTF-8"
+
+
+def require_file(
+    path: Path, error: type[FgslamError], remedy: str, most_bytes: int | None = None
+) -> None:
+    """Raises ``error`` unless a path is that of a file of data, of a size that can be read.
+
+    Who opens a pipe waits for its other end, and a device may have no end.
+    """
+    try:
+        found = path.stat()
+    except (OSError, ValueError) as cause:  # the second: a name that holds NUL
+        reason = cause.strerror if isinstance(cause, OSError) else str(cause)
+        raise error(f"cannot read {path}: {reason}; {remedy}") from cause
+    if not stat.S_ISREG(found.st_mode):
+        kind = next((word for is_it, word in _KINDS if is_it(found.st_mode)), "no file")
+        raise error(f"cannot read {path}: it is {kind}; {remedy}")
+    if most_bytes is not None and found.st_size > most_bytes:
+        size, most = found.st_size / 1e6, most_bytes / 1e6
+        raise error(f"cannot read {path}: {size:.1f} MB, {most:g} MB at most; {remedy}")
+
+
+_KINDS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+    (stat.S_ISSOCK, "a socket"),
+)
 
 
 def read_lines(path: Path, error: type[DatasetError] = DatasetError) -> list[tuple[int, str]]:

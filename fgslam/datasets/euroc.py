@@ -15,6 +15,7 @@ from fgslam.core.estimates import Trajectory
 from fgslam.core.files import read_lines
 from fgslam.core.geometry import inverse
 from fgslam.core.sensors import CameraRig
+from fgslam.datasets.calibrated import mounted
 from fgslam.datasets.images import (
     RawImages,
     StereoFiles,
@@ -50,7 +51,7 @@ def open_euroc(settings: EurocSettings) -> Recording:
     folders = [root / name for name in CAMERA_FOLDERS]
     for folder in folders:
         require_folder(folder, "a stereo pair needs two cameras, but the folder")
-    rig = load_rig(*(folder / "sensor.yaml" for folder in folders))
+    rig = _rig(settings, root, folders)
     right_folder, left_folder = (folders[k] for k in rig.sources)
     stamps, files, notes = _pairs(right_folder, left_folder, rig, settings)
     chosen = select_frames(len(stamps), settings)
@@ -58,6 +59,7 @@ def open_euroc(settings: EurocSettings) -> Recording:
     return Recording(
         name=root.resolve().parent.name if root.name == "mav0" else root.resolve().name,
         rig=rig.plain(),
+        unrectified=rig.rectifier is not None,
         timestamps=stamps[chosen],
         identity=_identity(folders, files),
         ground_truth=_true_poses(root, rig, stamps[chosen]),
@@ -66,6 +68,18 @@ def open_euroc(settings: EurocSettings) -> Recording:
         load_images=RawImages(files, rig).load,
         load_colour=RawImages(files, rig).load_colour,
     )
+
+
+def _rig(settings: EurocSettings, root: Path, folders: list[Path]) -> StereoRig:
+    """By the file that is given, both sensor.yaml, or, as in TUM-VI, the camchain beside mav0."""
+    own = [folder / "sensor.yaml" for folder in folders]
+    if settings.camera_file is not None:
+        return mounted(load_rig(settings.camera_file), settings)
+    if not any(path.is_file() for path in own):
+        for chain in (root.parent / "dso" / "camchain.yaml", root.parent / "camchain.yaml"):
+            if chain.is_file():
+                return mounted(load_rig(chain), settings)
+    return mounted(load_rig(*own), settings)
 
 
 def _pairs(
@@ -83,7 +97,8 @@ def _pairs(
 
 
 def _identity(folders: list[Path], files: StereoFiles) -> str:
-    defining = [folder / name for folder in folders for name in ("sensor.yaml", "data.csv")]
+    named = [folder / name for folder in folders for name in ("sensor.yaml", "data.csv")]
+    defining = [path for path in named if path.is_file()]
     images = [path for pair in files.paths for path in pair if path.is_file()]
     return recording_identity(defining, images)
 

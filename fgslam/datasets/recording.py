@@ -44,6 +44,7 @@ class Recording(Brief):
         indices: (n,) the recording's own numbers of the selected frames.
         load_images: reads the images of one of the recording's own frames.
         load_colour: reads them in red, green, blue; None where they are grey anyway.
+        unrectified: the images are rectified when they are read.
         odometry_source: where the body's motions come from, or None. Asked once, when first
             needed, so that a bad odometry file hurts only who uses it.
     """
@@ -57,6 +58,7 @@ class Recording(Brief):
     indices: IntArray
     load_images: ImageLoader
     odometry_source: OdometrySource | None = None
+    unrectified: bool = False
     load_colour: ImageLoader | None = None
 
     def __len__(self) -> int:

@@ -161,7 +161,7 @@ class KittiSettings(RecordingSettings):
 
 
 @dataclass(frozen=True, config=STRICT)
-class EurocSettings(RecordingSettings):
+class EurocSettings(CalibratedSettings):
     """EuRoC MAV in its native layout, rectified on reading (docs/datasets/euroc.md)."""
 
     kind: Literal["euroc"] = "euroc"

@@ -171,11 +171,12 @@ def _said(config: ExperimentConfig, sequence: Sequence) -> str:
     rig, stamps = sequence.rig, sequence.timestamps
     duration = float(stamps[-1] - stamps[0])
     rate = f" at {(len(stamps) - 1) / duration:.3g} Hz" if duration > 0.0 else ""
+    lenses = ", unrectified" if getattr(sequence, "unrectified", False) else ""
     motion = {"recorded": "odometry", "constant_velocity": "no odometry"}
     truth = "" if sequence.ground_truth is None else "; truth, for evaluation only"
     line = (
         f"{sequence.name}: {LAYOUTS[config.dataset.kind].name}, {rig.cameras} cameras "
-        f"{rig.width}x{rig.height}; {len(stamps)} frames{rate}; "
+        f"{rig.width}x{rig.height}{lenses}; {len(stamps)} frames{rate}; "
         f"{motion.get(config.odometry.kind, config.odometry.kind)}{truth}; estimator "
         f"{config.estimator.kind}"
     )

@@ -38,7 +38,7 @@ from fgslam.runs.engine import (
 from fgslam.runs.folder import COMPARISON_FILE, RUN_MARKER, ExistingFolder, is_run_folder
 from fgslam.runs.homing_comparison import open_homing_comparison
 from fgslam.runs.metric_tables import ate_table
-from fgslam.runs.slam_comparison import open_slam_comparison
+from fgslam.runs.slam_comparison import judged_apart, open_slam_comparison
 from fgslam.runs.units import Progress, Stopped
 
 DEFAULT_FOLDER = "compare"
@@ -118,6 +118,7 @@ def choose(config: Experiment, choice: Choice) -> tuple[Any, ...]:
         chosen = own if getattr(config, "compare", ()) else list(known)
     else:
         chosen = list(dict.fromkeys(name.strip() for name in choice.names if name.strip()))
+    chosen = _with_motion(config, choice, chosen, known)
     unknown = [name for name in chosen if name not in known]
     if unknown or not chosen:
         what = f"no estimator {unknown[0]!r}" if unknown else "no estimator named"
@@ -134,6 +135,26 @@ def choose(config: Experiment, choice: Choice) -> tuple[Any, ...]:
                 f"{', '.join(chosen)}"
             )
     return tuple(_with(known[title], config, choice.overrides) for title in chosen)
+
+
+def _with_motion(
+    config: Experiment, choice: Choice, chosen: list[str], known: dict[str, Any]
+) -> list[str]:
+    """The titles without dead reckoning where there was no odometry.
+
+    Raises ConfigError where it is asked for by name.
+    """
+    if not isinstance(config, ExperimentConfig):
+        return chosen
+    slam = [known[title] for title in chosen if title in known]
+    kept = judged_apart(config, slam)
+    left_out = [one.title for one in slam if one not in kept]
+    if left_out and choice.names is not None:
+        raise ConfigError(
+            f"--estimators {left_out[0]}: the run had no odometry (odometry.kind constant_velocity)"
+            ", so dead reckoning has no motion to add up; leave it out"
+        )
+    return [title for title in chosen if title not in left_out]
 
 
 def _of_one_noise(variants: dict[str, Any], config: Experiment) -> dict[str, Any]:

@@ -18,7 +18,8 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from fgslam.core.errors import ConfigError
+from fgslam.core.errors import ConfigError, shortened
+from fgslam.core.yaml_text import PlainLoader, read_yaml
 from fgslam.runs.named_experiments import suggestion
 from fgslam.runs.retired_settings import RETIRED
 
@@ -127,48 +128,18 @@ def _kind(values: Mapping[str, Any], group: str) -> Any:
 
 def read_mapping(path: Path) -> dict[str, Any]:
     """The `key: value` pairs of a YAML file. Raises ConfigError, naming it."""
-    try:
-        text = path.read_text(encoding="utf-8")
-        values = yaml.safe_load(text)
-        repeated = _repeated_key(yaml.SafeLoader(text).get_single_node())
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; {suggestion(path)}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error}); give a YAML text file") from None
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}{_problem(error)}; correct that line") from None
-    except RecursionError:
-        raise ConfigError(f"{path}: not valid YAML (nested too deeply); correct it") from None
-    if repeated is not None:
-        line = repeated.start_mark.line + 1
-        raise ConfigError(f"{path}, line {line}: key {repeated.value} is given twice; remove one")
+    if not path.exists():
+        raise ConfigError(f"{path}: no such file; {suggestion(path)}")
+    values = read_yaml(path, ConfigError)
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: holds no `key: value` pairs; see experiments/ for examples")
-    return values
+    return {_key(path, key): value for key, value in values.items()}
 
 
-def _problem(error: yaml.YAMLError) -> str:
-    """Where and why a text is no YAML, in a few words."""
-    if not isinstance(error, yaml.MarkedYAMLError) or error.problem_mark is None:
-        return f": not valid YAML ({' '.join(str(error).split())})"
-    return f", line {error.problem_mark.line + 1}: not valid YAML ({error.problem})"
-
-
-def _repeated_key(node: Any) -> Any:
-    """First key node that repeats one of its mapping, or None: YAML forbids it, PyYAML does not."""
-    if node is None or node.id == "scalar":
-        return None
-    if node.id == "sequence":
-        return next(filter(None, map(_repeated_key, node.value)), None)
-    known: set[Any] = set()
-    for key, value in node.value:
-        if key.id == "scalar" and key.value in known:
-            return key
-        known.add(key.value if key.id == "scalar" else None)
-        inner = _repeated_key(value)
-        if inner is not None:
-            return inner
-    return None
+def _key(path: Path, key: object) -> str:
+    if not isinstance(key, str):
+        raise ConfigError(f"{path}: key {key!r} is no text; correct it")
+    return key
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,9 +248,9 @@ def _describe(errors: list[ErrorDetails], where: str, schema: Schema) -> str:
         return f"{where}: {key}.kind is missing; add one of {_kinds(schema, names)}{more}"
     if first["type"] == "union_tag_invalid":
         kinds, tag = _kinds(schema, names), first["ctx"]["tag"]
-        return f"{where}: {key}.kind is {tag!r}; use one of {kinds}{more}"
+        return f"{where}: {key}.kind is {shortened(repr(tag))}; use one of {kinds}{more}"
     words = _PLAIN_WORDS.get(first["type"], first["msg"])
-    return f"{where}: {key} = {first['input']!r} is not usable: {words}{more}"
+    return f"{where}: {key} = {shortened(repr(first['input']))} is not usable: {words}{more}"
 
 
 def _kinds(schema: Schema, names: list[str]) -> str:
@@ -362,7 +333,7 @@ def typed_value(text: str, accepted: Sequence[Schema]) -> Any:
         yaml.YAMLError: the setting is no text, and this is not valid YAML.
     """
     try:
-        node = yaml.SafeLoader(text).get_single_node()
+        node = PlainLoader(text).get_single_node()
     except yaml.YAMLError:
         if _is_text(accepted):
             return text.strip()
@@ -399,7 +370,7 @@ def _value(node: yaml.Node | None, accepted: Sequence[Schema]) -> Any:
     if isinstance(node, yaml.SequenceNode):
         items = [item for one in accepted for item in one.get("items", ())]
         return [_value(item, items) for item in node.value]
-    value = yaml.SafeLoader("").construct_object(node, deep=True)
+    value = PlainLoader("").construct_object(node, deep=True)
     if not isinstance(node, yaml.ScalarNode) or not _is_text(accepted):
         return value
     return None if value is None and "null" in _types(accepted) else node.value

@@ -59,6 +59,23 @@ R = TypeVar("R", bound="RunResult")
 R_co = TypeVar("R_co", bound="RunResult", covariant=True)
 
 
+@dataclass(frozen=True, slots=True)
+class LocatedShare:
+    """How many frames (or queries) what was seen gave a pose, of how many."""
+
+    frames: int
+    of: int
+
+    @property
+    def enough(self) -> bool:
+        """Whether at least half were; less is no success, and `fgslam` exits with 3."""
+        return 2 * self.frames >= self.of
+
+    def __str__(self) -> str:
+        share = 100.0 * self.frames / self.of if self.of else 0.0
+        return f"{self.frames} of {self.of} frames ({share:.0f} %)"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
     """How a run ended, and what is said of it: terminal and page show the same.
@@ -74,6 +91,7 @@ class RunResult:
         failed: an estimator was asked for, and none gave an answer.
         written: there is a folder with files.
         reached: how far an interrupted run got, in words; may be empty.
+        located: frames that were located; None where the task locates none.
     """
 
     config: Experiment
@@ -86,6 +104,7 @@ class RunResult:
     failed: bool = False
     written: bool = True
     reached: str = ""
+    located: LocatedShare | None = None
 
     @property
     def metrics(self) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from fgslam.core.errors import DatasetError, FgslamError
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.trajectories import read_covariances
+from fgslam.core.yaml_text import plain_values
 from fgslam.report.content import Picture
 from fgslam.report.point_cloud import MapPoints, read_ply
 from fgslam.report.run_results import (
@@ -124,7 +125,7 @@ def _text(path: Path | None) -> str:
 def _mapping(text: str) -> dict[str, Any]:
     """The configuration as plain values; what cannot be read is shown as text only."""
     try:
-        values = yaml.safe_load(text)
+        values = plain_values(text)
     except yaml.YAMLError:
         return {}
     return values if isinstance(values, dict) else {}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.settings import DeadReckoningSettings, EstimatorSettings
 from fgslam.core.errors import DatasetError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.trajectories import Trajectory
@@ -66,6 +66,15 @@ def open_slam_comparison(
         "log": digest_of([run / LOG_FILE]),
     }
     return Task(provenance, lambda context: _compare(run, config, len(log), estimators, context))
+
+
+def judged_apart(
+    config: ExperimentConfig, estimators: Sequence[EstimatorSettings]
+) -> tuple[EstimatorSettings, ...]:
+    """Estimators whose replay means something: without odometry, dead reckoning has no motion."""
+    if config.odometry.kind != "constant_velocity":
+        return tuple(estimators)
+    return tuple(one for one in estimators if one.kind != DeadReckoningSettings.kind)
 
 
 def replay_apart(

@@ -65,8 +65,11 @@ def test_a_frozen_camera_is_said_in_console_status_and_report(
         shutil.copyfile(images[4], image)
     output = {"pictures": False, "report": True, "checkpoint_seconds": 0.0}
     config = write_config(tmp_path / "frozen.yaml", experiment(own_recording, output=output))
-    main(monkeypatch, "run", config, "--out", tmp_path / "run")
+    status = main(monkeypatch, "run", config, "--out", tmp_path / "run")
     said = " ".join(capsys.readouterr().out.split())
+    assert status == 3  # hardly anything was located
+    assert "only 5 of 12 frames (42 %) were located by landmarks" in said
+    assert metrics_of(tmp_path / "run")["located"] == {"frames": 5, "of": 12}
     words = "image of the frame before once more: 7 of 12 frames, from 5 to 11, are not used"
     assert words in said
     assert metrics_of(tmp_path / "run")["status_counts"]["camera_fault"] == 7

@@ -111,7 +111,7 @@ def test_nothing_to_see_is_refused_not_an_error(
     for path in own_recording.glob("*/000004.png"):
         path.write_bytes(b"no image")
     three = ("--set", "dataset.start=3", "--set", "dataset.stop=6")
-    assert main(monkeypatch, "localize", map_file, own_recording, *three) == 0
+    assert main(monkeypatch, "localize", map_file, own_recording, *three) == 3
     lines = capsys.readouterr().out.splitlines()
     assert "too_few_matches" in lines[0]
     assert "only 0 features look like a landmark" in lines[0]

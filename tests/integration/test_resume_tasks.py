@@ -396,6 +396,41 @@ def before_each_deletion(values: dict[str, Any], folder: Path, kept: Path) -> li
     return found
 
 
+@pytest.mark.parametrize("stage", ["pairs", "plain pairs"])
+def test_interrupted_pairs_say_so_and_count_nothing_that_is_not_done(
+    stage: str,
+    values_of: Callable[[str], dict[str, Any]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def one_by_one(work: Any, arguments: Any, _jobs: int, stopped: Any, *_: object) -> Any:
+        for index, argument in enumerate(arguments):
+            if stopped():
+                return
+            yield index, work(argument)
+
+    monkeypatch.setattr("fgslam.runs.units.run_apart", one_by_one)
+    values = values_of("homing_pairs") | {"reference": True}
+    reached: list[int] = []
+
+    def progress(what: str, done: int, _total: int) -> None:
+        if what == stage and done:
+            reached.append(done)
+
+    ended = run(values, tmp_path / "run", progress=progress, stopped=lambda: bool(reached))
+    every = VIEWS * (VIEWS - 1) // 2
+    assert ended.status == "interrupted"
+    assert not any("Plain SIFT" in line for line in ended.lines)
+    assert ended.metrics["reference"] is None
+    done = ended.metrics["pairs"]
+    assert ended.reached == f"after {done} of {every} pairs"
+    assert (f"{every - done} more are not answered yet" in ended.lines[0]) == (done < every)
+    whole = run(values, tmp_path / "run", "resume")
+    assert whole.status == "finished"
+    assert any("Plain SIFT" in line for line in whole.lines)
+    assert "yet" not in whole.lines[0]
+
+
 @pytest.mark.parametrize("task", ["homing_pairs", "homing_trials"])
 def test_a_command_killed_by_a_signal_resumes_to_the_same_bytes(
     task: str,

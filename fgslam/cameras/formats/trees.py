@@ -17,6 +17,7 @@ from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
 from fgslam.core.files import read_text
 from fgslam.core.geometry import is_rigid, pose, rotation_from_quaternion
+from fgslam.core.yaml_text import PlainLoader
 
 Tree: TypeAlias = Mapping[str, Any]
 """Keys and values of a file; OpenCV's matrices are arrays."""
@@ -26,8 +27,10 @@ _TIGHT = re.compile(r"^(\s*[\w.]+):(?=[^\s:/\\])")
 _DEEPEST = 20  # levels of nesting: no calibration has ten
 
 
-class _Loader(yaml.SafeLoader):
-    """YAML's safe loader, with OpenCV's matrices as what they hold."""
+class _Loader(PlainLoader):
+    """The loader of plain values, with OpenCV's matrices as what they hold."""
+
+    most_values = 1_000_000
 
 
 def _plain(loader: yaml.SafeLoader, node: Any) -> Any:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-import yaml
 
 from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.cameras.omni.mirrors import (
@@ -28,9 +27,10 @@ from fgslam.cameras.omni.settings import (
     OCamCalibSettings,
     RadialPolynomialSettings,
 )
-from fgslam.core.errors import CalibrationError
-from fgslam.core.files import read_lines, read_text
+from fgslam.core.errors import CalibrationError, shortened
+from fgslam.core.files import read_lines
 from fgslam.core.settings import make_settings
+from fgslam.core.yaml_text import read_yaml
 
 Size = tuple[int, int]
 
@@ -129,19 +129,10 @@ def _read(source: str | Path) -> tuple[OmniCameraKind, Path | None]:
             f"file, or one of {', '.join(_KINDS)}"
         )
     if path.suffix.lower() in (".yaml", ".yml"):
-        return _settings_of(_read_keys(path)), path.parent
+        return _settings_of(read_yaml(path, CalibrationError)), path.parent
     if any(line.startswith("INPUT_WIDTH") for _, line in read_lines(path, CalibrationError)):
         return BloggieSettings(file=path.name), path.parent
     return OCamCalibSettings(file=path.name), path.parent
-
-
-def _read_keys(path: Path) -> Any:
-    text = read_text(path, CalibrationError, "give a YAML text file")
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        message = " ".join(str(error).split())
-        raise CalibrationError(f"{path}: not valid YAML ({message}); correct it") from None
 
 
 def _settings_of(source: object) -> OmniCameraKind:
@@ -149,8 +140,8 @@ def _settings_of(source: object) -> OmniCameraKind:
         return source
     if not isinstance(source, Mapping) or source.get("kind") not in _KINDS:
         raise CalibrationError(
-            f"camera: {source!r} describes none; give a calibration file, or keys with a kind, one "
-            f"of {', '.join(_KINDS)}"
+            f"camera: {shortened(repr(source))} describes none; give a calibration file, or keys "
+            f"with a kind, one of {', '.join(_KINDS)}"
         )
     kind = _KINDS[source["kind"]]
     return make_settings(kind, {str(key): value for key, value in source.items()}, "camera")

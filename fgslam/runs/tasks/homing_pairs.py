@@ -78,13 +78,16 @@ def _run(config: HomingPairsConfig, views: OmniRecording, context: Context) -> R
     numbers["images"] = len(features)
     numbers["reference"] = _reference(config, views, context) if whole else None
     whole = whole and not context.stopped()
+    left = len(pairs_of(len(views))) - len(answers)
+    asked = f" {left} more are not answered yet." if left else ""
     result = RunResult(
         config,
         folder,
         "finished" if whole else "interrupted",
-        _sentences(numbers, errors),
+        _sentences(numbers, errors, asked),
         _tables(errors),
         (*views.notes, *failures),
+        reached=f"after {len(answers)} of {len(answers) + left} pairs",
     )
     write_document(result, numbers)
     pictures = draw_pairs(folder, views, search, answers, errors, config.output.pictures)
@@ -102,7 +105,10 @@ def _run(config: HomingPairsConfig, views: OmniRecording, context: Context) -> R
 def _reference(
     config: HomingPairsConfig, views: OmniRecording, context: Context
 ) -> dict[str, JsonValue] | None:
-    """The same pairs by plain SIFT and two-point RANSAC, for comparison; None where not asked."""
+    """The same pairs by plain SIFT and two-point RANSAC, for comparison.
+
+    None where it is not asked for, or not all pairs are done.
+    """
     if not config.reference:
         return None
     features = extract_features(views, config.dataset, None, context)
@@ -110,6 +116,8 @@ def _reference(
     vector = never_refusing(config.homing_vector)
     search = PairSearch(tuple(features), every, PLAIN_MATCHING, vector, config.seed)
     answers, _ = answer_pairs(search, context, "plain pairs")
+    if len(features) < len(views) or len(answers) < len(every):
+        return None
     answers = [with_support(answer, PLAIN_INLIERS) for answer in answers]
     write_pairs(context.folder / REFERENCE_FILE, answers, view_names(views))
     return _judged(answers, views)[1]
@@ -142,8 +150,10 @@ def _judged(
     return errors, answer_numbers(answers) | of_errors
 
 
-def _sentences(numbers: dict[str, JsonValue], errors: PairErrors | None) -> tuple[str, ...]:
-    lines = [f"{numbers['answered']} of {numbers['pairs']} pairs are answered."]
+def _sentences(
+    numbers: dict[str, JsonValue], errors: PairErrors | None, asked: str
+) -> tuple[str, ...]:
+    lines = [f"{numbers['answered']} of {numbers['pairs']} pairs are answered.{asked}"]
     reference = numbers["reference"]
     if isinstance(reference, dict):
         lines.append(
@@ -168,7 +178,7 @@ _COLUMNS = (
     ("rotation deg median", "rotation_median_deg", "absolute error of the rotation", ".2f"),
     ("p95 ", "rotation_p95_deg", "95 % of the answers are better", ".2f"),
     ("worse than 10 deg", "worse_than_10_deg", "answers whose direction or rotation is", "d"),
-    ("covered joint 95 %", "covered_joint_95", "errors within the stated joint 95 % region", ".3f"),
+    ("covered joint 95 %", "covered_joint_95", "errors within the stated joint 95 % region", ".1%"),
     ("NEES", "nees_per_dof", "normalised error squared per degree of freedom: 1 is right", ".2f"),
 )
 
@@ -189,7 +199,7 @@ def _tables(errors: PairErrors | None) -> tuple[TextTable, ...]:
 
 def _cell(group: dict[str, JsonValue], key: str, spec: str) -> str:
     value = group.get(key)
-    return "-" if not isinstance(value, int | float) else format(value, spec)
+    return "-" if not isinstance(value, int | float) else format(value, spec).replace("%", " %")
 
 
 def _figures(

@@ -7,7 +7,7 @@ a picture, the page. Numbers: queries answered, right, inexact and false ones, e
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from fgslam.runs.config import (
     make_experiment,
 )
 from fgslam.runs.config_models import LocalisationConfig
-from fgslam.runs.engine import Context, Opening, Task, provenance_of
+from fgslam.runs.engine import Context, LocatedShare, Opening, Task, provenance_of
 from fgslam.runs.folder import ExistingFolder, begin_run_folder, is_run_folder, write_config
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.owner import Owner
@@ -143,7 +143,12 @@ def localize(wanted: Wanted, progress: Progress, stopped: Callable[[], bool]) ->
         notes = (*_other_frontend(config, given), *result.notes)
         result = dataclasses.replace(result, notes=notes)
         write_results(result, given, f"{sequence.name}, in the map {given.path}")
-        return _one_by_one(result)
+        return dataclasses.replace(_one_by_one(result), located=_share(asked.attempts))
+
+
+def _share(attempts: Collection[Attempt]) -> LocatedShare:
+    found = [one for one in attempts if one.found is not None and one.found.found]
+    return LocatedShare(len(found), len(attempts))
 
 
 def _one_by_one(result: LocalisationResult) -> LocalisationResult:

@@ -25,10 +25,11 @@ from fgslam.runs.metric_tables import comparison_particulars, comparison_tables
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.owner import give_back
 from fgslam.runs.report import report_from_folder
-from fgslam.runs.slam_comparison import replay_apart
+from fgslam.runs.slam_comparison import judged_apart, replay_apart
 from fgslam.runs.tasks import slam_map_entry as map_entry
 from fgslam.runs.tasks import slam_state as state
 from fgslam.runs.tasks.slam_map_entry import Entry, GivenMap
+from fgslam.runs.tasks.slam_metrics import located
 from fgslam.runs.tasks.slam_outputs import (
     RunOutputs,
     draw_frame,
@@ -317,7 +318,7 @@ def _compare(outputs: RunOutputs, live: EstimatorMetrics, context: Context) -> d
     Those beside the live one replay the run's log.
     """
     config, folder = outputs.config, outputs.folder
-    others = config.estimators[1:]
+    others = judged_apart(config, config.estimators[1:])
     if not others:
         return {}
     metrics = {outputs.title: live} | replay_apart(config, folder, others, context)
@@ -349,6 +350,7 @@ def _result(
         notes=run_notes(outputs, live),
         particulars=(*files, *comparison_particulars(compared or {}, outputs.folder)),
         reached=f"after {len(outputs.recorder)} frames",
+        located=located(outputs.recorder),
         outputs=outputs,
         live=live,
         pictures=pictures,

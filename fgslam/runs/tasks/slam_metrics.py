@@ -19,9 +19,11 @@ from fgslam.evaluation.judging import Answer, Truth, judge_answer
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, UpdateTime
 from fgslam.report.content import Column, TextTable
 from fgslam.report.tables import Cell, write_csv
+from fgslam.runs.engine import LocatedShare
 from fgslam.slam.replay import peak_memory_mb
 from fgslam.slam.results import STAGES, RunRecorder
 
+_NO_IMAGE = EgoMotionStatus.NO_IMAGE.value
 _ESTIMATOR_STAGES = ("predict", "update")
 _LOOP_STAGES = ("watch", "predict", "stereo", "track", "places", "update", "calibrate")
 
@@ -54,11 +56,19 @@ def run_numbers(recorder: RunRecorder) -> dict[str, JsonValue]:
         "mean_residual_px": _median(recorder.column("mean_residual_px")),
         "stereo_precision": _mean(recorder.column("stereo_precision")),
         "correlation_x_yaw": _sideways_yaw(recorder),
-        "frames_without_image": int(np.count_nonzero(recorder.column("problem") != "")),
+        "located": asdict(located(recorder)),
+        "frames_without_image": int(np.count_nonzero(recorder.column("status") == _NO_IMAGE)),
         "frame_problems": frame_problems(recorder),
         "loop_ms": asdict(UpdateTime.of(_stage_sum(times, _LOOP_STAGES))),
         "sift_ms": asdict(UpdateTime.of(_stage_sum(times, ("sift",)))),
     }
+
+
+def located(recorder: RunRecorder) -> LocatedShare:
+    """Frames that landmarks gave a pose; the first one, which the world is, among them."""
+    statuses = [EgoMotionStatus(status) for status in recorder.column("status").tolist()]
+    known = [one.measured or one is EgoMotionStatus.FIRST for one in statuses]
+    return LocatedShare(sum(known), len(known))
 
 
 def frame_problems(recorder: RunRecorder) -> list[str]:

@@ -43,6 +43,7 @@ from fgslam.runs.tasks.slam_metrics import (
     closures_of,
     estimator_metrics,
     frame_problems,
+    located,
     place_numbers,
     run_numbers,
     write_closures,
@@ -167,7 +168,13 @@ class RunOutputs:
         """Notes on the recording, its cameras and its first images."""
         of_cameras = camera_remarks(self.recorder, self.pipeline.watch)
         of_images = stereo_remarks(self.recorder)
-        return (*self.sequence.notes, *self.notes, *of_cameras, *of_images)
+        return (*self.sequence.notes, *self.notes, *self._unlocated(), *of_cameras, *of_images)
+
+    def _unlocated(self) -> tuple[str, ...]:
+        found = located(self.recorder)
+        if found.enough:
+            return ()
+        return (f"only {found} were located by landmarks; the rest of the path is predicted",)
 
     def _about(self, status: str) -> dict[str, JsonValue]:
         return {
@@ -191,6 +198,7 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
     matches = numbers["landmark_matches"]
     rows: list[tuple[str, object]] = [
         ("frames", f"{len(outputs.recorder)} of {len(outputs.sequence)}"),
+        ("located by landmarks", located(outputs.recorder)),
         ("pose found from", _counts(numbers["status_counts"])),
         ("landmarks", metrics.landmarks),
         ("landmarks matched, median (5 %)", _spread(matches)),

@@ -247,6 +247,37 @@ BAD = [
 ]
 
 
+def test_tum_vi_has_its_calibration_in_a_camchain_beside(tmp_path: Path) -> None:
+    """Wide lenses, no sensor.yaml, images of 16 bits."""
+    root = euroc(tmp_path, (LEFT, RIGHT))
+    native = opened(root)
+    chain = {}
+    for k, camera in enumerate(("cam0", "cam1")):
+        (root / "mav0" / camera / "sensor.yaml").unlink()
+        chain[camera] = {
+            "camera_model": "pinhole",
+            "intrinsics": [30.0, 30.0, 31.5, 23.5],
+            "distortion_model": "equidistant",
+            "distortion_coeffs": [0.003, 0.0007, -0.0002, 0.00002],
+            "resolution": list(EUROC_SIZE),
+        }
+        for path in (root / "mav0" / camera / "data").iterdir():
+            save(path, picture(50 * k, *EUROC_SIZE).astype(np.uint16) << 8)
+    step = np.eye(4)
+    step[0, 3] = -0.101
+    chain["cam1"]["T_cn_cnm1"] = step.tolist()
+    with pytest.raises(CalibrationError):
+        opened(root)
+    (root / "dso").mkdir()
+    (root / "dso" / "camchain.yaml").write_text(yaml.safe_dump(chain), encoding="utf-8")
+    recording = opened(root)
+    assert recording.rig.baseline == pytest.approx(0.101, abs=1e-9)
+    assert np.array_equal(recording.timestamps, native.timestamps)
+    assert recording.frame(0).images[0].dtype == np.uint8
+    given = opened(root, camera_file=str(root / "dso" / "camchain.yaml"))
+    assert given.rig.fx == recording.rig.fx
+
+
 @pytest.mark.parametrize(("spoil", "error", "words"), BAD)
 def test_bad_recording_is_refused_in_one_line(
     tmp_path: Path, spoil: object, error: type[FgslamError], words: list[str]

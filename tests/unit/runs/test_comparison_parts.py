@@ -42,6 +42,7 @@ from fgslam.runs.metric_tables import (
     comparison_tables,
     metrics_table,
 )
+from fgslam.runs.slam_comparison import judged_apart
 from fgslam.runs.tasks.truth import points_under
 from fgslam.runs.trials import Trial, summarise, together
 
@@ -64,6 +65,16 @@ def test_one_log_has_one_noise_model() -> None:
     asked = Choice(("isam2", "batch"), ("estimators.batch.noise_factor=4",))
     assert [s.noise_factor for s in choose(weighed, asked)] == [2.5, 4.0]
     assert choose(config(), Choice(("batch",))) == (all_kinds()["batch"],)
+
+
+def test_dead_reckoning_without_odometry_is_no_row_of_a_comparison() -> None:
+    guessed = config(odometry={"kind": "constant_velocity"}, compare=["odometry", "isam2"])
+    assert [one.kind for one in choose(guessed, Choice())] == ["landmark_kalman", "isam2"]
+    assert [one.kind for one in judged_apart(guessed, guessed.estimators[1:])] == ["isam2"]
+    with pytest.raises(ConfigError, match="--estimators odometry: the run had no odometry"):
+        choose(guessed, Choice(("odometry", "isam2")))
+    measured = config(compare=["odometry", "isam2"])
+    assert "odometry" in [one.kind for one in choose(measured, Choice())]
 
 
 def test_the_configurations_estimators_are_the_default() -> None:

@@ -164,9 +164,8 @@ def test_a_wrong_item_of_a_vector_is_named_by_its_place(tmp_path: Path) -> None:
         (b"name: [1, 2\n", ", line 2: not valid YAML"),
         (b"name: x\n  seed: 1\n", ", line 2: not valid YAML"),
         (b"name: !!python/object/apply:os.system ['true']\n", ", line 1: not valid YAML"),
-        (b"\x89PNG\r\n\x1a\n\x00\xff\xfe", "cannot be read"),
         (b"name: a\x00b\n", "not valid YAML"),
-        (b"[" * 5000, "not valid YAML"),
+        (b"[" * 5000, ", line 1: not valid YAML (nested over 50 deep)"),
     ],
 )
 def test_files_that_are_no_configuration(content: bytes, expected: str, tmp_path: Path) -> None:
@@ -179,8 +178,16 @@ def test_files_that_are_no_configuration(content: bytes, expected: str, tmp_path
     assert "\n" not in str(caught.value)
 
 
+def test_a_file_that_is_no_text(tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n\x00\xff\xfe")
+    with pytest.raises(ConfigError, match="not text in UTF-8; give a YAML text file") as caught:
+        load_config(path)
+    assert str(caught.value).startswith(f"cannot read {path}: ")
+
+
 def test_a_folder_and_nothing_at_all(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"cannot be read .*; give a YAML text file"):
+    with pytest.raises(ConfigError, match=r"cannot read .*: it is a folder; give a YAML text file"):
         load_config(tmp_path)
     with pytest.raises(ConfigError, match="no such file; give a YAML file"):
         load_config(tmp_path / "absent.yaml")
