@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -228,13 +229,15 @@ _HEADER = (
     "information: g2o's error (translation, vector part of the quaternion), metres and half angles",
     "left out: observations that the run rejected, constraints of a floor, closures of loops, "
     "odometry to frames located anew",
-    "landmarks that the map no longer holds start where they were first seen",
+    "vertices: the optimum of these measurements as GTSAM's readG2o weighs them, first pose held; "
+    "an estimator that weighs and rejects otherwise differs",
 )
 
 
 def export_graph(path: Path, log_file: Path, folder: Path, remark: str = "") -> str:
-    """Writes a log's measurements, started at an estimator's final poses and map, as .g2o.
+    """Writes a log's measurements and the poses and map that fit them best, as .g2o.
 
+    The optimum is the file's own, as GTSAM reads it, found from an estimator's final answer.
     Stereo and range-bearing observations become points with their first-order covariance.
 
     Args:
@@ -249,16 +252,24 @@ def export_graph(path: Path, log_file: Path, folder: Path, remark: str = "") -> 
     Raises:
         FgslamError: another ending, or a file that is missing or damaged.
     """
+    from fgslam.backend.g2o_optimum import g2o_optimum  # not before: it loads GTSAM
+
     log = MeasurementLog.load(log_file)
     trajectory = Trajectory.load(folder / "final.tum")
     points = read_ply(folder / "map.ply")
     graph = build_graph(log, trajectory, points.ids, points.positions)
-    write_g2o(path, graph, [*([remark] if remark else []), *_HEADER])
+    header = [*([remark] if remark else []), *_HEADER]
+    write_g2o(path, graph, header)
+    settled = g2o_optimum(path, len(graph.poses))
+    if settled is not None:
+        poses, landmarks = settled
+        write_g2o(path, dataclasses.replace(graph, poses=poses, landmarks=landmarks), header)
+    where = "their optimum" if settled is not None else "the estimate: they have no single optimum"
     left_out = sum(len(increment.observations) for increment in log) - len(graph.points)
     return (
         f"{path}: {len(graph.poses)} poses, {len(graph.landmarks)} landmarks, "
         f"{len(graph.motions)} odometry edges, {len(graph.points)} observations "
-        f"({left_out} rejected ones left out)"
+        f"({left_out} rejected ones left out); starts at {where}"
     )
 
 
