@@ -59,7 +59,7 @@ def open_euroc(settings: EurocSettings) -> Recording:
     return Recording(
         name=root.resolve().parent.name if root.name == "mav0" else root.resolve().name,
         rig=rig.plain(),
-        unrectified=rig.rectifier is not None,
+        rectifier=rig.rectifier,
         timestamps=stamps[chosen],
         identity=_identity(folders, files),
         ground_truth=_true_poses(root, rig, stamps[chosen]),

@@ -73,7 +73,7 @@ def open_image_folder(
     return Recording(
         name=root.resolve().name,
         rig=rig.plain(),
-        unrectified=rig.rectifier is not None,
+        rectifier=rig.rectifier,
         timestamps=stamps[chosen],
         identity=recording_identity(defining, (p for images in listed for p in images.values())),
         ground_truth=None if truth is None else trajectory_at_frames(truth, stamps[chosen]),

@@ -48,7 +48,7 @@ def open_kitti_raw(settings: KittiRawSettings) -> Recording:
     return Recording(
         name=drive.resolve().name,
         rig=rig.plain(),
-        unrectified=rig.rectifier is not None,
+        rectifier=rig.rectifier,
         timestamps=stamps[chosen],
         identity=recording_identity(lists, (path for pair in pairs for path in pair)),
         ground_truth=None,

@@ -40,7 +40,7 @@ def open_loose_images(
     return Recording(
         name=root.resolve().name,
         rig=rig.plain(),
-        unrectified=rig.rectifier is not None,
+        rectifier=rig.rectifier,
         timestamps=stamps[chosen],
         identity=recording_identity(
             [*lists, *([odometry_file] if odometry_file else [])],

@@ -5,6 +5,7 @@ A reader is imported when its kind is opened: what one needs takes others a seco
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, TypeAlias
 
 from fgslam.core.recordings import MeasurementRecording
@@ -46,8 +47,21 @@ def open_recording(
         DatasetError: the recording is missing, malformed or empty.
         CalibrationError: its calibration is missing or impossible.
     """
+    found = _opened(settings, odometry or RecordedOdometrySettings())
+    return found if found.rectifier is None else _judged(found)
+
+
+def _judged(recording: Recording) -> Recording:
+    """With a note where its calibration does not fit its images."""
+    from fgslam.datasets.checks.fit import fit_notes
+
+    notes = fit_notes(lambda i: recording.frame(i).images, len(recording))
+    return replace(recording, notes=(*notes, *recording.notes))
+
+
+def _opened(settings: FileRecordingSettings, odometry: RecordedOdometrySettings) -> Recording:
     if isinstance(settings, _WithOdometry):
-        return _open_with_odometry(settings, odometry or RecordedOdometrySettings())
+        return _open_with_odometry(settings, odometry)
     match settings:
         case VideoSettings():
             from fgslam.datasets.stereo_video import open_video

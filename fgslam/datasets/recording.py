@@ -14,6 +14,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fgslam.cameras.rectification import Rectifier
 from fgslam.core.arrays import Brief, FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory
@@ -44,9 +45,10 @@ class Recording(Brief):
         indices: (n,) the recording's own numbers of the selected frames.
         load_images: reads the images of one of the recording's own frames.
         load_colour: reads them in red, green, blue; None where they are grey anyway.
-        unrectified: the images are rectified when they are read.
         odometry_source: where the body's motions come from, or None. Asked once, when first
             needed, so that a bad odometry file hurts only who uses it.
+        rectifier: what makes the images its own that the cameras gave; None where they are stored
+            rectified.
     """
 
     name: str
@@ -58,8 +60,13 @@ class Recording(Brief):
     indices: IntArray
     load_images: ImageLoader
     odometry_source: OdometrySource | None = None
-    unrectified: bool = False
     load_colour: ImageLoader | None = None
+    rectifier: Rectifier | None = None
+
+    @property
+    def unrectified(self) -> bool:
+        """Whether the images are rectified when they are read."""
+        return self.rectifier is not None
 
     def __len__(self) -> int:
         return len(self.indices)

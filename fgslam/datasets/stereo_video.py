@@ -52,7 +52,7 @@ def open_video(settings: VideoSettings) -> Recording:
     return Recording(
         name=given.stem if len(films) == 1 else given.resolve().name.replace("*", ""),
         rig=rig.plain(),
-        unrectified=rig.rectifier is not None,
+        rectifier=rig.rectifier,
         timestamps=(numbers / rate)[chosen],
         identity=recording_identity([], films),
         ground_truth=None,

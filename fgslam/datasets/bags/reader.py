@@ -53,7 +53,7 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
     return Recording(
         name=where.resolve().stem,
         rig=rig.plain(),
-        unrectified=rig.rectifier is not None,
+        rectifier=rig.rectifier,
         timestamps=stamps[used],
         identity=recording_identity([], [f for path in paths for f in bag_files(path)]),
         ground_truth=None,
