@@ -152,15 +152,14 @@ class GraphSettings(NamedSettings):
     floor: FloorSettings = FloorSettings()
     kernel: KernelSettings = KernelSettings()
     noise_factor: Annotated[
-        float,
+        Annotated[float, Field(gt=0.0)] | None,
         Field(
-            gt=0.0,
             description="standard deviations of landmark measurements are multiplied by this when "
-            "they are weighed; kernel and trim judge by the stated ones. Above 1 where errors of a "
-            "landmark persist from frame to frame, which a graph of independent measurements "
-            "would average away",
+            "they are weighed; kernel and trim judge by the stated ones. null: estimated from "
+            "the residuals, since errors of a landmark persist from frame to frame, which a graph "
+            "of independent measurements would average away",
         ),
-    ] = 1.0
+    ] = None
     gate_px: Annotated[
         float,
         Field(

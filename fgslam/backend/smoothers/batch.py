@@ -84,7 +84,7 @@ class BatchSolver(WholeGraphSolver):
     def _minimise(self, graph: WholeGraph, state: State) -> tuple[State, WholeGraph]:
         """Values at the minimum, and the factors that count there."""
         if self._settings.method == "gnc":
-            return graduated(graph, state, MINIMUM, self._settings.noise_factor)
+            return graduated(graph, state, MINIMUM, self._builder.noise_factor)
         if self._settings.trim:
-            return trimmed(graph, state, MINIMUM, self._settings.noise_factor)
+            return trimmed(graph, state, MINIMUM, self._builder.noise_factor)
         return graph.minimum(state, MINIMUM.iterations, MINIMUM.tolerance), graph

@@ -10,12 +10,13 @@ import numpy as np
 
 from fgslam.backend.settings import GraphSettings, KernelSettings
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting, Track
+from fgslam.backend.smoothers.persistence import MeasurementNoise, Persistence, StatedNoise
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.measurements import Observations, Odometry
 from fgslam.core.sensors import CameraRig, Sensor
-from fgslam.factors.graphs import landmark_key, pose_key, without_gaps
+from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.landmark import RangeBearingFactors, StereoFactors
 from fgslam.factors.motion import (
     floor_factors,
@@ -23,7 +24,7 @@ from fgslam.factors.motion import (
     point_prior,
     pose_prior,
 )
-from fgslam.factors.noise import Whitening
+from fgslam.factors.noise import Whitening, plain
 
 WEAK_PARALLAX = 8.0  # range over its deviation below which a landmark gets a weak prior
 _WEAK_PRIOR_RANGES = 2.0  # keeps a first step before the camera: docs/derivations/smoothers.md
@@ -90,7 +91,7 @@ class GraphBuilder:
         graph: all factors; one taken out leaves an empty slot.
         admission: the landmarks, and which of them the graph holds.
         frames: those whose poses are in the graph, in time order.
-        kernel: around each observation, in the factors' deviations.
+        noise: of its landmark observations.
     """
 
     def __init__(
@@ -106,16 +107,17 @@ class GraphBuilder:
         With ``remember`` off, for a bounded lag, nothing is kept: factors of poses are handed out,
         and observations as they are.
         """
-        width = settings.kernel.width / settings.noise_factor
-        self.kernel = KernelSettings(settings.kernel.name, width)
         self._remember = remember
         self._sensor = sensor
         self._settings = settings
         self._floor = floor
         self._prior = prior
-        self._noise = settings.noise_factor**2
-        whitening = Whitening(self.kernel.name, width)
-        self._factors = landmark_factors(sensor, whitening)
+        factor = settings.noise_factor
+        self.noise: MeasurementNoise = (
+            Persistence(sensor) if factor is None else StatedNoise(factor)
+        )
+        self._power_of: dict[int, float] = {}
+        self._weigh()
         self._rows: dict[int, list[int]] = {}
         self._id_of: list[int] = []
         self._seen_frame: list[int] = []
@@ -125,9 +127,15 @@ class GraphBuilder:
         self.frames: list[int] = []
 
     @property
+    def kernel(self) -> KernelSettings:
+        """Around each observation, its width in the factors' deviations."""
+        kernel = self._settings.kernel
+        return KernelSettings(kernel.name, kernel.width / self.noise_factor)
+
+    @property
     def noise_factor(self) -> float:
         """By which the factors' deviations exceed those by which wrong matches are judged."""
-        return float(np.sqrt(self._noise))
+        return float(np.sqrt(self.noise.power / self.noise.spread))
 
     @property
     def variables(self) -> int:
@@ -142,6 +150,7 @@ class GraphBuilder:
             landmarks: the tracker's map after this frame: initial values, and how well each
                 landmark is known given the poses.
         """
+        self._weigh()
         new = NewFactors(tracked.frame, gtsam.NonlinearFactorGraph(), gtsam.Values())
         self._add_pose(new, tracked)
         self.frames.append(tracked.frame)
@@ -214,10 +223,32 @@ class GraphBuilder:
         return [int(variable) for variable in np.unique(seen[depth <= 0.0])]
 
     def kept_factors(self) -> Any:
-        """The graph without its empty slots."""
-        return without_gaps(self.graph)
+        """The graph without its empty slots, all observations weighed as is known now."""
+        self._weigh()
+        now, models = self._power, dict[tuple[bytes, float], Any]()
+        out = gtsam.NonlinearFactorGraph()
+        for row in range(self.graph.size()):
+            if self.graph.exists(row):
+                factor, power = self.graph.at(row), self._power_of.get(row, now)
+                out.add(factor if power == now else self._weighed(factor, now / power, models))
+        return out
 
     # ----------------------------------------------------------------------------------------
+
+    def _weigh(self) -> None:
+        """New factors weigh their observations as is known now."""
+        kernel = self.kernel
+        self._power = self.noise.power
+        self._whitening = Whitening(kernel.name, kernel.width)
+        self._factors = landmark_factors(self._sensor, self._whitening)
+
+    def _weighed(self, factor: Any, ratio: float, models: dict[tuple[bytes, float], Any]) -> Any:
+        """An observation's factor with ``ratio`` times its variance, and the kernel of now."""
+        covariance = plain(factor).noiseModel().covariance()
+        name = covariance.tobytes(), ratio
+        if name not in models:
+            models[name] = self._whitening.model(ratio * covariance)
+        return factor.cloneWithNewNoiseModel(models[name])
 
     def _add_pose(self, new: NewFactors, tracked: TrackedFrame) -> None:
         key = pose_key(new.frame)
@@ -290,9 +321,10 @@ class GraphBuilder:
             pose_key(sighting.frame),
             landmark_key(track.variable),
             sighting.measurement,
-            self._noise * sighting.covariance,
+            self._power * sighting.covariance,
         )
         self._rows[track.variable].append(self._push(new, factor))
+        self._power_of[int(self.graph.size()) - 1] = self._power
         self._seen_frame.append(sighting.frame)
         self._seen_variable.append(track.variable)
 

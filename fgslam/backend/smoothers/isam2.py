@@ -105,7 +105,7 @@ class Isam2Solver(WholeGraphSolver):
 
     def _minimise(self, graph: WholeGraph, state: State) -> tuple[State, WholeGraph]:
         """Values at the minimum, and the factors that count there."""
-        return trimmed(graph, state, MINIMUM, self._settings.noise_factor)
+        return trimmed(graph, state, MINIMUM, self._builder.noise_factor)
 
     def _join(self, found: Any | None) -> None:
         """Goes on with the graph that has the loop; from these values where they are given."""

@@ -48,6 +48,8 @@ from fgslam.core.geometry import (
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
 from fgslam.core.sensors import Sensor
 
+_STAND_IN_FACTOR = 2.0  # by which the deviations of a motion model's steps count less in a graph
+
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class GraphProblem:
@@ -133,8 +135,10 @@ class Smoother:
         if increment.relocalised and self._inputs.increments:
             increment = dataclasses.replace(increment, odometry=self._unknown_step(tracking))
         require_finite(increment, tracking)
+        before = self._tracker.predict(None).wTc
         stats = self._tracker.update(dataclasses.replace(increment, loops=()), tracking)
         self._record(increment, tracking)
+        self._learn_noise(increment, tracking, before)
         tracked = self._admitted(increment, tracking)
         entering = self._entering(tracked, at_once=bool(increment.loops))
         for frame in entering:
@@ -202,6 +206,14 @@ class Smoother:
         self._eras.append(self._takeovers)
         self._answer = None
 
+    def _learn_noise(self, increment: Increment, tracking: EgoMotion, before: FloatArray) -> None:
+        """What fits of a frame teaches how large errors are, and how long they persist."""
+        observed = increment.observations
+        matched = observed.select(~observed.is_new).select(tracking.inliers)
+        fitting = matched.join(observed.select(observed.is_new))
+        frame = len(self._inputs.increments) - 1
+        self._builder.noise.learn(frame, inverse(before) @ tracking.wTc, fitting)
+
     def _admitted(self, increment: Increment, tracking: EgoMotion) -> TrackedFrame:
         """The frame with those observations that fit; landmarks that moved have started anew."""
         admission, observed = self._builder.admission, increment.observations
@@ -214,7 +226,8 @@ class Smoother:
         used &= ~np.isin(matched.ids, moved.ids)
         accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
         frame = len(self._inputs.increments) - 1
-        return TrackedFrame(frame, tracking.wTc, increment.odometry, self._held(accepted))
+        motion = _as_measurement(increment.odometry, tracking)
+        return TrackedFrame(frame, tracking.wTc, motion, self._held(accepted))
 
     def _held(self, observed: Observations) -> Observations:
         """Those of landmarks that are in the map, pruned ones no longer."""
@@ -364,6 +377,17 @@ class MapSmoother(Smoother):
         self._prior = self._smoothed = prior
         self._builder.start_at(prior)
         self._tracker.correct(prior, np.empty(0, np.int64), np.empty((0, 3)))
+
+
+def _as_measurement(motion: Odometry | None, tracking: EgoMotion) -> Odometry | None:
+    """What a step weighs in the graph: one that only goes on from poses before measures nothing.
+
+    Its velocity comes from the very matches that the graph holds already; weighed as predicted, it
+    would tie the path to that of the tracker. Where there are no matches, it is all there is.
+    """
+    if motion is None or motion.measured or not tracking.status.measured:
+        return motion
+    return dataclasses.replace(motion, covariance=_STAND_IN_FACTOR**2 * motion.covariance)
 
 
 def _moved_on(last: Prediction, motion: FloatArray) -> Prediction:

@@ -1,0 +1,276 @@
+"""How large the errors of landmark measurements are, and how long they persist, from residuals.
+
+A graph takes the errors of a landmark's measurements to be independent from frame to frame. Those
+of SIFT are not: the appearance changes slowly with the view. What that costs a path is the power of
+the errors in their slowest part, the one that leans a landmark's whole track forwards or backwards
+as a drift of the camera would. docs/derivations/measurement_noise.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.geometry import (
+    in_front,
+    inverse,
+    measurement_difference,
+    project,
+    projection_jacobian,
+    reorthonormalise,
+    triangulate,
+)
+from fgslam.core.measurements import Observations
+from fgslam.core.sensors import Sensor
+
+_LEAST_SIGHTINGS = 4  # of a track that is judged: a place and a slope take two
+_LONGEST = 30  # sightings of a track, at which it is judged although it goes on
+_ENDED_AFTER = 5  # frames without a sighting
+_EVERY = 5  # frames between judgements
+_ITERATIONS = 3
+_BENDS = 4.0  # deviations at which the weight of a residual falls while the place is fitted
+_ASTRAY = 4.0  # times the track's own median residual: it holds a wrong match
+_LEAST_PART = 0.1  # of a leaning, that no other place of the landmark explains
+_STATED = np.array([30.0, 0.3])
+"""Samples that the stated noise counts for: numbers of single residuals, longest tracks."""
+_BOUNDS = (0.05, 400.0)  # of variances over the stated ones
+
+
+@dataclass(slots=True)
+class _Track:
+    frames: list[int] = field(default_factory=list)
+    measurement: list[FloatArray] = field(default_factory=list)
+    covariance: list[FloatArray] = field(default_factory=list)
+
+
+class MeasurementNoise(Protocol):
+    """How much larger than stated the errors of measurements are, as known so far."""
+
+    @property
+    def spread(self) -> float:
+        """Variance of a single measurement over the stated one: what a wrong match is judged by."""
+        ...
+
+    @property
+    def power(self) -> float:
+        """Variance over the stated one by which a graph of independent measurements weighs them."""
+        ...
+
+    def learn(self, frame: int, step: FloatArray, accepted: Observations) -> None:
+        """Takes in a frame's observations that fit, ``step`` (4, 4) on from the frame before."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class StatedNoise:
+    """Noise as stated, times a factor of the settings when it is weighed."""
+
+    factor: float
+
+    @property
+    def spread(self) -> float:
+        """One."""
+        return 1.0
+
+    @property
+    def power(self) -> float:
+        """The factor squared."""
+        return self.factor**2
+
+    def learn(self, frame: int, step: FloatArray, accepted: Observations) -> None:
+        """Nothing."""
+
+
+class Persistence:
+    """Variances of measurements over the stated ones: of a single one, and by whole tracks."""
+
+    def __init__(self, sensor: Sensor) -> None:
+        """As stated, until tracks have ended."""
+        self._sensor = sensor
+        self._tracks: dict[int, _Track] = {}
+        self._pose = np.eye(4)
+        self._poses: dict[int, FloatArray] = {}
+        # Of single residuals and of leanings (rows) the sum of squares, and its expectation.
+        self._sums = np.column_stack([_STATED, _STATED])
+
+    @property
+    def spread(self) -> float:
+        """From the residuals of tracks that have ended."""
+        return _ratio(self._sums[0])
+
+    @property
+    def power(self) -> float:
+        """What independent measurements would need to lean those tracks as much as they do."""
+        return _ratio(self._sums[1])
+
+    def learn(self, frame: int, step: FloatArray, accepted: Observations) -> None:
+        """Takes in a frame's observations that fit, and judges tracks that have ended.
+
+        Poses are chained by steps: a smoother's correction of the whole path leans no track.
+        """
+        self._pose = reorthonormalise(self._pose @ step)
+        self._poses[frame] = self._pose
+        measured = zip(
+            accepted.ids.tolist(), accepted.measurement, accepted.covariance, strict=True
+        )
+        for identity, measurement, covariance in measured:
+            track = self._tracks.setdefault(identity, _Track())
+            track.frames.append(frame)
+            track.measurement.append(measurement)
+            track.covariance.append(covariance)
+        if frame % _EVERY == 0:
+            self._judge(frame)
+
+    def _judge(self, frame: int) -> None:
+        ended = [i for i, track in self._tracks.items() if _over(track, frame)]
+        tracks = [self._tracks.pop(i) for i in ended]
+        tracks = [track for track in tracks if len(track.frames) >= _LEAST_SIGHTINGS]
+        if tracks:
+            sightings = _Sightings.of(tracks, self._poses)
+            fitted = sightings.fitted(self._sensor)
+            if fitted is not None:
+                self._sums += fitted.powers()
+        first = min((track.frames[0] for track in self._tracks.values()), default=frame)
+        self._poses = {k: wTc for k, wTc in self._poses.items() if k >= first}
+
+
+def _ratio(sums: FloatArray) -> float:
+    return float(np.clip(sums[0] / sums[1], *_BOUNDS))
+
+
+def _over(track: _Track, frame: int) -> bool:
+    return len(track.frames) >= _LONGEST or frame - track.frames[-1] > _ENDED_AFTER
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sightings:
+    """All sightings (n) of m tracks, one track after the other.
+
+    Attributes:
+        cTw: (n, 4, 4) poses from which they were made.
+        measurement: (n, 3).
+        whitening: (n, 3, 3).
+        start: (m,) row of each track's first sighting.
+    """
+
+    cTw: FloatArray
+    measurement: FloatArray
+    whitening: FloatArray
+    start: IntArray
+
+    @staticmethod
+    def of(tracks: list[_Track], poses: dict[int, FloatArray]) -> _Sightings:
+        counts = np.array([len(track.frames) for track in tracks])
+        covariance = np.concatenate([track.covariance for track in tracks])
+        return _Sightings(
+            inverse(np.array([poses[k] for track in tracks for k in track.frames])),
+            np.concatenate([track.measurement for track in tracks]),
+            np.linalg.inv(np.linalg.cholesky(covariance)),
+            np.cumsum(counts) - counts,
+        )
+
+    @property
+    def track(self) -> IntArray:
+        """(n,) which track each belongs to."""
+        return np.repeat(np.arange(len(self.start)), self.counts)
+
+    @property
+    def counts(self) -> IntArray:
+        """(m,) sightings of each track."""
+        return np.diff(np.append(self.start, len(self.measurement)))
+
+    def select(self, tracks: FloatArray) -> _Sightings:
+        """Those of some tracks (m,), a mask."""
+        rows, counts = tracks[self.track], self.counts[tracks]
+        return _Sightings(
+            self.cTw[rows], self.measurement[rows], self.whitening[rows], np.cumsum(counts) - counts
+        )
+
+    def fitted(self, sensor: Sensor) -> _Fitted | None:
+        """With each landmark where its sightings have it; without those that hold a wrong match."""
+        last = self.start + self.counts - 1
+        local = triangulate(sensor, self.measurement[last])
+        wTc = inverse(self.cTw[last])
+        places = np.einsum("mij,mj->mi", wTc[:, :3, :3], local) + wTc[:, :3, 3]
+        found = self
+        for _ in range(_ITERATIONS):
+            points = found._points(places)
+            before = np.logical_and.reduceat(in_front(sensor, points), found.start)
+            if not before.all():
+                found, places = found.select(before), places[before]
+                if not len(places):
+                    return None
+                points = found._points(places)
+            residual, jacobian = found._linear(sensor, points)
+            length = np.linalg.norm(residual, axis=1) / _BENDS
+            weight = 1.0 / (1.0 + length**2)
+            places = places + found._step(residual, jacobian, weight)
+        return _Fitted.of(found, *found._linear(sensor, found._points(places)))
+
+    def _points(self, places: FloatArray) -> FloatArray:
+        moved = np.einsum("nij,nj->ni", self.cTw[:, :3, :3], places[self.track])
+        return np.asarray(moved + self.cTw[:, :3, 3])
+
+    def _linear(self, sensor: Sensor, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Normalised residuals (n, 3) and their derivative (n, 3, 3) by the place."""
+        off = measurement_difference(sensor, self.measurement, project(sensor, points))
+        jacobian = projection_jacobian(sensor, points) @ self.cTw[:, :3, :3]
+        return np.einsum("nij,nj->ni", self.whitening, off), self.whitening @ jacobian
+
+    def _step(self, residual: FloatArray, jacobian: FloatArray, weight: FloatArray) -> FloatArray:
+        weighed = weight[:, None, None] * jacobian
+        normal = np.add.reduceat(np.swapaxes(weighed, 1, 2) @ jacobian, self.start)
+        gradient = np.add.reduceat(np.einsum("nci,nc->ni", weighed, residual), self.start)
+        return np.einsum("mij,mj->mi", np.linalg.pinv(normal), gradient)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fitted:
+    """Tracks' residuals after the least squares of each landmark's place."""
+
+    sightings: _Sightings
+    residual: FloatArray
+    jacobian: FloatArray
+    inverse_normal: FloatArray
+
+    @staticmethod
+    def of(sightings: _Sightings, residual: FloatArray, jacobian: FloatArray) -> _Fitted | None:
+        """Without tracks that hold a residual far beyond their others."""
+        length = np.linalg.norm(residual, axis=1)
+        start, counts = sightings.start, sightings.counts
+        ends = start + counts
+        median = np.array([np.median(length[a:b]) for a, b in zip(start, ends, strict=True)])
+        good = np.maximum.reduceat(length, start) <= _ASTRAY * median
+        if not good.any():
+            return None
+        rows = good[sightings.track]
+        kept = sightings.select(good)
+        residual, jacobian = residual[rows], jacobian[rows]
+        turned = np.swapaxes(jacobian, 1, 2)
+        normal = np.linalg.pinv(np.add.reduceat(turned @ jacobian, kept.start))
+        gradient = np.add.reduceat(np.einsum("nci,nc->ni", jacobian, residual), kept.start)
+        step = np.einsum("mij,mj->mi", normal, gradient)
+        residual = residual - np.einsum("nci,ni->nc", jacobian, step[kept.track])
+        return _Fitted(kept, residual, jacobian, normal)
+
+    def powers(self) -> FloatArray:
+        """Sum and expectation of the squares of single residuals, and of leanings (2, 2).
+
+        Expected of independent errors of variance one; what another place of the landmark would
+        explain is missing from both.
+        """
+        start, track = self.sightings.start, self.sightings.track
+        counts = self.sightings.counts
+        single = (self.residual**2).sum(), 3.0 * (counts - 1.0).sum()
+        ramp = np.arange(len(track)) - start[track] - 0.5 * (counts[track] - 1.0)
+        ramp /= np.sqrt(np.add.reduceat(ramp**2, start))[track]
+        lean = np.add.reduceat(ramp[:, None] * self.residual, start)
+        by_place = np.add.reduceat(ramp[:, None, None] * self.jacobian, start)
+        part = 1.0 - np.einsum("mci,mij,mcj->mc", by_place, self.inverse_normal, by_place)
+        counted = part >= _LEAST_PART
+        # What a track says of a drift goes with the square of its length, times its sightings.
+        weight = np.broadcast_to((counts / _LONGEST)[:, None] ** 3, part.shape)[counted]
+        return np.array([single, (weight @ (lean**2)[counted], weight @ part[counted])])
