@@ -61,7 +61,7 @@ class Acceptance:
 class GraphLoops:
     """The loops of a graph that keeps every pose: which were accepted, and at what cost."""
 
-    def __init__(self, builder: GraphBuilder, kernel: KernelSettings) -> None:
+    def __init__(self, builder: GraphBuilder, kernel: KernelSettings | None = None) -> None:
         """No loop yet; the kernel is that of the observations where the graph is solved."""
         self._builder, self._kernel = builder, kernel
         self._accepted: list[Constraint] = []
@@ -90,7 +90,9 @@ class GraphLoops:
         if misfit(constraint_factor(known), values) <= _AGREES:
             self._accept(known)
             return Acceptance(True, None, f"{what}: as expected, nothing moved")
-        graph, state = WholeGraph.of(self._builder.kept_factors(), values, self._kernel)
+        graph, state = WholeGraph.of(
+            self._builder.kept_factors(), values, self._kernel or self._builder.kernel
+        )
         state = minimum(graph, state)
         loops = [*self._accepted, known]
         guess = first_guess(self._builder, graph.values(state), drive.chain, loops)

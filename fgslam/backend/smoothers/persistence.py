@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.geometry import (
     in_front,
     inverse,
@@ -30,7 +30,7 @@ _LEAST_SIGHTINGS = 4  # of a track that is judged: a place and a slope take two
 _LONGEST = 30  # sightings of a track, at which it is judged although it goes on
 _ENDED_AFTER = 5  # frames without a sighting
 _EVERY = 5  # frames between judgements
-_ITERATIONS = 3
+_ITERATIONS = 5
 _BENDS = 4.0  # deviations at which the weight of a residual falls while the place is fitted
 _ASTRAY = 4.0  # times the track's own median residual: it holds a wrong match
 _LEAST_PART = 0.1  # of a leaning, that no other place of the landmark explains
@@ -182,7 +182,7 @@ class _Sightings:
         """(m,) sightings of each track."""
         return np.diff(np.append(self.start, len(self.measurement)))
 
-    def select(self, tracks: FloatArray) -> _Sightings:
+    def select(self, tracks: BoolArray) -> _Sightings:
         """Those of some tracks (m,), a mask."""
         rows, counts = tracks[self.track], self.counts[tracks]
         return _Sightings(
@@ -196,9 +196,10 @@ class _Sightings:
         wTc = inverse(self.cTw[last])
         places = np.einsum("mij,mj->mi", wTc[:, :3, :3], local) + wTc[:, :3, 3]
         found = self
-        for _ in range(_ITERATIONS):
+        for iteration in range(_ITERATIONS):
             points = found._points(places)
-            before = np.logical_and.reduceat(in_front(sensor, points), found.start)
+            sound = in_front(sensor, points) & np.isfinite(points).all(axis=1)
+            before = np.logical_and.reduceat(sound, found.start)
             if not before.all():
                 found, places = found.select(before), places[before]
                 if not len(places):
@@ -206,7 +207,8 @@ class _Sightings:
                 points = found._points(places)
             residual, jacobian = found._linear(sensor, points)
             length = np.linalg.norm(residual, axis=1) / _BENDS
-            weight = 1.0 / (1.0 + length**2)
+            # At first all count: where the last sighting has the landmark may be wrong itself.
+            weight = 1.0 / (1.0 + length**2) if iteration else np.ones(len(length))
             places = places + found._step(residual, jacobian, weight)
         return _Fitted.of(found, *found._linear(sensor, found._points(places)))
 
@@ -224,7 +226,7 @@ class _Sightings:
         weighed = weight[:, None, None] * jacobian
         normal = np.add.reduceat(np.swapaxes(weighed, 1, 2) @ jacobian, self.start)
         gradient = np.add.reduceat(np.einsum("nci,nc->ni", weighed, residual), self.start)
-        return np.einsum("mij,mj->mi", np.linalg.pinv(normal), gradient)
+        return np.asarray(np.einsum("mij,mj->mi", np.linalg.pinv(normal), gradient))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -228,7 +228,7 @@ class WholeGraphSolver:
     ) -> None:
         """Nothing to solve yet; loops are judged with the builder's kernel or with another."""
         self._builder, self._floor = builder, floor
-        self._loops = GraphLoops(builder, kernel or builder.kernel)
+        self._loops = GraphLoops(builder, kernel)
         self._values = gtsam.Values()
         self._answer: Refined | None = None
         self.remarks: list[str] = []
