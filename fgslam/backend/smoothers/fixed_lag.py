@@ -7,7 +7,6 @@ forgotten it, which is the price of a constant effort.
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -85,10 +84,7 @@ class FixedLagSolver:
         self._builder, self._floor = problem.builder, problem.floor
         self._in_seconds = settings.lag_frames is None
         self._lag = float(settings.lag_frames or settings.lag_s or 0.0)
-        self._noise = settings.noise_factor**2
-        width = settings.kernel.width / settings.noise_factor
-        kernel = dataclasses.replace(settings.kernel, width=width)
-        self._window = Window(problem.sensor, kernel)
+        self._window = Window(problem.sensor, problem.builder.kernel)
         self._solved: Solved | None = None
         self._oldest = 0
         self._poses: list[FloatArray] = []
@@ -211,6 +207,7 @@ class FixedLagSolver:
         """A frame's pose, landmarks and observations into the window."""
         pose = new.values.atPose3(pose_key(new.frame)).matrix()
         self._window.add_pose(new.frame, pose, new.graph)
+        self._window.kernel = self._builder.kernel
         known = self._window.landmarks.variables
         before = int(known[-1]) if len(known) else -1
         entered = sorted({v for v, _ in new.sightings if v > before})
@@ -221,7 +218,7 @@ class FixedLagSolver:
                 np.array([s.frame for _, s in new.sightings], np.int64),
                 np.array([v for v, _ in new.sightings], np.int64),
                 np.array([s.measurement for _, s in new.sightings]),
-                self._noise * np.array([s.covariance for _, s in new.sightings]),
+                self._builder.noise.power * np.array([s.covariance for _, s in new.sightings]),
             )
 
     def _solve(self) -> None:

@@ -112,11 +112,12 @@ class Window:
         observed: from these poses.
         factors: GTSAM's graph on these poses alone.
         prior: what has left.
+        kernel: around each observation.
     """
 
     def __init__(self, sensor: Sensor, kernel: KernelSettings) -> None:
         """Empty."""
-        self._sensor, self._kernel = sensor, kernel
+        self._sensor, self.kernel = sensor, kernel
         self.frames: list[int] = []
         self.poses = np.empty((0, 4, 4))
         none = np.empty(0, np.int64)
@@ -200,7 +201,7 @@ class Window:
 
     def _look(self, observed: Observed) -> Look:
         """Some of the window's observations; a kernel weighs each where it is linearised."""
-        (pose, point), o, kernel = self._rows(observed), observed, self._kernel
+        (pose, point), o, kernel = self._rows(observed), observed, self.kernel
         at, places = self._where_linearised()
         rows = linearised(self._sensor, at[pose], places[point], o.measurement, o.root)
         squared = np.einsum("ki,ki->k", rows.residual, rows.residual)
