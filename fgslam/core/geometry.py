@@ -212,12 +212,13 @@ def compose_covariance(motion: FloatArray, before: FloatArray, noise: FloatArray
 
 
 def compose_odometry(steps: Iterable[Odometry]) -> Odometry:
-    """Consecutive independent steps as one, with its covariance."""
-    motion, covariance = np.eye(4), np.zeros((6, 6))
+    """Consecutive independent steps as one, with its covariance; measured if all of them are."""
+    motion, covariance, measured = np.eye(4), np.zeros((6, 6)), True
     for step in steps:
         covariance = compose_covariance(step.motion, covariance, step.covariance)
         motion = motion @ step.motion
-    return Odometry(motion, covariance)
+        measured = measured and step.measured
+    return Odometry(motion, covariance, measured)
 
 
 def is_rigid(matrix: FloatArray) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -116,7 +117,7 @@ class GraphBuilder:
         self.noise: MeasurementNoise = (
             Persistence(sensor) if factor is None else StatedNoise(factor)
         )
-        self._power_of: dict[int, float] = {}
+        self._variance_of: dict[int, float] = {}
         self._weigh()
         self._rows: dict[int, list[int]] = {}
         self._id_of: list[int] = []
@@ -223,31 +224,39 @@ class GraphBuilder:
         return [int(variable) for variable in np.unique(seen[depth <= 0.0])]
 
     def kept_factors(self) -> Any:
-        """The graph without its empty slots, all observations weighed as is known now."""
+        """The graph without its empty slots, weighed as is known now what depends on the noise."""
         self._weigh()
-        now, models = self._power, dict[tuple[bytes, float], Any]()
+        models: dict[tuple[bytes, float], Any] = {}
         out = gtsam.NonlinearFactorGraph()
         for row in range(self.graph.size()):
             if self.graph.exists(row):
-                factor, power = self.graph.at(row), self._power_of.get(row, now)
-                out.add(factor if power == now else self._weighed(factor, now / power, models))
+                factor, then = self.graph.at(row), self._variance_of.get(row)
+                out.add(factor if then is None else self._weighed(factor, then, models))
         return out
 
     # ----------------------------------------------------------------------------------------
 
     def _weigh(self) -> None:
-        """New factors weigh their observations as is known now."""
+        """New factors weigh what depends on the noise as is known now."""
         kernel = self.kernel
-        self._power = self.noise.power
+        self._power, self._persistence = self.noise.power, self.noise_factor**2
         self._whitening = Whitening(kernel.name, kernel.width)
         self._factors = landmark_factors(self._sensor, self._whitening)
 
-    def _weighed(self, factor: Any, ratio: float, models: dict[tuple[bytes, float], Any]) -> Any:
-        """An observation's factor with ``ratio`` times its variance, and the kernel of now."""
+    def _weighed(self, factor: Any, then: float, models: dict[tuple[bytes, float], Any]) -> Any:
+        """An observation (with the kernel of now) or a guessed step, as is known now.
+
+        ``then`` is by what its variance was multiplied when it was made.
+        """
+        now = self._power if factor.dim() == 3 else self._persistence
+        if now == then:
+            return factor
         covariance = plain(factor).noiseModel().covariance()
-        name = covariance.tobytes(), ratio
+        name = covariance.tobytes(), now / then
         if name not in models:
-            models[name] = self._whitening.model(ratio * covariance)
+            scaled = now / then * covariance
+            gaussian = gtsam.noiseModel.Gaussian.Covariance
+            models[name] = (self._whitening.model if factor.dim() == 3 else gaussian)(scaled)
         return factor.cloneWithNewNoiseModel(models[name])
 
     def _add_pose(self, new: NewFactors, tracked: TrackedFrame) -> None:
@@ -258,9 +267,23 @@ class GraphBuilder:
         elif tracked.motion is None:
             raise ValueError(f"frame {new.frame}: no motion from the frame before")
         else:
-            self._push(new, odometry_factor(pose_key(self.frames[-1]), key, tracked.motion))
+            self._add_step(new, tracked.motion)
         for factor in floor_factors(key, self._floor, tracked.wTc):
             self._push(new, factor)
+
+    def _add_step(self, new: NewFactors, motion: Odometry) -> None:
+        """From the frame before; the errors of one that goes on as before persist like images'.
+
+        Its velocity comes from nothing but matches, and its noise from how far they scatter.
+        """
+        if not motion.measured:
+            covariance = self._persistence * motion.covariance
+            motion = dataclasses.replace(motion, covariance=covariance)
+        row = self._push(
+            new, odometry_factor(pose_key(self.frames[-1]), pose_key(new.frame), motion)
+        )
+        if not motion.measured:
+            self._variance_of[row] = self._persistence
 
     def _add_observations(
         self, new: NewFactors, tracked: TrackedFrame, landmarks: LandmarkMap
@@ -323,8 +346,9 @@ class GraphBuilder:
             sighting.measurement,
             self._power * sighting.covariance,
         )
-        self._rows[track.variable].append(self._push(new, factor))
-        self._power_of[int(self.graph.size()) - 1] = self._power
+        row = self._push(new, factor)
+        self._rows[track.variable].append(row)
+        self._variance_of[row] = self._power
         self._seen_frame.append(sighting.frame)
         self._seen_variable.append(track.variable)
 

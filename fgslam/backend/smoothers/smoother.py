@@ -48,8 +48,6 @@ from fgslam.core.geometry import (
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
 from fgslam.core.sensors import Sensor
 
-_STAND_IN_FACTOR = 2.0  # by which the deviations of a motion model's steps count less in a graph
-
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class GraphProblem:
@@ -226,8 +224,7 @@ class Smoother:
         used &= ~np.isin(matched.ids, moved.ids)
         accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
         frame = len(self._inputs.increments) - 1
-        motion = _as_measurement(increment.odometry, tracking)
-        return TrackedFrame(frame, tracking.wTc, motion, self._held(accepted))
+        return TrackedFrame(frame, tracking.wTc, increment.odometry, self._held(accepted))
 
     def _held(self, observed: Observations) -> Observations:
         """Those of landmarks that are in the map, pruned ones no longer."""
@@ -377,17 +374,6 @@ class MapSmoother(Smoother):
         self._prior = self._smoothed = prior
         self._builder.start_at(prior)
         self._tracker.correct(prior, np.empty(0, np.int64), np.empty((0, 3)))
-
-
-def _as_measurement(motion: Odometry | None, tracking: EgoMotion) -> Odometry | None:
-    """What a step weighs in the graph: one that only goes on from poses before measures nothing.
-
-    Its velocity comes from the very matches that the graph holds already; weighed as predicted, it
-    would tie the path to that of the tracker. Where there are no matches, it is all there is.
-    """
-    if motion is None or motion.measured or not tracking.status.measured:
-        return motion
-    return dataclasses.replace(motion, covariance=_STAND_IN_FACTOR**2 * motion.covariance)
 
 
 def _moved_on(last: Prediction, motion: FloatArray) -> Prediction:
