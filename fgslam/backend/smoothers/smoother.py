@@ -159,7 +159,7 @@ class Smoother:
             answer.pose_covariances,
             self._map.reported(answer),
             (*self._solver.remarks, *self._builder.admission.remarks, *answer.remarks),
-            noise_factor=self._builder.noise_factor,
+            noise_factor=float(np.sqrt(self._builder.noise.power)),
         )
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
