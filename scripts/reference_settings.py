@@ -31,7 +31,7 @@ FIRST = {
     "seed": "of everything random in the run",
     "frontend.ego_motion.dof": "3 on a flat floor, 5 at a fixed height, 6 for a rig in the hand",
     "frontend.stereo.pixel_sigma": "standard deviation of a feature's place in the image",
-    "estimator.noise_factor": "above 1 on images, whose errors persist from frame to frame",
+    "estimator.noise_factor": "a number in place of the estimate",
     "estimator.lag_frames, estimator.keyframe_every": "how far back `fixed_lag` looks; every how "
     "many frames `isam2` keeps one",
     "frontend.loops": "`{}` switches loop closing on",

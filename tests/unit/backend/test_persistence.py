@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from simulated import RIG
 
+from fgslam.backend.settings import GraphSettings
+from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
 from fgslam.backend.smoothers.persistence import Persistence, StatedNoise
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.measurements import Observations
+from fgslam.core.estimates import LandmarkMap, Prediction
+from fgslam.core.floor import Floor
+from fgslam.core.measurements import Observations, Odometry
+from fgslam.factors.noise import plain
 
 SIGMA = np.array([0.2, 0.2, 0.15])  # of (column, row, disparity), pixels, as stated
 FRAMES, IN_VIEW = 120, 60
@@ -85,3 +92,47 @@ def test_a_factor_of_the_settings_is_learned_by_nothing() -> None:
     noise = StatedNoise(3.0)
     noise.learn(0, STEP, observed(np.arange(1), np.zeros((1, 3))))
     assert (noise.spread, noise.power) == (1.0, 9.0)
+
+
+@dataclasses.dataclass(slots=True)
+class Known:
+    """Noise that a test sets."""
+
+    spread: float = 1.0
+    power: float = 1.0
+
+    def learn(self, frame: int, step: FloatArray, accepted: Observations) -> None:
+        """Nothing."""
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_a_graph_is_weighed_anew_by_what_is_known_at_its_end(measured: bool) -> None:
+    """Observations by their power; a step that only goes on as before by what persists of it."""
+    origin = Prediction(np.eye(4), 1e-8 * np.eye(6))
+    builder = GraphBuilder(RIG, GraphSettings(), Floor.under(RIG, 6), origin)
+    noise = builder.noise = Known()
+    point = np.array([[0.1, 0.1, 2.0]])
+    known = LandmarkMap(np.arange(1), point, 1e-6 * np.eye(3)[None])
+    step = g.se3_exp(np.array([0.0, 0.0, 0.0, 0.05, 0.0, 0.0]))
+    for k in range(3):
+        noise.spread, noise.power = (1.0, 1.0) if k < 2 else (2.0, 18.0)
+        wTc = np.linalg.matrix_power(step, k)
+        seen = observed(np.arange(1), g.project(RIG, g.transform_to_camera(wTc, point)))
+        motion = Odometry(step, 1e-4 * np.eye(6), measured) if k else None
+        builder.add(TrackedFrame(k, wTc, motion, seen), known)
+    graph = builder.kept_factors()
+    models = [plain(graph.at(row)).noiseModel().covariance() for row in range(graph.size())]
+    # The middle one of a stereo factor's numbers is the right column, whose variance is stated.
+    columns = [float(found[1, 1]) for found in models if found.shape == (3, 3)]
+    steps = [found for found in models if found.shape == (6, 6)][1:]
+    np.testing.assert_allclose(columns, 18.0 * SIGMA[0] ** 2, rtol=1e-9, atol=0.0)
+    np.testing.assert_allclose(
+        steps, [(1.0 if measured else 9.0) * 1e-4 * np.eye(6)] * 2, rtol=1e-9
+    )
+    assert builder.kernel.width == pytest.approx(3.0 / 3.0)
+
+
+def test_steps_together_are_measured_if_each_is() -> None:
+    wheels, guess = Odometry(STEP, np.eye(6)), Odometry(STEP, np.eye(6), measured=False)
+    assert g.compose_odometry([wheels, wheels]).measured
+    assert not g.compose_odometry([wheels, guess, wheels]).measured

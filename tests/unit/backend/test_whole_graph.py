@@ -29,7 +29,7 @@ def problem(name: Any, seed: int = 0, wrong: float = 0.05) -> tuple[Any, Any, Ke
     rng = np.random.default_rng(seed)
     increments = wrong_matches(drawn(seed, frames=20).increments, wrong, rng)
     kernel = KernelSettings(name, 3.0)
-    estimator, _ = run(BatchSettings(kernel=kernel, trim=False), increments)
+    estimator, _ = run(BatchSettings(kernel=kernel, trim=False, noise_factor=1.0), increments)
     graph, values = estimator._builder.kept_factors(), estimator._solver._values
     for before, after in LOOPS:
         motion = inverse(poses_of_frame(values, before)) @ poses_of_frame(values, after)

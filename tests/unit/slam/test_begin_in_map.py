@@ -134,7 +134,7 @@ def test_the_first_pose_is_as_uncertain_as_prior_map_and_measurement_say(
     points = g.transform_to_camera(WTC, saved.landmarks.positions[:20])
     jacobian = g.projection_jacobian(RIG, points)
     by_pose, by_landmark = jacobian @ g.point_pose_jacobian(points), jacobian @ WTC[:3, :3].T
-    noise = getattr(settings, "noise_factor", 1.0) ** 2 * increment.observations.covariance
+    noise = increment.observations.covariance
     whole = g.congruence(by_landmark, saved.landmarks.covariances[:20]) + noise
     gained = np.swapaxes(by_pose, 1, 2) @ np.linalg.inv(whole) @ by_pose
     information = np.linalg.inv(PRIOR.covariance) + gained.sum(axis=0)
