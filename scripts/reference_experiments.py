@@ -45,9 +45,10 @@ REASONS = {
 
 BY_HAND = {
     "frontend.stereo.pixel_sigma": "noise of SIFT, measured on rendered images against the truth",
-    "estimator.noise_factor": "persistence of errors: an estimate by default, but these are not measured with it",
-    "compare.noise_factor": "as above; on EuRoC odometry is the truth with noise, and the less images count "
-    "the better",
+    "estimator.noise_factor": "how long errors persist: an estimate by default, "
+    "with which these are not measured",
+    "compare.noise_factor": "as above; on EuRoC odometry is the truth with noise, and the less "
+    "images count the better",
     "frontend.database.valid_hits": "frames half a metre apart: by the default 35 of 50 queries "
     "are found, by two hits 45",
 }
