@@ -383,6 +383,9 @@ def main() -> None:
     """Entry point: runs a command, turns a user's mistake into one line and exit status 2."""
     # None is used, and the search through all installed packages is a tenth of reading settings.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+    # What is wrong with an image is said here; what its header claims is not believed.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", "100000000")
     arguments = sys.argv[1:] or ["--help"]
     signals.forget()
     try:

@@ -19,7 +19,7 @@ import numpy as np
 
 from fgslam.core.arrays import IntArray, StateArrays
 from fgslam.core.errors import FgslamError, MeasurementLogError
-from fgslam.core.files import replacing
+from fgslam.core.files import replacing, require_file
 
 Items: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
 """Arrays by name: their kind (of ``numpy.dtype.kind``) and the shape of one row."""
@@ -36,6 +36,9 @@ _UNREADABLE = (
     zlib.error,
 )
 """What NumPy and zipfile raise on truncated, damaged and foreign files."""
+_UNPACKED_FREELY = 100_000_000
+_MOST_PACKED = 50
+"""Bytes out of one: maps are packed by two, their emptiest arrays by thirty."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,8 @@ class ArrayFile:
 
     def load(self, path: Path) -> StateArrays:
         """All arrays of a file, never unpickled. Raises :attr:`error` for what cannot be read."""
+        if path.exists() and not path.is_file() and not path.is_dir():
+            require_file(path, self.error, self.give)  # who opens a pipe waits for its other end
         try:
             path.open("rb").close()
         except FileNotFoundError:
@@ -79,6 +84,7 @@ class ArrayFile:
             raise self.error(f"{path}: cannot be read ({error.strerror}); {self.give}") from None
         try:
             with np.load(path, allow_pickle=False) as file:
+                _require_plain(file)
                 return {name: file[name] for name in file.files}
         except _UNREADABLE as error:
             cause = " ".join(str(error).split()) or type(error).__name__
@@ -136,6 +142,20 @@ class ArrayFile:
         if start[0] != 0 or (np.diff(start) < 0).any():
             raise self.damaged(name, where)
         return int(start[-1])
+
+
+def _require_plain(file: Any) -> None:
+    """Raises ValueError for what no archive of arrays holds: other files, far more than it is."""
+    members = file.zip.infolist()
+    foreign = [one.filename for one in members if not one.filename.endswith(".npy")]
+    if foreign:
+        raise ValueError(f"holds {foreign[0]}, which is no array")
+    names = [one.filename for one in members]
+    if len(set(names)) < len(names):
+        raise ValueError("holds an array twice")
+    size, packed = (sum(getattr(m, k) for m in members) for k in ("file_size", "compress_size"))
+    if size > _UNPACKED_FREELY + _MOST_PACKED * packed:
+        raise ValueError(f"would unpack to {size / 1e6:.0f} MB from {packed / 1e6:.0f}")
 
 
 def write_arrays(path: Path, arrays: StateArrays, compressed: bool = False) -> int:

@@ -15,12 +15,15 @@ import numpy.typing as npt
 from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
+from fgslam.core.files import require_file
 from fgslam.datasets.loose_files import IMAGE_SUFFIXES
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 # Some writers pad a JPEG after its end marker.
 _JPEG_TAIL = 64
+_MOST_PIXELS = 100_000_000
+"""The largest cameras have that many; SIFT would need 30 GB for one such image."""
 
 
 def list_numbered_images(folder: Path) -> dict[int, Path]:
@@ -96,6 +99,10 @@ def decode_grey(data: bytes, name: str) -> Image:
     image = _decoded(data, name, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if image.dtype == np.uint16:
         return grey_of_16_bits(np.asarray(image, np.uint16))
+    if image.dtype != np.uint8:
+        raise FrameError(
+            f"image {name} has pixels of type {image.dtype}; convert it to 8 or 16 bits a pixel"
+        )
     return np.ascontiguousarray(image, np.uint8)
 
 
@@ -108,13 +115,13 @@ def grey_of_16_bits(image: npt.NDArray[np.uint16]) -> Image:
 
 
 def _bytes_of(path: Path) -> bytes:
+    remedy = "restore the file, or leave the frame out with dataset.start/stop/stride"
+    if path.exists() and not path.is_file():
+        require_file(path, FrameError, remedy)  # who reads a pipe waits, a device may have no end
     try:
         return path.read_bytes()
     except OSError as cause:
-        raise FrameError(
-            f"image {path} cannot be read: {cause.strerror}; restore the file, or leave the frame "
-            "out with dataset.start/stop/stride"
-        ) from cause
+        raise FrameError(f"image {path} cannot be read: {cause.strerror}; {remedy}") from cause
 
 
 def _decoded(data: bytes, name: str, mode: int) -> npt.NDArray[Any]:
@@ -136,7 +143,8 @@ def _require_complete(name: str, data: bytes) -> None:
     else:
         fault = None if data else "is empty"
     if fault is not None:
-        raise FrameError(f"image {name} {fault}; copy the file again from its source")
+        mend = "" if ";" in fault else "; copy the file again from its source"
+        raise FrameError(f"image {name} {fault}{mend}")
 
 
 def _png_fault(data: bytes) -> str | None:
@@ -149,10 +157,22 @@ def _png_fault(data: bytes) -> str | None:
             break
         if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
             return f"is damaged (checksum of its {kind.decode('latin-1')} chunk)"
+        if kind == b"IHDR" and (fault := _size_fault(data[at + 8 : end])):
+            return fault
+        if kind == b"acTL":
+            return "is animated; give one file an image"
         if kind == b"IEND":
             return None
         at = end + 4
     return f"is truncated at {len(data)} bytes"
+
+
+def _size_fault(header: bytes) -> str | None:
+    """What is wrong with the size in a PNG's header: a few bytes may stand for gigabytes."""
+    width, height = (int.from_bytes(header[k : k + 4], "big") for k in (0, 4))
+    if 0 < width * height <= _MOST_PIXELS:
+        return None
+    return f"claims to be {width}x{height}, at most {_MOST_PIXELS / 1e6:.0f} megapixels are read"
 
 
 # --------------------------------------------------------------------------------------------
