@@ -116,8 +116,8 @@ class LandmarkKalmanGraphSettings(PerLandmarkSettings):
 
     kind: Literal["landmark_kalman_graph"] = "landmark_kalman_graph"
     update: Annotated[
-        Literal["pixel", "world"],
-        Field(description="as landmark_kalman's; the averaging of 4.1 is no least-squares problem"),
+        Literal["pixel", "world", "running_mean", "half"],
+        Field(description="as landmark_kalman's; the averaging of 4.1 by factors of equal weight"),
     ] = "pixel"
 
 

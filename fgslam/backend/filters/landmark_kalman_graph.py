@@ -322,7 +322,7 @@ class LandmarkKalmanGraph(LandmarkKalman):
         Where the tracking found no minimum (first frame, too few matches, capped, no image), the
         pose is the tracking's.
         """
-        _require_depth(increment, tracking.inliers, self._settings.update == "world")
+        _require_depth(increment, tracking.inliers, self._settings.update != "pixel")
         if tracking.status is EgoMotionStatus.OK and tracking.weighted_at is not None:
             matched = increment.observations.select(~increment.observations.is_new)
             found = self._pose_graph.solve(
@@ -347,6 +347,25 @@ class LandmarkKalmanGraph(LandmarkKalman):
         positions, noise = self._observed_positions(observed)
         offsets = positions - self._rows.positions[rows]
         return self._apply(rows, fused(self._rows.covariances[rows], offsets, noise))
+
+    def _average(self, rows: IntArray, observed: Observations) -> float:
+        """Equal weights: what was known counts as its sightings (or as one), the new one as one.
+
+        The minimum's curvature is then the weights', not the errors'. The elimination gives the
+        gain, which carries the errors' covariances; the innovation is weighed by these.
+        """
+        positions, noise = self._observed_positions(observed)
+        known = self._rows.covariances[rows]
+        offsets = positions - self._rows.positions[rows]
+        one = np.tile(np.eye(3), (len(rows), 1, 1))
+        counts = np.ones(len(rows))
+        if self._settings.update == "running_mean":
+            counts = self._rows.counts[rows].astype(np.float64)
+        mean = fused(one / counts[:, None, None], offsets, one)
+        gain = mean.covariances  # the new sighting's information is the identity
+        self._rows.positions[rows] += mean.steps
+        self._rows.covariances[rows] = congruence(one - gain, known) + congruence(gain, noise)
+        return fused(known, offsets, noise).misfit
 
     def _observed_positions(self, observed: Observations) -> tuple[FloatArray, FloatArray]:
         """A stereo factor alone, eliminated where it is met exactly."""
@@ -379,7 +398,7 @@ class LandmarkKalmanGraph(LandmarkKalman):
 def _require_depth(increment: Increment, inliers: BoolArray, world: bool) -> None:
     """A factor of a point at infinity or behind constrains nothing: there is nothing to invert.
 
-    Where observed positions are fused (``world``), this goes for matches, too.
+    Where observed positions are fused (all but ``pixel``), this goes for matches, too.
     """
     seen = increment.observations
     placed = seen.is_new.copy()

@@ -103,7 +103,7 @@ def updated(pair: Pair, depths: FloatArray, covariance: FloatArray, seed: int) -
 @given(
     depths=st.lists(st.floats(0.3, 20.0), min_size=1, max_size=8),
     covariance=st.sampled_from([EXACT, UNCERTAIN, PLANAR]),
-    update=st.sampled_from(["pixel", "world"]),
+    update=st.sampled_from(["pixel", "world", "running_mean", "half"]),
     seed=st.integers(0, 2**32 - 1),
 )
 def test_an_update_is_the_closed_form(
@@ -117,7 +117,7 @@ def test_an_update_is_the_closed_form(
 @given(
     depths=st.lists(st.floats(20.0, 100.0), min_size=1, max_size=8),
     covariance=st.sampled_from([EXACT, UNCERTAIN, PLANAR]),
-    update=st.sampled_from(["pixel", "world"]),
+    update=st.sampled_from(["pixel", "world", "running_mean", "half"]),
     seed=st.integers(0, 2**32 - 1),
 )
 def test_far_points_are_equal_as_far_as_their_condition_allows(
@@ -167,6 +167,8 @@ def test_the_innovation_is_the_same(rng: np.random.Generator) -> None:
 CASES = {
     "default": (EgoMotionSettings(), {}),
     "world update": (EgoMotionSettings(), {"update": "world"}),
+    "running mean": (EgoMotionSettings(), {"update": "running_mean"}),
+    "half and half": (EgoMotionSettings(), {"update": "half"}),
     "exact pose": (EgoMotionSettings(), {"pose_covariance": False}),
     "fixed height": (EgoMotionSettings(dof=5), {}),
     "planar": (EgoMotionSettings(dof=3), {}),
