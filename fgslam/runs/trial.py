@@ -20,7 +20,7 @@ from fgslam.runs.settings import OutputSettings
 from fgslam.runs.slam_comparison import load_truth
 from fgslam.runs.tasks.slam import open_slam
 from fgslam.runs.tasks.slam_map_entry import arrival_of
-from fgslam.runs.tasks.slam_measurements import open_measured, write_recording
+from fgslam.runs.tasks.slam_measurements import open_measured, write_log_and_truth
 from fgslam.slam.replay import replay
 
 _OUTPUT = OutputSettings(pictures=False, report=False, checkpoint_seconds=1e9)
@@ -55,11 +55,12 @@ def perform_trial(task: TrialTask) -> Trial:
         )
         if config.on_measurements:
             run.mkdir()
-            write_recording(run, config, open_measured(config))
+            write_log_and_truth(run, open_measured(config))
         else:
             run_task(open_slam, config, run)
         log = MeasurementLog.load(run / LOG_FILE)
-        truth, arrival = load_truth(run, log), arrival_of(run)
+        truth = load_truth(run, log)
+        arrival = None if config.on_measurements else arrival_of(run)  # these begin in no map
     metrics, nees = {}, {}
     for settings in task.estimators:
         answer = replay(log, settings, config.frontend.ego_motion, arrival=arrival)

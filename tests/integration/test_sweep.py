@@ -195,6 +195,8 @@ def test_another_experiment_and_another_folder_are_refused(drive: Path, tmp_path
     other.write_text(yaml.safe_dump(DRIVE | {"name": "other"}))
     with pytest.raises(ConfigError, match="is a sweep of short_drive, not of other"):
         do(other, ["seed=0"], tmp_path / "out", "resume")
+    again = do(drive, ["seed=3"], tmp_path / "out", "overwrite")
+    assert (again.table().seed.tolist(), done(tmp_path / "out")) == ([3], 1)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").touch()
     with pytest.raises(OutputError, match="holds something else than a sweep"):

@@ -19,7 +19,7 @@ from fgslam.report.tables import LANDMARK_TRUTH_FILE, StageTime, write_landmark_
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of
 from fgslam.runs.estimator_files import FRAMES_FILE, read_frames
-from fgslam.runs.folder import LOG_FILE, write_config
+from fgslam.runs.folder import LOG_FILE
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, replay_apart, write_comparison
 from fgslam.runs.tasks.slam_metrics import spread
 from fgslam.runs.tasks.slam_outputs import RunFigures, draw_run
@@ -55,14 +55,6 @@ def _run(config: ExperimentConfig, recording: MeasurementRecording, context: Con
         draw_run(folder, _figures(folder, config, recording, rows))
     about = _about(config, recording, rows)
     return write_comparison(context, config, len(recording.log), metrics, about, folder)
-
-
-def write_recording(
-    folder: Path, config: ExperimentConfig, recording: MeasurementRecording
-) -> None:
-    """What every estimator's replay starts from: configuration, log, truth."""
-    write_config(folder, config, provenance_of(recording))
-    write_log_and_truth(folder, recording)
 
 
 def write_log_and_truth(folder: Path, recording: MeasurementRecording) -> None:

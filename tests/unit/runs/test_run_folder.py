@@ -160,6 +160,7 @@ def names_of_files() -> list[str]:
         importlib.import_module(found.name)
         for package in (fgslam.runs, fgslam.report)
         for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+        if not found.name.startswith("fgslam.runs.sweeps")  # these have folders of their own
     ]
     stated = [item for module in modules for item in vars(module).items()]
     return sorted({v for k, v in stated if k.endswith(("_FILE", "_MARKER")) and isinstance(v, str)})
