@@ -40,15 +40,22 @@ class Rectifier(Brief):
         order: per camera, which of the images given as (right, left[, top]) is its own; another
             order than 0, 1, 2 where the calibration says that what is called left is on the right.
         size: width and height of the raw images, pixels; None: those of the rig.
+        shown: per camera, what of its raw image may be used (h, w), nonzero where it may; None:
+            all of it. Empty: all of every image.
+
+    Without maps the images are rectified as they are.
     """
 
     rig: CameraRig
     maps: tuple[tuple[MapArray, MapArray], ...]
     order: tuple[int, ...] = (0, 1, 2)
     size: tuple[int, int] | None = None
+    shown: tuple[Image | None, ...] = ()
 
     def rectify(self, camera: int, image: Image) -> Image:
         """Rectified image (h, w) of camera 0 (right), 1 (left) or 2 (top), bilinear."""
+        if not self.maps:
+            return image
         columns, rows = self.maps[camera]
         return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_LINEAR), np.uint8)
 
@@ -63,11 +70,38 @@ class Rectifier(Brief):
 
     @cached_property
     def masks(self) -> tuple[npt.NDArray[np.bool_], ...]:
-        """Per camera, which pixels (h, w) of its rectified image show something."""
+        """Per camera, which pixels (h, w) of its rectified image show something to be used."""
+        return tuple(self._mask(camera) for camera in range(self.rig.cameras))
+
+    def _mask(self, camera: int) -> npt.NDArray[np.bool_]:
         width, height = self.raw_size
+        shown = self.shown[camera] if self.shown else None
+        if not self.maps:
+            whole = np.ones((height, width), np.bool_)
+            return whole if shown is None else shown > 0
+        columns, rows = self.maps[camera]
+        # A pixel reaches half a pixel around its centre.
+        seen = (columns >= -0.5) & (columns <= width - 0.5)
+        seen &= (rows >= -0.5) & (rows <= height - 0.5)
+        if shown is None:
+            return np.asarray(seen)
+        # Black beyond the image, and half of white and black is none.
+        found = cv2.remap(
+            np.where(shown > 0, 255, 0).astype(np.uint8), columns, rows, cv2.INTER_LINEAR
+        )
+        return np.asarray(seen & (found == 255))
+
+    @cached_property
+    def margins(self) -> tuple[npt.NDArray[np.float32], ...]:
+        """Per camera, how far each pixel (h, w) is from what shows nothing; empty: all are full."""
+        if all(mask.all() for mask in self.masks):
+            return ()
+        # The picture's own border is none: features reach over it as in any image.
         return tuple(
-            (columns >= 0) & (columns <= width - 1) & (rows >= 0) & (rows <= height - 1)
-            for columns, rows in self.maps
+            np.asarray(cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5), np.float32)
+            if not mask.all()
+            else np.full(mask.shape, np.inf, np.float32)
+            for mask in self.masks
         )
 
 

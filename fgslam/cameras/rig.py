@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
 from fgslam.cameras.assembly import assembled, at_size, in_metres
 from fgslam.cameras.calibration import read_json_object
@@ -72,6 +74,11 @@ class StereoRig(CameraRig):
     def image_size(self) -> tuple[int, int]:
         """Width and height in pixels of the images that the cameras give."""
         return (self.width, self.height) if self.rectifier is None else self.rectifier.raw_size
+
+    @property
+    def margins(self) -> tuple[npt.NDArray[np.float32], ...]:
+        """Per camera, how far each rectified pixel is from what shows nothing; empty: all do."""
+        return () if self.rectifier is None else self.rectifier.margins
 
     def plain(self) -> CameraRig:
         """The rectified rig alone, without what makes images its own."""
@@ -147,7 +154,9 @@ def load_rig(
 
     Where the cameras are not rectified, the rig holds the maps that rectify them, and a session
     applies them to the raw images that it is given. ``remarks`` of the rig say what was noticed.
-    docs/howto/your_camera.md lists the formats.
+    docs/howto/your_camera.md lists the formats. Pictures ``mask_left.png``, ``mask_right.png`` and
+    ``mask_top.png`` beside the file (of EuRoC ``mask.png`` in a camera's folder) hide what is black
+    in them: one's own robot, the rim of a lens.
 
     Args:
         path: the file, or a folder that holds one.
@@ -168,15 +177,65 @@ def load_rig(
     require_options(size, unit_m, fov_deg)
     own = _own_rectified(Path(path), cameras) if path2 is None else None
     if own is not None and (size is None or size == (own.width, own.height)):
-        return own
+        return with_masks(own, Path(path))
     found = read_calibration_file(Path(path), None if path2 is None else Path(path2), size)
-    return rig_of(at_size(in_metres(chosen_cameras(found, cameras), unit_m), size, scale), fov_deg)
+    found = at_size(in_metres(chosen_cameras(found, cameras), unit_m), size, scale)
+    return with_masks(rig_of(found, fov_deg), Path(path))
 
 
 def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
     """The rig of a calibration that is read; see :func:`load_rig`."""
     made = assembled(calibration, fov_deg)
     return _stereo_rig(made.rig, made.rectifier, made.sources, made.remarks)
+
+
+def with_masks(rig: StereoRig, path: Path) -> StereoRig:
+    """The rig with the masks that lie beside a calibration, of the raw images' size.
+
+    Raises:
+        CalibrationError: a mask is no picture, or has another size.
+    """
+    folder = path if path.is_dir() else path.parent
+    order = range(rig.cameras) if rig.rectifier is None else rig.rectifier.order[: rig.cameras]
+    shown = []
+    for given, source in zip(order, rig.sources, strict=False):
+        beside = folder / f"mask_{('right', 'left', 'top')[given]}.png"
+        of_euroc = folder.parent / f"cam{source}" / "mask.png"
+        if path.is_dir():
+            of_euroc = folder / f"cam{source}" / "mask.png"
+        shown.append(_mask(beside, rig) if beside.is_file() else _mask(of_euroc, rig))
+    if all(one is None for one in shown):
+        return rig
+    plain = Rectifier(rig.plain(), ())
+    raw = replace(rig.rectifier or plain, shown=tuple(shown))
+    return replace(rig, rectifier=raw, remarks=(*rig.remarks, _hidden(raw)))
+
+
+def _mask(path: Path, rig: StereoRig) -> Image | None:
+    if not path.is_file():
+        return None
+    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    width, height = rig.image_size
+    if mask is None or mask.shape != (height, width):
+        found = "no picture" if mask is None else f"{mask.shape[1]}x{mask.shape[0]}"
+        raise CalibrationError(
+            f"{path}: is {found}, but a mask has the size of the images, {width}x{height}; black "
+            "is hidden"
+        )
+    return np.where(mask > _WHITE, 255, 0).astype(np.uint8)
+
+
+_WHITE = 127
+
+
+def _hidden(rectifier: Rectifier) -> str:
+    names = ("right", "left", "top")
+    parts = [
+        f"{100.0 * float(np.mean(one == 0)):.0f} % of the {names[k]} images"
+        for k, one in enumerate(rectifier.shown)
+        if one is not None
+    ]
+    return f"masks hide {', '.join(parts)}"
 
 
 def _own_rectified(path: Path, cameras: Sequence[int] | None) -> StereoRig | None:

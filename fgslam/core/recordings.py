@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+import numpy.typing as npt
 
 from fgslam.core.arrays import FloatArray, Image, IntArray, Rows
 from fgslam.core.estimates import Trajectory
@@ -19,12 +20,15 @@ from fgslam.core.sensors import CameraRig
 class Frame:
     """The images of one instant, in the order right, left[, top]; grey, uint8, (height, width).
 
-    ``index`` counts the recording's own frames (before ``start``/``stop``/``stride``).
+    ``index`` counts the recording's own frames (before ``start``/``stop``/``stride``). ``margins``
+    are (height, width) of each camera: how far a pixel is from what shows nothing, a black border
+    or what a mask hides, in pixels; empty where all images are full.
     """
 
     index: int
     timestamp: float
     images: tuple[Image, ...]
+    margins: tuple[npt.NDArray[np.float32], ...] = ()
 
     def digest(self) -> int:
         """64 bits of the images' contents: by them a frame is known again in any recording."""

@@ -48,7 +48,7 @@ def open_recording(
         CalibrationError: its calibration is missing or impossible.
     """
     found = _opened(settings, odometry or RecordedOdometrySettings())
-    return found if found.rectifier is None else _judged(found)
+    return _judged(found) if found.unrectified else found
 
 
 def _judged(recording: Recording) -> Recording:

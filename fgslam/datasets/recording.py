@@ -66,7 +66,7 @@ class Recording(Brief):
     @property
     def unrectified(self) -> bool:
         """Whether the images are rectified when they are read."""
-        return self.rectifier is not None
+        return self.rectifier is not None and bool(self.rectifier.maps)
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -75,7 +75,8 @@ class Recording(Brief):
         """Images of frame ``i``, 0 <= i < len. Raises FrameError when missing or corrupt."""
         self._check_index(i, 0)
         index = int(self.indices[i])
-        return Frame(index, float(self.timestamps[i]), self.load_images(index))
+        margins = () if self.rectifier is None else self.rectifier.margins
+        return Frame(index, float(self.timestamps[i]), self.load_images(index), margins)
 
     def colour(self, i: int) -> tuple[Image, ...]:
         """Images of frame ``i`` in red, green, blue, or grey where the recording is. FrameError."""

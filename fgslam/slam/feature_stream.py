@@ -5,15 +5,17 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
+from itertools import zip_longest
+from typing import Protocol, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
-from fgslam.core.arrays import Image
+from fgslam.core.arrays import BoolArray, Image
 from fgslam.core.errors import ConfigError, FrameError
 from fgslam.core.features import Features
 from fgslam.core.recordings import Frame, Sequence
@@ -21,6 +23,8 @@ from fgslam.core.recordings import Frame, Sequence
 # Frames in work at once. Three images on two cores leave one idle at the end of each frame;
 # the next frame's images fill the gap.
 _FRAMES_AHEAD = 3
+# Of a feature's scale: so far around it reaches the Gaussian that finds it.
+_SUPPORT = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +90,7 @@ class FrameDescriber:
         if self._pool is None:
             self._pool = ThreadPoolExecutor(len(frame.images))
         timed = partial(_timed, self._extract)
-        tasks = [self._pool.submit(timed, image) for image in frame.images]
+        tasks = [self._pool.submit(timed, *view) for view in _views(frame)]
         return _Pending(found.i, frame, "", found.load_ms, tasks).finish()
 
     def close(self) -> None:
@@ -145,13 +149,32 @@ class FeatureStream:
         if self._extract is None:
             return _Pending(i, frame, "", load_ms, [])
         timed = partial(_timed, self._extract)
-        tasks = [pool.submit(timed, image) for image in frame.images]
+        tasks = [pool.submit(timed, *view) for view in _views(frame)]
         return _Pending(i, frame, "", load_ms, tasks)
 
 
-def _timed(extract: FeatureExtractor, image: Image) -> tuple[Features, float]:
+_Margin: TypeAlias = npt.NDArray[np.float32] | None
+
+
+def _views(frame: Frame) -> Iterable[tuple[Image, _Margin]]:
+    """Each image with its margins; None where it is full."""
+    return zip_longest(frame.images, frame.margins)
+
+
+def _timed(extract: FeatureExtractor, image: Image, margin: _Margin) -> tuple[Features, float]:
     start = time.perf_counter()
-    return _checked(extract(image)), 1e3 * (time.perf_counter() - start)
+    found = _checked(extract(image))
+    if margin is not None:
+        found = found.select(_clear(found, margin))
+    return found, 1e3 * (time.perf_counter() - start)
+
+
+def _clear(found: Features, margin: npt.NDArray[np.float32]) -> BoolArray:
+    """Which features (n,) are clear of what shows nothing: that would be seen in every image."""
+    height, width = margin.shape
+    column, row = np.rint(found.xy).astype(np.int64).T
+    at = margin[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    return np.asarray(at > _SUPPORT * found.scale)
 
 
 def _checked(found: Features) -> Features:

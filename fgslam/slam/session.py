@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import DEFAULT_ESTIMATOR, EstimatorSettings
-from fgslam.cameras.rig import require_rig
+from fgslam.cameras.rig import StereoRig, require_rig
 from fgslam.core.arrays import FloatArray
 from fgslam.core.checks import later_time, require_seed
 from fgslam.core.errors import ConfigError, FrameError, SessionError
@@ -127,6 +127,7 @@ class Session:
         self.recorder = RunRecorder(MeasurementLog(rig, self.pipeline.motion.description()))
         self._left_out = _LeftOut()
         self._seen = FirstImages()
+        self._margins = rig.margins if isinstance(rig, StereoRig) else ()
         self._odometry = odometry
         self._ended = ""
         self._failed = False
@@ -188,7 +189,7 @@ class Session:
         timestamp = later_time(t, self._last_time(), "session", FrameError)
         body = checked_odometry(odometry, self._odometry) if i else None
         checked = None if images is None else checked_images(images, self.rig)
-        frame = None if checked is None else Frame(i, timestamp, checked)
+        frame = None if checked is None else Frame(i, timestamp, checked, self._margins)
         with one_blas_thread():
             found = undescribed(i, frame)
             if self.frontend.tracking == "sift" or self._start is not None:

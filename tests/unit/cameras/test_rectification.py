@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -240,3 +241,51 @@ def rectified_pixels(rig: StereoRig, one: RawCamera, pixels: FloatArray) -> Floa
     """Raw pixels (n, 2) of a camera in the rectified view."""
     rays = one.unproject(pixels) @ one.bTc[:3, :3].T @ rig.bTc[:3, :3]
     return np.asarray(rays[:, :2] / rays[:, 2:] * [rig.fx, rig.fy] + [rig.cx, rig.cy])
+
+
+# --------------------------------------------------------------------------------------------
+# Black borders and masks
+
+
+def test_a_full_view_has_no_margins_and_a_wider_one_has() -> None:
+    cameras = (
+        camera((0.0, 0.0, 0.0), TURNS[0], "radtan", "a"),
+        camera((0.12, 0.0, 0.0), TURNS[1], "radtan", "b"),
+    )
+    calibration = Calibration("made", "made", cameras)
+    assert rig_of(calibration).margins == ()
+    wide = rig_of(calibration, fov_deg=100.0)
+    white = np.full(SIZE[::-1], 255, np.uint8)
+    for margin, image in zip(wide.margins, wide.rectified((white, white)), strict=True):
+        assert 0.2 < float(np.mean(margin == 0.0)) < 0.6
+        assert (image[margin == 0.0] < 255).all()
+        assert (image[margin > 1.5] == 255).all()
+
+
+def write_rectified(folder: Path) -> Path:
+    values = {"width": 160, "height": 120, "fx": 100.0, "fy": 100.0, "cx": 80.0, "cy": 60.0}
+    (folder / "calib.json").write_text(json.dumps(values | {"baseline_m": 0.1}))
+    return folder
+
+
+def test_a_mask_beside_the_calibration_hides_what_is_black(tmp_path: Path) -> None:
+    mask = np.full((120, 160), 255, np.uint8)
+    mask[90:] = 0
+    cv2.imwrite(str(write_rectified(tmp_path) / "mask_left.png"), mask)
+    rig = load_rig(tmp_path)
+    assert rig.remarks == ("masks hide 25 % of the left images",)
+    right, left = rig.margins
+    assert np.isinf(right).all()
+    assert left[89, 80] == pytest.approx(1.0)
+    assert left[60, 80] == pytest.approx(30.0, abs=0.5)
+    image = np.arange(120 * 160, dtype=np.uint32).astype(np.uint8).reshape(120, 160)
+    np.testing.assert_array_equal(rig.rectified((image, image))[1], image)
+
+
+def test_a_mask_of_another_size_is_refused(tmp_path: Path) -> None:
+    cv2.imwrite(str(write_rectified(tmp_path) / "mask_right.png"), np.zeros((60, 80), np.uint8))
+    with pytest.raises(CalibrationError, match=r"mask_right\.png: is 80x60, .* 160x120"):
+        load_rig(tmp_path)
+    (tmp_path / "mask_right.png").write_text("no picture")
+    with pytest.raises(CalibrationError, match="is no picture"):
+        load_rig(tmp_path)

@@ -1,0 +1,33 @@
+"""Features of frames: none is found near a black border or what a mask hides."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fgslam.core.arrays import Image
+from fgslam.core.features import Features
+from fgslam.core.recordings import Frame
+from fgslam.slam.feature_stream import FrameDescriber
+
+PLACES = np.array([[10.0, 10.0], [20.0, 10.0], [30.4, 10.0]])
+SCALES = np.array([2.0, 2.0, 4.0])
+
+
+def three(_: Image) -> Features:
+    return Features(PLACES, SCALES, np.zeros(3), np.zeros((3, 128), np.uint8))
+
+
+@pytest.mark.parametrize(("hidden", "kept"), [(3, [0, 1, 2]), (5, [1, 2]), (17, [2]), (19, [])])
+def test_features_reach_three_scales_around(hidden: int, kept: list[int]) -> None:
+    """The first columns are hidden: at 10 a feature of scale 2 wants 6 px, at 30 one of 4 12 px."""
+    image = np.zeros((20, 40), np.uint8)
+    margin = np.tile(np.maximum(np.arange(40.0) - hidden, 0.0), (20, 1)).astype(np.float32)
+    full = np.full((20, 40), np.inf, np.float32)
+    describer = FrameDescriber(three)
+    right, left = describer.describe(0, Frame(0, 0.0, (image, image), (margin, full))).features
+    np.testing.assert_array_equal(right.xy, PLACES[kept])
+    np.testing.assert_array_equal(left.xy, PLACES)
+    whole = describer.describe(0, Frame(0, 0.0, (image, image))).features
+    assert [len(found) for found in whole] == [3, 3]
+    describer.close()
