@@ -21,7 +21,7 @@ from fgslam.cameras.rectification import Rectifier
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
-from fgslam.core.geometry import is_rigid
+from fgslam.core.rig_checks import rig_fault
 from fgslam.core.sensors import CameraRig
 
 
@@ -101,39 +101,8 @@ def require_rig(rig: CameraRig) -> None:
             f"rig: it is a {type(rig).__name__}; give a fgslam.StereoRig, or load one by "
             "fgslam.StereoRig.load(file)"
         )
-    for name in ("width", "height"):
-        value = getattr(rig, name)
-        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value <= 0:
-            raise CalibrationError(f"rig: {name} is {value!r}; give the images' size in pixels")
-    for name in ("fx", "fy", "baseline", "vertical_baseline"):
-        _require_length(rig, name)
-    for name, extent in (("cx", rig.width), ("cy", rig.height)):
-        value = getattr(rig, name)
-        # Cropped images may have it outside, but hardly by more than their own size.
-        if not is_finite_number(value) or not -extent <= value <= 2 * extent:
-            raise CalibrationError(
-                f"rig: {name} is {value!r}, far from the image of {rig.width}x{rig.height} pixels; "
-                "give the principal point (column, row) in pixels of these images"
-            )
-    if not is_rigid(np.asarray(rig.bTc, np.float64)):
-        raise CalibrationError(
-            "rig: bTc must be a rigid motion (4, 4), the pose of the right camera in the body; "
-            "correct it, or leave it out"
-        )
-
-
-def _require_length(rig: CameraRig, name: str) -> None:
-    value = getattr(rig, name)
-    if name == "vertical_baseline" and value is None:
-        return
-    if not is_finite_number(value) or value <= 0.0:
-        what = (
-            "the distance between the cameras in metres; one camera alone cannot measure depth, "
-            "and a negative one means that left and right are swapped"
-            if "baseline" in name
-            else "the focal length in pixels"
-        )
-        raise CalibrationError(f"rig: {name} is {value!r}, not a positive number; give {what}")
+    if fault := rig_fault(rig):
+        raise CalibrationError(f"rig: {fault}")
 
 
 # --------------------------------------------------------------------------------------------

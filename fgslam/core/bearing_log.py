@@ -25,6 +25,7 @@ from fgslam.core.array_files import (
     rows_of,
     write_arrays,
 )
+from fgslam.core.array_values import require_covariances, require_finite, require_single
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.homing import (
@@ -176,6 +177,14 @@ def _require_consistent(arrays: StateArrays, where: str) -> None:
         expected["truth_robots"] = ("f", (images, 3))
         expected["truth_landmarks"] = ("f", (features, 2))
     LOG.require(arrays, expected, where)
+    known = ("start_time", "image_time", "vector", "map_bearing", "image_bearing")
+    require_finite(LOG, arrays, (*known, "image_sigma_bearing"), where)
+    vector = arrays["vector_covariance"][None]
+    require_covariances(LOG, "vector_covariance", vector, where, definite=False)
+    require_single(LOG, "map_ids", arrays["map_ids"], offsets([features]), where)
+    require_single(LOG, "image_ids", arrays["image_ids"], arrays["image_start"], where)
+    if not (arrays["image_sigma_bearing"] > 0.0).all():
+        raise MeasurementLogError(f"{where}: a deviation of a bearing is not positive; run again")
     times = np.append(arrays["start_time"], arrays["image_time"])
     if not (np.diff(times) > 0.0).all():
         raise MeasurementLogError(f"{where}: times of the images do not increase; run again")

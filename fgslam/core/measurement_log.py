@@ -29,9 +29,11 @@ from fgslam.core.array_files import (
     split,
     write_arrays,
 )
+from fgslam.core.array_values import require_covariances, require_finite, require_single
 from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
+from fgslam.core.rig_checks import rig_fault
 from fgslam.core.rig_correction import term_names
 from fgslam.core.sensors import CameraRig, RangeBearingSensor, Sensor
 
@@ -154,8 +156,10 @@ class MeasurementLog(Brief):
         """The log back from its arrays; ``where`` names the source in messages."""
         header = _read_header(arrays, where)
         _require_consistent(arrays, where)
+        _require_sound(arrays, where)
         loops, relocalised = _loops(arrays, header["version"], where)
-        log = MeasurementLog(_sensor(header["sensor"], arrays["rig_bTc"]), header["motion"])
+        sensor = _sensor(header["sensor"], arrays["rig_bTc"], where)
+        log = MeasurementLog(sensor, header["motion"])
         corrections = _corrections(arrays, header["version"], log.rig, where)
         observed = _split_observations(arrays, "")
         missed = _split(arrays, "missed")
@@ -202,11 +206,28 @@ def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
     return header
 
 
-def _sensor(values: dict[str, Any], bTc: FloatArray) -> Sensor:
+def _sensor(values: dict[str, Any], bTc: FloatArray, where: str) -> Sensor:
     numbers = {name: value for name, value in values.items() if name != "kind"}
-    if values["kind"] == "stereo":
-        return CameraRig(**numbers, bTc=bTc)
-    return RangeBearingSensor(**numbers, bTc=bTc)
+    if values["kind"] != "stereo":
+        return RangeBearingSensor(**numbers, bTc=bTc)
+    rig = CameraRig(**numbers, bTc=bTc)
+    if fault := rig_fault(rig):
+        raise MeasurementLogError(f"{where}: the log's rig cannot be one: {fault}; run again")
+    return rig
+
+
+def _require_sound(arrays: StateArrays, where: str) -> None:
+    """Raises MeasurementLogError for values that no run measures."""
+    require_finite(LOG, arrays, ("timestamp", "rig_bTc", "measurement"), where)
+    covariances = from_upper(arrays["measurement_covariance"], 3)
+    require_covariances(LOG, "measurement_covariance", covariances, where)
+    known = ~np.isnan(arrays["odometry_motion"][:, 0, 0])
+    motions = {"odometry_motion": arrays["odometry_motion"][known]}
+    require_finite(LOG, motions, ("odometry_motion",), where)
+    moved = arrays["odometry_covariance"][known]
+    require_covariances(LOG, "odometry_covariance", moved, where, definite=False)
+    ids, start = arrays["observation_id"], arrays["observation_start"]
+    require_single(LOG, "observation_id", ids, start, where)
 
 
 def _require_consistent(arrays: StateArrays, where: str) -> None:

@@ -17,11 +17,13 @@ from typing import Any
 import numpy as np
 
 from fgslam.core.array_files import ArrayFile, Items, from_upper, of_rows
+from fgslam.core.array_values import require_covariances, require_finite
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MapError
 from fgslam.core.estimates import LandmarkMap, Trajectory
 from fgslam.core.features import LandmarkAppearances
 from fgslam.core.files import replacing
+from fgslam.core.rig_checks import rig_fault
 from fgslam.core.sensors import CameraRig
 
 FILE = ArrayFile(
@@ -332,16 +334,19 @@ def _require_consistent(header: dict[str, Any], arrays: StateArrays, where: str)
     }.items():
         if not sound:
             raise MapError(f"{where}: array {name} is out of order; make the map again")
-    for name in finite:
-        if not np.isfinite(arrays[name]).all():
-            raise MapError(f"{where}: array {name} is not finite; make the map again")
+    require_finite(FILE, arrays, finite, where)
+    covariances = arrays["landmark_covariance"]
+    require_covariances(FILE, "landmark_covariance", covariances, where, definite=False)
 
 
 def _rig(header: dict[str, Any], bTc: FloatArray, where: str) -> CameraRig:
     values = header["rig"]
     if set(values) != set(_RIG):
         raise MapError(f"{where}: the map's header names no rig; make the map again")
-    return CameraRig(**values, bTc=bTc)
+    rig = CameraRig(**values, bTc=bTc)
+    if fault := rig_fault(rig):
+        raise MapError(f"{where}: the map's rig cannot be one: {fault}; make the map again")
+    return rig
 
 
 def _write_member(archive: zipfile.ZipFile, name: str, array: np.ndarray[Any, Any]) -> None:

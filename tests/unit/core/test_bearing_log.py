@@ -75,3 +75,30 @@ def test_foreign_and_truncated_files_are_refused(log: BearingLog, tmp_path: Path
         BearingLog.load(path)
     with pytest.raises(MeasurementLogError, match="no such file"):
         BearingLog.load(tmp_path / "none.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("image_bearing", np.nan, "array image_bearing is not finite"),
+        ("image_sigma_bearing", 0.0, "a deviation of a bearing is not positive"),
+        ("vector_covariance", -1.0, "array vector_covariance, row 0, is no covariance"),
+        ("start_time", np.nan, "array start_time is not finite"),
+    ],
+)
+def test_values_that_no_homing_measures_are_refused(
+    log: BearingLog, name: str, value: float, words: str
+) -> None:
+    arrays = log.to_arrays()
+    spoilt = arrays[name].copy()
+    spoilt[...] = value
+    with pytest.raises(MeasurementLogError, match=f"a.npz: {words}"):
+        BearingLog.from_arrays(arrays | {name: spoilt}, "a.npz")
+
+
+def test_a_feature_that_one_image_has_twice_is_refused(log: BearingLog) -> None:
+    arrays = log.to_arrays()
+    ids = arrays["image_ids"].copy()
+    ids[1] = ids[0]
+    with pytest.raises(MeasurementLogError, match=f"image_ids holds {ids[0]} twice in part 0"):
+        BearingLog.from_arrays(arrays | {"image_ids": ids}, "a.npz")

@@ -24,7 +24,8 @@ RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 
 def increment(k: int, rng: np.random.Generator, seen: int, with_odometry: bool) -> Increment:
     noise = rng.standard_normal((seen, 3, 3))
-    covariance = noise + np.swapaxes(noise, 1, 2)
+    covariance = noise @ np.swapaxes(noise, 1, 2)
+    covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2.0 + 0.1 * np.eye(3)
     step = rng.standard_normal((6, 6))
     return Increment(
         index=3 * k,
@@ -341,3 +342,65 @@ def test_corrections_of_the_rig_make_version_4(log: MeasurementLog, tmp_path: Pa
     write_arrays(tmp_path / "log.npz", arrays | {"rig_correction": arrays["rig_correction"][:, 1:]})
     with pytest.raises(MeasurementLogError, match="rig_correction"):
         MeasurementLog.load(tmp_path / "log.npz")
+
+
+# --------------------------------------------------------------------------------------------
+# Values: shapes that fit may still hold what no run wrote
+
+
+def spoilt(file: Path, name: str, at: object, value: object) -> Path:
+    arrays = load_arrays(file)
+    arrays[name][at] = value
+    write_arrays(file, arrays)
+    return file
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "value", "words"),
+    [
+        ("timestamp", 0, np.nan, "array timestamp is not finite"),
+        ("measurement", (3, 1), np.inf, "array measurement is not finite"),
+        ("measurement_covariance", (2, 0), -1.0, "row 2, is no covariance"),
+        ("measurement_covariance", (2, 1), 1e6, "row 2, is no covariance"),
+        ("measurement_covariance", 4, 0.0, "row 4, is no covariance"),
+        ("measurement_covariance", (4, 5), np.nan, "measurement_covariance is not finite"),
+        ("odometry_covariance", (1, 0, 0), -1.0, "array odometry_covariance, row 0, is no"),
+        ("odometry_covariance", (1, 0, 1), 1e6, "array odometry_covariance, row 0, is no"),
+        ("odometry_motion", (1, 2, 2), np.inf, "array odometry_motion is not finite"),
+        ("rig_bTc", (0, 0), 7.0, "the log's rig cannot be one: bTc must be a rigid motion"),
+    ],
+)
+def test_values_that_no_run_measures_are_refused(
+    name: str, at: object, value: object, words: str, file: Path
+) -> None:
+    with pytest.raises(MeasurementLogError, match=re.escape(words)) as caught:
+        MeasurementLog.load(spoilt(file, name, at, value))
+    assert str(caught.value).startswith(f"{file}: ")
+
+
+def test_an_identity_that_one_frame_sees_twice_is_refused(file: Path) -> None:
+    first = load_arrays(file)["observation_id"][0]
+    with pytest.raises(MeasurementLogError, match=f"observation_id holds {first} twice in part 0"):
+        MeasurementLog.load(spoilt(file, "observation_id", 3, first))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("fx", -100.0, "fx is -100.0, not a positive number"),
+        ("fy", "x", "fy is 'x', not a positive number"),
+        ("baseline", 0, "baseline is 0, not a positive number"),
+        ("width", 1.5, "width is 1.5; give the images' size"),
+        ("cx", 1e9, "far from the image of 320x240"),
+    ],
+)
+def test_a_calibration_that_cannot_be_one_is_refused(
+    key: str, value: object, words: str, file: Path
+) -> None:
+    arrays = load_arrays(file)
+    header = json.loads(str(arrays["header"]))
+    header["sensor"][key] = value
+    arrays["header"] = np.array(json.dumps(header))
+    write_arrays(file, arrays)
+    with pytest.raises(MeasurementLogError, match=re.escape(words)):
+        MeasurementLog.load(file)

@@ -250,6 +250,8 @@ def _set(name: str, value: Any) -> Callable[[dict[str, Any], dict[str, Any]], No
         (lambda header, arrays: header.pop("about"), "header is damaged"),
         (lambda header, arrays: header.update(counts={}), "is absent or damaged"),
         (lambda header, arrays: header["rig"].pop("fx"), "names no rig"),
+        (lambda header, arrays: header["rig"].update(fx=-100.0), "fx is -100.0, not a positive"),
+        (_set("landmark_covariance", lambda a: -a), "landmark_covariance, row 0, is no covariance"),
         (lambda header, arrays: header.update(triangles=["pose"]), "array pose is absent"),
         (lambda header, arrays: header["same_as"].update(a="b"), "array b is absent"),
     ],
