@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Protocol
 
@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
+from fgslam.core.estimates import EgoMotionStatus, Estimate, LandmarkMap, Trajectory
 from fgslam.core.geometry import transform_to_world
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LandmarkTruth
@@ -107,6 +107,7 @@ class Answer:
         nis, nis_dof: (n,) innovations squared and their degrees of freedom.
         update_ms: (n,) prediction and update.
         peak_memory_mb: of the process.
+        predicted: frames whose pose no landmark measured: bridged by odometry, or by the velocity.
     """
 
     estimate: Estimate
@@ -116,6 +117,7 @@ class Answer:
     nis_dof: IntArray
     update_ms: FloatArray
     peak_memory_mb: float | None = None
+    predicted: int = 0
 
     @staticmethod
     def of(replay: Replayed) -> Answer:
@@ -128,6 +130,7 @@ class Answer:
             nis_dof=replay.column("nis_dof").astype(np.int64),
             update_ms=replay.column("update_ms").astype(np.float64),
             peak_memory_mb=replay.peak_memory_mb,
+            predicted=predicted_frames(replay.column("status").tolist()),
         )
 
 
@@ -169,6 +172,7 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
         peak_memory_mb=answer.peak_memory_mb,
         more={
             "frames": max(len(answer.online), len(final)),
+            "predicted_frames": answer.predicted,
             **_alignment_notes(aligned, first),
             "nees_pose": _as_json(judged["pose"]),
             "nees_landmark": _as_json(judged["landmark"]),
@@ -201,6 +205,12 @@ def judge_replay(replay: Replayed, truth: Truth) -> Judgement:
         }
     )
     return Judgement(replace(metrics, more=more), judged.nees)
+
+
+def predicted_frames(statuses: Iterable[str]) -> int:
+    """How many of the statuses say that no landmark measured the pose; the first frame is given."""
+    found = map(EgoMotionStatus, statuses)
+    return sum(not one.measured and one is not EgoMotionStatus.FIRST for one in found)
 
 
 def closure_counts(closed: Sequence[bool]) -> dict[str, JsonValue]:

@@ -38,7 +38,7 @@ from fgslam.runs.engine import (
 from fgslam.runs.folder import COMPARISON_FILE, RUN_MARKER, ExistingFolder, is_run_folder
 from fgslam.runs.homing_comparison import open_homing_comparison
 from fgslam.runs.metric_tables import ate_table
-from fgslam.runs.slam_comparison import judged_apart, open_slam_comparison
+from fgslam.runs.slam_comparison import judged_apart, named, open_slam_comparison
 from fgslam.runs.units import Progress, Stopped
 
 DEFAULT_FOLDER = "compare"
@@ -256,7 +256,9 @@ def metrics_of(results: Sequence[RunResult]) -> dict[str, dict[str, Any]]:
 def ate_tables(results: Sequence[RunResult]) -> tuple[TextTable, ...]:
     """Final ATE of each estimator on each run, where there are several runs of SLAM."""
     found = _of_slam(results)
-    return (ate_table(found),) if len(found) > 1 else ()
+    names = [named(one.config) for one in results if isinstance(one.config, ExperimentConfig)]
+    columns = [(name, values) for name, (_, values) in zip(names, found, strict=True)]
+    return (ate_table(columns),) if len(found) > 1 else ()
 
 
 def load_run(run: Path) -> ExperimentConfig | HomingExperiment:

@@ -48,28 +48,60 @@ def comparison_particulars(values: Mapping[str, Any], out: Path) -> tuple[tuple[
 
 
 def page_table(values: Mapping[str, Any]) -> TextTable:
-    """The table of the page; values that are not known read `-`."""
-    rows = {title: metrics or {} for title, metrics in values.items()}
-    return _table("comparison", "Comparison", _PAGE, rows)
+    """The table of the page, of metrics by marked title; values that are not known read `-`."""
+    return _table("comparison", "Comparison", _PAGE, values)
 
 
 def ate_table(runs: Sequence[tuple[str, Mapping[str, Any]]]) -> TextTable:
     """Final ATE of each estimator on each run, given by its name and metrics by title."""
     rows = []
     for title in dict.fromkeys(title for _, values in runs for title in values):
-        found = [value_at(values.get(title, {}), "ate_rmse_m") for _, values in runs]
-        rows.append((title, tuple(UNKNOWN if ate is None else _cm(ate) for ate in found)))
+        found = [_ate_cell(title, values) for _, values in runs]
+        rows.append((title, tuple(found)))
     columns = tuple(Column(name, "final ATE, cm") for name, _ in runs)
     return TextTable("ate", "final ATE, cm, SE3 aligned", "estimator", columns, tuple(rows))
+
+
+def _ate_cell(title: str, values: Mapping[str, Any]) -> str:
+    """An ATE with the marks of its estimator in its run."""
+    ate = value_at(values.get(title) or {}, "ate_rmse_m")
+    if ate is None:
+        return UNKNOWN
+    name = list(marked(values))[list(values).index(title)]
+    return f"{_cm(ate)}{name.removeprefix(title)}"
 
 
 def metrics_table(
     heading: str, columns: Sequence[MetricColumn], values: Mapping[str, Any]
 ) -> TextTable:
     """Values of metrics.json by estimator, as text; without columns that no estimator fills."""
-    failed = {title: " (failed)" if value_at(m, "failure") else "" for title, m in values.items()}
-    marked = {title + failed[title]: metrics for title, metrics in values.items()}
-    return _table(heading, heading, columns, marked)
+    return _table(heading, heading, columns, marked(values))
+
+
+def marked(values: Mapping[str, Any], remark: str = "", say_failed: bool = True) -> dict[str, Any]:
+    """The metrics of estimators under titles that say what is not all there.
+
+    That it failed (but for a page, which says so itself), how many of the frames it saw, how many
+    of its poses no landmark measured, and ``remark``, what all of a run's are marked with.
+    """
+    frames = max((value_at(m, "frames") or 0 for m in values.values()), default=0)
+    out = {}
+    for title, metrics in values.items():
+        failed = "failed" if say_failed and value_at(metrics or {}, "failure") else ""
+        out[_marked(title, metrics or {}, frames, (failed, remark))] = metrics or {}
+    return out
+
+
+def _marked(title: str, metrics: Mapping[str, Any], frames: int, more: tuple[str, str]) -> str:
+    own, predicted = value_at(metrics, "frames"), value_at(metrics, "predicted_frames")
+    parts = [
+        more[0],
+        f"{own} of {frames} frames" if own is not None and own < frames else "",
+        f"{predicted} poses predicted" if predicted else "",
+        more[1],
+    ]
+    said = ", ".join(filter(None, parts))
+    return f"{title} ({said})" if said else title
 
 
 def _table(

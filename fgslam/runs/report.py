@@ -31,10 +31,11 @@ from fgslam.report.run_results import (
 from fgslam.report.slam_page import write_report
 from fgslam.report.tables import read_metrics
 from fgslam.runs.folder import CALIBRATION_FILE, LOG_FILE, REPORT_FILE, RUN_MARKER
-from fgslam.runs.metric_tables import page_table
+from fgslam.runs.metric_tables import marked, page_table
 from fgslam.runs.tasks.slam_metrics import LOOPS_FILE, read_closures
 
 _UP = np.array([0.0, -1.0, 0.0])
+_SYNTHETIC = "synthetic odometry"
 _TIMED_STAGES = ("predict", "update")
 
 
@@ -79,7 +80,12 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
     pictures = next((p for p in folders if (p / "pictures").is_dir()), folder) / "pictures"
     loops = _find(folders, LOOPS_FILE)
     places, closures = (None, []) if loops is None else read_closures(loops)
-    comparison = page_table(metrics["estimators"])
+    synthetic = _SYNTHETIC if metrics.get("remark") else ""
+    of_estimators = marked(metrics["estimators"], synthetic, say_failed=False)
+    comparison = page_table(of_estimators)
+    estimators = tuple(
+        replace(one, title=title) for one, title in zip(estimators, of_estimators, strict=True)
+    )
     return ReportData(
         title=str(metrics.get("name") or config.get("name") or folder.name),
         subtitle=_subtitle(metrics, config),

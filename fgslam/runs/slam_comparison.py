@@ -68,6 +68,11 @@ def open_slam_comparison(
     return Task(provenance, lambda context: _compare(run, config, len(log), estimators, context))
 
 
+def named(config: ExperimentConfig) -> str:
+    """The run's name over tables; that its odometry was made from the truth is said there."""
+    return f"{config.name} (synthetic odometry)" if config.remark else config.name
+
+
 def judged_apart(
     config: ExperimentConfig, estimators: Sequence[EstimatorSettings]
 ) -> tuple[EstimatorSettings, ...]:
@@ -138,7 +143,7 @@ def write_comparison(
         config,
         out,
         status,
-        tables=comparison_tables(config.name, frames, values),
+        tables=comparison_tables(named(config), frames, values),
         particulars=comparison_particulars(values, out),
         failed=all(one.more.get("failure") for one in metrics.values()),
     )

@@ -73,7 +73,9 @@ def test_a_frozen_camera_is_said_in_console_status_and_report(
     words = "image of the frame before once more: 7 of 12 frames, from 5 to 11, are not used"
     assert words in said
     assert metrics_of(tmp_path / "run")["status_counts"]["camera_fault"] == 7
-    assert words in (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert words in page
+    assert f"{KIND} (7 poses predicted)" in page
 
 
 def replace_line(path: Path, number: int, line: str) -> None:

@@ -25,7 +25,7 @@ from fgslam.runs.metric_tables import comparison_particulars, comparison_tables
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.owner import give_back
 from fgslam.runs.report import report_from_folder
-from fgslam.runs.slam_comparison import judged_apart, replay_apart
+from fgslam.runs.slam_comparison import judged_apart, named, replay_apart
 from fgslam.runs.tasks import slam_map_entry as map_entry
 from fgslam.runs.tasks import slam_state as state
 from fgslam.runs.tasks.slam_map_entry import Entry, GivenMap
@@ -341,7 +341,7 @@ def _result(
     files = [("trajectory", str(own / "final.tum")), ("map", str(own / "map.ply"))]
     files += [("saved map", about_map)] if about_map else []
     files += [("pictures", f"{pictures[0].parent}/")] if pictures else []
-    tables = comparison_tables(outputs.config.name, len(outputs.recorder), compared or {})
+    tables = comparison_tables(named(outputs.config), len(outputs.recorder), compared or {})
     return SlamResult(
         config=outputs.config,
         folder=outputs.folder,

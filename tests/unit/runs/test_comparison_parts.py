@@ -38,11 +38,14 @@ from fgslam.runs.config import ExperimentConfig, make_config
 from fgslam.runs.estimator_files import points_from_log
 from fgslam.runs.metric_tables import (
     TRIAL_COLUMNS,
+    ate_table,
     comparison_particulars,
     comparison_tables,
+    marked,
     metrics_table,
+    page_table,
 )
-from fgslam.runs.slam_comparison import judged_apart
+from fgslam.runs.slam_comparison import judged_apart, named
 from fgslam.runs.tasks.truth import points_under
 from fgslam.runs.trials import Trial, summarise, together
 
@@ -55,6 +58,35 @@ def config(**more: Any) -> ExperimentConfig:
 
 # --------------------------------------------------------------------------------------------
 # Which estimators
+
+
+def test_what_is_not_all_there_is_marked_in_every_table() -> None:
+    whole = EstimatorMetrics(ate_rmse_m=0.01, more={"frames": 30, "predicted_frames": 0})
+    ended = EstimatorMetrics(ate_rmse_m=0.02, more={"frames": 12, "failure": "no solution"})
+    bridged = EstimatorMetrics(ate_rmse_m=0.03, more={"frames": 30, "predicted_frames": 8})
+    values = {
+        "ekf": whole.as_json(),
+        "isam2": ended.as_json(),
+        "batch": bridged.as_json(),
+    }
+    titles = ["ekf", "isam2 (failed, 12 of 30 frames)", "batch (8 poses predicted)"]
+    for table in comparison_tables("drive", 30, values):
+        assert [name for name, _ in table.rows] == titles
+    on_page = marked(values, "synthetic odometry", say_failed=False)
+    assert [name for name, _ in page_table(on_page).rows] == [
+        "ekf (synthetic odometry)",
+        "isam2 (12 of 30 frames, synthetic odometry)",
+        "batch (8 poses predicted, synthetic odometry)",
+    ]
+    cells = dict(ate_table([("drive", values)]).rows)
+    assert cells["isam2"] == ("2.00 (failed, 12 of 30 frames)",)
+    assert cells["ekf"] == ("1.00",)
+
+
+def test_synthetic_odometry_stands_over_every_table() -> None:
+    guessed = config(odometry={"kind": "synthetic"})
+    assert named(guessed) == "x (synthetic odometry)"
+    assert named(config()) == "x"
 
 
 def test_one_log_has_one_noise_model() -> None:
