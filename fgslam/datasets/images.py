@@ -84,6 +84,21 @@ def encoded_png(image: Image) -> bytes:
     return bytes(cv2.imencode(".png", shown)[1])
 
 
+def read_depth_image(path: Path) -> npt.NDArray[Any]:
+    """A depth image (height, width), uint16 or float, as it is stored.
+
+    Raises:
+        FrameError: absent, incomplete, no image, or of colours or 8 bits.
+    """
+    image = _decoded(_bytes_of(path), str(path), cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2 or image.dtype == np.uint8:
+        raise FrameError(
+            f"image {path} is no depth image: {image.dtype} of {image.ndim} dimensions; 16 bits or "
+            "floats of one channel are needed"
+        )
+    return image
+
+
 def decode_grey(data: bytes, name: str) -> Image:
     """The image (height, width) in grey, uint8, of an encoded image's bytes.
 

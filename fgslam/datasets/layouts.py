@@ -267,6 +267,22 @@ def _lacking_of_video(folder: Path) -> tuple[str, ...]:
     return () if films_in(folder) else ("one film, or one of a left and one of a right camera",)
 
 
+_COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images")
+
+
+def colour_and_depth(folder: Path) -> tuple[Path, Path] | None:
+    """Folders of colour and of depth images beside each other, or None."""
+    colour = next((folder / name for name in _COLOUR_FOLDERS if (folder / name).is_dir()), None)
+    depth = folder / "depth"
+    return (colour, depth) if colour is not None and depth.is_dir() else None
+
+
+def _lacking_of_rgbd(folder: Path) -> tuple[str, ...]:
+    if colour_and_depth(folder):
+        return ()
+    return _absent(folder, ("depth",)) or ("rgb, or color",)
+
+
 def _lacking_of_loose_images(folder: Path) -> tuple[str, ...]:
     found = find_cameras(folder)
     return () if found else ("images of a left and a right camera, by their names",)
@@ -283,6 +299,9 @@ LAYOUTS = {
     "kitti_raw": Layout("KITTI raw", _lacking_of_kitti_raw, lambda folder: False),
     "bag": Layout("ROS bag", _lacking_of_bag, lambda folder: False, BAG_ENDINGS),
     "video": Layout("film", _lacking_of_video, lambda folder: False, VIDEO_ENDINGS),
+    "rgbd": Layout(
+        "colour and depth", _lacking_of_rgbd, lambda folder: (folder / "depth.txt").is_file()
+    ),
     "light_field": Layout(
         "light field",
         lambda folder: _absent(folder, ("positions.csv", "calib.json")),

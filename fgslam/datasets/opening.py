@@ -22,6 +22,7 @@ from fgslam.datasets.settings import (
     MeasurementDatasetSettings,
     OdometrySettings,
     RecordedOdometrySettings,
+    RgbdSettings,
     SimulatedMeasurementsSettings,
     StereoTracksSettings,
     UtiasRangeBearingSettings,
@@ -62,11 +63,9 @@ def _judged(recording: Recording) -> Recording:
 def _opened(settings: FileRecordingSettings, odometry: RecordedOdometrySettings) -> Recording:
     if isinstance(settings, _WithOdometry):
         return _open_with_odometry(settings, odometry)
+    if isinstance(settings, _FilmOrDepth):
+        return _open_film_or_depth(settings)
     match settings:
-        case VideoSettings():
-            from fgslam.datasets.stereo_video import open_video
-
-            return open_video(settings)
         case KittiSettings():
             from fgslam.datasets.kitti import open_kitti
 
@@ -83,6 +82,19 @@ def _opened(settings: FileRecordingSettings, odometry: RecordedOdometrySettings)
             from fgslam.datasets.light_field import open_light_field
 
             return open_light_field(settings)
+
+
+_FilmOrDepth: TypeAlias = VideoSettings | RgbdSettings
+
+
+def _open_film_or_depth(settings: _FilmOrDepth) -> Recording:
+    if isinstance(settings, VideoSettings):
+        from fgslam.datasets.stereo_video import open_video
+
+        return open_video(settings)
+    from fgslam.datasets.rgbd import open_rgbd
+
+    return open_rgbd(settings)
 
 
 _WithOdometry: TypeAlias = ImageFolderSettings | LooseImagesSettings | BagSettings

@@ -45,6 +45,7 @@ class Recording(Brief):
         indices: (n,) the recording's own numbers of the selected frames.
         load_images: reads the images of one of the recording's own frames.
         load_colour: reads them in red, green, blue; None where they are grey anyway.
+        disparity_sigma_px: noise of the disparity where a depth camera gives it, or None.
         odometry_source: where the body's motions come from, or None. Asked once, when first
             needed, so that a bad odometry file hurts only who uses it.
         rectifier: what makes the images its own that the cameras gave; None where they are stored
@@ -62,6 +63,7 @@ class Recording(Brief):
     odometry_source: OdometrySource | None = None
     load_colour: ImageLoader | None = None
     rectifier: Rectifier | None = None
+    disparity_sigma_px: float | None = None
 
     @property
     def unrectified(self) -> bool:

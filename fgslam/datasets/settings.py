@@ -123,6 +123,33 @@ class VideoSettings(CalibratedSettings):
 
 
 @dataclass(frozen=True, config=STRICT)
+class RgbdSettings(CalibratedSettings):
+    """Colour and depth images, as in TUM RGB-D or in two folders (docs/datasets/rgbd.md)."""
+
+    kind: Literal["rgbd"] = "rgbd"
+    depth_scale: Annotated[
+        float | None,
+        Field(
+            gt=0.0,
+            description="units of a depth image in a metre; null: 5000 in TUM's layout, 1000 "
+            "(millimetres) of other 16-bit images, 1 of floats",
+        ),
+    ] = None
+    depth_sigma_m: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="noise of a depth of 1 m; it grows with the square of the depth (Kinect: "
+            "Khoshelham and Elberink 2012)",
+        ),
+    ] = 1.425e-3
+    pairing_tolerance_ms: Annotated[
+        float,
+        Field(gt=0.0, le=1000.0, description="largest time between colour and depth, ms"),
+    ] = 20.0
+
+
+@dataclass(frozen=True, config=STRICT)
 class KittiRawSettings(CalibratedSettings):
     """A synchronised and rectified drive of KITTI raw (docs/datasets/kitti.md)."""
 
@@ -263,6 +290,7 @@ FileRecordingSettings: TypeAlias = (
     ImageFolderSettings
     | LooseImagesSettings
     | VideoSettings
+    | RgbdSettings
     | BagSettings
     | KittiSettings
     | KittiRawSettings

@@ -51,6 +51,14 @@ class StereoSettings:
         float,
         Field(gt=0.0, description="standard deviation of a SIFT coordinate, pixels"),
     ] = 0.3
+    disparity_sigma_px: Annotated[
+        float | None,
+        Field(
+            gt=0.0,
+            description="standard deviation of the disparity, pixels, where a depth camera gives "
+            "it and not a second image; null: by pixel_sigma",
+        ),
+    ] = None
 
     @property
     def largest_disparity_px(self) -> float:

@@ -162,8 +162,7 @@ class StereoMatcher:
         if len(cameras) < len(features):
             linear = partial_map(cameras, len(features), self._vertical_to_horizontal)
         measurement = np.concatenate(used, axis=1) @ linear.T
-        variance = self._settings.pixel_sigma**2
-        covariance = np.tile(variance * (linear @ linear.T), (len(pixels), 1, 1))
+        covariance = np.tile(self._covariance(linear), (len(pixels), 1, 1))
         scale, orientation = _average([(features[camera], index) for camera, index in seen])
         return StereoFeatures(
             measurement=measurement,
@@ -175,6 +174,14 @@ class StereoMatcher:
             position_covariance=triangulation_covariance(self._rig, measurement, covariance),
             pixels=pixels,
         )
+
+    def _covariance(self, linear: FloatArray) -> FloatArray:
+        """Of (column, row, disparity) (3, 3) by the map from pixels, or of a measured depth."""
+        covariance = self._settings.pixel_sigma**2 * (linear @ linear.T)
+        if self._settings.disparity_sigma_px is not None:
+            covariance[2, :] = covariance[:, 2] = 0.0
+            covariance[2, 2] = self._settings.disparity_sigma_px**2
+        return np.asarray(covariance)
 
 
 def _average(pairs: list[tuple[Features, IntArray]]) -> tuple[FloatArray, FloatArray]:

@@ -74,6 +74,8 @@ def bare_experiment(
     sequence = open_sequence(make_config(values, where, overrides))
     if not has_odometry(sequence):
         values["odometry"] = {"kind": "constant_velocity"}
+    if (noise := getattr(sequence, "disparity_sigma_px", None)) is not None:
+        values["frontend"] = {"stereo": {"disparity_sigma_px": noise}}
     config = make_config(values, where, overrides)
     return Bare(values, config, _said(config, sequence))
 

@@ -1,0 +1,258 @@
+"""Colour and depth images, as in TUM RGB-D or in two folders (docs/datasets/rgbd.md).
+
+Depth is measured as disparity: what a second camera beside the colour camera would see is made from
+the depth image, and found again by the front-end as in any stereo pair.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fgslam.cameras.calibration import level_mounting
+from fgslam.cameras.calibration_files import read_calibration_file
+from fgslam.cameras.raw_cameras import RawCamera
+from fgslam.cameras.rectification import MapArray, View, sampling_maps
+from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.errors import CalibrationError, DatasetError, FrameError
+from fgslam.core.estimates import Trajectory
+from fgslam.core.files import read_lines
+from fgslam.core.sensors import CameraRig
+from fgslam.datasets.images import first_size, read_colour_image, read_depth_image, sized
+from fgslam.datasets.layouts import colour_and_depth
+from fgslam.datasets.loose_files import CameraFiles, images_in, pair_files
+from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
+from fgslam.datasets.recording import Recording, recording_identity, select_frames
+from fgslam.datasets.settings import RgbdSettings
+from fgslam.datasets.stamps import stamps_of
+from fgslam.datasets.tables import read_tum_table, trajectory_at_frames
+from fgslam.datasets.virtual_view import seen_from_the_left
+
+BASELINE_M = 0.08
+"""Of the camera that is made up: about that of depth cameras, so that both see much the same."""
+
+_FOUND_AGAIN_PX = 0.15  # by which SIFT finds a point again in a view made of the same image
+_TUM_SCALE, _MILLIMETRES = 5000.0, 1000.0
+_NEAREST_M, _FARTHEST_M = 0.05, 50.0  # of the median depth of an image
+_TUM_CAMERAS = {
+    "1": (517.3, 516.5, 318.6, 255.3),
+    "2": (520.9, 521.0, 325.1, 249.7),
+    "3": (535.4, 539.2, 320.1, 247.6),
+}
+"""fx, fy, cx, cy of the colour cameras, as TUM publishes them; their distortion is left out."""
+
+
+def open_rgbd(settings: RgbdSettings) -> Recording:
+    """Open colour and depth images; the colour camera is the reference.
+
+    Raises:
+        DatasetError: images are missing or do not pair, or depths are in another unit.
+        CalibrationError: nothing says the colour camera's focal length.
+    """
+    root = Path(settings.path)
+    pairs, stamps, notes, lists = _pairs(root, settings)
+    size = first_size(colour for colour, _ in pairs)
+    if size is None:
+        raise DatasetError(f"{root}: not one colour image can be read; check dataset.path")
+    camera, known = _camera(root, settings, size)
+    rig = _rig(camera, settings)
+    scale, said = _scale(root, pairs, settings)
+    chosen = select_frames(len(pairs), settings)
+    images = _Images(pairs, rig, _Undistorted.of(camera), scale)
+    truth = root / "groundtruth.txt"
+    own = rig.fx * BASELINE_M * settings.depth_sigma_m
+    return Recording(
+        name=root.resolve().name,
+        rig=rig,
+        timestamps=stamps[chosen],
+        identity=recording_identity(lists, (path for pair in pairs for path in pair)),
+        ground_truth=_true_poses(truth, stamps[chosen]) if truth.is_file() else None,
+        notes=(*notes, *known, said),
+        indices=chosen,
+        load_images=images.load,
+        load_colour=images.load_colour,
+        disparity_sigma_px=round(float(np.hypot(own, _FOUND_AGAIN_PX)), 3),
+    )
+
+
+def _true_poses(path: Path, frames: FloatArray) -> Trajectory:
+    return trajectory_at_frames(read_tum_table(path)[1], frames)
+
+
+# --------------------------------------------------------------------------------------------
+# Files
+
+
+def _pairs(
+    root: Path, settings: RgbdSettings
+) -> tuple[tuple[tuple[Path, Path], ...], FloatArray, tuple[str, ...], tuple[Path, ...]]:
+    """Colour and depth of each frame, their stamps (n,) in seconds, notes and lists."""
+    lists = (root / "rgb.txt", root / "depth.txt")
+    if all(path.is_file() for path in lists):
+        (colour_at, colours), (depth_at, depths) = (_listed(path) for path in lists)
+        tolerance = 1e-3 * settings.pairing_tolerance_ms
+        names = (str(lists[0]), str(lists[1]))
+        (rows, partners), notes = pair_stamps(colour_at, depth_at, tolerance, names)
+        named = zip(rows.tolist(), partners.tolist(), strict=True)
+        pairs = tuple((colours[i], depths[j]) for i, j in named)
+        words = tuple(n.replace("right", "colour").replace("left", "depth") for n in notes)
+        return pairs, NANOSECONDS * colour_at[rows].astype(np.float64), words, lists
+    folders = colour_and_depth(root)
+    if folders is None:
+        raise DatasetError(f"{root} has no folders of colour and depth images (rgb/ and depth/)")
+    files = [tuple(images_in(folder)) for folder in folders]
+    for folder, found in zip(folders, files, strict=True):
+        if not found:
+            raise DatasetError(f"{folder} holds no image; restore it")
+    pairs, notes = pair_files(CameraFiles(files[1], files[0], root, interleaved=False))
+    stamps, assumed, used = stamps_of([colour for colour, _ in pairs], (folders[0], root), None)
+    return pairs, stamps, (*notes, *assumed), used
+
+
+def _listed(path: Path) -> tuple[IntArray, list[Path]]:
+    """Stamps (n,) in nanoseconds and files of a list ``seconds file``."""
+    stamps, files = [], []
+    for number, text in read_lines(path):
+        words = text.split()
+        if len(words) < 2 or re.fullmatch(r"\d+(\.\d+)?", words[0]) is None:
+            raise DatasetError(f"{path}, line {number}: expected seconds and a file; correct it")
+        whole, _, part = words[0].partition(".")
+        stamps.append(int(whole) * 10**9 + int(part[:9].ljust(9, "0") or 0))
+        files.append(path.parent / words[1])
+    if not stamps or np.any(np.diff(stamps) <= 0):
+        raise DatasetError(f"{path}: lists no image, or times do not increase; restore the file")
+    return np.array(stamps, np.int64), files
+
+
+def _scale(
+    root: Path, pairs: tuple[tuple[Path, Path], ...], settings: RgbdSettings
+) -> tuple[float, str]:
+    """Units a metre, and the depth that follows from it in words. Raises DatasetError."""
+    depth = _first_depth(root, pairs)
+    assumed = _TUM_SCALE if (root / "depth.txt").is_file() else _MILLIMETRES
+    scale = settings.depth_scale or (assumed if depth.dtype == np.uint16 else 1.0)
+    seen = depth[np.isfinite(depth) & (depth > 0)]
+    if len(seen) == 0:
+        raise DatasetError(f"{pairs[0][1]} holds no depth at all; check the depth images")
+    median = float(np.median(seen)) / scale
+    if not _NEAREST_M < median < _FARTHEST_M:
+        raise DatasetError(
+            f"{root}: the median depth is {median:.4g} m at {scale:g} units a metre, which no "
+            "depth camera sees; say the unit: --set dataset.depth_scale=1000 for millimetres, 1 "
+            "for metres"
+        )
+    return scale, f"depth is taken as {scale:g} units a metre: its median is {median:.3g} m"
+
+
+def _first_depth(root: Path, pairs: tuple[tuple[Path, Path], ...]) -> FloatArray | Image:
+    for _, path in pairs:
+        try:
+            return read_depth_image(path)
+        except FrameError:
+            continue
+    raise DatasetError(f"{root}: not one depth image can be read; restore them")
+
+
+# --------------------------------------------------------------------------------------------
+# The colour camera
+
+
+def _camera(
+    root: Path, settings: RgbdSettings, size: tuple[int, int]
+) -> tuple[RawCamera, tuple[str, ...]]:
+    """The colour camera by the given file, the folder's own, or as TUM publishes it."""
+    if settings.camera_file is not None:
+        return _of_file(Path(settings.camera_file), size), ()
+    own = sorted(p for p in root.iterdir() if p.suffix in (".json", ".yaml", ".yml", ".xml"))
+    if len(own) == 1:
+        return _of_file(own[0], size), ()
+    known = re.search(r"(?:freiburg|fr)([123])(?!\d)", root.resolve().name)
+    if known is None or size != (640, 480):
+        raise CalibrationError(
+            f"{root}: nothing says the colour camera's focal length; give its calibration by "
+            "--camera FILE"
+        )
+    fx, fy, cx, cy = _TUM_CAMERAS[known[1]]
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    camera = RawCamera(*size, matrix, np.zeros(4), np.eye(4), f"freiburg{known[1]}")
+    return camera, (f"the camera is taken as TUM's freiburg{known[1]}, without distortion",)
+
+
+def _of_file(path: Path, size: tuple[int, int]) -> RawCamera:
+    camera = read_calibration_file(path, size=size).cameras[0]
+    stated = (camera.width, camera.height)
+    if stated != (0, 0) and stated != size:
+        raise CalibrationError(
+            f"{path} is for images of {stated[0]}x{stated[1]}, the colour images have "
+            f"{size[0]}x{size[1]}; give the calibration of these"
+        )
+    return replace(camera, width=size[0], height=size[1])
+
+
+def _rig(camera: RawCamera, settings: RgbdSettings) -> CameraRig:
+    fx, fy, cx, cy = (float(camera.matrix[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    bTc = np.eye(4)
+    if settings.camera_yaw_deg is not None or settings.lever_arm_m is not None:
+        bTc = level_mounting(settings.camera_yaw_deg or 0.0, settings.lever_arm_m or (0.0,) * 3)
+    return CameraRig(camera.width, camera.height, fx, fy, cx, cy, BASELINE_M, None, bTc)
+
+
+@dataclass(frozen=True, eq=False)
+class _Undistorted:
+    """Where each pixel of an undistorted image is in the camera's own."""
+
+    columns: MapArray
+    rows: MapArray
+
+    @staticmethod
+    def of(camera: RawCamera) -> _Undistorted | None:
+        """None where there is nothing to mend."""
+        if camera.model == "radtan" and not np.any(camera.distortion):
+            return None
+        view = View(camera.matrix, (camera.width, camera.height))
+        return _Undistorted(*sampling_maps(camera, np.eye(3), view))
+
+    def apply(self, image: Image, nearest: bool) -> Image:
+        """The image, with its pixels between others blended, or, of depth, the nearest."""
+        how = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
+        return np.asarray(cv2.remap(image, self.columns, self.rows, how))
+
+
+@dataclass(frozen=True, eq=False)
+class _Images:
+    """Frames as a stereo pair: the colour camera on the right, the view made by depth left."""
+
+    pairs: tuple[tuple[Path, Path], ...]
+    rig: CameraRig
+    undistorted: _Undistorted | None
+    scale: float
+
+    def load(self, index: int) -> tuple[Image, ...]:
+        """(right, left) in grey. Raises FrameError."""
+        return tuple(
+            np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+            for image in self.load_colour(index)
+        )
+
+    def load_colour(self, index: int) -> tuple[Image, ...]:
+        """The same in red, green, blue."""
+        size = (self.rig.width, self.rig.height)
+        colour_file, depth_file = self.pairs[index]
+        colour = sized(read_colour_image(colour_file), f"image {colour_file}", *size)
+        depth = read_depth_image(depth_file)
+        if depth.shape != colour.shape[:2]:
+            raise FrameError(
+                f"image {depth_file} is {depth.shape[1]}x{depth.shape[0]}, its colour image "
+                f"{size[0]}x{size[1]}; depth must be registered to colour"
+            )
+        if self.undistorted is not None:
+            colour = self.undistorted.apply(colour, nearest=False)
+            depth = self.undistorted.apply(depth, nearest=True)
+        metres = depth.astype(np.float32) / np.float32(self.scale)
+        known = np.isfinite(metres) & (metres > 0.0)
+        shift = self.rig.fx * self.rig.baseline / np.where(known, metres, np.inf)
+        return colour, seen_from_the_left(colour, shift.astype(np.float32), known)

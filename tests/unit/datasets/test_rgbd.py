@@ -1,0 +1,166 @@
+"""Colour and depth: the view that depth makes, TUM's layout, two folders, units."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from dataset_builders import HEIGHT, WIDTH, picture, save
+
+from fgslam.core.errors import CalibrationError, DatasetError, FrameError
+from fgslam.core.sensors import CameraRig
+from fgslam.datasets.layouts import recognise_layout
+from fgslam.datasets.recording import Recording
+from fgslam.datasets.rgbd import BASELINE_M, open_rgbd
+from fgslam.datasets.settings import RgbdSettings
+from fgslam.datasets.virtual_view import seen_from_the_left
+from fgslam.frontend.settings import StereoSettings
+from fgslam.frontend.stereo import StereoMatcher
+from fgslam.runs.bare_recording import bare_experiment
+
+FOCAL = 250.0  # at 2 m the view is shifted by 10 px
+DEPTH_M = 2.0
+
+
+def opened(root: Path, **settings: Any) -> Recording:
+    return open_rgbd(RgbdSettings(path=str(root), **settings))
+
+
+def camera(root: Path, **changes: Any) -> None:
+    matrix = {"fx": FOCAL, "fy": FOCAL, "cx": 15.5, "cy": 11.5, "width": WIDTH, "height": HEIGHT}
+    values = {**matrix, "baseline_m": 0.1, **changes}
+    (root / "calib.json").write_text(json.dumps(values), encoding="utf-8")
+
+
+def tum(root: Path, frames: int = 4, late: float = 0.005) -> Path:
+    """TUM's layout: a wall 2 m away; depth is ``late`` seconds later; frame 2 has no depth."""
+    lines: dict[str, list[str]] = {"rgb": [], "depth": []}
+    for k in range(frames):
+        for name in lines:
+            stamp = f"{1305031232.1 + 0.1 * k + (late if name == 'depth' else 0.0):.6f}"
+            depth = np.full((HEIGHT, WIDTH), round(5000 * DEPTH_M), np.uint16)
+            colour = np.dstack([picture(10 + k)] * 3)
+            if (k, name) != (2, "depth"):
+                save(root / name / f"{stamp}.png", colour if name == "rgb" else depth)
+                lines[name].append(f"{stamp} {name}/{stamp}.png")
+    for name, listed in lines.items():
+        text = "\n".join(["# timestamp filename", *listed])
+        (root / f"{name}.txt").write_text(text, encoding="utf-8")
+    truth = [f"{1305031232.0 + 0.05 * k:.4f} {0.01 * k} 0 0 0 0 0 1" for k in range(20)]
+    (root / "groundtruth.txt").write_text("\n".join(truth), encoding="utf-8")
+    camera(root)
+    return root
+
+
+# --------------------------------------------------------------------------------------------
+# The view from the left
+
+
+def test_each_pixel_is_further_right_by_its_disparity() -> None:
+    image = cv2.GaussianBlur(picture(1, 80, 60), (0, 0), 1.5)
+    shift = np.full(image.shape, 7.5, np.float32)
+    view = seen_from_the_left(image, shift, np.ones(image.shape, bool))
+    between = 0.5 * (image[:, 20:60].astype(float) + image[:, 21:61])
+    assert np.abs(view[:, 28:68] - between).max() <= 1.0  # at column u + 7.5, half a pixel aside
+
+
+def test_what_is_near_hides_what_is_far_and_the_unknown_has_no_texture() -> None:
+    image = picture(2, 80, 60)
+    shift = np.full(image.shape, 4.0, np.float32)
+    shift[20:40, 30:50] = 12.0
+    known = np.ones(image.shape, bool)
+    known[50:] = False
+    view = seen_from_the_left(image, shift, known)
+    assert np.array_equal(view[20:40, 42:62], image[20:40, 30:50])
+    assert np.array_equal(view[0:20, 4:], image[0:20, :-4])
+    assert np.abs(np.diff(view[56:].astype(int), axis=1)).max() < 20
+    assert np.abs(np.diff(image[56:].astype(int), axis=1)).max() > 150
+
+
+def test_the_disparity_has_the_noise_of_the_depth_and_is_independent_of_the_place() -> None:
+    rig = CameraRig(64, 48, FOCAL, FOCAL, 31.5, 23.5, 0.1, None, np.eye(4))
+    settings = StereoSettings(disparity_sigma_px=0.2)
+    covariance = StereoMatcher(rig, settings, appearance=None)._covariance(  # type: ignore[arg-type]
+        np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [-1, 0, 1, 0]])
+    )
+    sigma2 = settings.pixel_sigma**2
+    assert np.allclose(covariance, np.diag([sigma2, sigma2, 0.04]), rtol=0.0, atol=1e-15)
+
+
+# --------------------------------------------------------------------------------------------
+# Recordings
+
+
+def test_the_layout_of_tum(tmp_path: Path) -> None:
+    root = tum(tmp_path / "walk")
+    assert recognise_layout(root) == {"kind": "rgbd", "path": str(root)}
+    recording = opened(root)
+    assert len(recording) == 3
+    right, left = recording.frame(2).images
+    assert np.array_equal(right, picture(13))
+    assert np.array_equal(left[:, 10:], right[:, :-10])
+    assert recording.rig.baseline == BASELINE_M
+    truth = recording.ground_truth
+    assert truth is not None
+    assert np.allclose(truth.poses[:, 0, 3], [0.02, 0.04, 0.08], rtol=0.0, atol=1e-4)
+    assert "1 colour images have no partner within 20 ms" in recording.notes[0]
+    assert recording.notes[-1] == "depth is taken as 5000 units a metre: its median is 2 m"
+
+
+def test_the_noise_of_depth_is_part_of_the_experiment(tmp_path: Path) -> None:
+    bare = bare_experiment(tum(tmp_path / "walk"))
+    # 250 px * 0.08 m * 1.425 mm, and 0.15 px by which a point is found again.
+    assert bare.values["frontend"] == {"stereo": {"disparity_sigma_px": 0.153}}
+    assert bare.config.frontend.stereo.disparity_sigma_px == 0.153
+    assert "walk: colour and depth, 2 cameras 32x24; 3 frames" in bare.said
+
+
+@pytest.mark.parametrize(("kind", "units"), [(np.uint16, 1000.0), (np.float32, 1.0)])
+def test_two_folders_in_millimetres_or_metres(tmp_path: Path, kind: Any, units: float) -> None:
+    for k in (9, 10):
+        save(tmp_path / "color" / f"{k}.png", picture(k))
+        ending = "png" if kind == np.uint16 else "tiff"
+        depth = np.full((HEIGHT, WIDTH), DEPTH_M * units, kind)
+        save(tmp_path / "depth" / f"{k}.{ending}", depth)
+    camera(tmp_path)
+    recording = opened(tmp_path)
+    assert [int(recording.frame(i).images[0][0, 0]) for i in range(2)] == [9, 10]
+    right, left = recording.frame(1).images
+    assert np.array_equal(left[:, 10:], right[:, :-10])
+    assert f"taken as {units:g} units a metre" in recording.notes[-1]
+
+
+def test_depth_in_the_wrong_unit_is_said(tmp_path: Path) -> None:
+    root = tum(tmp_path)
+    with pytest.raises(DatasetError, match=r"median depth is 1e\+04 m at 1 units a metre.*=1000 f"):
+        opened(root, depth_scale=1.0)
+    with pytest.raises(DatasetError, match=r"median depth is 0\.01 m at 1e\+06 units a metre"):
+        opened(root, depth_scale=1e6)
+
+
+def test_the_colour_camera(tmp_path: Path) -> None:
+    root = tum(tmp_path / "walk")
+    (root / "calib.json").rename(tmp_path / "mine.json")
+    with pytest.raises(CalibrationError, match="nothing says the colour camera's focal length"):
+        opened(root)
+    assert opened(root, camera_file=str(tmp_path / "mine.json")).rig.fx == FOCAL
+    camera(root, width=640, height=480)
+    with pytest.raises(CalibrationError, match="is for images of 640x480, the colour images have"):
+        opened(root)
+
+
+def test_depth_that_is_not_registered_or_no_depth(tmp_path: Path) -> None:
+    root = tum(tmp_path)
+    depths = sorted((root / "depth").iterdir())
+    save(depths[0], np.full((12, 16), 10000, np.uint16))
+    save(depths[1], picture(1))
+    recording = opened(root)
+    with pytest.raises(FrameError, match="is 16x12, its colour image 32x24; depth must be regis"):
+        recording.frame(0)
+    with pytest.raises(FrameError, match="is no depth image: uint8 of 2 dimensions"):
+        recording.frame(1)
+    assert recording.frame(2).images[0][0, 0] == 13
