@@ -7,6 +7,7 @@ how all of it ends within a moment.
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import queue
@@ -18,6 +19,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from fgslam.core.errors import ConfigError, FgslamError, OutputError
@@ -203,12 +205,11 @@ def crew_at(scheduler: str) -> Iterator[DaskCrew]:
     """
     from distributed import Client
 
-    where = {"scheduler_file": scheduler} if scheduler.endswith(".json") else {"address": scheduler}
     with ExitStack() as stack:
         stack.enter_context(_quiet())
         try:
-            client = Client(**where, timeout=_CONNECT_S, set_as_default=False)
-        except (OSError, TimeoutError, ValueError, TypeError) as error:
+            client = Client(_address(scheduler), timeout=_CONNECT_S, set_as_default=False)
+        except (OSError, TimeoutError, ValueError, TypeError, KeyError) as error:
             words = " ".join(str(error).split())[:200]
             raise ConfigError(
                 f"--scheduler {scheduler}: no Dask scheduler answers there ({words}); start one by "
@@ -216,6 +217,16 @@ def crew_at(scheduler: str) -> Iterator[DaskCrew]:
             ) from None
         stack.callback(_close, client)
         yield DaskCrew(client)
+
+
+def _address(scheduler: str) -> str:
+    """An address with a port. Raises OSError, ValueError, TypeError or KeyError for none."""
+    from distributed.comm import get_address_host_port
+
+    if scheduler.endswith(".json"):
+        scheduler = str(json.loads(Path(scheduler).read_text(encoding="utf-8"))["address"])
+    get_address_host_port(scheduler)
+    return scheduler
 
 
 class LocalCrew:

@@ -135,9 +135,14 @@ def test_what_had_not_come_in_when_it_was_stopped_is_named(which: str, crew: Das
     assert found == [(k, WorkerEnded(k + 1, "interrupted before it began")) for k in range(3)]
 
 
-def test_no_scheduler_is_one_line() -> None:
-    words = "--scheduler nowhere:x: no Dask scheduler answers there"
-    with pytest.raises(ConfigError, match=words), crew_at("nowhere:x"):
+@pytest.mark.parametrize("given", ["nowhere:x", "nowhere", "absent.json", "list.json"])
+def test_no_scheduler_is_one_line(
+    given: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "list.json").write_text("[]")
+    words = f"--scheduler {given}: no Dask scheduler answers there"
+    with pytest.raises(ConfigError, match=words), crew_at(given):
         pass
 
 
