@@ -5,7 +5,7 @@ PYTEST = .venv/bin/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder
 DEMO_OUT ?= runs/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check docs bench bench-long baseline clean
+.PHONY: help setup demo test test-all check docs fuzz bench bench-long baseline clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -36,6 +36,11 @@ check: setup ## linter, formatter and type checker; changes nothing
 docs: setup ## build the documentation into build/site; strict, without network
 	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict --quiet
 	.venv/bin/python -m scripts.check_site build/site
+
+FUZZ_CASES ?= 500
+
+fuzz: setup ## damaged and odd inputs of each kind to what reads them (FUZZ_CASES=5000 for long)
+	.venv/bin/python -m scripts.fuzz --cases $(FUZZ_CASES)
 
 bench: setup ## measure speed as ratios, write bench.json
 	.venv/bin/python -m benchmarks speed

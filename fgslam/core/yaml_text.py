@@ -76,15 +76,16 @@ def read_yaml(path: Path, error: type[FgslamError], give: str = "give a YAML tex
 
 def plain_values(text: str) -> Any:
     """What a YAML text holds. Raises yaml.YAMLError, also for what safe_load lets pass."""
-    loader = PlainLoader(text)
-    try:
-        node = loader.get_single_node()
-        if node is None:
-            return None
+    node = composed(text)
+    return None if node is None else PlainLoader("").construct_document(node)
+
+
+def composed(text: str) -> Any:
+    """The root node of a YAML text, None of an empty one. Raises yaml.YAMLError as above."""
+    node = PlainLoader(text).get_single_node()
+    if node is not None:
         _expanded(node, {})
-        return loader.construct_document(node)
-    finally:
-        loader.dispose()
+    return node
 
 
 def problem_of(error: yaml.YAMLError) -> str:

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from fgslam.core.errors import ConfigError, shortened
-from fgslam.core.yaml_text import PlainLoader, read_yaml
+from fgslam.core.yaml_text import PlainLoader, composed, read_yaml
 from fgslam.runs.named_experiments import suggestion
 from fgslam.runs.retired_settings import RETIRED
 
@@ -333,7 +333,7 @@ def typed_value(text: str, accepted: Sequence[Schema]) -> Any:
         yaml.YAMLError: the setting is no text, and this is not valid YAML.
     """
     try:
-        node = PlainLoader(text).get_single_node()
+        node = composed(text)
     except yaml.YAMLError:
         if _is_text(accepted):
             return text.strip()
