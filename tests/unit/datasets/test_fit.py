@@ -13,6 +13,8 @@ from fgslam.cameras.rig import load_rig
 from fgslam.core.arrays import Image
 from fgslam.core.errors import FrameError
 from fgslam.datasets.checks.fit import fit_notes
+from fgslam.datasets.opening import open_recording
+from fgslam.datasets.settings import EurocSettings
 
 
 def pair(disparity: int, rows: int) -> tuple[Image, Image]:
@@ -86,3 +88,17 @@ def test_real_pairs(shared_data: Path, kind: str) -> None:
 
     notes = fit_notes(load, 3)
     assert notes == () if words is None else words in notes[0]
+
+
+@pytest.mark.data
+def test_a_real_drive_fits_its_calibration_and_no_other(shared_data: Path) -> None:
+    """EuRoC's own sensor.yaml against that of another camera of the same size (MYNT EYE)."""
+    root = shared_data / "euroc_v101_raw"
+    other = shared_data / "cameras/calibrations/vins_fusion/mynteye/mynteye_stereo_imu_config.yaml"
+    if not root.is_dir() or not other.is_file():
+        pytest.skip(f"no raw recording at {root}, or no calibration at {other}")
+    found = open_recording(EurocSettings(path=str(root), stop=3))
+    assert found.unrectified
+    assert not any("does not fit" in note for note in found.notes)
+    wrong = open_recording(EurocSettings(path=str(root), stop=3, camera_file=str(other)))
+    assert "the calibration does not fit the images" in wrong.notes[0]
