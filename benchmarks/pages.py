@@ -26,7 +26,13 @@ GROUPS: dict[str, tuple[str, ...]] = {
     ),
     "Filters and smoothers": ("filter_or_smoother", "robustness"),
     "Maps": ("lasting_landmarks", "saved_maps", "relocalisation", "loops"),
-    "Homing": ("homing_vectors", "homing_drives", "topological_maps", "homing_estimators"),
+    "Homing": (
+        "homing_vectors",
+        "homing_drives",
+        "own_routes",
+        "topological_maps",
+        "homing_estimators",
+    ),
     "Speed": (
         "key_frames",
         "speed",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fgslam.cli import options, signals
+from fgslam.cli import options, routes, signals
 from fgslam.cli.calibrate import app as calibrate_app
 from fgslam.cli.camera import app as camera_app
 from fgslam.cli.performing import (
@@ -214,6 +214,8 @@ def _baselines(results: Results, written: Path | None, expected: Baseline | None
 
 
 app.command()(sweep)
+app.command()(routes.teach)
+app.command()(routes.follow)
 
 
 @app.command()

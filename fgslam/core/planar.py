@@ -70,3 +70,9 @@ def bearings(wTr: FloatArray, points: FloatArray) -> FloatArray:
     """(n,) bearings of points (n, 2) from a pose, counter-clockwise from its heading (eqs 7, 9)."""
     seen = to_robot(wTr, points)
     return np.arctan2(seen[:, 1], seen[:, 0])
+
+
+def circular_median(angles: FloatArray) -> float:
+    """The angle of (n,), n > 0, with the least sum of absolute differences to all."""
+    apart = np.abs(wrap(angles[:, None] - angles[None, :]))
+    return float(angles[int(np.argmin(apart.sum(axis=0)))])

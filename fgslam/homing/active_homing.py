@@ -20,7 +20,7 @@ from fgslam.core.homing import (
     TwoViewVector,
     among,
 )
-from fgslam.core.planar import bearings, wrap
+from fgslam.core.planar import bearings, circular_median, wrap
 from fgslam.homing.settings import HomingControlSettings
 
 _MAX_ACROSS = 0.1
@@ -256,9 +256,3 @@ def common_turn(before: TrackedBearings, now: TrackedBearings) -> float:
         return float("nan")
     change = wrap(before.bearing[mine] - now.bearing[other])
     return circular_median(change)
-
-
-def circular_median(angles: FloatArray) -> float:
-    """The angle of (n,), n > 0, with the least sum of absolute differences to all."""
-    apart = np.abs(wrap(angles[:, None] - angles[None, :]))
-    return float(angles[int(np.argmin(apart.sum(axis=0)))])

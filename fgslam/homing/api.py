@@ -6,15 +6,23 @@ The tasks ``homing_pairs`` and ``path_following`` run the same parts; nothing is
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, Literal
 
 import numpy.typing as npt
 
 from fgslam.backend.homing.factory import homing_settings_of, make_homing_estimator
 from fgslam.backend.homing.settings import HomingEstimatorKind
 from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.core.arrays import Image
 from fgslam.core.checks import is_finite_number, later_time, require_seed
-from fgslam.core.errors import CalibrationError, EstimatorError, SessionError, StoredMapError
+from fgslam.core.errors import (
+    CalibrationError,
+    ConfigError,
+    EstimatorError,
+    SessionError,
+    StoredMapError,
+)
 from fgslam.core.homing import Refusal, TwoViewVector
 from fgslam.core.settings import make_settings
 from fgslam.frontend.features.images import colour_image
@@ -24,10 +32,12 @@ from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.view_pairs import pair_generator, vector_between
 from fgslam.homing.command import Drive, DriveCommand
 from fgslam.homing.front_end import make_front_end, unusable
+from fgslam.homing.guided import GuidedHoming
 from fgslam.homing.path_following import HomingChain, LegOutcome
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.settings import DRIVING, FrontEndSettings, HomingBehaviourSettings
 from fgslam.homing.steering import Steering
+from fgslam.homing.teaching import Teacher, with_neighbours_votes
 
 
 class HomingVector:
@@ -94,8 +104,12 @@ def teach(
     *,
     names: Sequence[str] | None = None,
     features: OmniFeatureSettings | None = None,
+    select: bool = False,
 ) -> PathMemory:
     """The path along target images: their features in order, to be followed or saved.
+
+    Of each image 300 SIFT features and 100 column segments are kept, 20 kB in a file: those that
+    its neighbours show, too, and the strongest all around.
 
     Args:
         images: (height, width, 3) RGB or (height, width) grey uint8, in the order in which they
@@ -103,6 +117,8 @@ def teach(
         camera: that took them.
         names: one an image, for people; None numbers them.
         features: extraction; None: the defaults.
+        select: the images are a drive's, near each other, as of a film; few of them are chosen by
+            what they have in common (:mod:`fgslam.homing.teaching`).
 
     Raises:
         CalibrationError: ``camera`` is none.
@@ -110,17 +126,42 @@ def teach(
         StoredMapError: there is no image, or not one name an image.
     """
     size = (_require_camera(camera, "teach").width, camera.height)
-    extractor = OmniFeatureExtractor(camera, features or DRIVING.features)
-    found = tuple(
-        extractor.extract(colour_image(image, size, f"image {k}")) for k, image in enumerate(images)
-    )
+    front_end = replace(DRIVING, features=features or DRIVING.features)
+    given = (colour_image(image, size, f"image {k}") for k, image in enumerate(images))
+    if select:
+        return _selected(given, camera, front_end, names)
+    extractor = OmniFeatureExtractor(camera, front_end.features)
+    found = with_neighbours_votes([extractor.extract(image) for image in given], front_end)
     if not found:
         raise StoredMapError("path: no target image; give at least one")
-    return PathMemory.of(found, names)
+    return PathMemory.of(found, names, camera)
+
+
+def _selected(
+    images: Iterable[Image],
+    camera: OmniCamera,
+    front_end: FrontEndSettings,
+    names: Sequence[str] | None,
+) -> PathMemory:
+    teacher = Teacher(camera, front_end)
+    passed_over: tuple[int, str, Image] | None = None
+    for k, image in enumerate(images):
+        if names is not None and k >= len(names):
+            raise StoredMapError(f"path: {len(names)} names for more images; give one an image")
+        passed_over = (k, str(k) if names is None else names[k], image)
+        if k >= teacher.next:
+            teacher.take(*passed_over)
+            passed_over = None
+    if passed_over is not None:  # the last one is the path's end
+        teacher.take(*passed_over)
+    return teacher.finish().memory
 
 
 class PathFollower:
     """Drives along a taught path: an image in, speed and turning rate out.
+
+    The robot may be put down anywhere on the path, be carried off, or lose sight of it: while the
+    next path image is not matched, its place is sought among all of them.
 
     Followers share nothing: any number of them work side by side. Used as a context manager it is
     closed at the end.
@@ -135,6 +176,7 @@ class PathFollower:
         behaviour: HomingBehaviourSettings | None = None,
         front_end: FrontEndSettings = DRIVING,
         seed: int = 0,
+        by: Literal["tracks", "looks"] = "tracks",
     ) -> None:
         """Begins before the first target.
 
@@ -142,14 +184,17 @@ class PathFollower:
             camera: of the robot; the path may have been taught with another one.
             path: of :func:`fgslam.teach`, or loaded.
             estimator: its kind, ``homing_graph``, ``homing_ekf``, ``alv`` or ``snapshot``, or its
-                settings.
+                settings; used with tracks.
             behaviour: control, steering (largest speed), skipping of targets; None: the defaults.
             front_end: features, matching, tracking.
             seed: of RANSAC's samples; the same images then give the same commands.
+            by: ``tracks``: features are matched once a leg and tracked from then on, ten images a
+                second; ``looks``: every image is matched with the path anew, at any rate, whoever
+                drives: of a recording, say.
 
         Raises:
             CalibrationError: ``camera`` is none.
-            ConfigError: there is no such estimator.
+            ConfigError: there is no such estimator, or no such way to follow.
             StoredMapError: ``path`` is none.
         """
         if not isinstance(path, PathMemory):
@@ -159,14 +204,17 @@ class PathFollower:
             )
         self._camera = _require_camera(camera, "PathFollower")
         require_seed(seed, "PathFollower")
+        if by not in ("tracks", "looks"):
+            raise ConfigError(f"PathFollower: by is {by!r}; give 'tracks' or 'looks'")
         settings = homing_settings_of(estimator)
         behaviour = behaviour or HomingBehaviourSettings()
-        self._homing = HomingChain(
+        chain = HomingChain(
             make_front_end(camera, front_end, seed),
             path.images,
             lambda start: make_homing_estimator(start, settings),
             behaviour.control,
         )
+        self._homing = GuidedHoming(chain, path, (camera, front_end, seed), tracks=by == "tracks")
         self._steering = Steering(behaviour.steering)
         self._longest_step = 1.0 / behaviour.loop.images_per_s
         self._time: float | None = None
@@ -187,10 +235,10 @@ class PathFollower:
         self._require_open()
         seconds = self._elapsed(time)
         size = (self._camera.width, self._camera.height)
-        command = self._homing.step(colour_image(image, size), float(time))
+        command, place = self._homing.step(colour_image(image, size), float(time))
         drive = self._steering.step(command, seconds)
         self._time = float(time)
-        return DriveCommand(drive.speed, drive.turn_rate, command)
+        return DriveCommand(drive.speed, drive.turn_rate, command, place)
 
     def driven(self, v: float, omega: float, seconds: float) -> None:
         """Reports that the robot drove otherwise than commanded, as obstacle avoidance makes it.
@@ -213,7 +261,7 @@ class PathFollower:
                 "time that is not negative"
             )
         self._steering.driven(Drive(v, omega, overridden=True))
-        self._homing.held_up(seconds)
+        self._homing.chain.held_up(seconds)
 
     @property
     def finished(self) -> bool:
@@ -223,12 +271,12 @@ class PathFollower:
     @property
     def legs(self) -> tuple[LegOutcome, ...]:
         """How each leg that is over ended, in order."""
-        return tuple(self._homing.outcomes)
+        return tuple(self._homing.chain.outcomes)
 
     def close(self) -> None:
         """Ends it; the present leg, if any, ends unfinished."""
         if not self._closed and self._time is not None:
-            self._homing.interrupt(self._time, "closed")
+            self._homing.chain.interrupt(self._time, "closed")
         self._closed = True
 
     def __enter__(self) -> PathFollower:

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from enum import Enum
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.homing import Refusal
+from fgslam.core.homing import Refusal, TwoViewVector
+
+SURE = 0.9  # probability from which a place on a path counts as known
 
 
 class HomingState(str, Enum):
@@ -69,6 +71,34 @@ class Drive:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class PathPlace:
+    """Where on a path one image was taken.
+
+    Attributes:
+        nearest: number of the path image that is probably the nearest one.
+        probability: that it, or the one before or after it, is.
+        target: number of the path image to go to next.
+        vector: from the image to the target; None where it is refused.
+        refusal: why, in words; empty where there is a vector.
+        remaining: part of the way between path images that is left, roughly: by parallax.
+        reached: the path's end is.
+    """
+
+    nearest: int
+    probability: float
+    target: int
+    vector: TwoViewVector | None
+    refusal: str
+    remaining: float
+    reached: bool
+
+    @property
+    def sure(self) -> bool:
+        """Whether the place is known."""
+        return self.probability >= SURE
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class DriveCommand:
     """What the wheels are to do after one image.
 
@@ -76,11 +106,13 @@ class DriveCommand:
         v: speed, m/s, forward.
         omega: turning rate, rad/s, counter-clockwise.
         homing: where home is and how sure that is; the properties below are of it.
+        place: where on the path the image was taken; None where that was not looked for.
     """
 
     v: float
     omega: float
     homing: Command
+    place: PathPlace | None = None
 
     @property
     def time(self) -> float:

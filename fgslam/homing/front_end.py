@@ -25,6 +25,7 @@ from fgslam.frontend.homing.matching import match_features
 from fgslam.frontend.homing.trackable_points import move_to_trackable
 from fgslam.frontend.homing.two_view_geometry import make_local_map, triangulable
 from fgslam.homing.active_homing import parallax
+from fgslam.homing.compact import best_all_around
 from fgslam.homing.settings import FrontEndSettings
 
 
@@ -140,10 +141,7 @@ class ImageFrontEnd:
         refusal = unusable(image, present)
         if refusal is not None:
             return refusal
-        matches = match_features(present, target, self._settings.features.matching)
-        if self._settings.wrong_matches > 0.0:
-            matches = mixed_with_wrong(matches, self._settings.wrong_matches, self._rng)
-        vector = estimate_homing_vector(matches, self._settings.homing_vector, self._rng)
+        vector, matches = compare_views(present, target, self._settings, self._rng)
         return vector if isinstance(vector, Refusal) else (present, matches, vector)
 
     def _started(
@@ -177,6 +175,19 @@ class ImageFrontEnd:
         return HomingStart(time, vector, local_map, points)
 
 
+def compare_views(
+    present: OmniFeatures,
+    target: OmniFeatures,
+    settings: FrontEndSettings,
+    rng: np.random.Generator,
+) -> tuple[TwoViewVector | Refusal, BearingMatches]:
+    """The homing vector between two images by their features alone, and the tentative matches."""
+    matches = match_features(present, target, settings.features.matching)
+    if settings.wrong_matches > 0.0:
+        matches = mixed_with_wrong(matches, settings.wrong_matches, rng)
+    return estimate_homing_vector(matches, settings.homing_vector, rng), matches
+
+
 def make_front_end(camera: OmniCamera, settings: FrontEndSettings, seed: int) -> ImageFrontEnd:
     """The front-end of one drive, with a random generator of its own."""
     return ImageFrontEnd(camera, settings, np.random.default_rng((seed, _STREAM)))
@@ -188,13 +199,7 @@ def surest_all_around(matches: BearingMatches, most: int) -> IntArray:
     Features on one side alone would leave the homing vector open along a valley.
     """
     order = np.argsort(-matches.quality, kind="stable")
-    sector = np.floor(np.mod(matches.bearing_a[order], 2.0 * np.pi) / (2.0 * np.pi / _SECTORS))
-    rank = np.zeros(len(order), dtype=np.int64)
-    for k in range(_SECTORS):
-        inside = sector == k
-        rank[inside] = np.arange(np.count_nonzero(inside))
-    turn = np.argsort(rank, kind="stable")
-    return np.asarray(np.sort(order[turn[:most]]), dtype=np.int64)
+    return best_all_around(matches.bearing_a, order, most, _SECTORS)
 
 
 def mixed_with_wrong(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVector
+from fgslam.core.homing import Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
 
 _MUTUAL_DEG = 5.0  # largest difference between the answers there and back, beyond three deviations
@@ -18,8 +18,6 @@ _ONE_WAY_SUPPORT = 25
 """Inliers of an edge that is answered in one direction and ambiguous in the other."""
 
 Answer: TypeAlias = TwoViewVector | Refusal
-Linker: TypeAlias = Callable[[OmniFeatures, OmniFeatures], Answer]
-"""The homing vector from the first image's place to the second's."""
 Pair: TypeAlias = tuple[int, int]
 
 _SIGMAS = 3.0

@@ -7,19 +7,39 @@ anywhere, so that a robot that was carried off finds itself again.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Mapping
+from typing import Protocol, TypeAlias
+
 import numpy as np
-from scipy.sparse import diags
+from scipy.sparse import csr_matrix, diags
 
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason
-from fgslam.homing.links import Linker
+from fgslam.core.homing import OmniFeatures, RefusalReason
+from fgslam.homing.links import Answer
 from fgslam.homing.retrieval import VisualWords
 from fgslam.homing.settings import LocalisationSettings
-from fgslam.homing.topological_map import TopologicalMap
+
+Linker: TypeAlias = Callable[[OmniFeatures, int], Answer]
+"""The homing vector from an image's place to that of a node, by its number."""
 
 _BACKGROUND = 4.0  # inliers that a wrong place may get, on average
 
+_AT_NODE = 100.0  # inliers, at least, of an image that was taken at the node itself
+
 _STAY = 0.5  # chance to be still at the node of the last image
+
+Weigher: TypeAlias = Callable[[Mapping[int, Answer]], Mapping[int, float]]
+"""What speaks for each node, in inliers, of the answers of those that were matched."""
+
+
+class Places(Protocol):
+    """Images as nodes, a map's or a path's."""
+
+    def __len__(self) -> int: ...
+
+    def graph(self) -> csr_matrix:
+        """(n, n) costs of going from one node to another."""
+        ...
 
 
 class Localiser:
@@ -27,14 +47,18 @@ class Localiser:
 
     Attributes:
         belief: (n,) probabilities; uniform before the first image.
+        likelihood: (n,) of the last image at each node, up to a factor.
+        answers: homing vectors of the last image to those nodes that it was matched with.
     """
 
     def __init__(
         self,
-        topology: TopologicalMap,
+        topology: Places,
         words: VisualWords,
         linker: Linker,
         settings: LocalisationSettings,
+        weigh: Weigher | None = None,
+        transition: FloatArray | None = None,
     ) -> None:
         """Begins with a uniform belief.
 
@@ -43,27 +67,41 @@ class Localiser:
             words: of the map's images, in their order.
             linker: homing vector from the robot's image to a node's.
             settings: chances and the number of nodes to match with.
+            weigh: evidence of answers; None: their inliers.
+            transition: (n, n) chances to go from row to column between two images, without leaps;
+                None: along the links, those that cost less sooner.
         """
         self._map = topology
         self._words = words
         self._linker = linker
         self._settings = settings
-        self._transition = _transition(topology)
+        self._weigh = weigh or inliers_of
+        self._transition = _transition(topology) if transition is None else transition
         self.belief: FloatArray = np.full(len(topology), 1.0 / max(len(topology), 1))
+        self.answers: dict[int, Answer] = {}
+        self.likelihood: FloatArray = np.ones(len(topology))
         self._fresh = True
 
-    def update(self, image: OmniFeatures) -> FloatArray:
+    def update(self, image: OmniFeatures, also: Collection[int] = ()) -> FloatArray:
         """The belief after one more image.
+
+        Args:
+            image: its features.
+            also: nodes that it is matched with in any case.
 
         Returns:
             (n,) the belief, a copy.
         """
-        expected = self.belief if self._fresh else self._moved()
+        expected = self.expected()
         self._fresh = False
-        supports = self._supports(image, expected)
-        posterior = expected * likelihoods(supports, _BACKGROUND)
+        self.likelihood = likelihoods(self._supports(image, expected, also), _BACKGROUND)
+        posterior = expected * self.likelihood
         self.belief = posterior / posterior.sum()
         return self.belief.copy()
+
+    def expected(self) -> FloatArray:
+        """(n,) the belief before the next image is seen."""
+        return self.belief if self._fresh else self._moved()
 
     def best(self) -> tuple[int, float]:
         """The most probable node and its probability."""
@@ -74,16 +112,15 @@ class Localiser:
         leap = self._settings.leap
         return (1.0 - leap) * (self.belief @ self._transition) + leap / len(self.belief)
 
-    def _supports(self, image: OmniFeatures, expected: FloatArray) -> IntArray:
-        """(n,) inliers of the nodes that are worth a match; 0 for the others."""
-        out = np.zeros(len(self._map), dtype=np.int64)
-        for node in self._candidates(image, expected):
-            answer = self._linker(image, self._map.images[node])
-            if not isinstance(answer, Refusal):
-                out[node] = answer.support
-            elif answer.reason is RefusalReason.AT_TARGET:
-                # There is no better match than the place itself; its answer bears no count.
-                out[node] = max(len(image.sift), 1)
+    def _supports(
+        self, image: OmniFeatures, expected: FloatArray, also: Collection[int]
+    ) -> FloatArray:
+        """(n,) evidence of the nodes that are worth a match; 0 for the others."""
+        nodes = np.union1d(self._candidates(image, expected), np.array([*also], dtype=np.int64))
+        self.answers = {node: self._linker(image, node) for node in nodes.tolist()}
+        out = np.zeros(len(self._map))
+        for node, evidence in self._weigh(self.answers).items():
+            out[node] = evidence
         return out
 
     def _candidates(self, image: OmniFeatures, expected: FloatArray) -> IntArray:
@@ -97,7 +134,15 @@ class Localiser:
         return np.sort(np.concatenate([likely, rest]))
 
 
-def likelihoods(supports: IntArray, background: float) -> FloatArray:
+def inliers_of(answers: Mapping[int, Answer]) -> dict[int, float]:
+    """Inliers of each node; where an image was taken at a node itself, as many as any other has."""
+    out = {node: float(answer.support if answer else 0) for node, answer in answers.items()}
+    best = max([*out.values(), _AT_NODE])
+    at = (n for n, a in answers.items() if not a and a.reason is RefusalReason.AT_TARGET)
+    return out | dict.fromkeys(at, best)
+
+
+def likelihoods(supports: FloatArray, background: float) -> FloatArray:
     """(n,) of an image at each node, up to a factor: its inliers and those of a wrong place.
 
     Linear, not exponential as independent inliers would have it: features of one image stand and
@@ -107,7 +152,7 @@ def likelihoods(supports: IntArray, background: float) -> FloatArray:
     return np.asarray(supports, dtype=np.float64) + background
 
 
-def _transition(topology: TopologicalMap) -> FloatArray:
+def _transition(topology: Places) -> FloatArray:
     """(n, n) chances to go from row to column between two images, without leaps."""
     graph = topology.graph()
     graph.data = 1.0 / graph.data

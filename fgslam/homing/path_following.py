@@ -99,6 +99,24 @@ class HomingChain:
             command = self._numbered(self.controller.step(image, time))
         return command
 
+    @property
+    def target(self) -> int:
+        """Number of the target image that is aimed at, or was last."""
+        return self._target
+
+    @property
+    def given_up(self) -> bool:
+        """Whether the path ended in a refusal."""
+        return self._ended is not None and self._ended.state is HomingState.REFUSED
+
+    def aim(self, target: int, time: float, reason: str) -> None:
+        """Goes on to another target, for the robot was found elsewhere; also after giving up."""
+        if self._ended is None:
+            self._note("skipped", time, self.controller.remaining, reason)
+        self._ended, self._skipped = None, []
+        self._target, self._began = target, time
+        self.controller = self._new_controller()
+
     def held_up(self, seconds: float) -> None:
         """See :meth:`HomingController.held_up`."""
         self.controller.held_up(seconds)

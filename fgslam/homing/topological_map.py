@@ -11,10 +11,12 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.core.array_files import ArrayFile, Items, of_rows, rows_of
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import OmniFeatures
+from fgslam.homing.feature_files import VERSIONS
 from fgslam.homing.link_consistency import InlierRows, LinkConsistency, ThirdViewConsistency
 from fgslam.homing.links import Answer, Link, Pair, link_pairs
 from fgslam.homing.path_memory import PathMemory, load_images, save_images
@@ -23,7 +25,7 @@ from fgslam.homing.settings import TopologicalMapSettings
 
 FILE = ArrayFile(
     name="fgslam topological map",
-    versions=(1,),
+    versions=VERSIONS,
     error=StoredMapError,
     give="give a file that holds one",
     again="build it again",
@@ -49,6 +51,7 @@ class TopologicalMap:
         links: accepted, ascending by their pair (a < b).
         costs: (m,) of the links: 1 for a leg of many inliers and a sure direction, more otherwise.
         rejected: pairs that were answered, but not accepted, and why; not saved.
+        camera: that took the images; None where it is not known.
     """
 
     images: tuple[OmniFeatures, ...]
@@ -56,6 +59,7 @@ class TopologicalMap:
     links: tuple[Link, ...]
     costs: FloatArray
     rejected: Mapping[Pair, str]
+    camera: OmniCamera | None = None
 
     def __len__(self) -> int:
         return len(self.images)
@@ -100,7 +104,13 @@ class TopologicalMap:
 
     def path(self, nodes: Sequence[int]) -> PathMemory:
         """The target images of a route, ready to be followed."""
-        return PathMemory.of([self.images[k] for k in nodes], [self.names[k] for k in nodes])
+        images, names = [self.images[k] for k in nodes], [self.names[k] for k in nodes]
+        return PathMemory.of(images, names, self.camera)
+
+    @property
+    def memory(self) -> PathMemory:
+        """The nodes' images alone."""
+        return PathMemory(self.images, self.names, self.camera)
 
     def save(self, path: str | Path) -> float:
         """Writes the map atomically.
@@ -112,7 +122,7 @@ class TopologicalMap:
             OutputError: it cannot be written.
         """
         links = _link_arrays(self.links, self.costs)
-        return save_images(FILE, path, self.images, self.names, links)
+        return save_images(FILE, path, self.memory, links)
 
     @staticmethod
     def load(path: str | Path) -> TopologicalMap:
@@ -121,9 +131,9 @@ class TopologicalMap:
         Raises:
             StoredMapError: the file is missing, truncated, damaged, foreign or of another version.
         """
-        images, names, arrays = load_images(FILE, path)
-        links, costs = _read_links(arrays, len(images), str(path))
-        return TopologicalMap(images, names, links, costs, {})
+        memory, arrays = load_images(FILE, path)
+        links, costs = _read_links(arrays, len(memory), str(path))
+        return TopologicalMap(memory.images, memory.names, links, costs, {}, memory.camera)
 
 
 # --------------------------------------------------------------------------------------------

@@ -30,6 +30,7 @@ from fgslam.frontend.settings import FrontendSettings
 from fgslam.homing.settings import (
     HomingBehaviourSettings,
     LocalisationSettings,
+    SteeringSettings,
     TopologicalMapSettings,
 )
 from fgslam.runs.config_reading import kind_as_settings, with_default_kind
@@ -305,6 +306,32 @@ class OmniVideoConfig(HomingExperiment):
     most_points: Annotated[int, Field(ge=1, description="up to so many")] = 160
 
 
+class TeachConfig(HomingExperiment):
+    """A route chosen from a recording of an omnidirectional camera."""
+
+    task: Annotated[Literal["teach"], _TASK]
+    dataset: OmniDatasetSettings
+    route: Annotated[
+        str | None, Field(description="file to write; null: RUN/route.fgpath alone")
+    ] = None
+
+
+class FollowConfig(HomingExperiment):
+    """A recording along a taught route: place, homing vector and command of each image."""
+
+    task: Annotated[Literal["follow"], _TASK]
+    dataset: OmniDatasetSettings
+    route: Annotated[str, Field(description="file that a route was taught into")]
+    taught_camera: Annotated[
+        bool,
+        Field(
+            description="the camera is the one that the route was taught with, whatever "
+            "`dataset.camera` says"
+        ),
+    ] = True
+    steering: SteeringSettings = SteeringSettings()
+
+
 class HomingTrialsConfig(HomingExperiment):
     """Simulated homings of bearings alone: estimators against outliers."""
 
@@ -379,6 +406,8 @@ TASKS: dict[str | None, type[Experiment]] = {
     "homing_pairs": HomingPairsConfig,
     "topological_map": TopologicalMapConfig,
     "omni_video": OmniVideoConfig,
+    "teach": TeachConfig,
+    "follow": FollowConfig,
     "homing_trials": HomingTrialsConfig,
     "homing": HomingConfig,
     "path_following": PathFollowingConfig,

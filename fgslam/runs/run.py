@@ -9,10 +9,12 @@ from fgslam.runs.config_models import (
     DrivingConfig,
     Experiment,
     ExperimentConfig,
+    FollowConfig,
     HomingPairsConfig,
     HomingTrialsConfig,
     LocalisationConfig,
     OmniVideoConfig,
+    TeachConfig,
     TopologicalMapConfig,
 )
 from fgslam.runs.engine import Opener, RunResult, run_task
@@ -42,7 +44,7 @@ def run_experiment(
     return run_task(opener_of(config), config, folder, existing, progress, stopped)
 
 
-def opener_of(config: Experiment) -> Opener[RunResult]:  # noqa: PLR0911 - one a task
+def opener_of(config: Experiment) -> Opener[RunResult]:  # noqa: C901, PLR0911 - one a task
     """What opens the data of a configuration; each task is imported when it is run."""
     match config:
         case ExperimentConfig(on_measurements=True):
@@ -69,6 +71,14 @@ def opener_of(config: Experiment) -> Opener[RunResult]:  # noqa: PLR0911 - one a
             from fgslam.runs.tasks.homing_video import open_video
 
             return open_video
+        case TeachConfig():
+            from fgslam.runs.tasks.route_teaching import open_teaching
+
+            return open_teaching
+        case FollowConfig():
+            from fgslam.runs.tasks.route_following import open_following
+
+            return open_following
         case HomingTrialsConfig():
             from fgslam.runs.tasks.homing_trials import open_trials
 

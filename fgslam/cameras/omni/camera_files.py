@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -68,6 +69,20 @@ def load_camera(
         source, folder = _read(source)
         return make_camera(source, size, folder)
     return make_camera(_settings_of(source), size)
+
+
+def camera_keys(source: str | Path) -> dict[str, Any]:
+    """The keys that describe the camera of a file, or a kind alone, as under ``dataset.camera``.
+
+    Raises:
+        CalibrationError: the file is missing or malformed.
+        ConfigError: a key or its value is wrong.
+    """
+    settings, folder = _read(source)
+    keys = {name: value for name, value in asdict(settings).items() if value is not None}
+    if folder is not None and "file" in keys:
+        keys["file"] = str(folder / keys["file"])
+    return keys
 
 
 def _require_size(size: object) -> None:

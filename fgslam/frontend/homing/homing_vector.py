@@ -12,7 +12,7 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.homing import BearingMatches, Refusal, RefusalReason, TwoViewVector
-from fgslam.core.planar import unit, wrap
+from fgslam.core.planar import circular_median, unit, wrap
 from fgslam.frontend.homing.matching import (
     COMMON_CHANCE,
     gain,
@@ -86,7 +86,8 @@ class HomingSearch:
         candidates = self.different(_REFINED)
         if not len(candidates):
             text = "no pair of matches agrees on any homing vector"
-            return Refusal(RefusalReason.TOO_FEW_INLIERS, text)
+            alone = self._turned_alone()
+            return Refusal(RefusalReason.TOO_FEW_INLIERS, text) if alone is None else alone
         refined = self.refined(candidates)
         at_target = self.turn_at_target(refined[0])
         return self._judged(refined) if at_target is None else at_target
@@ -217,16 +218,27 @@ class HomingSearch:
         That must be as well supported as any answer, and from enough sides: a single thing looks
         alike from anywhere, and like turned when it is another one of its kind.
         """
+        return self._turn_of(best.inliers) if np.any(best.inliers) else None
+
+    def _turned_alone(self) -> Refusal | None:
+        """The same where no two matches have parallax enough for a hypothesis: one image twice.
+
+        Most matches must be explained by the turn.
+        """
+        turns = wrap(self._matches.bearing_a - self._matches.bearing_b)
+        psi = circular_median(turns)
+        still = np.abs(wrap(turns - psi)) < np.deg2rad(self._settings.at_target_parallax_deg)
+        return self._turn_of(still) if 2 * np.count_nonzero(still) > len(still) else None
+
+    def _turn_of(self, inliers: BoolArray) -> Refusal | None:
         m, limit = self._matches, np.deg2rad(self._settings.at_target_parallax_deg)
-        if not np.any(best.inliers):
-            return None
         turns = wrap(m.bearing_a - m.bearing_b)
-        psi = float(np.angle(np.mean(np.exp(1j * turns[best.inliers]))))
+        psi = float(np.angle(np.mean(np.exp(1j * turns[inliers]))))
         parallaxes = np.abs(wrap(turns - psi))
-        parallax = float(np.median(parallaxes[best.inliers]))
+        parallax = float(np.median(parallaxes[inliers]))
         if parallax >= limit:
             return None
-        turned = best.inliers & (parallaxes < _TURNED * limit)
+        turned = inliers & (parallaxes < _TURNED * limit)
         if (
             self.independent_inliers(turned) < self._settings.min_inliers
             or _spread(m.bearing_a[turned]) < _LEAST_SPREAD

@@ -325,3 +325,31 @@ def draw_view_tracks(path: Path, view: Image, trails: Sequence[FloatArray], titl
 def _unbroken(trail: FloatArray, most: float) -> list[FloatArray]:
     """Parts of a trail between crossings of the seam."""
     return np.split(trail, np.flatnonzero(np.abs(np.diff(trail[:, 0])) > most) + 1)
+
+
+_SHEET_COLUMNS = 4
+_SHEET_WIDTH_IN = 11.0
+
+
+def draw_sheet(path: Path, images: Sequence[Image], titles: Sequence[str]) -> None:
+    """Pictures side by side, row after row.
+
+    Args:
+        path: of the PNG.
+        images: (h, w, 3) red, green, blue; at least one.
+        titles: above each.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    across = min(_SHEET_COLUMNS, len(images))
+    down = -(-len(images) // across)
+    aspect = images[0].shape[0] / images[0].shape[1]
+    height = down * (_SHEET_WIDTH_IN / across * aspect + 0.35)
+    with picture(path, _SHEET_WIDTH_IN, height) as figure:
+        every = figure.subplots(down, across, squeeze=False).ravel()
+        for axes, image, title in zip(every, images, titles, strict=False):
+            step = max(1, image.shape[1] // _SHOWN_PX)
+            show_image(axes, image[::step, ::step], title)
+        for axes in every[len(images) :]:
+            axes.set_visible(False)

@@ -376,8 +376,9 @@ def _localise(
     )
     rng = np.random.default_rng((config.seed, 1))
 
-    def linker(image: OmniFeatures, node: OmniFeatures) -> TwoViewVector | Refusal:
-        return vector_between(image, node, config.features.matching, config.homing_vector, rng)[0]
+    def linker(image: OmniFeatures, node: int) -> TwoViewVector | Refusal:
+        matching, vector = config.features.matching, config.homing_vector
+        return vector_between(image, nodes[node], matching, vector, rng)[0]
 
     words = VisualWords(nodes, rng)
     localiser = Localiser(topology, words, linker, config.localisation)

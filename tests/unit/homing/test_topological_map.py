@@ -368,7 +368,11 @@ def test_images_without_features_are_like_none() -> None:
 def localiser(topology: TopologicalMap, settings: LocalisationSettings) -> Localiser:
     """With a vocabulary of the map's own images."""
     words = VisualWords(topology.images, np.random.default_rng(0))
-    return Localiser(topology, words, link_by_landmarks, settings)
+
+    def linked(image: OmniFeatures, node: int) -> Answer:
+        return link_by_landmarks(image, topology.images[node])
+
+    return Localiser(topology, words, linked, settings)
 
 
 def views_at(places: Iterable[float]) -> list[OmniFeatures]:

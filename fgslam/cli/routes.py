@@ -1,0 +1,96 @@
+"""Commands of routes: teach one from a recording, follow it with another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fgslam.cli import options
+from fgslam.cli.performing import existing_folder, exit_as, show_all, under_way
+
+Recording = Annotated[
+    Path,
+    typer.Argument(
+        metavar="RECORDING",
+        help="a film, or a folder of pictures, of an omnidirectional camera",
+    ),
+]
+OmniCamera = Annotated[
+    str | None,
+    typer.Option(
+        "--camera",
+        metavar="FILE",
+        help="calibration of its camera: OCamCalib, BloggieUnwarp, YAML; or `equirectangular` "
+        "for whole panoramas",
+    ),
+]
+Report = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="the run folder itself; default runs/NAME")
+]
+
+
+def teach(  # noqa: PLR0913 - each option is a parameter
+    recording: Recording,
+    out: Annotated[Path, typer.Option(metavar="ROUTE", help="the file to write, .fgpath")],
+    camera: OmniCamera = None,
+    report: Report = None,
+    start: options.Start = None,
+    stop: options.Stop = None,
+    stride: options.Stride = None,
+    overrides: options.Overrides = None,
+    overwrite: options.Overwrite = False,
+) -> None:
+    """Choose the path images of a drive, and write what is to be remembered of them.
+
+    Few images are chosen, each seen well from the one before; a table and the page say why each.
+    """
+    from fgslam.runs.bare_routes import teaching
+
+    chosen = _frames(start, stop, stride)
+    config = teaching(recording, camera, out, [*(overrides or ()), *chosen])
+    _perform(config, report, overwrite)
+
+
+def follow(  # noqa: PLR0913 - each option is a parameter
+    route: Annotated[
+        Path, typer.Argument(metavar="ROUTE", help="a route, as fgslam teach writes it")
+    ],
+    recording: Recording,
+    camera: OmniCamera = None,
+    out: Report = None,
+    start: options.Start = None,
+    stop: options.Stop = None,
+    stride: options.Stride = None,
+    overrides: options.Overrides = None,
+    overwrite: options.Overwrite = False,
+) -> None:
+    """Follow a route with another recording of the way: place, homing vector and command.
+
+    What a robot would be told at each image, by the same follower; refusals with their reason.
+    Exits with 1 where no image is recognised. Without --camera it is the route's own.
+    """
+    from fgslam.runs.bare_routes import following
+
+    chosen = _frames(start, stop, stride)
+    config = following(route, recording, camera, [*(overrides or ()), *chosen])
+    _perform(config, out, overwrite)
+
+
+def _frames(start: int | None, stop: int | None, stride: int | None) -> list[str]:
+    given = {"dataset.start": start, "dataset.stop": stop, "dataset.stride": stride}
+    return options.as_overrides({**given})
+
+
+def _perform(config: object, folder: Path | None, overwrite: bool) -> None:
+    from fgslam.runs.config_models import Experiment
+    from fgslam.runs.run import run_experiment
+
+    if not isinstance(config, Experiment):
+        raise TypeError("an experiment is wanted")
+    place = folder or Path("runs") / config.name
+    with under_way() as (progress, stopped):
+        result = run_experiment(config, place, existing_folder(overwrite), progress, stopped)
+    show_all([result], "the same command with --overwrite")
+    exit_as([result])

@@ -1,0 +1,237 @@
+"""Features of many images as the arrays of a file, each number as coarse as it may be.
+
+Version 2: angles in steps of a ten-thousandth of a radian, a fiftieth of a feature's own deviation;
+deviations and sizes as bytes on a logarithmic scale, 3 % of themselves; colours, 1 %; column
+descriptors, which are compared in steep combinations, with 13 bits of mantissa. Version 1 had
+float32 throughout. SIFT descriptors are bytes in both. Where a feature lay in the image is not
+kept: it is NaN after reading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from fgslam.core.array_files import ArrayFile, joined, of_rows, offsets, split
+from fgslam.core.arrays import FloatArray, StateArrays
+from fgslam.core.errors import StoredMapError
+from fgslam.core.homing import ColumnSegments, OmniFeatures, UprightFeatures
+
+VERSIONS = (1, 2)
+"""Of files that hold features; written is the last."""
+
+_FEATURES = ArrayFile(
+    name="fgslam features",
+    versions=VERSIONS,
+    error=StoredMapError,
+    give="give a file that holds some",
+    again="write the file again",
+)
+
+Array: TypeAlias = np.ndarray[Any, Any]
+_Arrays: TypeAlias = dict[str, tuple[type, tuple[int, ...]]]
+"""Arrays by what their first axis counts, with type and the shape of an item."""
+
+_SIFT: _Arrays = {
+    "sift_bearing": (np.int16, ()),
+    "sift_elevation": (np.int16, ()),
+    "sift_spread": (np.uint8, (2,)),
+    "sift_correlation": (np.int8, ()),
+    "sift_scale": (np.uint8, ()),
+    "sift_descriptors": (np.uint8, (128,)),
+    "sift_colour": (np.float16, (3,)),
+}
+_COLUMNS: _Arrays = {
+    "column_bearing": (np.int16, ()),
+    "column_sigma_bearing": (np.uint8, ()),
+    "column_tangents": (np.float32, (2,)),
+    "column_sigma_tangents": (np.uint8, (2,)),
+    "column_descriptors": (np.float32, (11,)),
+}
+_SIFT_1: _Arrays = {
+    "sift_bearing": (np.float32, ()),
+    "sift_elevation": (np.float32, ()),
+    "sift_spread": (np.float16, (3,)),  # two deviations and the correlation
+    "sift_scale": (np.float32, ()),
+    "sift_descriptors": (np.uint8, (128,)),
+    "sift_colour": (np.float16, (3,)),
+}
+_COLUMNS_1: _Arrays = {
+    "column_bearing": (np.float32, ()),
+    "column_sigma_bearing": (np.float16, ()),
+    "column_tangents": (np.float32, (2,)),
+    "column_sigma_tangents": (np.float16, (2,)),
+    "column_descriptors": (np.float32, (11,)),
+}
+
+_ANGLE = 32767.0 / np.pi
+_LEAST, _MOST = 1e-5, 10.0  # of what is kept as a byte, radians
+_BYTE = 255.0 / np.log(_MOST / _LEAST)
+_CORRELATION = 127.0
+_MANTISSA = 10  # bits of 23 that are dropped
+
+
+def pack_features(images: Sequence[OmniFeatures]) -> StateArrays:
+    """All features of images, in their order, as the arrays of a file."""
+    out: StateArrays = {
+        "sift_start": offsets([len(i.sift) for i in images]),
+        "column_start": offsets([len(i.columns) for i in images]),
+    }
+    sift = [_sift_arrays(i.sift) for i in images]
+    columns = [_column_arrays(i.columns) for i in images]
+    for specification, parts in ((_SIFT, sift), (_COLUMNS, columns)):
+        for name, (kind, item) in specification.items():
+            out[name] = joined([p[name].astype(kind) for p in parts], item, kind)
+    return out
+
+
+def unpack_features(
+    arrays: Mapping[str, Any], where: str, version: int = VERSIONS[-1]
+) -> tuple[OmniFeatures, ...]:
+    """The features back.
+
+    Args:
+        arrays: as :func:`pack_features` made them; others among them are passed over.
+        where: the file's name, for messages.
+        version: of the file.
+
+    Raises:
+        StoredMapError: an array is absent or damaged.
+    """
+    coarse = version > 1
+    sift = _split(arrays, "sift_start", _SIFT if coarse else _SIFT_1, where)
+    columns = _split(arrays, "column_start", _COLUMNS if coarse else _COLUMNS_1, where)
+    if len(sift) != len(columns):
+        raise _FEATURES.damaged("column_start", where)
+    if coarse:
+        sift, columns = list(map(_fine_sift, sift)), list(map(_fine_columns, columns))
+    return tuple(
+        OmniFeatures(_sift_of(s), _columns_of(c)) for s, c in zip(sift, columns, strict=True)
+    )
+
+
+def _split(
+    arrays: Mapping[str, Any], start: str, specification: _Arrays, where: str
+) -> list[dict[str, Array]]:
+    rows = _FEATURES.require_offsets(arrays, start, None, where)
+    kinds = {name: (np.dtype(kind).kind, item) for name, (kind, item) in specification.items()}
+    _FEATURES.require(arrays, of_rows(rows, kinds), where)
+    whole = {name: split(arrays[name], arrays[start]) for name in specification}
+    return [
+        {name: parts[k] for name, parts in whole.items()} for k in range(len(arrays[start]) - 1)
+    ]
+
+
+# --------------------------------------------------------------------------------------------
+# One image to its arrays
+
+
+def _sift_arrays(features: UprightFeatures) -> dict[str, Array]:
+    deviations = np.sqrt(features.covariance[:, [0, 1], [0, 1]])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        correlation = features.covariance[:, 0, 1] / deviations.prod(axis=1)
+    return {
+        "sift_bearing": _steps(features.bearing),
+        "sift_elevation": _steps(features.elevation),
+        "sift_spread": _bytes(deviations),
+        "sift_correlation": np.round(_CORRELATION * np.clip(np.nan_to_num(correlation), -1, 1)),
+        "sift_scale": _bytes(features.scale),
+        "sift_descriptors": features.descriptors,
+        "sift_colour": _coarse(features.colour),
+    }
+
+
+def _column_arrays(segments: ColumnSegments) -> dict[str, Array]:
+    return {
+        "column_bearing": _steps(segments.bearing),
+        "column_sigma_bearing": _bytes(segments.sigma_bearing),
+        "column_tangents": _shortened(segments.tangents),
+        "column_sigma_tangents": _bytes(segments.sigma_tangents),
+        "column_descriptors": _shortened(segments.descriptors),
+    }
+
+
+def _steps(angle: FloatArray) -> FloatArray:
+    """Angles in [-pi, pi] as whole numbers."""
+    return np.asarray(np.round(_ANGLE * angle))
+
+
+def _bytes(values: FloatArray) -> FloatArray:
+    """Positive values on a logarithmic scale as whole numbers, 0 to 255."""
+    inside = np.clip(values, _LEAST, _MOST)
+    return np.asarray(np.round(_BYTE * np.log(inside / _LEAST)))
+
+
+def _shortened(values: FloatArray) -> Array:
+    """Values as float32 that end in zeros, which a file's compression takes away."""
+    bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
+    half = np.uint32(1 << (_MANTISSA - 1))
+    kept = (bits + half) & np.uint32(0xFFFFFFFF << _MANTISSA & 0xFFFFFFFF)
+    return kept.view(np.float32)
+
+
+def _coarse(values: FloatArray) -> Array:
+    """Values as float16 with six bits of mantissa: 0.8 % of themselves."""
+    bits = np.ascontiguousarray(values, np.float16).view(np.uint16)
+    return ((bits + np.uint16(8)) & np.uint16(0xFFF0)).view(np.float16)
+
+
+# --------------------------------------------------------------------------------------------
+# And back
+
+
+def _fine_sift(part: dict[str, Array]) -> dict[str, Array]:
+    """Arrays of version 2 as those of version 1."""
+    spread = _of_bytes(part["sift_spread"])
+    correlation = part["sift_correlation"] / _CORRELATION
+    return part | {
+        "sift_bearing": part["sift_bearing"] / _ANGLE,
+        "sift_elevation": part["sift_elevation"] / _ANGLE,
+        "sift_spread": np.column_stack([spread, correlation]),
+        "sift_scale": _of_bytes(part["sift_scale"]),
+    }
+
+
+def _fine_columns(part: dict[str, Array]) -> dict[str, Array]:
+    return part | {
+        "column_bearing": part["column_bearing"] / _ANGLE,
+        "column_sigma_bearing": _of_bytes(part["column_sigma_bearing"]),
+        "column_sigma_tangents": _of_bytes(part["column_sigma_tangents"]),
+    }
+
+
+def _of_bytes(codes: Array) -> FloatArray:
+    return np.asarray(_LEAST * np.exp(codes / _BYTE))
+
+
+def _sift_of(part: Mapping[str, Array]) -> UprightFeatures:
+    n = len(part["sift_bearing"])
+    spread = _doubles(part["sift_spread"])
+    covariance = np.empty((n, 2, 2))
+    covariance[:, [0, 1], [0, 1]] = spread[:, :2] ** 2
+    covariance[:, 0, 1] = covariance[:, 1, 0] = spread.prod(axis=1)
+    return UprightFeatures(
+        pixels=np.full((n, 2), np.nan),
+        bearing=_doubles(part["sift_bearing"]),
+        elevation=_doubles(part["sift_elevation"]),
+        covariance=covariance,
+        scale=_doubles(part["sift_scale"]),
+        descriptors=part["sift_descriptors"],
+        colour=_doubles(part["sift_colour"]),
+    )
+
+
+def _columns_of(part: Mapping[str, Array]) -> ColumnSegments:
+    return ColumnSegments(
+        bearing=_doubles(part["column_bearing"]),
+        sigma_bearing=_doubles(part["column_sigma_bearing"]),
+        tangents=_doubles(part["column_tangents"]),
+        sigma_tangents=_doubles(part["column_sigma_tangents"]),
+        descriptors=_doubles(part["column_descriptors"]),
+    )
+
+
+def _doubles(array: Array) -> FloatArray:
+    return array.astype(np.float64)

@@ -1,0 +1,271 @@
+"""Where along a taught path an image was taken, and where its next path image lies.
+
+Each image is matched with the path images that are believed to be near and with those that look
+alike; a Bayes filter along the path (:mod:`.localisation`) joins what they say. So a robot that was
+put down anywhere, or was carried off, finds its place, and a wall that looks like another one does
+not lead astray. The homing vector to the next path image comes from the same matches: no tracking,
+so images may be far apart, or the robot's motion somebody else's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.core.arrays import FloatArray
+from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVector
+from fgslam.core.planar import wrap
+from fgslam.homing.active_homing import CONTRADICTION_DEG, parallax
+from fgslam.homing.command import SURE, PathPlace
+from fgslam.homing.front_end import compare_views
+from fgslam.homing.links import Answer
+from fgslam.homing.localisation import Localiser, inliers_of
+from fgslam.homing.path_memory import PathMemory
+from fgslam.homing.retrieval import VisualWords
+from fgslam.homing.settings import FrontEndSettings, LocalisationSettings
+
+LIKELY = 0.5  # below this there is no homing vector either
+_CANDIDATES = 6  # path images that an image is matched with, half of them because they look alike
+_ALL = 60  # so many path images at most are all tried while the place is not known
+_OTHERS = 3  # path images elsewhere that tell how many matches a wrong place has
+_AHEAD, _BACK = 0.4, 0.1  # chances to be at the path image after or before by the next image
+_LEAVING, _COMING = 0.02, 0.5
+"""Chances to have left the route since the last image, and to have come upon it."""
+
+_ELSEWHERE = 12.0
+"""Evidence, in inliers, that the best of a route's images may get from another place: what the
+homing vector itself demands, and the background of the filter."""
+
+_NEAR = 0.25
+"""Parallax to a path image over that to the one after it, at which the robot turns to the latter:
+a third of a leg is left. Nearer, the direction to it is noise."""
+
+_REACHED, _PASSED = 0.07, 0.25
+"""Parts of the last leg: as `switch_fraction` of control, and as its passing by."""
+
+_CONTRADICTION = np.deg2rad(CONTRADICTION_DEG)
+_AGREEING = 3  # images in a row that agree, until what contradicts those before is believed
+_SIGMAS = 4.0  # between two homing vectors of which one must be wrong
+_STREAM = 9  # of the seed's random numbers
+
+
+@dataclass(slots=True, eq=False)
+class _Aim:
+    """The path image that is aimed at, and what was seen of it.
+
+    Attributes:
+        target: its number.
+        across: direction of the robot's way in the target's axes, radians; NaN before it is known.
+        doubted: one that contradicted it, and must be seen again.
+        agreeing: images in a row that saw it.
+        widest: largest parallax so far, radians.
+        after: as ``across``, of the path image after the target, in the last image.
+        fresh: it was not looked at yet.
+        elsewhere: the last image was taken where the robot would not come by on its way.
+        reached: the last image was taken at the path's end.
+    """
+
+    target: int
+    across: float = float("nan")
+    doubted: float = float("nan")
+    agreeing: int = 0
+    widest: float = 0.0
+    after: float = float("nan")
+    fresh: bool = True
+    elsewhere: bool = False
+    reached: bool = False
+
+
+class PathPlaces:
+    """Follows a robot along a path, image by image."""
+
+    def __init__(self, path: PathMemory, settings: FrontEndSettings, seed: int = 0) -> None:
+        """Knows nothing of the place at first.
+
+        Args:
+            path: taught.
+            settings: of matching and homing vector.
+            seed: of everything random.
+        """
+        self._path, self._settings = path, settings
+        self._rng = np.random.default_rng((seed, _STREAM))
+        self._parallax: dict[int, float] = {}
+        self._matches: dict[int, int] = {}
+        self._probability, self._on_route = 0.0, _COMING
+        self._localiser = Localiser(
+            path,
+            VisualWords(path.images, self._rng),
+            self._link,
+            LocalisationSettings(candidates=_CANDIDATES),
+            self._weighed,
+            _forward(len(path)),
+        )
+        self._aim: _Aim | None = None
+
+    @property
+    def belief(self) -> FloatArray:
+        """(n,) probability of each path image to be the nearest one."""
+        return self._localiser.belief.copy()
+
+    def look(self, features: OmniFeatures) -> PathPlace:
+        """The place of one more image."""
+        self._parallax, self._matches = {}, {}
+        lost = self._probability < SURE
+        every = range(len(self._path))
+        wanted = every if lost and len(every) <= _ALL else self._wanted()
+        expected = self._localiser.expected()
+        belief = self._localiser.update(features, wanted)
+        self._on_route = self._still_on_route(float(expected @ self._localiser.likelihood))
+        nearest = int(np.argmax(belief))
+        near = float(belief[max(nearest - 1, 0) : nearest + 2].sum())
+        probability = self._probability = self._on_route * near
+        if probability < LIKELY:
+            refusal = f"place not known: {100.0 * probability:.0f} % at {self._path.names[nearest]}"
+            return PathPlace(nearest, probability, nearest, None, refusal, 1.0, False)
+        aim = self._aimed(nearest)
+        reached = self._reached(aim, nearest)
+        vector, refusal = self._vector(aim)
+        return PathPlace(
+            nearest, probability, aim.target, vector, refusal, self._remaining(aim), reached
+        )
+
+    # ----------------------------------------------------------------------------------------
+
+    def _link(self, image: OmniFeatures, node: int) -> Answer:
+        answer, matches = compare_views(image, self._path.images[node], self._settings, self._rng)
+        self._matches[node] = len(matches)
+        if isinstance(answer, TwoViewVector):
+            inliers = matches.select(answer.inliers)
+            self._parallax[node] = parallax(inliers, answer.rotation)
+        elif answer.reason is RefusalReason.AT_TARGET:
+            self._parallax[node] = 0.0
+        return answer
+
+    def _wanted(self) -> list[int]:
+        """Path images that are matched in any case: the one aimed at and its neighbours."""
+        if self._aim is None:
+            return []
+        near = range(self._aim.target - 1, self._aim.target + 2)
+        return [k for k in near if 0 <= k < len(self._path)]
+
+    def _still_on_route(self, likelihood: float) -> float:
+        """Probability that the image was taken on the route at all.
+
+        Args:
+            likelihood: of the image if it was; elsewhere it would be ``_ELSEWHERE``.
+        """
+        on = self._on_route
+        on = on * (1.0 - _LEAVING) + (1.0 - on) * _COMING
+        return on * likelihood / (on * likelihood + (1.0 - on) * _ELSEWHERE)
+
+    def _weighed(self, answers: Mapping[int, Answer]) -> dict[int, float]:
+        """Inliers of path images, and by how much their matches exceed those of wrong places.
+
+        In dim light the right place often has too few inliers for a homing vector, but more
+        matches than the wrong ones.
+        """
+        inliers = inliers_of(answers)
+        counts = {k: self._matches[k] for k in answers}
+        best = max(counts, key=lambda k: (inliers[k], counts[k]))
+        others = [count for k, count in counts.items() if abs(k - best) > 1]
+        usual = np.median(others) if len(others) >= _OTHERS else min(counts.values())
+        return {k: inliers[k] + max(counts[k] - float(usual), 0.0) for k in answers}
+
+    def _aimed(self, nearest: int) -> _Aim:
+        """The path image to go to: the nearest one or, once that is passed, the one after it."""
+        if self._aim is None or self._elsewhere(self._aim, nearest):
+            self._aim = _Aim(nearest)
+        last = len(self._path) - 1
+        if self._aim.target == nearest < last and self._passed(self._aim):
+            self._aim = _Aim(nearest + 1)
+        return self._aim
+
+    def _elsewhere(self, aim: _Aim, nearest: int) -> bool:
+        """Whether the target lies behind, or two images in a row say that it is not near."""
+        before, aim.elsewhere = aim.elsewhere, aim.target > nearest + 1
+        return aim.target < nearest or (before and aim.elsewhere)
+
+    def _passed(self, aim: _Aim) -> bool:
+        """Whether the path image lies behind, as seen from the robot's way to the one after it.
+
+        On the way that one must have been seen alike in two images: the robot will go by it.
+        """
+        k = aim.target
+        here, ahead = self._parallax.get(k), self._parallax.get(k + 1)
+        answer, before = self._localiser.answers.get(k + 1), aim.after
+        aim.after = _across(answer) if isinstance(answer, TwoViewVector) else float("nan")
+        if here == 0.0:
+            return True
+        agreed = aim.fresh or _away(aim.after, before) <= _CONTRADICTION
+        aim.fresh = False
+        if here is None or ahead is None or not agreed:
+            return False
+        return here < _NEAR * ahead or self._apart(k, k + 1) > np.pi / 2
+
+    def _confirmed(self, aim: _Aim, across: float, limit: float) -> bool:
+        """Whether enough images in a row agree on what contradicts those before."""
+        aim.agreeing = aim.agreeing + 1 if _away(across, aim.doubted) <= limit else 1
+        aim.doubted = across
+        return aim.agreeing >= _AGREEING
+
+    def _apart(self, a: int, b: int) -> float:
+        """Angle between the directions to two path images; 0 where one is not known."""
+        first, second = self._localiser.answers.get(a), self._localiser.answers.get(b)
+        if not isinstance(first, TwoViewVector) or not isinstance(second, TwoViewVector):
+            return 0.0
+        return abs(float(wrap(np.array(first.direction - second.direction))))
+
+    def _remaining(self, aim: _Aim) -> float:
+        seen = self._parallax.get(aim.target)
+        if seen is None or aim.widest == 0.0:
+            return 1.0 if seen is None else 0.0
+        return min(1.0, seen / aim.widest)
+
+    def _reached(self, aim: _Aim, nearest: int) -> bool:
+        """Whether two images in a row were taken at the path's end, or just past it."""
+        last = len(self._path) - 1
+        before, aim.reached = aim.reached, aim.target == last == nearest and self._at_end(aim)
+        return before and aim.reached
+
+    def _at_end(self, aim: _Aim) -> bool:
+        last = len(self._path) - 1
+        seen = self._parallax.get(last)
+        if seen is None:
+            return False
+        left = seen / max(self._parallax.get(last - 1, 0.0), aim.widest, 1e-9)
+        beyond = last > 0 and 0.0 < self._apart(last - 1, last) < np.pi / 2
+        return seen == 0.0 or left <= _REACHED or (beyond and left <= _PASSED)
+
+    def _vector(self, aim: _Aim) -> tuple[TwoViewVector | None, str]:
+        """The homing vector to the target, unless it contradicts those before it for once."""
+        answer = self._localiser.answers.get(aim.target)
+        if answer is None:
+            return None, "not matched"
+        if isinstance(answer, Refusal):
+            return None, answer.details
+        aim.widest = max(aim.widest, self._parallax[aim.target])
+        across = _across(answer)
+        sigma = float(np.sqrt(answer.covariance[0, 0] + answer.covariance[1, 1]))
+        limit = max(_CONTRADICTION, _SIGMAS * sigma)
+        if _away(across, aim.across) > limit and not self._confirmed(aim, across, limit):
+            return None, "contradicts the images before, needs others that agree"
+        aim.across, aim.agreeing = across, 0
+        return answer, ""
+
+
+def _forward(count: int) -> FloatArray:
+    """(n, n) chances to be at each path image by the next image: staying or going on, mostly."""
+    steps = np.eye(count, k=1) * _AHEAD + np.eye(count, k=-1) * _BACK
+    return np.asarray(steps + np.diag(1.0 - steps.sum(axis=1)))
+
+
+def _across(vector: TwoViewVector) -> float:
+    """Direction of the way to a target in the target's axes: it does not change as robots turn."""
+    return float(wrap(np.array(vector.direction - vector.rotation)))
+
+
+def _away(one: float, other: float) -> float:
+    """Absolute difference of two angles; NaN where one is not known."""
+    return abs(float(wrap(np.array(one - other)))) if np.isfinite(one + other) else float("nan")

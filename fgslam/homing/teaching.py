@@ -1,0 +1,278 @@
+"""Which images of a drive become path images: few, but each seen well from the one before.
+
+From the last path image on, later images are compared with it. As long as enough features are
+common and the direction between both places is known well, the way may be left to one leg; where
+that ends, the last image for which it held becomes the next path image. An image with too little
+parallax adds nothing and is passed over. So the spacing follows the place: far apart in a hall,
+near each other at a corner. Images are taken in once, in their order; of a film that moves slowly
+only some are looked at.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.core.arrays import Image
+from fgslam.core.errors import StoredMapError
+from fgslam.core.homing import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
+from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.homing.view_pairs import pair_generator
+from fgslam.homing.active_homing import parallax
+from fgslam.homing.compact import Votes, compacted
+from fgslam.homing.front_end import compare_views, unusable
+from fgslam.homing.path_memory import PathMemory
+from fgslam.homing.settings import FrontEndSettings
+
+COMMON = 80
+"""Features that two neighbouring path images must share. A third of them is left in 20 kB and from
+beside the path; homing needs eight."""
+
+DIRECTION_DEG = 4.0  # deviation of the direction from one path image to the next
+PARALLAX_DEG = 2.0
+"""Median of the common features between two path images; below, one of both is superfluous: the
+direction between them would hang on noise."""
+
+_MISSES = 3  # images one after another without enough in common end a leg: one may be blurred
+_SKIPPED = 0.15  # of the images since the last path image: so many are passed over unseen
+_WEIGHT_BEFORE = 1.0  # vote of the path image before, against all votes of the images after it
+
+START, FULL, GAP, END = "start", "common features", "gap", "end"
+
+
+@dataclass(frozen=True, slots=True)
+class TaughtImage:
+    """Why an image became a path image, and what it has in common with the one before.
+
+    Attributes:
+        number: of the image in the recording.
+        name: its name.
+        reason: ``start`` and ``end`` of the recording; ``common features``: the last one with
+            enough of them in common with the path image before; ``gap``: it has not, and there is
+            none in between.
+        common: inliers of the homing vector from the path image before; 0 where it is refused.
+        parallax_deg: their median parallax.
+        direction_deg: of this image from the one before; NaN where it is not known.
+        sigma_deg: its deviation.
+        refusal: why there is no homing vector; empty where there is one.
+    """
+
+    number: int
+    name: str
+    reason: str
+    common: int = 0
+    parallax_deg: float = float("nan")
+    direction_deg: float = float("nan")
+    sigma_deg: float = float("nan")
+    refusal: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Taught:
+    """A path, and how its images were chosen.
+
+    Attributes:
+        memory: the path.
+        rows: one a path image.
+        seen: images that were compared.
+        unusable: images that were too dark or empty, in words.
+    """
+
+    memory: PathMemory
+    rows: tuple[TaughtImage, ...]
+    seen: int
+    unusable: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    number: int
+    name: str
+    features: OmniFeatures
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Compared:
+    """A later image against the last path image."""
+
+    view: _View
+    row: TaughtImage
+    inliers: BearingMatches | None
+    near: bool
+
+    @property
+    def enough(self) -> bool:
+        """Whether both could be neighbours on the path."""
+        if self.row.common < COMMON:
+            return self.near
+        return self.row.parallax_deg < PARALLAX_DEG or self.row.sigma_deg <= DIRECTION_DEG
+
+    @property
+    def apart(self) -> bool:
+        """Whether it lies far enough from the last path image to be one."""
+        return not self.near and self.row.parallax_deg >= PARALLAX_DEG
+
+
+@dataclass(slots=True, eq=False)
+class _Leg:
+    """What was seen since the last path image."""
+
+    begin: _View
+    votes: Votes
+    best: _Compared | None = None
+    misses: list[_Compared] = field(default_factory=list)
+
+
+class Teacher:
+    """Takes the images of a drive in their order, and keeps the path images.
+
+    Attributes:
+        next: number of the next image that is worth having; those before it may be left unread.
+    """
+
+    def __init__(self, camera: OmniCamera, settings: FrontEndSettings, seed: int = 0) -> None:
+        """Begins before the first image."""
+        self._camera, self._settings, self._seed = camera, settings, seed
+        self._extractor = OmniFeatureExtractor(camera, settings.features)
+        self._leg: _Leg | None = None
+        self._last: _View | None = None
+        self._kept: list[tuple[_View, OmniFeatures]] = []
+        self._rows: list[TaughtImage] = []
+        self._unusable: list[str] = []
+        self._seen = 0
+        self.next = 0
+
+    def take(self, number: int, name: str, image: Image) -> None:
+        """Looks at one more image (height, width, 3). Raises FrameError if not the camera's."""
+        features = self._extractor.extract(image)
+        self.next = number + 1
+        self._seen += 1
+        refusal = unusable(image, features)
+        if refusal is not None:
+            self._unusable.append(f"{name}: {refusal.details}")
+        else:
+            self._last = _View(number, name, features)
+            self._look(self._last)
+
+    def finish(self) -> Taught:
+        """The path; its last image is the last one seen that lies apart from the one before.
+
+        Raises:
+            StoredMapError: not one image could be used.
+        """
+        while self._leg is not None and self._leg.misses:
+            for view in self._end_leg(self._leg):
+                self._compare(self._leg, view)
+        if self._leg is None:
+            why = f" ({self._unusable[0]})" if self._unusable else ""
+            raise StoredMapError(f"path: no image that can be used{why}; give at least one")
+        self._go_to_the_end(self._leg)
+        self._keep(self._leg)
+        names = [view.name for view, _ in self._kept]
+        memory = PathMemory.of([found for _, found in self._kept], names, self._camera)
+        return Taught(memory, tuple(self._rows), self._seen, tuple(self._unusable))
+
+    # ----------------------------------------------------------------------------------------
+
+    def _look(self, view: _View) -> None:
+        if self._leg is None:
+            self._rows.append(TaughtImage(view.number, view.name, START))
+            self._leg = _Leg(view, Votes.none(view.features))
+            return
+        waiting = deque([view])
+        while waiting:
+            self._compare(self._leg, waiting.popleft())
+            if len(self._leg.misses) >= _MISSES:
+                waiting.extendleft(reversed(self._end_leg(self._leg)))
+        since = view.number - self._leg.begin.number
+        self.next = view.number + 1 + (0 if self._leg.misses else int(_SKIPPED * since))
+
+    def _compare(self, leg: _Leg, view: _View) -> None:
+        found = self._compared(leg.begin, view)
+        if found.inliers is not None:
+            leg.votes = leg.votes.plus(found.inliers, 1.0, second=False)
+        if not found.enough:
+            leg.misses.append(found)
+            return
+        leg.misses.clear()
+        if found.apart:
+            leg.best = found
+
+    def _end_leg(self, leg: _Leg) -> list[_View]:
+        """Begins the next leg at the best image, else at the first that has too little in common.
+
+        Returns:
+            Later images, to be compared with it.
+        """
+        misses = [miss.view for miss in leg.misses]
+        if leg.best is not None:
+            self._begin(leg.best, FULL)
+            return [view for view in misses if view.number > leg.best.view.number]
+        self._begin(leg.misses[0], GAP)
+        return misses[1:]
+
+    def _go_to_the_end(self, leg: _Leg) -> None:
+        """Makes the last image the path's last one, or the last that lies apart from the others."""
+        if leg.best is not None and self._last is not None and leg.best.view is not self._last:
+            self._begin(leg.best, FULL)
+            leg.best = self._compared(leg.best.view, self._last)
+        if leg.best is not None and leg.best.apart:
+            self._begin(leg.best, END)
+
+    def _begin(self, chosen: _Compared, reason: str) -> None:
+        if self._leg is not None:
+            self._keep(self._leg)
+        row = chosen.row
+        self._rows.append(
+            TaughtImage(
+                row.number, row.name, reason, row.common, row.parallax_deg, row.direction_deg,
+                row.sigma_deg, row.refusal,
+            )
+        )  # fmt: skip
+        votes = Votes.none(chosen.view.features)
+        if chosen.inliers is not None:
+            votes = votes.plus(chosen.inliers, _WEIGHT_BEFORE, second=True)
+        self._leg = _Leg(chosen.view, votes)
+
+    def _keep(self, leg: _Leg) -> None:
+        self._kept.append((leg.begin, compacted(leg.begin.features, leg.votes)))
+
+    def _compared(self, first: _View, view: _View) -> _Compared:
+        rng = pair_generator(self._seed, first.number, view.number)
+        vector, matches = compare_views(first.features, view.features, self._settings, rng)
+        if isinstance(vector, Refusal):
+            row = TaughtImage(view.number, view.name, "", refusal=vector.details)
+            return _Compared(view, row, None, vector.reason is RefusalReason.AT_TARGET)
+        inliers = matches.select(vector.inliers)
+        return _Compared(view, _row_of(view, vector, inliers), inliers, False)
+
+
+def _row_of(view: _View, vector: TwoViewVector, inliers: BearingMatches) -> TaughtImage:
+    return TaughtImage(
+        number=view.number,
+        name=view.name,
+        reason="",
+        common=len(inliers),
+        parallax_deg=float(np.rad2deg(parallax(inliers, vector.rotation))),
+        direction_deg=float(np.rad2deg(vector.direction)),
+        sigma_deg=float(np.rad2deg(np.sqrt(vector.covariance[0, 0]))),
+    )
+
+
+def with_neighbours_votes(
+    images: Sequence[OmniFeatures], settings: FrontEndSettings, seed: int = 0
+) -> list[OmniFeatures]:
+    """What is kept of path images that were chosen by somebody else: what neighbours show, too."""
+    votes = [Votes.none(one) for one in images]
+    for k in range(len(images) - 1):
+        rng = pair_generator(seed, k, k + 1)
+        vector, matches = compare_views(images[k], images[k + 1], settings, rng)
+        if isinstance(vector, TwoViewVector):
+            inliers = matches.select(vector.inliers)
+            votes[k] = votes[k].plus(inliers, 1.0, second=False)
+            votes[k + 1] = votes[k + 1].plus(inliers, 1.0, second=True)
+    return [compacted(one, vote) for one, vote in zip(images, votes, strict=True)]

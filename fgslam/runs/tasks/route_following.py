@@ -1,0 +1,261 @@
+"""Task `follow`: a recording along a taught route, image by image as a robot would be told.
+
+Files: follow.csv (place, homing vector, command or refusal of each image), metrics.json, the page.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import CalibrationError, FrameError
+from fgslam.core.planar import wrap
+from fgslam.datasets.omni_recording import OmniRecording
+from fgslam.datasets.opening import open_omni
+from fgslam.evaluation.metrics import JsonValue
+from fgslam.homing.api import PathFollower
+from fgslam.homing.command import SURE, DriveCommand
+from fgslam.homing.path_memory import PathMemory
+from fgslam.homing.settings import HomingBehaviourSettings
+from fgslam.report.content import Column, TextTable
+from fgslam.report.figures.homing import Line, curve_figure
+from fgslam.report.figures.traces import Figure
+from fgslam.report.tables import Cell, write_csv
+from fgslam.runs.config_models import FollowConfig
+from fgslam.runs.engine import (
+    Context,
+    Opening,
+    RunResult,
+    Task,
+    provenance_of,
+    write_document,
+    write_page,
+)
+from fgslam.runs.tasks.homing_views import mirror_notes
+
+FOLLOW_FILE = "follow.csv"
+COLUMNS = (
+    "image",
+    "name",
+    "time_s",
+    "path_image",
+    "path_image_name",
+    "probability",
+    "target",
+    "direction_deg",
+    "sigma_direction_deg",
+    "rotation_deg",
+    "sigma_rotation_deg",
+    "correlation",
+    "inliers",
+    "remaining",
+    "v_mps",
+    "omega_deg_s",
+    "state",
+    "refusal",
+)
+_RATE_HZ = 10.0  # of images without times
+_JUMP_DEG = 30.0
+_NUMBER = re.compile(r"-?\d+(\.\d+)?(e-?\d+(\.\d+)?)?")
+
+
+def open_following(config: FollowConfig, opening: Opening) -> Task[RunResult]:
+    """Opens route and recording. Raises StoredMapError, DatasetError or CalibrationError."""
+    path = PathMemory.load(config.route)
+    recording = open_omni(config.dataset)
+    if config.taught_camera:
+        recording = _with_taught_camera(config, path, recording)
+    recording = replace(recording, notes=recording.notes + mirror_notes(recording))
+    ground = provenance_of(recording) | {"log": {"route": config.route, "images": len(path)}}
+    return Task(ground, lambda context: _run(config, path, recording, context))
+
+
+def _with_taught_camera(
+    config: FollowConfig, path: PathMemory, recording: OmniRecording
+) -> OmniRecording:
+    camera, given = path.camera, recording.camera
+    if camera is None:
+        raise CalibrationError(
+            f"{config.route}: holds no camera; give the recording's own, --camera FILE"
+        )
+    if (camera.width, camera.height) != (given.width, given.height):
+        raise CalibrationError(
+            f"{recording.name}: pictures have {given.width}x{given.height} pixels, but the route "
+            f"was taught with {camera.width}x{camera.height}; give their own camera, --camera FILE"
+        )
+    return replace(recording, camera=camera)
+
+
+def _run(
+    config: FollowConfig, path: PathMemory, recording: OmniRecording, context: Context
+) -> RunResult:
+    """Stopped early, the images so far count."""
+    folder = context.folder
+    commands, damaged = _follow(config, path, recording, context)
+    whole = len(commands) + len(damaged) == len(recording)
+    rows = [_row(i, recording, path, command) for i, command in commands.items()]
+    write_csv(folder / FOLLOW_FILE, COLUMNS, rows)
+    numbers = _numbers(list(commands.values()), len(recording))
+    result = RunResult(
+        config, folder, "finished" if whole else "interrupted", _sentences(numbers, path),
+        (_table(numbers), *_refusals(list(commands.values()))), (*recording.notes, *damaged),
+        (("table", str(folder / FOLLOW_FILE)),), failed=not numbers["sure"],
+    )  # fmt: skip
+    write_document(result, numbers)
+    write_page(
+        result,
+        f"{len(commands)} images of {recording.name} along {len(path)} path images",
+        figures=tuple(_figures(commands)),
+    )
+    return result
+
+
+def _follow(
+    config: FollowConfig, path: PathMemory, recording: OmniRecording, context: Context
+) -> tuple[dict[int, DriveCommand], list[str]]:
+    """Commands by image, and images that could not be read, in words."""
+    behaviour = HomingBehaviourSettings(steering=config.steering)
+    commands: dict[int, DriveCommand] = {}
+    damaged: list[str] = []
+    with PathFollower(
+        recording.camera, path, behaviour=behaviour, seed=config.seed, by="looks"
+    ) as follower:
+        for i in range(len(recording)):
+            if context.stopped():
+                break
+            try:
+                commands[i] = follower.step(recording.image(i), _time(recording, i))
+            except FrameError as error:
+                damaged.append(str(error))
+            context.progress("following", i + 1, len(recording))
+    return commands, damaged
+
+
+def _time(recording: OmniRecording, i: int) -> float:
+    seconds = float(recording.timestamps[i])
+    return seconds if np.isfinite(seconds) else i / _RATE_HZ
+
+
+def _row(i: int, recording: OmniRecording, path: PathMemory, command: DriveCommand) -> list[Cell]:
+    place, homing = command.place, command.homing
+    sigma = np.sqrt(np.diag(homing.covariance)[1:])
+    known = bool(np.isfinite(sigma).all())
+    nearest = None if place is None else place.nearest
+    return [
+        int(recording.ids[i]),
+        recording.names[i],
+        command.time,
+        nearest,
+        None if nearest is None else path.names[nearest],
+        None if place is None else place.probability,
+        None if place is None else place.target,
+        np.rad2deg(command.heading) if known else None,
+        np.rad2deg(sigma[0]),
+        np.rad2deg(homing.rotation),
+        np.rad2deg(sigma[1]),
+        homing.covariance[1, 2] / (sigma[0] * sigma[1]) if known else None,
+        None if place is None or place.vector is None else place.vector.support,
+        command.remaining if known else None,
+        command.v,
+        np.rad2deg(command.omega),
+        command.state.value,
+        "" if known else command.reason,
+    ]
+
+
+# --------------------------------------------------------------------------------------------
+# What is said
+
+
+def _numbers(commands: list[DriveCommand], recorded: int) -> dict[str, JsonValue]:
+    places = [c.place for c in commands if c.place is not None]
+    sure = [p for p in places if p.sure]
+    directions = _directions(commands)
+    jumps = np.abs(np.rad2deg(wrap(np.diff(directions[np.isfinite(directions)]))))
+    return {
+        "images": len(commands),
+        "recorded_images": recorded,
+        "sure": len(sure),
+        "with_vector": int(np.isfinite(directions).sum()),
+        "first_path_image": sure[0].nearest if sure else None,
+        "last_path_image": sure[-1].nearest if sure else None,
+        "end_reached": any(p.reached for p in places),
+        "jumps": int((jumps > _JUMP_DEG).sum()),
+        "steps": len(jumps),
+        "inliers_median": _median([p.vector.support for p in places if p.vector]),
+    }
+
+
+def _directions(commands: list[DriveCommand]) -> FloatArray:
+    """(n,) to the next path image, radians; NaN where it is refused."""
+    known = [bool(np.isfinite(c.homing.covariance[1, 1])) for c in commands]
+    return np.array([c.heading if k else np.nan for c, k in zip(commands, known, strict=True)])
+
+
+def _median(values: list[int]) -> float | None:
+    return float(np.median(values)) if values else None
+
+
+def _sentences(numbers: dict[str, JsonValue], path: PathMemory) -> tuple[str, ...]:
+    if not numbers["sure"]:
+        return (
+            f"Not one of {numbers['images']} images is recognised on the route: is it the way that "
+            "was taught, and the right camera?",
+        )
+    end = "is reached" if numbers["end_reached"] else "is not reached"
+    return (
+        f"The place is known (probability {SURE:g}) in {numbers['sure']} of {numbers['images']} "
+        f"images, from path image {numbers['first_path_image']} to {numbers['last_path_image']} of "
+        f"0 to {len(path) - 1}; the end {end}.",
+        f"{numbers['with_vector']} images have a homing vector to the next path image; it turns by "
+        f"more than {_JUMP_DEG:g} degrees from one to the next {numbers['jumps']} times.",
+    )
+
+
+def _table(numbers: dict[str, JsonValue]) -> TextTable:
+    rows = (
+        ("images", "images"),
+        ("place known", "sure"),
+        ("homing vector", "with_vector"),
+        ("features of it, median", "inliers_median"),
+        ("turns by more than 30 degrees", "jumps"),
+    )
+    cells = tuple((name, ("-" if numbers[k] is None else f"{numbers[k]:g}",)) for name, k in rows)
+    return TextTable("follow", "The recording on the route", "", (Column("", "number"),), cells)
+
+
+def _refusals(commands: list[DriveCommand]) -> tuple[TextTable, ...]:
+    """Why images have no homing vector, numbers in the reasons as n; none where all have."""
+    unknown = [c for c in commands if not np.isfinite(c.homing.covariance[1, 1])]
+    kinds = Counter(_NUMBER.sub("n", c.reason.split(":")[0]) for c in unknown)
+    if not kinds:
+        return ()
+    rows = tuple((kind, (str(count),)) for kind, count in kinds.most_common())
+    columns = (Column("images", "refused for it"),)
+    return (TextTable("refusals", "Images without a homing vector", "reason", columns, rows),)
+
+
+def _figures(commands: dict[int, DriveCommand]) -> list[Figure]:
+    placed = {i: c.place for i, c in commands.items() if c.place is not None}
+    images = np.array(list(placed), np.float64)
+    nearest = np.array([p.nearest if p.sure else np.nan for p in placed.values()])
+    target = np.array([p.target if p.sure else np.nan for p in placed.values()], np.float64)
+    chance = np.array([100.0 * p.probability for p in placed.values()])
+    every = np.array(list(commands), np.float64)
+    direction = np.rad2deg(_directions(list(commands.values())))
+    where = ("place", "Place on the route", "Nearest path image and the next one to go to, where "
+             "the place is known.")  # fmt: skip
+    sure = ("probability", "Probability of the place", "That the path image, or the one before or "
+            "after it, is the nearest one.")  # fmt: skip
+    to = ("direction", "Direction to the next path image", "From the robot's heading, to the left "
+          "positive; a gap is a refusal.")  # fmt: skip
+    two = [Line("nearest", 0, images, nearest), Line("next", 1, images, target, "dot")]
+    return [
+        curve_figure(where, two, ("image", "path image")),
+        curve_figure(sure, [Line("probability", 0, images, chance)], ("image", "percent")),
+        curve_figure(to, [Line("direction", 0, every, direction)], ("image", "degrees")),
+    ]

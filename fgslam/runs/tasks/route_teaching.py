@@ -1,0 +1,212 @@
+"""Task `teach`: path images are chosen from a recording and written as a route.
+
+Files: route.fgpath, path_images.csv (which images, how far apart, and why), metrics.json, a sheet
+of the path images, the page.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fgslam.core.errors import OutputError
+from fgslam.core.files import make_subfolder
+from fgslam.datasets.omni_recording import OmniRecording
+from fgslam.evaluation.metrics import JsonValue
+from fgslam.homing.settings import DRIVING
+from fgslam.homing.teaching import FULL, GAP, Taught, TaughtImage, Teacher
+from fgslam.report.content import Column, Picture, TextTable
+from fgslam.report.figures.homing import Line, curve_figure
+from fgslam.report.figures.traces import Figure
+from fgslam.report.tables import write_csv
+from fgslam.runs.config_models import TeachConfig
+from fgslam.runs.engine import (
+    Context,
+    Opening,
+    RunResult,
+    Task,
+    provenance_of,
+    write_document,
+    write_page,
+)
+from fgslam.runs.tasks.homing_views import open_checked
+
+ROUTE_FILE = "route.fgpath"
+IMAGES_FILE = "path_images.csv"
+PICTURES = "pictures"
+_COLUMNS = (
+    "path_image",
+    "image",
+    "name",
+    "images_since_last",
+    "reason",
+    "common_features",
+    "parallax_deg",
+    "direction_deg",
+    "sigma_direction_deg",
+    "refusal",
+)
+
+
+def open_teaching(config: TeachConfig, opening: Opening) -> Task[RunResult]:
+    """Opens the recording and checks its mirror. Raises DatasetError, or OutputError."""
+    if config.route is not None and not Path(config.route).resolve().parent.is_dir():
+        raise OutputError(f"{config.route}: its folder does not exist; choose another one")
+    recording = open_checked(config.dataset)
+    return Task(provenance_of(recording), lambda context: _run(config, recording, context))
+
+
+def _run(config: TeachConfig, recording: OmniRecording, context: Context) -> RunResult:
+    """Stopped early, the route ends where the recording was read to."""
+    folder = context.folder
+    taught, whole = _teach(config, recording, context)
+    kilobytes = taught.memory.save(folder / ROUTE_FILE)
+    written = folder / ROUTE_FILE if config.route is None else Path(config.route)
+    if config.route is not None:
+        taught.memory.save(written)
+    write_csv(folder / IMAGES_FILE, _COLUMNS, list(_rows(taught)))
+    numbers = _numbers(taught, len(recording), kilobytes)
+    gaps = sum(row.reason == GAP for row in taught.rows)
+    lines = _sentences(taught, len(recording), kilobytes, gaps)
+    notes = (*recording.notes, *taught.unusable)
+    result = RunResult(
+        config, folder, "finished" if whole else "interrupted", lines, (_table(taught),), notes,
+        (("route", str(written)),),
+    )  # fmt: skip
+    write_document(result, numbers)
+    write_page(
+        result,
+        f"{len(taught.memory)} path images of {recording.name}",
+        figures=(_figure(taught),),
+        pictures=_sheet(folder, recording, taught, config.output.pictures),
+    )
+    return result
+
+
+def _teach(config: TeachConfig, recording: OmniRecording, context: Context) -> tuple[Taught, bool]:
+    """The route, and whether the whole recording was read."""
+    teacher = Teacher(recording.camera, DRIVING, config.seed)
+    last = len(recording) - 1
+    for i in range(len(recording)):
+        if context.stopped():
+            return teacher.finish(), False
+        if i >= teacher.next or i == last:
+            teacher.take(i, recording.names[i], recording.image(i))
+        context.progress("teaching", i + 1, len(recording))
+    return teacher.finish(), True
+
+
+class _Row(NamedTuple):
+    """A row of path_images.csv."""
+
+    path_image: int
+    image: int
+    name: str
+    since: int
+    reason: str
+    common: int | None
+    parallax: float
+    direction: float
+    sigma: float
+    refusal: str
+
+
+def _rows(taught: Taught) -> list[_Row]:
+    before = [taught.rows[0].number, *(row.number for row in taught.rows)]
+    return [_row(k, row, row.number - before[k]) for k, row in enumerate(taught.rows)]
+
+
+def _row(k: int, row: TaughtImage, since: int) -> _Row:
+    common = row.common if k else None
+    return _Row(
+        k, row.number, row.name, since, row.reason, common, row.parallax_deg, row.direction_deg,
+        row.sigma_deg, row.refusal,
+    )  # fmt: skip
+
+
+def _numbers(taught: Taught, recorded: int, kilobytes: float) -> dict[str, JsonValue]:
+    reasons = Counter(row.reason for row in taught.rows)
+    return {
+        "path_images": len(taught.memory),
+        "recorded_images": recorded,
+        "compared_images": taught.seen,
+        "kilobytes_per_image": kilobytes,
+        "reasons": dict(sorted(reasons.items())),
+        "common_features_least": min((r.common for r in taught.rows if r.common), default=None),
+    }
+
+
+def _sentences(taught: Taught, recorded: int, kilobytes: float, gaps: int) -> tuple[str, ...]:
+    said = (
+        f"{len(taught.memory)} of {recorded} images are path images, {kilobytes:.1f} kB each "
+        f"({taught.seen} were compared).",
+    )
+    if not gaps:
+        return (*said, "Each is seen well from the one before.")
+    return (
+        *said,
+        f"{gaps} have too little in common with the one before: a robot may lose its way there; "
+        "take more images in between.",
+    )
+
+
+def _table(taught: Taught) -> TextTable:
+    columns = (
+        Column("image", "in the recording"),
+        Column("since last", "images since the path image before"),
+        Column("reason", "why it was chosen"),
+        Column("common", "features in common with the path image before"),
+        Column("parallax (deg)", "median of theirs"),
+        Column("direction (deg)", "as seen from the path image before"),
+    )
+    rows = tuple(
+        (
+            str(row.path_image),
+            (
+                row.name,
+                str(row.since),
+                row.reason,
+                "-" if row.common is None else str(row.common),
+                _text(row.parallax),
+                f"{_text(row.direction)} ± {_text(row.sigma)}" if np.isfinite(row.sigma) else "-",
+            ),
+        )
+        for row in _rows(taught)
+    )
+    return TextTable("path_images", "The path images", "path image", columns, rows)
+
+
+def _text(value: float) -> str:
+    return f"{value:.1f}" if np.isfinite(value) else "-"
+
+
+def _figure(taught: Taught) -> Figure:
+    numbers = np.array([row.number for row in taught.rows], np.float64)
+    common = np.array([row.common for row in taught.rows], np.float64)
+    words = (
+        "common",
+        "Features in common with the path image before",
+        "Each path image at its place in the recording; the first has none before it.",
+    )
+    lines = [Line("common features", 0, numbers[1:], common[1:])]
+    return curve_figure(words, lines, ("image", "features"), y={"rangemode": "tozero"})
+
+
+def _sheet(
+    folder: Path, recording: OmniRecording, taught: Taught, most: int
+) -> tuple[Picture, ...]:
+    """The path images side by side; none where pictures are not wanted."""
+    if most == 0:
+        return ()
+    from fgslam.report.pictures.image_overlays import draw_sheet  # Matplotlib takes a second
+
+    titles = [
+        f"{k}: {row.name}" + ("" if row.reason == FULL else f" ({row.reason})")
+        for k, row in enumerate(taught.rows)
+    ]
+    path = make_subfolder(folder, PICTURES) / "path_images.png"
+    draw_sheet(path, [recording.image(row.number) for row in taught.rows], titles)
+    return (Picture("The path images, in their order", path.read_bytes()),)

@@ -1,0 +1,189 @@
+"""fgslam teach and fgslam follow: routes from folders of panoramas and films, and mistakes."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image as PictureFile
+from running import main
+
+from fgslam.homing.path_memory import PathMemory
+from fgslam.runs.folder import RUN_MARKER
+from tests import textured_room
+
+Capture = pytest.CaptureFixture[str]
+Patch = pytest.MonkeyPatch
+CAMERA = """kind: equirectangular
+top_elevation_deg: 54
+bottom_elevation_deg: -54
+"""
+
+
+def seen_at(metres: float, across: float = 0.4) -> np.ndarray:
+    """(91, 301, 3) a panorama on a straight way through the room."""
+    return textured_room.picture(np.array([-2.0 + metres, across, 0.0]))[::2, ::2]
+
+
+def folder_of(place: Path, metres: np.ndarray) -> Path:
+    place.mkdir()
+    for k, one in enumerate(metres.tolist()):
+        PictureFile.fromarray(np.ascontiguousarray(seen_at(one))).save(place / f"view_{k}.png")
+    return place
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A taught drive, another one of the same way, and the camera's keys."""
+    root = tmp_path_factory.mktemp("routes")
+    folder_of(root / "drive", np.arange(0.0, 3.6, 0.4))
+    folder_of(root / "again", np.arange(0.2, 3.6, 0.8))
+    (root / "camera.yaml").write_text(CAMERA, encoding="utf-8")
+    return root
+
+
+@pytest.fixture(scope="module")
+def taught(data: Path) -> Path:
+    with pytest.MonkeyPatch.context() as patch:
+        route = data / "route.fgpath"
+        given = (data / "drive", "--camera", data / "camera.yaml", "--out", route)
+        assert main(patch, "teach", *given, "--report", data / "taught") == 0
+    return route
+
+
+def mistake(capfd: Capture, monkeypatch: Patch, *arguments: object) -> str:
+    """The one line that a command prints which must fail."""
+    capfd.readouterr()
+    assert main(monkeypatch, *arguments) == 2
+    said = [line for line in capfd.readouterr().err.splitlines() if "moov atom" not in line]
+    (line,) = said  # beside what FFmpeg itself prints
+    assert line.startswith("fgslam: ")
+    return line
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_route_is_taught_with_the_reason_of_each_path_image(taught: Path, data: Path) -> None:
+    rows = rows_of(data / "taught" / "path_images.csv")
+    path = PathMemory.load(taught)
+    assert path.camera == textured_room_camera()
+    assert len(path) == len(rows) < 9
+    assert (rows[0]["reason"], rows[-1]["reason"]) == ("start", "end")
+    numbers = json.loads((data / "taught" / "metrics.json").read_text(encoding="utf-8"))
+    assert numbers["kilobytes_per_image"] <= 20.0
+    assert (data / "taught" / "pictures" / "path_images.png").stat().st_size > 10_000
+    assert (data / "taught" / "report.html").is_file()
+    assert (data / "taught" / "route.fgpath").read_bytes() == taught.read_bytes()
+
+
+def textured_room_camera() -> object:
+    from fgslam.cameras.omni.panoramas import Equirectangular
+
+    top = float(np.deg2rad(54.0))
+    return Equirectangular(301, 91, top, -top)
+
+
+def test_another_drive_follows_it(
+    taught: Path, data: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    """Without a camera given: the route's own."""
+    assert main(monkeypatch, "follow", taught, data / "again", "--out", tmp_path / "run") == 0
+    assert "the place is known" in capfd.readouterr().out.lower()
+    rows = rows_of(tmp_path / "run" / "follow.csv")
+    assert len(rows) == 5
+    places = [int(row["path_image"]) for row in rows]
+    assert places == sorted(places)
+    known = [row for row in rows if not row["refusal"]]
+    assert len(known) >= 3
+    for row in known[:-1]:
+        assert abs(float(row["direction_deg"])) < 5.0
+        assert float(row["sigma_direction_deg"]) < 5.0
+        assert float(row["v_mps"]) > 0.0
+    assert all(row["state"] == "wait" for row in rows if row["refusal"])
+    again = tmp_path / "again"
+    assert main(monkeypatch, "run", tmp_path / "run" / RUN_MARKER, "--out", again) == 0
+    assert (again / "follow.csv").read_bytes() == (tmp_path / "run" / "follow.csv").read_bytes()
+
+
+def test_another_place_is_said(
+    taught: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    rng = np.random.default_rng(0)
+    for k in range(2):
+        noise = rng.integers(0, 255, (91, 301, 3), np.uint8)
+        PictureFile.fromarray(noise).save(other / f"{k}.png")
+    assert main(monkeypatch, "follow", taught, other, "--out", tmp_path / "run") == 1
+    assert "is recognised on the route" in capfd.readouterr().out
+
+
+def film_of(path: Path, count: int) -> Path:
+    """Motion JPEG of panoramas, the first ones of the drive."""
+    film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (301, 91))
+    for k in range(count):
+        film.write(np.ascontiguousarray(seen_at(0.1 * k)[:, :, ::-1]))
+    film.release()
+    return path
+
+
+def test_a_film_is_a_recording_too(data: Path, tmp_path: Path, monkeypatch: Patch) -> None:
+    film, route = film_of(tmp_path / "walk.avi", 3), tmp_path / "r.fgpath"
+    monkeypatch.chdir(tmp_path)
+    camera = ("--camera", data / "camera.yaml")
+    assert main(monkeypatch, "teach", film, *camera, "--out", route) == 0
+    assert (tmp_path / "runs" / "teach_walk" / "path_images.csv").is_file()
+    assert len(PathMemory.load(route)) in (1, 2)
+
+
+def test_wrong_inputs_are_one_line_each(
+    taught: Path, data: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    out = ("--out", tmp_path / "r.fgpath")
+    drive, camera = data / "drive", ("--camera", data / "camera.yaml")
+    said = mistake(capfd, monkeypatch, "teach", drive, *out)
+    assert "no camera is given; add --camera FILE" in said
+    said = mistake(capfd, monkeypatch, "teach", drive, "--camera", "none.txt", *out)
+    assert "there is no file none.txt" in said
+    said = mistake(capfd, monkeypatch, "teach", tmp_path / "nowhere", *camera, *out)
+    assert "no such film or folder" in said
+    (tmp_path / "empty.mp4").write_bytes(b"")
+    said = mistake(capfd, monkeypatch, "teach", tmp_path / "empty.mp4", *camera, *out)
+    assert "cannot be opened as a video" in said
+    none = film_of(tmp_path / "none.avi", 0)
+    said = mistake(capfd, monkeypatch, "teach", none, *camera, *out)
+    assert "holds no frame" in said or "cannot be opened as a video" in said
+    said = mistake(
+        capfd, monkeypatch, "teach", drive, *camera, "--out", tmp_path / "no" / "r.fgpath"
+    )
+    assert "its folder does not exist" in said
+    assert not (tmp_path / "runs").exists()
+
+
+def test_wrong_routes_are_one_line_each(
+    taught: Path, data: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    again, cut = data / "again", tmp_path / "cut.fgpath"
+    said = mistake(capfd, monkeypatch, "follow", data / "camera.yaml", again)
+    assert "not a readable path memory" in said
+    cut.write_bytes(taught.read_bytes()[:-2000])
+    assert "truncated" in mistake(capfd, monkeypatch, "follow", cut, again)
+    assert "no such file" in mistake(capfd, monkeypatch, "follow", tmp_path / "none", again)
+    small = tmp_path / "small"
+    small.mkdir()
+    PictureFile.fromarray(np.ascontiguousarray(seen_at(0.0)[::2, ::2])).save(small / "0.png")
+    said = mistake(capfd, monkeypatch, "follow", taught, small)
+    assert "pictures have 151x46 pixels, but the route was taught with 301x91" in said
+    PathMemory.of(PathMemory.load(taught).images).save(tmp_path / "blind.fgpath")
+    said = mistake(capfd, monkeypatch, "follow", tmp_path / "blind.fgpath", again)
+    assert "holds no camera" in said
+    assert not (tmp_path / "runs").exists()
