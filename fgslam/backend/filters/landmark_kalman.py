@@ -131,6 +131,17 @@ class LandmarkRows:
         self.counts[:], self.homes[:] = counts, homes
 
 
+def _guessed(increment: Increment, tracking: EgoMotion) -> bool:
+    """Whether nothing measured a frame's pose: neither landmarks nor odometry, after the first.
+
+    What it starts is one piece, whose place among the rest nobody knows. The filter has no
+    correlations: with the guess's covariance on each landmark none would tell where the next frame
+    is, though together they do.
+    """
+    odometry = increment.odometry
+    return not tracking.status.measured and odometry is not None and not odometry.measured
+
+
 class LandmarkKalman:
     """Estimator of kind ``landmark_kalman``, on :class:`fgslam.backend.protocol.Estimator`."""
 
@@ -148,6 +159,7 @@ class LandmarkKalman:
         self._rig = rig
         self._settings = settings
         self._current = prior
+        self._by_pose: FloatArray | None = None  # what landmarks take over of the pose's covariance
         self._past = FilteredTrajectory()
         self._rows = LandmarkRows()
         self._drive = DriveRecord()
@@ -179,6 +191,8 @@ class LandmarkKalman:
         """
         self._past.require_later(increment)
         before, self._current = self._current, Prediction(tracking.wTc, tracking.covariance)
+        shared = self._settings.pose_covariance and not _guessed(increment, tracking)
+        self._by_pose = tracking.covariance if shared else None
         matched = increment.observations.select(~increment.observations.is_new)
         used = matched.select(tracking.inliers)
         nis, dof = self._update_matched(used)
@@ -311,9 +325,9 @@ class LandmarkKalman:
         points = transform_to_camera(wTc, self._rows.positions[rows])
         jacobian = projection_jacobian(self._rig, points)
         noise = observed.covariance
-        if self._settings.pose_covariance:
+        if self._by_pose is not None:
             by_pose = jacobian @ point_pose_jacobian(points)
-            noise = noise + congruence(by_pose, self._current.covariance)
+            noise = noise + congruence(by_pose, self._by_pose)
         expected = project(self._rig, points)
         innovation = measurement_difference(self._rig, observed.measurement, expected)
         return self._kalman(rows, jacobian @ wTc[:3, :3].T, innovation, noise)
@@ -357,9 +371,8 @@ class LandmarkKalman:
 
     def _observed_positions(self, observed: Observations) -> tuple[FloatArray, FloatArray]:
         """World positions (k, 3) of single observations, and covariances (k, 3, 3)."""
-        known = self._current.covariance if self._settings.pose_covariance else None
         measurement, noise = observed.measurement, observed.covariance
-        return placed(self._rig, self._current.wTc, measurement, noise, known)
+        return placed(self._rig, self._current.wTc, measurement, noise, self._by_pose)
 
     def _grow(self, ids: IntArray) -> None:
         """Expands the ellipsoids of missed landmarks (type II, Se et al. 6.4)."""

@@ -376,7 +376,7 @@ class LandmarkKalmanGraph(LandmarkKalman):
     def _eliminated(
         self, positions: FloatArray, priors: FloatArray | None, observed: Observations
     ) -> Eliminated:
-        by_pose = self._current.covariance if self._settings.pose_covariance else None
+        by_pose = self._by_pose
         factors = StereoFactors(self._cameras, Whitening())
         values = gtsam.Values()
         values.insert(_POSE, gtsam.Pose3(self._current.wTc))

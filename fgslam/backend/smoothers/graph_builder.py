@@ -15,6 +15,7 @@ from fgslam.backend.smoothers.persistence import MeasurementNoise, Persistence, 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
+from fgslam.core.geometry import triangulate
 from fgslam.core.measurements import Observations, Odometry
 from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.factors.graphs import landmark_key, pose_key
@@ -222,6 +223,21 @@ class GraphBuilder:
         depth = np.einsum("ki,ki->k", offset, poses[frames, :3, 2])
         # A variable that was taken out has no position, and NaN is not below zero.
         return [int(variable) for variable in np.unique(seen[depth <= 0.0])]
+
+    def seen_last(self, poses: FloatArray) -> dict[int, FloatArray]:
+        """Places (3,) of the graph's landmark variables, each from its last sighting alone.
+
+        Args:
+            poses: (n, 4, 4) ``wTc`` by frame, those of the graph at least.
+        """
+        tracks = [t for _, t in self.admission.in_graph() if np.isfinite(poses[t.last.frame, 0, 0])]
+        if not tracks:
+            return {}
+        seen = np.array([track.last.measurement for track in tracks])
+        wTc = poses[[track.last.frame for track in tracks]]
+        local = triangulate(self._sensor, seen)
+        places = np.einsum("kij,kj->ki", wTc[:, :3, :3], local) + wTc[:, :3, 3]
+        return {track.variable: place for track, place in zip(tracks, places, strict=True)}
 
     def kept_factors(self) -> Any:
         """The graph without its empty slots, weighed as is known now what depends on the noise."""

@@ -41,6 +41,7 @@ from fgslam.factors.graphs import (
 )
 
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
+_SINGLE = 3  # of these, before Cholesky's rounding is suspected
 
 
 def isam2_smoother(
@@ -160,29 +161,67 @@ class Isam2Solver(WholeGraphSolver):
 
         After an exception iSAM2's own state is unusable; the builder's graph is not.
         """
-        for _ in range(_REPAIRS):
-            key = suspect(error)
-            if key is not None and is_pose(key) and not self._with_qr:
-                self._with_qr = True
-                self.remarks.append(
-                    f"pose of frame {number(key)} known too unevenly for Cholesky at frame "
-                    f"{self._builder.frames[-1]}: iSAM2 built anew, with QR from here on"
-                )
-                try:
-                    self._rebuild(values)
-                    return
-                except RuntimeError as another:
-                    error = another
-                    continue
-            if key is None or is_pose(key) or not self._builder.in_graph(number(key)):
-                break
-            self._take_out(number(key), values, "left the system indeterminate")
-            try:
-                self._rebuild(values)
+        last: Exception | None = error
+        if self._put_before_cameras(values):
+            last = self._tried(values)
+        for repair in range(_REPAIRS):
+            if last is None:
                 return
-            except RuntimeError as another:
-                error = another
-        raise self._failed(error)
+            if not self._mended(values, last, several=repair >= _SINGLE):
+                break
+            last = self._tried(values)
+        if last is not None:
+            raise self._failed(last)
+
+    def _tried(self, values: Any) -> RuntimeError | None:
+        """Builds the solver anew; what it fails on, or None."""
+        try:
+            self._rebuild(values)
+        except RuntimeError as error:
+            return error
+        return None
+
+    def _mended(self, values: Any, error: Exception, several: bool) -> bool:
+        """Whether something was done about what the error names.
+
+        One landmark is to blame itself. Of ``several`` that failed after each other what hangs
+        together is known too unevenly, as a piece of the drive beyond a gap.
+        """
+        key = suspect(error)
+        if key is None:
+            return False
+        if (is_pose(key) or several) and not self._with_qr:
+            self._with_qr = True
+            what = f"pose of frame {number(key)}" if is_pose(key) else "the map beyond a gap"
+            self.remarks.append(
+                f"{what} known too unevenly for Cholesky at frame "
+                f"{self._builder.frames[-1]}: iSAM2 built anew, with QR from here on"
+            )
+            return True
+        if is_pose(key) or not self._builder.in_graph(number(key)):
+            return False
+        self._take_out(number(key), values, "left the system indeterminate")
+        return True
+
+    def _put_before_cameras(self, values: Any) -> int:
+        """How many landmarks a step took behind a camera; they are where they were seen last.
+
+        Behind a camera nothing holds them: each alone would leave the system indeterminate.
+        """
+        poses = np.full((self._builder.frames[-1] + 1, 4, 4), np.nan)
+        for frame in self._builder.frames:
+            poses[frame] = poses_of_frame(values, frame)
+        places = self._builder.seen_last(poses)
+        points = {v: values.atPoint3(landmark_key(v)) for v in places}
+        behind = self._builder.behind(poses, points)
+        for variable in behind:
+            values.update(landmark_key(variable), places[variable])
+        if behind:
+            self.remarks.append(
+                f"{len(behind)} landmarks came out behind a camera at frame "
+                f"{self._builder.frames[-1]}: put where they were seen last, iSAM2 built anew"
+            )
+        return len(behind)
 
     def _take_out(self, variable: int, values: Any, why: str) -> None:
         what = self._builder.take_out(variable)
@@ -198,7 +237,17 @@ class Isam2Solver(WholeGraphSolver):
         self._values = self._isam.calculateEstimate()
 
     def _covariance(self, frame: int) -> FloatArray:
-        """Marginal of a pose."""
-        covariance = np.asarray(self._isam.marginalCovariance(pose_key(frame)))
+        """Marginal of a pose; where the tree cannot tell it, it is built anew first."""
+        try:
+            covariance = np.asarray(self._isam.marginalCovariance(pose_key(frame)))
+        except RuntimeError as error:
+            self._repair(self._values, error)
+            covariance = self._marginal_again(frame)
         pose = poses_of_frame(self._values, frame)
         return np.asarray(allowed_parts(self._floor, pose[None], covariance[None])[0])
+
+    def _marginal_again(self, frame: int) -> FloatArray:
+        try:
+            return np.asarray(self._isam.marginalCovariance(pose_key(frame)))
+        except RuntimeError as error:
+            raise self._failed(error) from None

@@ -26,7 +26,7 @@ from smoothing import (
 from fgslam.backend.settings import Isam2Settings
 from fgslam.backend.smoothers.smoother import MapSmoother
 from fgslam.core.errors import EstimatorError
-from fgslam.factors.graphs import landmark_key, pose_key
+from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame
 
 EVERY_FRAME = Isam2Settings(update_every=1)
 FAILED = """
@@ -253,3 +253,40 @@ def test_joint_covariance_of_a_landmark_outside_the_graph_is_refused() -> None:
         with pytest.raises(EstimatorError, match=f"landmark {identity} waits outside"):
             estimator.joint_covariance(np.array([identity]))
     assert outside
+
+
+def test_landmarks_behind_a_camera_are_put_back_before_it() -> None:
+    """Where a bad step has left them nothing holds them, and the solver fails on each in turn."""
+    simulation, estimator = played(13)
+    solver, builder = estimator._solver, estimator._builder
+    tracks = [track for _, track in builder.admission.in_graph()][:30]
+    for track in tracks:
+        wTc = poses_of_frame(solver._values, track.last.frame)
+        solver._values.update(landmark_key(track.variable), wTc[:3, 3] - 2.0 * wTc[:3, 2])
+    spoil(estimator, landmark_key(tracks[0].variable))
+    play(estimator, simulation.increments[13:], FREE)
+    found = estimator.estimate()
+    assert_finite(found)
+    (remark,) = found.remarks
+    assert remark.startswith("30 landmarks came out behind a camera at frame 13: put where")
+    assert ate(found, simulation) < 0.01
+
+
+class Mute(Failing):
+    """A solver that is updated, but cannot tell a covariance."""
+
+    def update(self, *arguments: Any) -> None:
+        self._solver.update(*arguments)
+
+    def marginalCovariance(self, key: int) -> None:
+        raise RuntimeError(FAILED.format(key=key))
+
+
+def test_a_covariance_that_the_tree_cannot_tell_is_asked_of_a_new_one() -> None:
+    simulation, estimator = played(13)
+    estimator._solver._isam = Mute(estimator._solver._isam, "")
+    play(estimator, simulation.increments[13:], FREE)
+    found = estimator.estimate()
+    assert_finite(found)
+    assert found.remarks[0].endswith("iSAM2 built anew, with QR from here on")
+    assert ate(found, simulation) < 0.01

@@ -27,8 +27,9 @@ from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import Prediction
-from fgslam.core.measurements import Increment
+from fgslam.core.estimates import EgoMotionStatus, Prediction
+from fgslam.core.measurements import Increment, Odometry
+from fgslam.frontend.tracking.ego_motion import unmeasured
 
 SIGMA = np.array([0.3, 0.4, 0.2])
 NO_IDS = np.empty(0, np.int64)
@@ -515,3 +516,26 @@ def test_the_map_drifts_less_than_frame_to_frame() -> None:
         by_map.append(end_error(estimator, simulation.poses[-1]))
         by_frame.append(frame_to_frame(simulation))
     assert np.mean(by_map) < 0.7 * np.mean(by_frame)
+
+
+# --------------------------------------------------------------------------------------------
+# What a frame starts that nothing placed
+
+
+@pytest.mark.parametrize("measured", [False, True], ids=["guessed", "odometry"])
+def test_landmarks_take_no_guess_over(measured: bool, rng: np.random.Generator) -> None:
+    """A guessed pose is nobody's knowledge of single landmarks; odometry's uncertainty is."""
+    points = points_in_view(RIG, 5, (1.5, 6.0), rng)
+    estimator, z = make(), noisy(points, np.eye(4), rng)
+    vague = Prediction(np.eye(4), np.diag([0.5] * 3 + [20.0] * 3) ** 2)
+    step = Odometry(np.eye(4), vague.covariance, measured=measured)
+    estimator.update(frame(0, NO_IDS, np.empty((0, 3)), True), at(np.eye(4), 0))
+    lost = unmeasured(vague, EgoMotionStatus.TOO_FEW_MATCHES)
+    new = dataclasses.replace(frame(1, np.arange(5), z, True), odometry=step)
+    estimator.update(new, lost)
+    found = estimator.landmarks().covariances
+    alone = g.triangulation_covariance(RIG, z, np.tile(np.diag(SIGMA**2), (5, 1, 1)))
+    if measured:
+        assert (np.trace(found - alone, axis1=1, axis2=2) > 3 * 20.0**2).all()
+    else:
+        np.testing.assert_allclose(found, alone, rtol=1e-9)
