@@ -88,8 +88,9 @@ class MapMatchingSettings:
     rescue: Annotated[
         bool,
         Field(
-            description="where too few match, search the largest window by "
-            "descriptor before falling back to the odometry; needs appearance.mode descriptor"
+            description="where too few match, search the largest window by descriptor; where "
+            "most of it contradicts the pose, too, all that was seen lately, wherever predicted, "
+            "before falling back to the odometry; needs appearance.mode descriptor"
         ),
     ] = True
 

@@ -15,6 +15,10 @@ from fgslam.core.recordings import Sequence
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.slam.motion_noise import MotionNoise
 
+_LARGEST_SIGMA = np.repeat([3.0, 30.0], 3)
+"""Radians and metres, of a step that nothing measured: as of one that is free. More would say no
+more, and leave a graph that no solver solves."""
+
 
 class MotionModel(Protocol):
     """Gives the camera's motion from the previous frame to the next one."""
@@ -45,6 +49,10 @@ class MotionModel(Protocol):
 
         A closed loop has corrected it; or the camera was ``carried`` and has been found anew.
         """
+        ...
+
+    def regained(self, timestamp: float, wTc: FloatArray) -> None:
+        """Learns a pose that its prediction failed to foresee, though the camera moved there."""
         ...
 
     def description(self) -> dict[str, Any]:
@@ -88,6 +96,10 @@ class OdometryMotion:
         """The stand-in goes on from there."""
         self._stand_in.displaced(timestamp, wTc, carried)
 
+    def regained(self, timestamp: float, wTc: FloatArray) -> None:
+        """The stand-in goes on from there."""
+        self._stand_in.regained(timestamp, wTc)
+
     def description(self) -> dict[str, Any]:
         """The kind of odometry and what bridges its gaps."""
         return {"kind": self._kind, "stand_in": self._stand_in.description()}
@@ -125,15 +137,18 @@ class ConstantVelocityMotion:
 
         The velocity has wandered by ``sigma * T`` over the time T since it was last measured, so
         the step's standard deviation is ``sigma * T * dt``: ``sigma * dt^2`` from frame to frame,
-        and growing while the camera is blind.
+        and growing while the camera is blind. Then the velocity fades, too.
         """
         if self._timestamp is None:
             return None
         dt = timestamp - self._timestamp
         if self._velocity is None:
             return Odometry(np.eye(4), np.diag((self._start_sigma * dt) ** 2), measured=False)
-        variance = self._noise.variance * ((timestamp - self._measured_at) * dt) ** 2
-        return Odometry(se3_exp(self._velocity * dt), np.diag(variance), measured=False)
+        wandered = self._noise.variance * (timestamp - self._measured_at) ** 2
+        variance = np.minimum(wandered * dt**2, _LARGEST_SIGMA**2)
+        blind = self._measured_at < self._timestamp
+        velocity = _faded(self._velocity, wandered) if blind else self._velocity
+        return Odometry(se3_exp(velocity * dt), np.diag(variance), measured=False)
 
     def observe(self, timestamp: float, pose: Prediction, measured: bool) -> None:
         """Updates the velocity from the last two measured poses, its noise from how it changed.
@@ -165,6 +180,18 @@ class ConstantVelocityMotion:
         self._timestamp = self._measured_at = timestamp
         self._pose = wTc
 
+    def regained(self, timestamp: float, wTc: FloatArray) -> None:
+        """Goes on from there with the velocity of the step; after blind frames none is known.
+
+        The noise learns nothing: what was not foreseen once need not come again.
+        """
+        if self._founded and self._measured_at == self._timestamp:
+            step, dt = inverse(self._pose) @ wTc, timestamp - self._measured_at
+            self._velocity = se3_log(step) / dt
+            self.displaced(timestamp, wTc, carried=False)
+        else:
+            self.displaced(timestamp, wTc, carried=True)
+
     def description(self) -> dict[str, Any]:
         """Kind and numbers."""
         return asdict(self._settings)
@@ -189,6 +216,17 @@ class ConstantVelocityMotion:
         self._pose = state["pose"]
         self._velocity = None if np.isnan(state["velocity"][0]) else state["velocity"]
         self._noise.restore(state["noise"])
+
+
+def _faded(velocity: FloatArray, wandered: FloatArray) -> FloatArray:
+    """What is left (6,) of a velocity that has since wandered with these variances (6,).
+
+    The estimate of least variance between the old one and rest, turn and way each by itself: a
+    drone that may have changed by more than it moved is better expected where it was.
+    """
+    square = (velocity**2).reshape(2, 3).sum(axis=1)
+    lost = wandered.reshape(2, 3).sum(axis=1)
+    return np.asarray(velocity * np.repeat(square / np.maximum(square + lost, 1e-300), 3))
 
 
 def body_motion(sequence: Sequence, i: int, motion: MotionModel) -> Odometry | None:

@@ -200,14 +200,16 @@ class SlamPipeline:
             tracked = self.tracker.track(prediction, landmarks, stereo)
         else:
             tracked, stereo = self.key_frames.beside(carried, prediction, landmarks, stereo)
-        relocalised, maps_on = False, True
+        relocalised = tracked.ego_motion.status is EgoMotionStatus.RELOCALISED
+        maps_on = True
         if found.i == 0 and self.located is not None:
             anew = self.tracker.track_anew(self.located, landmarks, stereo)
             relocalised = anew.ego_motion.status.measured
             tracked = anew if relocalised else tracked
         elif self.places is not None and found.i > 0:
             tracked = self.places.placed_by_recent(tracked, prediction, landmarks, stereo)
-            tracked, relocalised = self.places.recover(tracked, landmarks, stereo.whole)
+            tracked, located = self.places.recover(tracked, landmarks, stereo.whole)
+            relocalised |= located
             maps_on = self.places.maps_on
         image = found.frame.images[0]
         association = self.tracker.associate(tracked, stereo, image, maps_on)
@@ -251,8 +253,10 @@ class _Seen:
 def observe(
     motion: MotionModel, increment: Increment, tracking: EgoMotion, stats: UpdateStats
 ) -> None:
-    """Hands the pose to the motion model; a jump by loop or relocalisation is no motion."""
-    if any(stats.closed) or increment.relocalised:
+    """Hands the pose to the motion model; a jump by loop or against the odometry is no motion."""
+    if increment.relocalised and not any(stats.closed) and not _known(increment.odometry):
+        motion.regained(increment.timestamp, stats.wTc)
+    elif any(stats.closed) or increment.relocalised:
         motion.displaced(increment.timestamp, stats.wTc, increment.relocalised)
     else:
         pose = Prediction(stats.wTc, tracking.covariance)
@@ -262,6 +266,8 @@ def observe(
 def _anchored(increment: Increment, tracking: EgoMotion, stats: UpdateStats) -> bool:
     """True if odometry or the map determined the pose, or the frame starts the map."""
     founding = stats.landmarks > 0 and stats.landmarks == int(increment.observations.is_new.sum())
-    odometry = increment.odometry
-    known = odometry is not None and odometry.measured
-    return known or tracking.status.measured or founding
+    return _known(increment.odometry) or tracking.status.measured or founding
+
+
+def _known(odometry: Odometry | None) -> bool:
+    return odometry is not None and odometry.measured

@@ -69,3 +69,17 @@ def test_frames_pushed_into_the_session_of_a_recording_give_the_run_s_poses(
     slam.result().trajectory.save(tmp_path / "pushed.tum")
     expected = (ran.folder / DEFAULT_ESTIMATOR / "final.tum").read_bytes()
     assert (tmp_path / "pushed.tum").read_bytes() == expected
+
+
+@pytest.mark.data
+def test_a_drone_that_turns_by_tens_of_degrees_a_frame_is_located(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    """No odometry, and steps of 20 degrees and 0.3 m in the mean: no velocity foretells them."""
+    quiet = {"output.pictures": False, "output.report": False, "dataset.stop": 18}
+    path = shared_data / "euroc_v101_kf100"
+    run = fg.run(path, tmp_path / "run", {**quiet, "estimator.kind": "landmark_kalman"})
+    numbers = run.metrics["estimators"]["landmark_kalman"]
+    assert sum(run.metrics["status_counts"].values()) == 18
+    assert set(run.metrics["status_counts"]) == {"first", "ok", "relocalised"}
+    assert numbers["ate_rmse_m"] < 0.04

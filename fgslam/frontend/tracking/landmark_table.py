@@ -97,6 +97,16 @@ class LandmarkTable:
             words=self._pool.words(places) if with_words else None,
         )
 
+    def described_lately(self, frames: int) -> IntArray:
+        """Identities (k,) whose looks are of the last frame that described any, or ``frames`` less.
+
+        Those of a saved map that this run has not seen yet are older.
+        """
+        owner, places = self._places_of(np.arange(len(self)))
+        used = self._pool.last_use(places)
+        lately = used >= max(int(used.max(initial=0)) - frames, 0)
+        return self.ids[np.unique(owner[lately])]
+
     @property
     def changes(self) -> int:
         """Grows with every change of a view: of the same landmarks the appearances are the same."""

@@ -11,13 +11,15 @@ import dataclasses
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction
 from fgslam.core.floor import Floor
-from fgslam.core.geometry import triangulate
+from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
 
-_SAMPLES = 200  # at half the matches wrong, no good triple among them once in 10^11
+_DRAWN = 4096  # at nine of ten matches wrong, no good triple among them once in 60
+_SAMPLES = 200  # of those that keep their shape
+_REFINED = 5  # of these; a few noisy depths make a poor pose, whose count says little
 _START_SIGMA_RAD = 0.5  # of the pose that starts the least squares: says nothing
 _START_SIGMA_M = 5.0
 _NEAR = 3.0  # outlier bounds within which a match agrees with a pose from three others
@@ -35,36 +37,62 @@ class Resection:
 
         The same problem gives the same bits: its samples are always drawn alike.
         """
-        start = self._start(problem)
-        if start is None:
+        found = [self._solved(start, problem) for start in self._starts(problem)]
+        if not found:
             nowhere = Prediction(np.eye(4), np.zeros((6, 6)))
             lost = unmeasured(nowhere, EgoMotionStatus.TOO_FEW_MATCHES)
             size = len(problem)
             return dataclasses.replace(
                 lost, inliers=np.zeros(size, np.bool_), residuals=np.full(size, np.inf)
             )
+        best = max(found, key=lambda one: int(one.inliers.sum()))
+        if not best.status.measured:
+            return best
+        return dataclasses.replace(best, status=EgoMotionStatus.RELOCALISED)
+
+    def rival(self, problem: PoseProblem, best: EgoMotion) -> int:
+        """Matches that agree with another pose, of those that do not agree with the best; at most.
+
+        Where so few are left that they could not be half as many, their number.
+        """
+        rest = problem.select(~self._near(best.wTc, problem))
+        if 2 * len(rest) <= int(best.inliers.sum()):
+            return len(rest)
+        found = [int(self._solved(start, rest).inliers.sum()) for start in self._starts(rest)]
+        return max(found, default=0)
+
+    def _solved(self, start: FloatArray, problem: PoseProblem) -> EgoMotion:
+        """Least squares over all matches, from a pose that says nothing but where to start."""
         sigma = np.repeat([_START_SIGMA_RAD, _START_SIGMA_M], 3)
-        found = self._solver.solve(Prediction(start, np.diag(sigma**2)), problem)
-        if not found.status.measured:
-            return found
-        return dataclasses.replace(found, status=EgoMotionStatus.RELOCALISED)
+        return self._solver.solve(Prediction(start, np.diag(sigma**2)), problem)
 
-    def _start(self, problem: PoseProblem) -> FloatArray | None:
-        """The pose from a few matches that most others agree with; None of too few."""
+    def _starts(self, problem: PoseProblem) -> FloatArray:
+        """(s, 4, 4) the poses from a few matches that most others agree with, best first."""
         floor = self._solver.floor
-        needed = sample_size(floor)
-        if len(problem) < needed:
-            return None
-        rng = np.random.default_rng(len(problem))
-        chosen = np.array([rng.choice(len(problem), needed, False) for _ in range(_SAMPLES)])
+        if len(problem) < sample_size(floor):
+            return np.empty((0, 4, 4))
         local = triangulate(self._solver.sensor, problem.measurement)
+        chosen = self._samples(problem, local)
         poses = align(local[chosen], problem.points[chosen], floor)
-        agreeing = [self._agreeing(wTc, problem) for wTc in poses]
-        return np.asarray(poses[int(np.argmax(agreeing))])
+        agreeing = np.array([int(self._near(wTc, problem).sum()) for wTc in poses])
+        return np.asarray(poses[np.argsort(-agreeing, kind="stable")[:_REFINED]])
 
-    def _agreeing(self, wTc: FloatArray, problem: PoseProblem) -> int:
-        residuals = self._solver.image_residuals(wTc, problem)
-        return int((residuals <= _NEAR * self._solver.farthest).sum())
+    def _samples(self, problem: PoseProblem, local: FloatArray) -> IntArray:
+        """Minimal samples (h, 2 or 3) of the matches; those that keep their shape, if any do."""
+        size, sensor = sample_size(self._solver.floor), self._solver.sensor
+        rng = np.random.default_rng(len(problem))
+        drawn = rng.integers(0, len(problem), (_DRAWN, size))
+        drawn = drawn[(np.diff(np.sort(drawn, axis=1), axis=1) > 0).all(axis=1)]
+        noise = triangulation_covariance(
+            sensor, problem.measurement, problem.measurement_covariance
+        ) + rounded(problem.point_covariances)
+        keep = rigid(local[drawn], problem.points[drawn], noise[drawn], self._solver.floor)
+        return np.asarray(drawn[keep if keep.any() else slice(None)][:_SAMPLES])
+
+    def _near(self, wTc: FloatArray, problem: PoseProblem) -> BoolArray:
+        """(k,) matches that a pose from a few others agrees with."""
+        near = _NEAR * self._solver.farthest
+        return np.asarray(self._solver.image_residuals(wTc, problem) <= near)
 
 
 _RIGID_SIGMAS = 3.0
@@ -74,6 +102,11 @@ _LEAST_SPREAD_M = 0.15  # shorter samples turn the pose by more than any measure
 def sample_size(floor: Floor) -> int:
     """Matches that fix a pose: 2 on a level floor, otherwise 3."""
     return 2 if floor.rigid_dof == 3 else 3
+
+
+def rounded(covariances: FloatArray) -> FloatArray:
+    """Ellipsoids (k, 3, 3) as balls: the map's axes in the camera's frame are not known yet."""
+    return np.asarray((np.trace(covariances, axis1=1, axis2=2) / 3.0)[:, None, None] * np.eye(3))
 
 
 def rigid(here: FloatArray, there: FloatArray, covariances: FloatArray, floor: Floor) -> BoolArray:

@@ -23,6 +23,7 @@ from fgslam.frontend.tracking.map_matching import (
     lean,
     predicted_covariance,
 )
+from fgslam.frontend.tracking.regaining import Regainer
 from fgslam.frontend.tracking.resection import Resection
 
 
@@ -88,6 +89,7 @@ class LandmarkTracker:
         self._matcher = matcher
         self._ego_motion = ego_motion
         self.resection = Resection(ego_motion)
+        self._regainer = Regainer(rig, database, ego_motion)
 
     def track(
         self, prediction: Prediction, landmarks: LandmarkMap, features: StereoFeatures
@@ -99,11 +101,23 @@ class LandmarkTracker:
             rescued = self._attempt(prediction, around, landmarks, features, anywhere=True)
             # A failed rescue proves nothing about what is new: the first attempt stands.
             tracked = rescued if rescued.ego_motion.status.measured else tracked
+        if self._matcher.rescues and _doubtful(tracked.ego_motion):
+            anew = self._regained(landmarks, features)
+            if anew is not None and _used(anew) >= 2 * _used(tracked):
+                return anew
         if self._matcher.refines and self._moved_far(tracked, landmarks):
             around = Prediction(tracked.ego_motion.wTc, tracked.ego_motion.covariance)
             refined = self._attempt(prediction, around, landmarks, features)
             tracked = refined if refined.ego_motion.status.measured else tracked
         return tracked
+
+    def _regained(self, landmarks: LandmarkMap, features: StereoFeatures) -> Tracked | None:
+        """The frame found by what was seen lately, without the prediction; None where it is not."""
+        found = self._regainer.find(landmarks, features)
+        if found is None:
+            return None
+        anew = self.track_anew(found, landmarks, features)
+        return anew if anew.ego_motion.status.measured else None
 
     def _moved_far(self, tracked: Tracked, landmarks: LandmarkMap) -> bool:
         """Whether the pose found shifts the expected landmarks out of the middle of their windows.
@@ -258,6 +272,15 @@ class LandmarkTracker:
             self._rig, around, landmarks.positions[rows], landmarks.covariances[rows]
         )
         return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+
+
+def _doubtful(found: EgoMotion) -> bool:
+    """Whether most of what was matched around the prediction contradicts the pose, or all."""
+    return not (found.status.measured and found.coherent)
+
+
+def _used(tracked: Tracked) -> int:
+    return int(tracked.ego_motion.inliers.sum())
 
 
 def _matched(

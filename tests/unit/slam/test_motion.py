@@ -158,7 +158,7 @@ def test_uncertainty_grows_with_the_square_of_the_interval() -> None:
         )
 
 
-def test_blind_frames_keep_the_velocity_and_lose_certainty() -> None:
+def test_blind_frames_lose_certainty_and_the_velocity_with_it() -> None:
     motion = ConstantVelocityMotion(SETTINGS)
     motion.observe(0.0, at(np.eye(4)), measured=True)
     motion.observe(0.5, at(g.se3_exp(0.5 * TWIST)), measured=True)
@@ -168,7 +168,10 @@ def test_blind_frames_keep_the_velocity_and_lose_certainty() -> None:
     blind = motion.between(2.0)
     assert fresh is not None
     assert blind is not None
-    np.testing.assert_array_equal(blind.motion, fresh.motion)
+    # 1.27 m/s and 0.32 rad/s, wandering by 3 m/s^2 and 100 degrees/s^2 an axis for 1.5 s.
+    kept = [0.1025 / (0.1025 + 3 * np.deg2rad(150.0) ** 2), 1.61 / (1.61 + 3 * 4.5**2)]
+    expected = np.repeat(kept, 3) * 0.5 * TWIST
+    np.testing.assert_allclose(g.se3_log(blind.motion), expected, rtol=1e-9)
     ratio = np.sqrt(np.diag(blind.covariance) / np.diag(fresh.covariance))
     np.testing.assert_allclose(ratio, 3.0, rtol=1e-12)
     # Seeing again, the velocity is the mean one since it was last measured.
@@ -176,6 +179,51 @@ def test_blind_frames_keep_the_velocity_and_lose_certainty() -> None:
     again = motion.between(2.5)
     assert again is not None
     np.testing.assert_allclose(again.motion, g.se3_exp(0.5 * TWIST), atol=1e-12)
+
+
+def test_a_car_keeps_its_velocity_through_a_gap() -> None:
+    """10 m/s, known to 0.1 m/s^2: a second without images changes little."""
+    steady = dataclasses.replace(SETTINGS, translation_sigma_mps2=(0.1, 0.1, 0.1), adapt=False)
+    motion = ConstantVelocityMotion(steady)
+    step = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    for k in range(2):
+        motion.observe(0.1 * k, at(g.se3_exp(k * step)), measured=True)
+    for k in range(2, 12):
+        motion.observe(0.1 * k, at(np.eye(4)), measured=False)
+    expected = motion.between(1.2)
+    assert expected is not None
+    assert expected.motion[2, 3] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_step_that_nothing_measured_is_at_most_free() -> None:
+    motion = ConstantVelocityMotion(SETTINGS)
+    motion.observe(0.0, at(np.eye(4)), measured=True)
+    motion.observe(0.5, at(g.se3_exp(0.5 * TWIST)), measured=True)
+    step = motion.between(100.0)
+    assert step is not None
+    np.testing.assert_allclose(np.sqrt(np.diag(step.covariance)), [3.0] * 3 + [30.0] * 3)
+
+
+def test_a_sudden_turn_found_anew_is_the_velocity_from_there() -> None:
+    motion = ConstantVelocityMotion(SETTINGS)
+    motion.observe(0.0, at(np.eye(4)), measured=True)
+    motion.observe(0.5, at(np.eye(4)), measured=True)
+    motion.regained(1.0, g.se3_exp(0.5 * TWIST))
+    step = motion.between(1.5)
+    assert step is not None
+    np.testing.assert_allclose(step.motion, g.se3_exp(0.5 * TWIST), atol=1e-12)
+
+
+def test_nothing_is_known_of_the_velocity_after_a_gap() -> None:
+    motion = ConstantVelocityMotion(SETTINGS)
+    motion.observe(0.0, at(np.eye(4)), measured=True)
+    motion.observe(0.5, at(g.se3_exp(0.5 * TWIST)), measured=True)
+    motion.observe(1.0, at(np.eye(4)), measured=False)
+    motion.regained(1.5, g.se3_exp(0.5 * TWIST))
+    step = motion.between(2.0)
+    assert step is not None
+    np.testing.assert_array_equal(step.motion, np.eye(4))
+    assert step.covariance[3, 3] == pytest.approx((0.5 * SETTINGS.start_speed_sigma_mps) ** 2)
 
 
 def test_a_motion_that_nobody_saw_is_no_part_of_the_velocity() -> None:

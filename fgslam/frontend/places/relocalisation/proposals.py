@@ -22,7 +22,14 @@ from fgslam.frontend.places.relocalisation.residuals import (
     refine,
     residuals,
 )
-from fgslam.frontend.tracking.resection import align, align_planar, floor_axes, rigid, sample_size
+from fgslam.frontend.tracking.resection import (
+    align,
+    align_planar,
+    floor_axes,
+    rigid,
+    rounded,
+    sample_size,
+)
 
 _AT_ONCE = 40_000  # residuals computed together; a few megabytes
 
@@ -163,9 +170,7 @@ def _draw(
 def _rigid(evidence: Evidence, samples: IntArray, floor: Floor) -> BoolArray:
     pairs = evidence.pairs
     here, there = pairs.seen.position[samples], pairs.points[samples]
-    # The map's ellipsoids are rounded to balls: their axes in the camera's frame are not known yet.
-    balls = np.trace(pairs.point_covariances, axis1=1, axis2=2) / 3.0
-    noise = pairs.seen.position_covariance + balls[:, None, None] * np.eye(3)
+    noise = pairs.seen.position_covariance + rounded(pairs.point_covariances)
     return np.asarray(rigid(here, there, noise[samples], floor))
 
 
