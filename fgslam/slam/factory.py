@@ -82,7 +82,9 @@ def make_tracker(rig: CameraRig, settings: FrontendSettings) -> LandmarkTracker:
     database = LandmarkDatabase(rig, settings.database, settings.stereo.largest_disparity_px)
     solver = EgoMotionSolver(rig, settings.ego_motion)
     matcher = MapMatcher(settings.matching, settings.appearance)
-    return LandmarkTracker(rig, database, matcher, solver)
+    tracker = LandmarkTracker(rig, database, matcher, solver)
+    tracker.expects_returns = settings.loops is not None
+    return tracker
 
 
 def make_key_frames(

@@ -81,9 +81,12 @@ class LandmarkTracker:
     ) -> None:
         """The database is shared with whoever shows or saves it.
 
-        With ``keeps_map`` nothing is booked, started or pruned: the map is only localised in.
+        With ``keeps_map`` nothing is booked, started or pruned: the map is only localised in. With
+        ``expects_returns`` place recognition tells old landmarks from recent ones where they
+        contradict each other; without, the prediction was wrong.
         """
         self.keeps_map = False
+        self.expects_returns = False
         self._rig = rig
         self.database = database
         self._matcher = matcher
@@ -101,7 +104,7 @@ class LandmarkTracker:
             rescued = self._attempt(prediction, around, landmarks, features, anywhere=True)
             # A failed rescue proves nothing about what is new: the first attempt stands.
             tracked = rescued if rescued.ego_motion.status.measured else tracked
-        if self._matcher.rescues and _doubtful(tracked.ego_motion):
+        if self._matcher.rescues and self._doubtful(tracked.ego_motion):
             anew = self._regained(landmarks, features)
             if anew is not None and _used(anew) >= 2 * _used(tracked):
                 return anew
@@ -110,6 +113,10 @@ class LandmarkTracker:
             refined = self._attempt(prediction, around, landmarks, features)
             tracked = refined if refined.ego_motion.status.measured else tracked
         return tracked
+
+    def _doubtful(self, found: EgoMotion) -> bool:
+        """Whether all of what was matched around the prediction contradicts the pose, or most."""
+        return not found.status.measured or not (found.coherent or self.expects_returns)
 
     def _regained(self, landmarks: LandmarkMap, features: StereoFeatures) -> Tracked | None:
         """The frame found by what was seen lately, without the prediction; None where it is not."""
@@ -272,11 +279,6 @@ class LandmarkTracker:
             self._rig, around, landmarks.positions[rows], landmarks.covariances[rows]
         )
         return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-
-
-def _doubtful(found: EgoMotion) -> bool:
-    """Whether most of what was matched around the prediction contradicts the pose, or all."""
-    return not (found.status.measured and found.coherent)
 
 
 def _used(tracked: Tracked) -> int:
