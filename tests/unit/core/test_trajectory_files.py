@@ -81,7 +81,7 @@ def test_the_suffix_chooses_the_format_in_any_case(tmp_path: Path) -> None:
         trajectory().save(tmp_path / f"b.{suffix.upper()}")
         written = (tmp_path / f"a.{suffix}").read_bytes()
         assert (tmp_path / f"b.{suffix.upper()}").read_bytes() == written
-    with pytest.raises(OutputError, match=r"use \.tum or \.kitti"):
+    with pytest.raises(OutputError, match=r"use \.tum, \.kitti or \.csv"):
         trajectory().save(tmp_path / "a.csv")
 
 

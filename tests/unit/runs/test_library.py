@@ -176,7 +176,7 @@ def test_a_trajectory_survives_its_file(driven: tuple[fg.Slam, fg.Result], tmp_p
     np.testing.assert_allclose(again.poses, path.poses, rtol=0, atol=1e-9)
     path.save(str(tmp_path / "path.kitti"))
     assert len((tmp_path / "path.kitti").read_text().splitlines()) == FRAMES
-    with pytest.raises(OutputError, match=r"use \.tum or \.kitti"):
+    with pytest.raises(OutputError, match=r"use \.tum, \.kitti or \.csv"):
         path.save(tmp_path / "path.csv")
 
 
