@@ -94,6 +94,7 @@ class GraphBuilder:
         admission: the landmarks, and which of them the graph holds.
         frames: those whose poses are in the graph, in time order.
         noise: of its landmark observations.
+        doubted: the rig, where it calibrates itself.
     """
 
     def __init__(
@@ -118,6 +119,7 @@ class GraphBuilder:
         self.noise: MeasurementNoise = (
             Persistence(sensor) if factor is None else StatedNoise(factor)
         )
+        self.doubted: CameraRig | None = None
         self._variance_of: dict[int, float] = {}
         self._weigh()
         self._rows: dict[int, list[int]] = {}
@@ -138,6 +140,11 @@ class GraphBuilder:
     def noise_factor(self) -> float:
         """By which the factors' deviations exceed those by which wrong matches are judged."""
         return float(np.sqrt(self.noise.power / self.noise.spread))
+
+    def corrects(self, correction: FloatArray | None) -> None:
+        """Takes note of what a frame's measurements were corrected by; None: they were not."""
+        if correction is not None and isinstance(self._sensor, CameraRig):
+            self.doubted = self._sensor
 
     @property
     def variables(self) -> int:

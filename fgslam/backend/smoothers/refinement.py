@@ -21,6 +21,7 @@ from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.loop_closing import Acceptance, GraphLoops, Minimum
 from fgslam.backend.smoothers.marginals import ChainMarginals, GraphMarginals, reduced
+from fgslam.backend.smoothers.rig_doubt import DoubtedMarginals
 from fgslam.backend.smoothers.solver import (
     ClosedLoop,
     Drive,
@@ -37,6 +38,7 @@ from fgslam.core.estimates import Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import reorthonormalise
 from fgslam.core.quantiles import chi_square_quantile
+from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.factors.graphs import number, poses_of_frame
 
@@ -161,11 +163,13 @@ class Refined:
         graph: the factors that count.
         state: of all variables that are left.
         remarks: what was left out, in words.
+        rig: one that calibrates itself, which is in doubt; None for one that is known.
     """
 
     graph: WholeGraph
     state: State
     remarks: tuple[str, ...] = ()
+    rig: CameraRig | None = None
 
     @property
     def variables(self) -> list[int]:
@@ -189,12 +193,14 @@ class Refined:
         return out
 
     @cached_property
-    def marginals(self) -> GraphMarginals | ChainMarginals:
+    def marginals(self) -> GraphMarginals | ChainMarginals | DoubtedMarginals:
         """Of all variables.
 
         Raises:
             EstimatorError: the measurements do not determine all variables.
         """
+        if self.rig is not None and self.graph.kinds:
+            return DoubtedMarginals.of(self.graph, self.state, self.rig)
         return reduced(self.graph.linear(self.state))
 
 
@@ -204,7 +210,7 @@ def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
     remarks: list[str] = []
     for _ in range(_SOLUTIONS):
         state, kept = minimise(graph, state)
-        found = Refined(kept, state, tuple(remarks))
+        found = Refined(kept, state, tuple(remarks), builder.doubted)
         lost = _lost(builder, found)
         if not lost:
             return found
@@ -212,7 +218,7 @@ def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
         rows = np.searchsorted(found.variables, sorted(lost)).astype(np.int64)
         graph, state = kept.without(rows, state)
     state, kept = minimise(graph, state)
-    return Refined(kept, state, tuple(remarks))
+    return Refined(kept, state, tuple(remarks), builder.doubted)
 
 
 class WholeGraphSolver:

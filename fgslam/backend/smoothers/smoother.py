@@ -201,6 +201,7 @@ class Smoother:
 
     def _record(self, increment: Increment, tracking: EgoMotion) -> None:
         self._inputs.append(increment, tracking)
+        self._builder.corrects(increment.rig_correction)
         self._eras.append(self._takeovers)
         self._answer = None
 

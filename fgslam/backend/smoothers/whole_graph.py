@@ -7,6 +7,7 @@ odometry, floor, loops, what is known of single landmarks) stay GTSAM's, which l
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial, reduce
 from typing import Any
@@ -30,6 +31,7 @@ from fgslam.factors.noise import kernel_losses, kernel_weights, plain
 from fgslam.factors.stacked import LinearRows
 
 PLAIN = KernelSettings("none")
+_AT_ONCE = 20_000  # observations, of which each takes some kilobytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,6 +190,34 @@ class WholeGraph:
             pose_gradient=rest.pose_gradient + _summed(poses, known @ column).ravel(),
             landmark_gradient=rest.landmark_gradient + _summed(points, of_point @ column).ravel(),
         )
+
+    def pulled(
+        self, state: State, shifts: Callable[[FloatArray], FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """What shifts of a rig's measurements do to the normal equations at a state.
+
+        Args:
+            state: where to linearise.
+            shifts: from measurements (k, 3) to their displacements by p parameters (k, 3, p).
+
+        Returns:
+            Gradients (3m + 6n, p) by the parameters, and the parameters' own information (p, p).
+        """
+        (kind,) = self.kinds
+        if not isinstance(kind, StereoSightings):
+            raise TypeError("only a rig's measurements are shifted")
+        rows, parts = kind.look(state.poses, state.points), []
+        for few in np.array_split(np.arange(len(kind.rows)), len(kind.rows) // _AT_ONCE + 1):
+            by = -kind.roots[few] @ shifts(kind.measured[few])
+            known = self.weights[few, None, None] * by
+            poses, points = (which[:, few] for which in self._incidence)
+            of_points = _summed(points, np.swapaxes(rows.by_point[few], 1, 2) @ known)
+            of_poses = _summed(poses, np.swapaxes(rows.by_pose[few], 1, 2) @ known)
+            own = np.einsum("kip,kiq->pq", by, known)
+            parts.append(np.concatenate([*of_points, *of_poses, own]))
+        found = reduce(np.add, parts)
+        p = found.shape[1]
+        return found[:-p], found[-p:]
 
     def minimum(
         self, state: State, iterations: int, tolerance: float, enough: float = 0.0

@@ -1,0 +1,98 @@
+"""What the doubt about a rig's calibration adds to the covariances of a solved graph.
+
+A rig that calibrates itself is not known exactly, and what is left shifts all measurements
+together: no average over landmarks and frames takes it out. The graph holds the correction as it is
+(Schmidt 1966: a parameter that is considered, not estimated); here its covariance is carried to
+first order into poses and landmarks. It is that of the correction given the prior of any
+calibration and the graph's own measurements, so the sum is the marginal of a graph that had the
+correction as a variable. docs/derivations/measurement_noise.md.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.backend.smoothers.marginals import (
+    ChainMarginals,
+    GraphMarginals,
+    LinearSystem,
+    reduced,
+)
+from fgslam.backend.smoothers.whole_graph import State, WholeGraph
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.rig_correction import displacements, prior_information
+from fgslam.core.sensors import CameraRig, measurement_map, pixel_model, vertical_to_horizontal
+
+
+@dataclass(frozen=True, eq=False)
+class DoubtedMarginals:
+    """Marginals of a graph, as :class:`GraphMarginals`, with the doubt about its rig.
+
+    Attributes:
+        held: the same with the correction held as it is.
+        gain: (3m + 6n, p) how landmarks and poses follow the correction's p terms.
+        correction: (p, p) covariance.
+    """
+
+    held: GraphMarginals | ChainMarginals
+    gain: FloatArray
+    correction: FloatArray
+
+    @staticmethod
+    def of(graph: WholeGraph, state: State, rig: CameraRig) -> DoubtedMarginals:
+        """At a solution; the rig as calibrated.
+
+        Raises:
+            EstimatorError: the measurements do not determine all variables.
+        """
+        system = graph.linear(state)
+        held = reduced(system)
+        pull, own = graph.pulled(state, lambda measured: shifts(rig, measured))
+        gain = np.column_stack([_step(held, system, one) for one in pull.T])
+        information = own + pull.T @ gain + prior_information(rig)
+        covariance = np.linalg.inv(0.5 * (information + information.T))
+        return DoubtedMarginals(held, gain, np.asarray(covariance))
+
+    def poses(self) -> FloatArray:
+        """(n, 6, 6) marginals, in the order of ``pose_keys``."""
+        columns = self.held.system.columns
+        gain = self.gain[columns:].reshape(-1, 6, len(self.correction))
+        return np.asarray(self.held.poses() + gain @ self.correction @ np.swapaxes(gain, 1, 2))
+
+    def landmarks(self) -> FloatArray:
+        """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
+        columns = self.held.system.columns
+        gain = self.gain[:columns].reshape(-1, 3, len(self.correction))
+        by_rig = gain @ self.correction @ np.swapaxes(gain, 1, 2)
+        return np.asarray(self.held.landmarks() + by_rig)
+
+    def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
+        """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by row of the key lists."""
+        at = self.held.system.columns + 6 * pose + np.arange(6)
+        rows = np.concatenate([at, (3 * landmarks[:, None] + np.arange(3)).ravel()])
+        gain = self.gain[rows]
+        return np.asarray(self.held.joint(pose, landmarks) + gain @ self.correction @ gain.T)
+
+
+def shifts(rig: CameraRig, measured: FloatArray) -> FloatArray:
+    """(k, 3, p) by which a unit of each term displaces measurements (k, 3)."""
+    ratio = vertical_to_horizontal(rig)
+    pixels = (measured @ pixel_model(rig.cameras, ratio).T).reshape(-1, rig.cameras, 2)
+    fuse = measurement_map("fused", rig.cameras, ratio)
+    return np.asarray(fuse @ displacements(rig, pixels))
+
+
+def _step(
+    held: GraphMarginals | ChainMarginals, system: LinearSystem, gradient: FloatArray
+) -> FloatArray:
+    """(3m + 6n,) the graph's step for another gradient."""
+    columns = system.columns
+    other = dataclasses.replace(
+        system, landmark_gradient=gradient[:columns], pose_gradient=gradient[columns:]
+    )
+    if isinstance(held, GraphMarginals):
+        return dataclasses.replace(held, system=other).step()
+    return ChainMarginals.of(other).step()
