@@ -226,6 +226,8 @@ def is_rigid(matrix: FloatArray) -> bool:
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         return False
     rotation = matrix[:3, :3]
+    if np.abs(rotation).max() > 2.0:  # whose product may overflow
+        return False
     orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=_RIGID_TOLERANCE)
     right_handed = np.linalg.det(rotation) > 0.0
     return bool(orthonormal and right_handed and np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]))

@@ -9,6 +9,10 @@ from fgslam.core.geometry import is_rigid
 from fgslam.core.sensors import CameraRig
 
 
+_FOCAL_RANGE = 1000.0
+"""Of focal length and image size: at one end a telescope, at the other no picture."""
+
+
 def rig_fault(rig: CameraRig) -> str:
     """Why the numbers cannot be those of a rig, and what to give; empty where they can."""
     for name in ("width", "height"):
@@ -18,6 +22,13 @@ def rig_fault(rig: CameraRig) -> str:
     for name in ("fx", "fy", "baseline", "vertical_baseline"):
         if fault := _length_fault(rig, name):
             return fault
+    for name in ("fx", "fy"):
+        value, size = getattr(rig, name), max(rig.width, rig.height)
+        if not size / _FOCAL_RANGE <= value <= size * _FOCAL_RANGE:
+            return (
+                f"{name} is {value!r} for images of {rig.width}x{rig.height} pixels; give the "
+                "focal length in pixels of these images"
+            )
     for name, extent in (("cx", rig.width), ("cy", rig.height)):
         value = getattr(rig, name)
         # Cropped images may have it outside, but hardly by more than their own size.

@@ -206,7 +206,7 @@ def is_ocamcalib(text: str) -> bool:
     """Whether it is a calib_results.txt of OCamCalib."""
     lines = (line.split() for line in text.splitlines() if not line.startswith("#"))
     first = next((words for words in lines if words), [""])
-    return first[0].isdecimal() and len(first) == 1 + int(first[0])
+    return first[0].isdecimal() and first[0].lstrip("0") == str(len(first) - 1)
 
 
 def read_ocam(path: Path) -> Calibration:
