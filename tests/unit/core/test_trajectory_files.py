@@ -76,13 +76,13 @@ def test_kitti_file_round_trip_keeps_the_poses(tmp_path: Path) -> None:
 
 
 def test_the_suffix_chooses_the_format_in_any_case(tmp_path: Path) -> None:
-    for suffix in ("tum", "kitti"):
+    for suffix in ("tum", "kitti", "csv"):
         trajectory().save(tmp_path / f"a.{suffix}")
         trajectory().save(tmp_path / f"b.{suffix.upper()}")
         written = (tmp_path / f"a.{suffix}").read_bytes()
         assert (tmp_path / f"b.{suffix.upper()}").read_bytes() == written
     with pytest.raises(OutputError, match=r"use \.tum, \.kitti or \.csv"):
-        trajectory().save(tmp_path / "a.csv")
+        trajectory().save(tmp_path / "a.txt")
 
 
 def test_empty_trajectory(tmp_path: Path) -> None:
@@ -159,6 +159,6 @@ def test_covariances_there_and_back(tmp_path: Path) -> None:
 
 
 def test_broken_covariance_file(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("timestamp,c\n")
+    (tmp_path / "a.txt").write_text("timestamp,c\n")
     with pytest.raises(DatasetError, match="line 1"):
-        read_covariances(tmp_path / "a.csv")
+        read_covariances(tmp_path / "a.txt")

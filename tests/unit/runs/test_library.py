@@ -177,7 +177,7 @@ def test_a_trajectory_survives_its_file(driven: tuple[fg.Slam, fg.Result], tmp_p
     path.save(str(tmp_path / "path.kitti"))
     assert len((tmp_path / "path.kitti").read_text().splitlines()) == FRAMES
     with pytest.raises(OutputError, match=r"use \.tum, \.kitti or \.csv"):
-        path.save(tmp_path / "path.csv")
+        path.save(tmp_path / "path.txt")
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".off"])
