@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import os
+import resource
 import sys
 
 from fgslam.cli import signals
+
+_LEAST_MEMORY = 700_000_000  # bytes of address space: below it libraries crash or hang at import
 
 
 def main() -> None:
     """The command line; as :func:`fgslam.cli.main.main`."""
     signals.watch()
+    _require_memory()
     try:
         from fgslam.cli.main import main as command
 
@@ -23,6 +27,18 @@ def main() -> None:
             signals.end()
         _flush()
         raise
+
+
+def _require_memory() -> None:
+    """Ends with a line where the system's limit is below what the libraries take by themselves."""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < _LEAST_MEMORY:
+        print(
+            f"fgslam: the memory limit of {limit / 1e6:.0f} MB (ulimit -v) is below the "
+            f"{_LEAST_MEMORY / 1e6:.0f} MB that the libraries need; raise it",
+            file=sys.stderr,
+        )
+        raise SystemExit(2)
 
 
 def _flush() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import subprocess
 import sys
 
@@ -69,3 +70,23 @@ def test_a_run_of_the_paper_s_filter_loads_no_solver_of_graphs_and_nothing_that_
     slow_parts = {"scipy.stats", "scipy.interpolate", "scipy.spatial.transform"}
     code = f"import sys, {modules}; assert not {slow_parts} & set(sys.modules); print(*sys.modules)"
     assert loaded(code) == {"numpy", "scipy", "cv2", "yaml"}
+
+
+def test_a_memory_limit_below_what_libraries_take_is_one_line() -> None:
+    """Below it NumPy's and OpenCV's libraries crash or hang while they are loaded."""
+
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (400_000_000, 400_000_000))
+
+    done = subprocess.run(  # noqa: S603 PLW1509 -- the child alone is limited
+        [sys.executable, "-m", "fgslam", "inspect", "."],
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=limited,
+        timeout=60,
+    )
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "memory limit of 400 MB" in line
+    assert "raise it" in line
