@@ -78,7 +78,7 @@ def test_a_memory_limit_below_what_libraries_take_is_one_line() -> None:
     def limited() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (400_000_000, 400_000_000))
 
-    done = subprocess.run(  # noqa: S603 PLW1509 -- the child alone is limited
+    done = subprocess.run(
         [sys.executable, "-m", "fgslam", "inspect", "."],
         capture_output=True,
         text=True,
