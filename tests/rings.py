@@ -73,6 +73,9 @@ class RingMotion(OdometryMotion):
     def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
         pass
 
+    def regained(self, timestamp: float, wTc: FloatArray) -> None:
+        pass
+
 
 def pipeline_of(
     poses: list[FloatArray],
