@@ -29,6 +29,9 @@ LEAST_SIGHTINGS = 3
 """Landmarks are compared with the truth that were seen so often: `valid` of Se et al. (6.1)."""
 
 
+_DEAD_RECKONING = "odometry"  # the kind of estimator that moves on odometry alone
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
     """What is known to be true of a run; None where nothing is.
@@ -121,7 +124,8 @@ class Answer:
 
     @staticmethod
     def of(replay: Replayed) -> Answer:
-        """The answer of a replay."""
+        """The answer of a replay; of dead reckoning no pose is marked, since none is measured."""
+        statuses = replay.column("status").tolist()
         return Answer(
             estimate=replay.estimate,
             online=replay.online,
@@ -130,7 +134,7 @@ class Answer:
             nis_dof=replay.column("nis_dof").astype(np.int64),
             update_ms=replay.column("update_ms").astype(np.float64),
             peak_memory_mb=replay.peak_memory_mb,
-            predicted=predicted_frames(replay.column("status").tolist()),
+            predicted=0 if replay.kind == _DEAD_RECKONING else predicted_frames(statuses),
         )
 
 

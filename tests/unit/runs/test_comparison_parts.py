@@ -6,7 +6,8 @@ import csv
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from fgslam.core.estimates import LandmarkMap
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LandmarkTruth
 from fgslam.evaluation.consistency import Nees
-from fgslam.evaluation.judging import seen_often
+from fgslam.evaluation.judging import Answer, seen_often
 from fgslam.evaluation.metrics import EstimatorMetrics, UpdateTime, value_at
 from fgslam.report.content import TextTable
 from fgslam.report.point_cloud import MapPoints
@@ -494,3 +495,19 @@ def test_what_is_no_baseline_is_refused(spoil: str, tmp_path: Path) -> None:
         checked(path)
     with pytest.raises(ConfigError, match="cannot be read"):
         checked(tmp_path / "absent.json")
+
+
+@pytest.mark.parametrize(("kind", "predicted"), [("isam2", 2), ("odometry", 0)])
+def test_poses_of_dead_reckoning_are_not_marked_as_predicted(kind: str, predicted: int) -> None:
+    """None of them is measured; a mark on those that tracking would not have measured misleads."""
+    columns = {"status": np.array(["first", "ok", "too_few_matches", "diverged"])}
+    empty = np.zeros(4)
+    replayed = SimpleNamespace(
+        kind=kind,
+        estimate=None,
+        online=None,
+        online_covariances=np.zeros((4, 6, 6)),
+        column=lambda name: columns.get(name, empty),
+        peak_memory_mb=1.0,
+    )
+    assert Answer.of(cast("Any", replayed)).predicted == predicted
