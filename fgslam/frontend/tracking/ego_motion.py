@@ -42,8 +42,6 @@ _REPEATS = 10  # minimisations with the remaining matches; two suffice on all re
 _EXACT_SIGMA = 1e-6  # radians and metres; stands for zero where a covariance is singular
 _KERNEL_WIDTH = 2.0  # standard deviations of a residual at which the robust kernel bends
 MAX_ITERATIONS = 15  # Newton steps of a minimisation, at most
-_MEDIAN_SQUARED = 2.366  # of chi-square with three degrees of freedom
-_LEAST_FOR_SPREAD = 12  # matches; the median of fewer scatters by more than a third
 _CAP_SIGMAS = 6.0  # deviations of the prediction that a correction may amount to
 _MAX_DAMPING = 1e8
 _LEAST_CURVATURE = 1e-10  # of the Hessian with unit diagonal; below it the pose is undetermined
@@ -243,7 +241,7 @@ class EgoMotionSolver:
             residual = self._residual(points, candidates.measurement)
             information = self._information(wTc, candidates)
             squared = np.einsum("ki,kij,kj->k", residual, information, residual)
-            near[near] = squared <= _spread(squared) * self._settings.outlier_sigmas**2
+            near[near] = squared <= self._settings.outlier_sigmas**2
         return near
 
     def _finish(
@@ -317,17 +315,6 @@ class EgoMotionSolver:
         points[behind] = (0.0, 0.0, 1.0)
         error = np.linalg.norm(self._residual(points, problem.measurement)[:, :2], axis=1)
         return np.where(behind, np.inf, error)
-
-
-def _spread(squared: FloatArray) -> float:
-    """Variance over the stated one, of a frame whose residuals are larger than stated; else 1.
-
-    By the median of squared normalised residuals (k,), which up to half of wrong matches do not
-    carry away (Rousseeuw and Leroy 1987).
-    """
-    if len(squared) < _LEAST_FOR_SPREAD:
-        return 1.0
-    return max(1.0, float(np.median(squared)) / _MEDIAN_SQUARED)
 
 
 def unmeasured(prediction: Prediction, status: EgoMotionStatus) -> EgoMotion:

@@ -79,7 +79,7 @@ def test_frame_with_two_hypotheses_is_placed_by_recent_landmarks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Back near the start, 0.24 m off: old landmarks and new ones, found in the same frames."""
-    late = dataclasses.replace(SETTINGS.loops, confirm=14)  # long after old landmarks are found
+    late = dataclasses.replace(SETTINGS.loops, confirm=18)  # long after old landmarks are found
     once = dataclasses.replace(SETTINGS.matching, refine=False)  # a second matching helps as well
     settings = dataclasses.replace(SETTINGS, lost=None, loops=late, matching=once)
 
