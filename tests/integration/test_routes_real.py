@@ -60,14 +60,14 @@ def followed(
     nodes = np.array([_number(name) for name in path.names])
     with (folder / "run" / "follow.csv").open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if _number(row["name"]) not in nodes]
-    assert all(row["path_image"] for row in rows)
     away = np.abs(np.array([_number(row["name"]) for row in rows])[:, None] - nodes)
     nearest = away == away.min(axis=1, keepdims=True)
-    places = np.array([int(row["path_image"]) for row in rows])
+    # A frame without a place is as far off as can be.
+    places = np.array([float(row["path_image"] or "inf") for row in rows])
     off = np.abs(np.arange(len(nodes)) - places[:, None])
     return Followed(
         off=np.where(nearest, off, np.inf).min(axis=1),
-        sure=np.array([float(row["probability"]) >= 0.9 for row in rows]),
+        sure=np.array([float(row["probability"] or 0.0) >= 0.9 for row in rows]),
         directions=np.deg2rad([float(row["direction_deg"] or "nan") for row in rows]),
         path_images=len(path),
         kilobytes=route.stat().st_size / 1000.0 / len(path),
