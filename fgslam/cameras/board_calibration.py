@@ -16,10 +16,18 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from fgslam.cameras.boards import Board, Corners
+from fgslam.cameras.formats.trees import intrinsic_matrix
 from fgslam.cameras.raw_cameras import RawCamera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.geometry import inverse, pose, transform_to_camera, transform_to_world
+from fgslam.core.geometry import (
+    inverse,
+    pose,
+    so3_exp,
+    so3_log,
+    transform_to_camera,
+    transform_to_world,
+)
 
 MODELS = {"radtan": 5, "equidistant": 4}
 """Lenses that can be calibrated, and how many parameters each has; names as of the lenses."""
@@ -41,7 +49,7 @@ def _projected(
 
     Intrinsics are fx, fy, cx, cy and the model's parameters.
     """
-    matrix, distortion = _matrix(intrinsics), intrinsics[4:]
+    matrix, distortion = intrinsic_matrix(*intrinsics[:4]), intrinsics[4:]
     if model == "equidistant":
         pixels, by = cv2.fisheye.projectPoints(
             points[:, None], turn[:3], turn[3:], matrix, distortion
@@ -79,12 +87,6 @@ def _first_guess(
         ) from error
     numbers = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     return np.array([*numbers, *np.ravel(distortion)[: MODELS[model]]])
-
-
-def _matrix(intrinsics: FloatArray) -> FloatArray:
-    """(3, 3) from fx, fy, cx, cy."""
-    fx, fy, cx, cy = intrinsics[:4]
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,11 +128,11 @@ def _rms(distances: FloatArray) -> float:
 
 def _matrix_of_turn(turn: FloatArray) -> FloatArray:
     """(4, 4) from rotation vector and translation."""
-    return pose(np.asarray(cv2.Rodrigues(turn[:3])[0], np.float64), turn[3:])
+    return pose(so3_exp(turn[:3]), turn[3:])
 
 
 def _turn_of_matrix(matrix: FloatArray) -> FloatArray:
-    return np.concatenate([np.ravel(cv2.Rodrigues(matrix[:3, :3])[0]), matrix[:3, 3]])
+    return np.concatenate([so3_log(matrix[:3, :3]), matrix[:3, 3]])
 
 
 def calibrate(
@@ -265,7 +267,7 @@ class _Problem:
     def _camera(
         self, size: tuple[int, int], intrinsics: FloatArray, fTc: FloatArray, number: int
     ) -> RawCamera:
-        matrix, distortion = _matrix(intrinsics), intrinsics[4:]
+        matrix, distortion = intrinsic_matrix(*intrinsics[:4]), intrinsics[4:]
         return RawCamera(*size, matrix, distortion, fTc, f"cam{number}", self.model)
 
     def _board_pose(self, corners: Corners, camera: RawCamera) -> FloatArray:

@@ -22,7 +22,7 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
 from fgslam.core.rig_checks import rig_fault
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 
 
 def _identity() -> FloatArray:
@@ -198,9 +198,8 @@ _WHITE = 127
 
 
 def _hidden(rectifier: Rectifier) -> str:
-    names = ("right", "left", "top")
     parts = [
-        f"{100.0 * float(np.mean(one == 0)):.0f} % of the {names[k]} images"
+        f"{100.0 * float(np.mean(one == 0)):.0f} % of the {CAMERA_NAMES[k]} images"
         for k, one in enumerate(rectifier.shown)
         if one is not None
     ]

@@ -84,7 +84,7 @@ def run(  # noqa: PLR0913 - each option is a parameter
     from fgslam.runs.bare_recording import experiment_of
 
     existing = existing_folder(overwrite, resume)
-    given = {**_frames(start, stop, stride, fps), "estimator.kind": estimator}
+    given = {**options.frames(start, stop, stride, fps), "estimator.kind": estimator}
     given |= {"map.load": map_in, "map.save": map_out}
     chosen = [*options.as_overrides(given), *options.topics_override(topics)]
     settings, said = experiment_of(config, camera, [*(overrides or ()), *chosen])
@@ -107,14 +107,6 @@ def run(  # noqa: PLR0913 - each option is a parameter
     exit_as([result])
 
 
-def _frames(
-    start: int | None, stop: int | None, stride: int | None, fps: float | None
-) -> dict[str, str | float | Path | None]:
-    """Which frames of a recording, and how fast they follow, by the keys that say it."""
-    names = ("start", "stop", "stride", "fps")
-    return {f"dataset.{k}": v for k, v in zip(names, (start, stop, stride, fps), strict=True)}
-
-
 @app.command()
 def init(  # noqa: PLR0913 - each option is a parameter
     recording: options.BareRecording,
@@ -130,7 +122,7 @@ def init(  # noqa: PLR0913 - each option is a parameter
     """Print the short configuration that repeats `fgslam run RECORDING`, as YAML."""
     from fgslam.runs.bare_recording import short_config
 
-    given = {**_frames(start, stop, stride, fps), "estimator.kind": estimator}
+    given = {**options.frames(start, stop, stride, fps), "estimator.kind": estimator}
     chosen = [*options.as_overrides(given), *options.topics_override(topics)]
     typer.echo(short_config(recording, camera, [*(overrides or ()), *chosen]), nl=False)
 

@@ -103,6 +103,14 @@ def as_overrides(given: Mapping[str, str | float | Path | None]) -> list[str]:
     ]
 
 
+def frames(
+    start: int | None, stop: int | None, stride: int | None, fps: float | None = None
+) -> dict[str, str | float | Path | None]:
+    """Which frames of a recording, and how fast they follow, by the keys that say it."""
+    names = ("start", "stop", "stride", "fps")
+    return {f"dataset.{k}": v for k, v in zip(names, (start, stop, stride, fps), strict=True)}
+
+
 def topics_override(topics: str | None) -> list[str]:
     """The override of the topics of a bag, from their names between commas."""
     if topics is None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fgslam.cli import options
 from fgslam.cli.performing import existing_folder, exit_as, show_all, under_way
+
+if TYPE_CHECKING:
+    from fgslam.runs.config_models import Experiment
 
 Recording = Annotated[
     Path,
@@ -48,7 +51,7 @@ def teach(  # noqa: PLR0913 - each option is a parameter
     """
     from fgslam.runs.bare_routes import teaching
 
-    chosen = _frames(start, stop, stride)
+    chosen = options.as_overrides(options.frames(start, stop, stride))
     config = teaching(recording, camera, out, [*(overrides or ()), *chosen])
     _perform(config, report, overwrite)
 
@@ -73,22 +76,14 @@ def follow(  # noqa: PLR0913 - each option is a parameter
     """
     from fgslam.runs.bare_routes import following
 
-    chosen = _frames(start, stop, stride)
+    chosen = options.as_overrides(options.frames(start, stop, stride))
     config = following(route, recording, camera, [*(overrides or ()), *chosen])
     _perform(config, out, overwrite)
 
 
-def _frames(start: int | None, stop: int | None, stride: int | None) -> list[str]:
-    given = {"dataset.start": start, "dataset.stop": stop, "dataset.stride": stride}
-    return options.as_overrides({**given})
-
-
-def _perform(config: object, folder: Path | None, overwrite: bool) -> None:
-    from fgslam.runs.config_models import Experiment
+def _perform(config: Experiment, folder: Path | None, overwrite: bool) -> None:
     from fgslam.runs.run import run_experiment
 
-    if not isinstance(config, Experiment):
-        raise TypeError("an experiment is wanted")
     place = folder or Path("runs") / config.name
     with under_way() as (progress, stopped):
         result = run_experiment(config, place, existing_folder(overwrite), progress, stopped)

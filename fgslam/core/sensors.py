@@ -63,6 +63,9 @@ class RangeBearingSensor(Brief):
     bTc: FloatArray
 
 
+CAMERA_NAMES = ("right", "left", "top")
+"""Of a rig's cameras in their order, the reference first."""
+
 Sensor: TypeAlias = CameraRig | RangeBearingSensor
 """What measures landmarks; each by three numbers."""
 

@@ -103,26 +103,31 @@ class Trajectory(Brief):
 
 def _tum_text(trajectory: Trajectory, remark: str) -> str:
     """Lines of `timestamp tx ty tz qx qy qz qw` (seconds, metres), as evo reads them."""
-    rows = np.column_stack([trajectory.timestamps, _sevens(trajectory)])
+    rows = np.column_stack([trajectory.timestamps, _printed_rows(trajectory)])
     return _comment(remark) + _format_rows(rows, _TUM_FORMAT)
 
 
 def _euroc_text(trajectory: Trajectory, remark: str) -> str:
     """EuRoC's ground-truth columns: nanoseconds, position, quaternion w first; of ``wTc``."""
-    sevens = _sevens(trajectory)[:, [0, 1, 2, 6, 3, 4, 5]]
-    lines = _format_rows(sevens, _EUROC_FORMAT).splitlines()
+    rows = _printed_rows(trajectory)[:, [0, 1, 2, 6, 3, 4, 5]]
+    lines = _format_rows(rows, _EUROC_FORMAT).splitlines()
     stamps = np.rint(trajectory.timestamps * 1e9).astype(np.int64).tolist()
-    rows = (f"{stamp},{line}\n" for stamp, line in zip(stamps, lines, strict=True))
-    return _comment(remark) + _EUROC_HEADER + "".join(rows)
+    text = (f"{stamp},{line}\n" for stamp, line in zip(stamps, lines, strict=True))
+    return _comment(remark) + _EUROC_HEADER + "".join(text)
 
 
-def _sevens(trajectory: Trajectory) -> FloatArray:
-    """(n, 7) x y z qx qy qz qw, rounded, without negative zeros."""
-    rows = np.empty((len(trajectory), _TUM_COLUMNS - 1))
-    rows[:, :3] = trajectory.poses[:, :3, 3]
-    for row, wTc in zip(rows, trajectory.poses, strict=True):
-        row[3:] = _canonical(quaternion_from_rotation(wTc[:3, :3]))
-    return _without_negative_zeros(rows, decimals=12)
+def _printed_rows(trajectory: Trajectory) -> FloatArray:
+    """:func:`pose_rows`, rounded as they are printed, without negative zeros."""
+    return _without_negative_zeros(pose_rows(trajectory.poses), decimals=12)
+
+
+def pose_rows(poses: FloatArray) -> FloatArray:
+    """(n, 7) x y z qx qy qz qw of poses (n, 4, 4), w not negative."""
+    rows = np.empty((len(poses), _TUM_COLUMNS - 1))
+    rows[:, :3] = poses[:, :3, 3]
+    for row, aTb in zip(rows, poses, strict=True):
+        row[3:] = _canonical(quaternion_from_rotation(aTb[:3, :3]))
+    return rows
 
 
 def _kitti_text(trajectory: Trajectory, _: str) -> str:

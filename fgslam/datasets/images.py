@@ -16,6 +16,7 @@ from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.files import require_file
+from fgslam.core.sensors import CAMERA_NAMES
 from fgslam.datasets.loose_files import IMAGE_SUFFIXES
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -194,7 +195,6 @@ def _size_fault(header: bytes) -> str | None:
 # Frames of several cameras
 
 
-CAMERA_NAMES = ("right", "left", "top")
 _NAMED_IN_NOTES = 5
 
 

@@ -6,7 +6,7 @@ tangent space at the new pose.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.core.recordings import Sequence as FrameSequence
 from fgslam.core.sensors import CameraRig
+from fgslam.datasets.recording import OdometrySource
 from fgslam.datasets.settings import RecordedOdometrySettings, SyntheticOdometrySettings
 from fgslam.datasets.tables import (
     TUM_COLUMNS,
@@ -206,6 +207,36 @@ def motions_from_poses(
     # Unlike a speed, a pose cannot be held beyond the log's ends: that would say "no motion".
     known = steps_covered(log.timestamps, frames, settings.max_gap_s, _POSE_HOLD_S)
     return _motions(poses, covariances, known)
+
+
+def recorded_motions(
+    name: str, read: Callable[[], SpeedLog | Trajectory], settings: RecordedOdometrySettings
+) -> OdometrySource:
+    """Body motions by speeds or poses that are read when motions are first asked for.
+
+    Args:
+        name: of the file or topic, for messages.
+        read: the log; raises OdometryError where it is malformed.
+        settings: noise and limits.
+
+    Raises:
+        OdometryError: (when motions are asked for) it covers none of the frames.
+    """
+
+    def source(frames: FloatArray) -> tuple[Odometry | None, ...]:
+        log = read()
+        if isinstance(log, SpeedLog):
+            steps = motions_from_speed(log, frames, settings)
+        else:
+            steps = motions_from_poses(log, frames, settings)
+        if len(frames) > 1 and all(step is None for step in steps):
+            raise OdometryError(
+                f"{name} covers none of the frames ({frames[0]:.3f} to {frames[-1]:.3f} s); check "
+                "that both use one clock, or set odometry.time_offset_s"
+            )
+        return steps
+
+    return source
 
 
 def pose_noise(motion: FloatArray, settings: RecordedOdometrySettings) -> FloatArray:

@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from fgslam.core.arrays import FloatArray
-from fgslam.core.errors import DatasetError, OdometryError
+from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory
-from fgslam.core.measurements import Odometry
 from fgslam.datasets.odometry import (
     SpeedLog,
-    motions_from_poses,
-    motions_from_speed,
     read_pose_log,
     read_speed_log,
+    recorded_motions,
 )
 from fgslam.datasets.odometry_columns import has_named_columns, read_named_columns
 from fgslam.datasets.recording import OdometrySource
@@ -49,20 +46,7 @@ def file_odometry(path: Path | None, settings: RecordedOdometrySettings) -> Odom
     if path is None:
         return None
 
-    def source(frames: FloatArray) -> tuple[Odometry | None, ...]:
-        log = _read(path, settings)
-        if isinstance(log, SpeedLog):
-            steps = motions_from_speed(log, frames, settings)
-        else:
-            steps = motions_from_poses(log, frames, settings)
-        if len(frames) > 1 and all(step is None for step in steps):
-            raise OdometryError(
-                f"{path} covers none of the frames ({frames[0]:.3f} to {frames[-1]:.3f} s); check "
-                "that both use one clock, or set odometry.time_offset_s"
-            )
-        return steps
-
-    return source
+    return recorded_motions(str(path), lambda: _read(path, settings), settings)
 
 
 def _read(path: Path, settings: RecordedOdometrySettings) -> SpeedLog | Trajectory:

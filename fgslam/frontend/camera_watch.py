@@ -14,10 +14,9 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray, Image, StateArrays
 from fgslam.core.rig_correction import EXPECTED_PX
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.frontend.image_lag import Lag, LagModel, LineRows, Shrunk, followed, spread_of
 
-CAMERAS = ("right", "left", "top")
 _WIDE_PX = 400  # wider images are made smaller
 _SURE = 5.0  # deviations: by chance once in three million frames
 _CALIBRATED = 3.0  # times what a calibration leaves: by so much may disparities be off zero
@@ -71,7 +70,9 @@ class CameraWatch:
             here, there = points[kept], found[kept]
             self._order(pair, self._factor * (there - here)[:, camera - 1])
             if pair.swapped and not swapped:
-                swapped = f"the images of the right and the {CAMERAS[camera]} camera are swapped"
+                swapped = (
+                    f"the images of the right and the {CAMERA_NAMES[camera]} camera are swapped"
+                )
             self._weigh(pair, now.grey[0], now.grey[camera], here, there)
             if self._before and not repeated and not swapped:
                 self._judge(camera, now, here, there)
@@ -84,9 +85,9 @@ class CameraWatch:
         for camera, pair in enumerate(self._pairs, 1):
             if pair.unequal:
                 out.append(
-                    f"the {CAMERAS[camera]} images were darker or brighter than the right ones by "
-                    f"more than a third of a stop in {pair.unequal} of {self._frames} frames; "
-                    "give all cameras one exposure time and gain"
+                    f"the {CAMERA_NAMES[camera]} images were darker or brighter than the right "
+                    f"ones by more than a third of a stop in {pair.unequal} of {self._frames} "
+                    "frames; give all cameras one exposure time and gain"
                 )
         return tuple(out)
 
@@ -216,7 +217,7 @@ class CameraWatch:
 
 
 def _named(which: list[bool]) -> str:
-    names = [CAMERAS[k] for k, one in enumerate(which) if one]
+    names = [CAMERA_NAMES[k] for k, one in enumerate(which) if one]
     verb = "camera delivers" if len(names) == 1 else "cameras deliver"
     return f"the {' and '.join(names)} {verb}"
 

@@ -24,7 +24,8 @@ import numpy as np
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import OutputError
 from fgslam.core.files import write_text
-from fgslam.core.geometry import congruence, quaternion_from_rotation
+from fgslam.core.geometry import congruence
+from fgslam.core.trajectories import pose_rows
 
 SUFFIX = ".g2o"
 EXACT_SIGMA = 1e-6
@@ -112,7 +113,7 @@ def information_of(covariances: FloatArray) -> FloatArray:
 
 def _vertices(graph: PoseLandmarkGraph) -> Iterator[str]:
     numbers = np.arange(len(graph.poses))
-    yield _lines("VERTEX_SE3:QUAT %d" + 7 * " %.12g", numbers[:, None], _seven(graph.poses))
+    yield _lines("VERTEX_SE3:QUAT %d" + 7 * " %.12g", numbers[:, None], pose_rows(graph.poses))
     if len(graph.poses):
         yield "FIX 0\n"
     landmarks = len(graph.poses) + np.arange(len(graph.landmarks))
@@ -123,7 +124,7 @@ def _motions(graph: PoseLandmarkGraph) -> Iterator[str]:
     upper = g2o_information(graph.motion_covariances)[:, _UPPER6[0], _UPPER6[1]]
     ends = np.column_stack([graph.motion_from, graph.motion_to])
     row_format = "EDGE_SE3:QUAT %d %d" + 7 * " %.12g" + 21 * " %.9g"
-    yield _lines(row_format, ends, np.column_stack([_seven(graph.motions), upper]))
+    yield _lines(row_format, ends, np.column_stack([pose_rows(graph.motions), upper]))
 
 
 def _observations(graph: PoseLandmarkGraph) -> Iterator[str]:
@@ -131,16 +132,6 @@ def _observations(graph: PoseLandmarkGraph) -> Iterator[str]:
     ends = np.column_stack([graph.seen_from, len(graph.poses) + graph.seen])
     row_format = f"EDGE_SE3_TRACKXYZ %d %d {_OFFSET_ID}" + 3 * " %.12g" + 6 * " %.9g"
     yield _lines(row_format, ends, np.column_stack([graph.points, upper]))
-
-
-def _seven(poses: FloatArray) -> FloatArray:
-    """(n, 7) x y z qx qy qz qw, w not negative."""
-    out = np.empty((len(poses), 7))
-    out[:, :3] = poses[:, :3, 3]
-    for row, wTc in zip(out, poses, strict=True):
-        quaternion = quaternion_from_rotation(wTc[:3, :3])
-        row[3:] = -quaternion if quaternion[3] < 0.0 else quaternion
-    return out
 
 
 def _lines(row_format: str, numbers: IntArray, values: FloatArray) -> str:

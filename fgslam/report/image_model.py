@@ -17,8 +17,9 @@ import numpy as np
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray
 from fgslam.core.errors import OutputError
 from fgslam.core.files import write_bytes, write_text
-from fgslam.core.geometry import inverse, quaternion_from_rotation
+from fgslam.core.geometry import inverse
 from fgslam.core.sensors import CameraRig
+from fgslam.core.trajectories import pose_rows
 
 _PINHOLE = 1  # COLMAP's number of that camera model
 _CAMERA = 1  # all images are of one camera: rectified rigs have equal intrinsics
@@ -160,12 +161,8 @@ class _Table:
 
 
 def _world_to_camera(poses: FloatArray) -> FloatArray:
-    out = np.empty((len(poses), 7))
-    for row, wTi in zip(out, poses, strict=True):
-        iTw = inverse(wTi)
-        x, y, z, w = quaternion_from_rotation(iTw[:3, :3])
-        row[:4], row[4:] = (w, x, y, z), iTw[:3, 3]
-    return out + 0.0
+    rows = pose_rows(np.array([inverse(wTi) for wTi in poses]).reshape(-1, 4, 4))
+    return rows[:, [6, 3, 4, 5, 0, 1, 2]] + 0.0
 
 
 def _camera_numbers(rig: CameraRig) -> tuple[float, ...]:

@@ -15,6 +15,7 @@ from fgslam.cameras.raw_cameras import Calibration, RawCamera, StatedView
 from fgslam.cameras.rig import StereoRig, chosen_cameras, require_options, rig_of
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, ConfigError
+from fgslam.core.sensors import CAMERA_NAMES
 
 _EDGE_STEPS = 60
 
@@ -140,7 +141,7 @@ def _row(found: Calibration, k: int) -> tuple[str, ...]:
 
 def _about(rig: StereoRig, found: Calibration) -> list[str]:
     names = [found.cameras[k].name for k in rig.sources]
-    parts = [f"{side} = {name}" for side, name in zip(_SIDES, names, strict=False)]
+    parts = [f"{side} = {name}" for side, name in zip(CAMERA_NAMES, names, strict=False)]
     lines = [f"rig: {', '.join(parts)}; baseline {1e3 * rig.baseline:.2f} mm"]
     if rig.vertical_baseline is not None:
         lines[0] += f", vertical baseline {1e3 * rig.vertical_baseline:.2f} mm"
@@ -152,9 +153,6 @@ def _about(rig: StereoRig, found: Calibration) -> list[str]:
         f"disparity at {rig.fx * rig.baseline:.1f} m"
     )
     return [*lines, *rig.remarks]
-
-
-_SIDES = ("right", "left", "top")
 
 
 def _overlap(rig: StereoRig) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,13 @@ from fgslam.core.measurements import Increment
 from fgslam.core.saved_map import SavedMap, load_map
 from fgslam.core.trajectories import read_covariances
 from fgslam.report.graph_file import PoseLandmarkGraph, require_graph_suffix, write_g2o
-from fgslam.report.point_cloud import read_ply, write_map
+from fgslam.report.point_cloud import MapPoints, read_ply, write_map
 from fgslam.report.ros_bag import SUFFIX as MCAP
 from fgslam.report.ros_bag import write_mcap
 from fgslam.report.tables import read_metrics
 from fgslam.runs.config import load_config
 from fgslam.runs.config_reading import read_mapping
-from fgslam.runs.exporting_images import export_images, pose_rows
+from fgslam.runs.exporting_images import export_images, rows_of_frames
 from fgslam.runs.folder import LOG_FILE, RUN_MARKER, is_run_folder
 from fgslam.runs.maps import drives_of, points_of, remark_of_map, valid_of
 
@@ -92,19 +93,44 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
     return [*lines, *_export(run, folder, wanted, remark)]
 
 
+class _Results:
+    """What an estimator left in a run; each file is read when it is first asked for, once."""
+
+    def __init__(self, run: Path, folder: Path) -> None:
+        self._run, self._folder = run, folder
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        return Trajectory.load(self._folder / "final.tum")
+
+    @cached_property
+    def points(self) -> MapPoints:
+        return read_ply(self._folder / "map.ply")
+
+    @cached_property
+    def log(self) -> MeasurementLog:
+        return MeasurementLog.load(log_of(self._run))
+
+    def save_trajectory(self, path: Path, remark: str) -> None:
+        covariances = None
+        if path.suffix.lower() == MCAP:
+            covariances = read_covariances(self._folder / "covariance.csv")[1]
+        _save(path, self.trajectory, covariances, remark)
+
+
 def _export(run: Path, folder: Path, wanted: Wanted, remark: str) -> Iterator[str]:
-    trajectory = Trajectory.load(folder / "final.tum")
-    points = read_ply(folder / "map.ply")
-    points = points.select(points.valid) if wanted.valid_only else points
+    found = _Results(run, folder)
     if wanted.trajectory is not None:
-        covariances = read_covariances(folder / "covariance.csv")[1]
-        _save(wanted.trajectory, trajectory, covariances, remark)
-        yield f"{wanted.trajectory}: {len(trajectory)} poses"
+        found.save_trajectory(wanted.trajectory, remark)
+        yield f"{wanted.trajectory}: {len(found.trajectory)} poses"
     if wanted.graph is not None:
-        yield export_graph(wanted.graph, log_of(run), folder, remark)
+        yield export_graph(wanted.graph, found.log, found.trajectory, found.points, remark)
+    if not (wanted.colour or wanted.images or wanted.map):
+        return
+    points = found.points.select(found.points.valid) if wanted.valid_only else found.points
     if wanted.colour or wanted.images:
-        log, config = MeasurementLog.load(log_of(run)), load_config(run / RUN_MARKER)
-        points, line = export_images(wanted.images, config, log, trajectory, points)
+        config = load_config(run / RUN_MARKER)
+        points, line = export_images(wanted.images, config, found.log, found.trajectory, points)
         yield from filter(None, [line])
     if wanted.map is not None:
         write_map(wanted.map, points, remark)
@@ -234,7 +260,9 @@ _HEADER = (
 )
 
 
-def export_graph(path: Path, log_file: Path, folder: Path, remark: str = "") -> str:
+def export_graph(
+    path: Path, log: MeasurementLog, trajectory: Trajectory, points: MapPoints, remark: str = ""
+) -> str:
     """Writes a log's measurements and the poses and map that fit them best, as .g2o.
 
     The optimum is the file's own, as GTSAM reads it, found from an estimator's final answer.
@@ -242,21 +270,19 @@ def export_graph(path: Path, log_file: Path, folder: Path, remark: str = "") -> 
 
     Args:
         path: the file.
-        log_file: the run's measurements.npz.
-        folder: the estimator's, with final.tum and map.ply.
+        log: the run's measurements.
+        trajectory: an estimator's final poses.
+        points: its landmarks.
         remark: put into a comment.
 
     Returns:
         A line about what was written.
 
     Raises:
-        FgslamError: another ending, or a file that is missing or damaged.
+        OutputError: another ending, or it cannot be written.
     """
     from fgslam.backend.g2o_optimum import g2o_optimum  # not before: it loads GTSAM
 
-    log = MeasurementLog.load(log_file)
-    trajectory = Trajectory.load(folder / "final.tum")
-    points = read_ply(folder / "map.ply")
     graph = build_graph(log, trajectory, points.ids, points.positions)
     header = [*([remark] if remark else []), *_HEADER]
     write_g2o(path, graph, header)
@@ -285,7 +311,7 @@ def build_graph(
             not in the map start where their first observation puts them.
         positions: (m, 3) world, metres.
     """
-    rows = pose_rows(log, trajectory)
+    rows = rows_of_frames(log, trajectory)
     kept = [_usable(increment) & (row >= 0) for increment, row in zip(log, rows, strict=True)]
     seen = [s.observations.select(keep) for s, keep in zip(log, kept, strict=True)]
     measurement = np.concatenate([np.empty((0, 3)), *(o.measurement for o in seen)])

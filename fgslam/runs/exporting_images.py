@@ -17,7 +17,7 @@ from fgslam.core.files import clear_output_errors, write_bytes
 from fgslam.core.geometry import pose
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Observations
-from fgslam.core.sensors import CameraRig, pixel_model, vertical_to_horizontal
+from fgslam.core.sensors import CAMERA_NAMES, CameraRig, pixel_model, vertical_to_horizontal
 from fgslam.datasets.images import encoded_png
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
@@ -26,7 +26,6 @@ from fgslam.report.point_cloud import MapPoints, write_map
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.opening import open_sequence
 
-CAMERAS = ("right", "left", "top")
 Pictures: TypeAlias = Callable[[int], tuple[Image, ...]]
 """Images (right, left[, top]) of a selected frame, grey or in red, green, blue."""
 
@@ -99,7 +98,7 @@ def build_model(log: MeasurementLog, trajectory: Trajectory, points: MapPoints) 
     if not isinstance(log.rig, CameraRig):
         raise DatasetError("the run's sensor has no images; export a run of cameras")
     rig, parts = log.rig, []
-    for increment, row in zip(log, pose_rows(log, trajectory).tolist(), strict=True):
+    for increment, row in zip(log, rows_of_frames(log, trajectory).tolist(), strict=True):
         if row >= 0:
             kept = increment.observations.select(~increment.rejected)
             parts.append(_seen_in(row, kept.select(np.isin(kept.ids, points.ids)), rig))
@@ -112,7 +111,7 @@ def build_model(log: MeasurementLog, trajectory: Trajectory, points: MapPoints) 
         names=tuple(
             f"{camera}/{row:06d}.png"
             for row in range(len(trajectory))
-            for camera in CAMERAS[: rig.cameras]
+            for camera in CAMERA_NAMES[: rig.cameras]
         ),
         poses=_camera_poses(rig, trajectory.poses),
         ids=used,
@@ -124,7 +123,7 @@ def build_model(log: MeasurementLog, trajectory: Trajectory, points: MapPoints) 
     )
 
 
-def pose_rows(log: MeasurementLog, trajectory: Trajectory) -> IntArray:
+def rows_of_frames(log: MeasurementLog, trajectory: Trajectory) -> IntArray:
     """(n,) row of the trajectory for each frame of a log, -1 where it has no pose."""
     row_of = {round(t, 9): row for row, t in enumerate(trajectory.timestamps.tolist())}
     return np.array([row_of.get(round(s.timestamp, 9), -1) for s in log], np.int64)

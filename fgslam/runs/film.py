@@ -19,7 +19,7 @@ from fgslam.report.pictures.film import FilmCanvas, Moment
 from fgslam.report.point_cloud import MapPoints, read_ply
 from fgslam.runs.config import load_config
 from fgslam.runs.exporting import log_of, results_folder
-from fgslam.runs.exporting_images import Pictures, frames_of, pose_rows
+from fgslam.runs.exporting_images import Pictures, frames_of, rows_of_frames
 from fgslam.runs.folder import RUN_MARKER
 from fgslam.runs.report import load_report
 
@@ -52,7 +52,7 @@ def film_of_run(run: Path, out: Path, estimator: str | None, progress: Progress)
         raise ConfigError(f"{run}: has {len(trajectory)} poses; a film needs two at least")
     fps = min(_MOST_FPS, 1.0 / float(np.median(np.diff(trajectory.timestamps))))
     rows, pictures = frames_of(load_config(run / RUN_MARKER), trajectory)
-    moments = _moments(log, pose_rows(log, trajectory), points, rows, pictures)
+    moments = _moments(log, rows_of_frames(log, trajectory), points, rows, pictures)
     data = load_report(run)
     plane = level_axes(data.up)[:2]
     truth = None if data.truth is None else data.truth.poses[:, :3, 3] @ plane.T

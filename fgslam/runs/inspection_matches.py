@@ -14,7 +14,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import FrameError
 from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.recordings import Sequence
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.datasets.checks.matches import (
     LEFT_RIGHT,
     TOP_RIGHT,
@@ -217,7 +217,7 @@ def match_facts(
     if not looks:
         return (("frames matched", "none could be read"),)
     counts = np.array([look.features for look in looks])
-    names = ("right", "left", "top")[: counts.shape[1]]
+    names = CAMERA_NAMES[: counts.shape[1]]
     found = [_spread(counts[:, c]) for c in range(counts.shape[1])]
     facts = [
         ("frames matched", f"{len(looks)}: {_numbers([look.index for look in looks])}"),

@@ -8,14 +8,14 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import OdometryError
-from fgslam.core.measurements import Odometry
+from fgslam.core.estimates import Trajectory
 from fgslam.datasets.bags.files import Topic
 from fgslam.datasets.bags.messages import ODOMETRY
 from fgslam.datasets.odometry import (
+    SpeedLog,
     checked_poses,
     checked_speeds,
-    motions_from_poses,
-    motions_from_speed,
+    recorded_motions,
 )
 from fgslam.datasets.recording import OdometrySource
 from fgslam.datasets.settings import RecordedOdometrySettings
@@ -33,20 +33,13 @@ def odometry_source(
         return None
     name = topic.name
 
-    def source(frames: FloatArray) -> tuple[Odometry | None, ...]:
+    def read() -> SpeedLog | Trajectory:
         table = _table(name, stamps, values)
         if topic.kind == ODOMETRY:
-            steps = motions_from_poses(checked_poses(table, settings), frames, settings)
-        else:
-            steps = motions_from_speed(checked_speeds(table, settings), frames, settings)
-        if len(frames) > 1 and all(step is None for step in steps):
-            raise OdometryError(
-                f"{name} covers none of the frames ({frames[0]:.3f} to {frames[-1]:.3f} s); check "
-                "that both use one clock, or set odometry.time_offset_s"
-            )
-        return steps
+            return checked_poses(table, settings)
+        return checked_speeds(table, settings)
 
-    return source
+    return recorded_motions(name, read, settings)
 
 
 def _table(name: str, stamps: FloatArray, values: FloatArray) -> Table:

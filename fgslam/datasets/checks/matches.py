@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.datasets.checks.recording import CAMERA_NAMES, Finding, Level, listed
+from fgslam.core.sensors import CAMERA_NAMES
+from fgslam.datasets.checks.recording import Finding, Level, listed
 
 _FEWEST_MATCHES = 20
 _SIGNIFICANT_DISPARITY_PX = 0.5

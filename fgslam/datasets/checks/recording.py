@@ -17,7 +17,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import FrameError
 from fgslam.core.recordings import Frame, Sequence
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 
 _LISTED = 5
 
@@ -68,7 +68,6 @@ def listed(items: list[int]) -> str:
 Progress: TypeAlias = Callable[[int, int], None]
 """Called with how much is done, and of how much."""
 
-CAMERA_NAMES = ("right", "left", "top")
 _DARK, _BRIGHT, _FLAT_SIGMA = 8.0, 247.0, 2.0
 _MAX_BRIGHTNESS_RATIO = 1.5
 _KINDS = (("black", "too dark"), ("white", "over-exposed"), ("flat", "without any structure"))

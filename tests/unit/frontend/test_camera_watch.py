@@ -13,8 +13,8 @@ import pytest
 
 import fgslam as fg
 from fgslam.core.arrays import Image
-from fgslam.core.sensors import CameraRig
-from fgslam.frontend.camera_watch import CAMERAS, CameraWatch
+from fgslam.core.sensors import CAMERA_NAMES, CameraRig
+from fgslam.frontend.camera_watch import CameraWatch
 from fgslam.frontend.image_lag import Lag, LagModel, LineRows
 
 BEGINS = 12  # the fault
@@ -99,7 +99,7 @@ def test_an_old_image_is_found_in_the_lab(
     lab: tuple[CameraRig, list[Images]], fault: Callable[[int], Fault], camera: int
 ) -> None:
     said, _ = watched(*lab, fault(camera))
-    assert_found(said, CAMERAS[camera])
+    assert_found(said, CAMERA_NAMES[camera])
 
 
 @pytest.mark.data
@@ -109,7 +109,7 @@ def test_an_old_image_is_found_on_a_real_road(
     road: tuple[CameraRig, list[Images]], fault: Callable[[int], Fault], camera: int
 ) -> None:
     said, _ = watched(*road, fault(camera))
-    assert_found(said, CAMERAS[camera])
+    assert_found(said, CAMERA_NAMES[camera])
 
 
 def test_swapped_cameras_are_found_in_the_lab(lab: tuple[CameraRig, list[Images]]) -> None:

@@ -22,7 +22,7 @@ from fgslam.report.graph_file import (
     information_of,
     write_g2o,
 )
-from fgslam.report.point_cloud import MapPoints, write_map
+from fgslam.report.point_cloud import MapPoints
 from fgslam.runs.exporting import build_graph, export_graph
 
 Lines = dict[str, list[list[float]]]
@@ -137,9 +137,7 @@ def test_gtsam_reads_a_graph_that_starts_at_its_optimum(
 ) -> None:
     graph, log, _ = exact_graph(rng, noise=1.0)
     held = np.unique(np.concatenate([increment.observations.ids for increment in log]))
-    log.save(tmp_path / "measurements.npz")
     stamps = np.array([increment.timestamp for increment in log])
-    Trajectory(stamps, graph.poses).save(tmp_path / "final.tum")
     points = MapPoints(
         ids=held,
         positions=graph.landmarks,
@@ -150,8 +148,7 @@ def test_gtsam_reads_a_graph_that_starts_at_its_optimum(
         valid=np.ones(len(held), np.bool_),
         permanent=np.zeros(len(held), np.bool_),
     )
-    write_map(tmp_path / "map.ply", points, "")
-    said = export_graph(tmp_path / "graph.g2o", tmp_path / "measurements.npz", tmp_path)
+    said = export_graph(tmp_path / "graph.g2o", log, Trajectory(stamps, graph.poses), points)
     assert "starts at their optimum" in said
     start, optimum = costs(tmp_path / "graph.g2o")
     assert start == pytest.approx(optimum, rel=1e-6, abs=0.0)
