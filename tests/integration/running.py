@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,6 +30,7 @@ from fgslam.slam.results import STAGES
 
 Capture = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch
+ROOT = Path(__file__).parents[2]
 KIND = "landmark_kalman"
 SAME_BYTES = (
     "measurements.npz",
@@ -41,6 +43,17 @@ SAME_BYTES = (
 """What the same configuration and seed must give to the byte."""
 HANGS_AFTER_S = 600.0
 """Longer than any command of these tests takes, on a machine that has other work as well."""
+
+
+def copy_of_checkout(folder: Path) -> Path:
+    """A copy of the checkout without what git ignores."""
+    left_out = shutil.ignore_patterns(".*", "build", "dist", "runs", "*.egg-info")
+    caches = shutil.ignore_patterns("__pycache__")
+
+    def ignore(source: str, names: list[str]) -> set[str]:
+        return (left_out if Path(source) == ROOT else caches)(source, names)
+
+    return Path(shutil.copytree(ROOT, folder, ignore=ignore))
 
 
 @dataclass(frozen=True)

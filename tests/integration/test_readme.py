@@ -12,14 +12,15 @@ from __future__ import annotations
 import os
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from running import ROOT, copy_of_checkout
 
-ROOT = Path(__file__).parents[2]
+import fgslam
+
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 DEMO_SHORT = (
     "fgslam run lab_loop --set dataset.stop=6 --set compare=[] --set output.pictures=false"
@@ -66,13 +67,7 @@ def installed_elsewhere(folder: Path) -> list[str]:
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
     """A copy of the checkout without what git ignores."""
-    left_out = shutil.ignore_patterns(".*", "build", "dist", "runs", "*.egg-info")
-    caches = shutil.ignore_patterns("__pycache__")
-
-    def ignore(folder: str, names: list[str]) -> set[str]:
-        return (left_out if Path(folder) == ROOT else caches)(folder, names)
-
-    folder = Path(shutil.copytree(ROOT, tmp_path / "checkout", ignore=ignore))
+    folder = copy_of_checkout(tmp_path / "checkout")
     provide_environment(folder)
     return folder
 
@@ -107,10 +102,20 @@ def replaced_in(folder: Path) -> dict[str, list[str]]:
     }
 
 
+def assert_whole(installed: Path) -> None:
+    """An installed package has every file of the checkout's, and the experiments."""
+    package = Path(fgslam.__file__).parent
+    files = [path for path in package.rglob("*") if path.is_file() and path.suffix != ".pyc"]
+    experiments = (ROOT / "experiments").glob("*.yaml")
+    expected = {path.relative_to(package) for path in files}
+    expected |= {path.relative_to(ROOT) for path in experiments}
+    assert not {path for path in expected if not (installed / path).is_file()}
+
+
 def assert_demo_and_installation(folder: Path) -> None:
     assert (folder / "runs/demo/report.html").is_file()
     assert (folder / "runs/demo/compare/comparison.csv").is_file()
-    assert (folder.parent / "installed/fgslam/py.typed").is_file()
+    assert_whole(folder.parent / "installed/fgslam")
 
 
 def test_commands_run_in_order_with_a_short_demo(checkout: Path) -> None:

@@ -1,0 +1,120 @@
+"""fgslam from its wheel alone: installed by pip, used in an empty folder, no checkout in sight."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tomllib
+import venv
+from pathlib import Path
+
+import pytest
+from running import HANGS_AFTER_S, ROOT, copy_of_checkout
+
+import fgslam
+
+_DISTRIBUTIONS = {
+    "PIL": "pillow",
+    "backports": "backports-zstd",
+    "cv2": "opencv-python-headless",
+    "dask": "distributed",  # its other half
+    "pydantic_core": "pydantic",  # its other half
+    "rerun": "rerun-sdk",
+    "skimage": "scikit-image",
+    "yaml": "pyyaml",
+}
+"""Where a module's distribution has another name."""
+_LOADED_BY_NAME = {"open3d", "skimage", "libusb_package"}
+
+
+def imported() -> set[str]:
+    """Top names of all that the package's modules import."""
+    found = set(_LOADED_BY_NAME)
+    for path in Path(fgslam.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                found.add(node.module or "")
+    return {name.partition(".")[0] for name in found} - set(sys.stdlib_module_names) - {"fgslam"}
+
+
+def plain(name: str) -> str:
+    """A distribution's name as package indices compare it."""
+    return re.sub(r"[-_.]+", "-", re.split(r"[<>=!~\[ ]", name)[0]).lower()
+
+
+def test_what_the_package_imports_is_declared() -> None:
+    """A library that comes along with another one today need not do so tomorrow."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    declared = {plain(name) for name in project["dependencies"]}
+    declared |= {plain(name) for name in project["optional-dependencies"]["viewer"]}
+    assert not {
+        module for module in imported() if plain(_DISTRIBUTIONS.get(module, module)) not in declared
+    }
+
+
+def run(folder: Path, *command: object, **changes: str) -> subprocess.CompletedProcess[str]:
+    """A command in a folder, with nothing of this process's paths."""
+    kept = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    done = subprocess.run(  # noqa: S603
+        list(map(str, command)),
+        cwd=folder,
+        env=kept | changes,
+        capture_output=True,
+        text=True,
+        timeout=HANGS_AFTER_S,
+        check=False,
+    )
+    assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+    return done
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The commands' folder of an environment with the wheel and the libraries of this one.
+
+    Only the libraries' folder is on its path: an editable checkout there stays out of reach.
+    """
+    folder = tmp_path_factory.mktemp("wheel")
+    pip = [sys.executable, "-m", "pip", "--quiet"]
+    build = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", folder]
+    checkout = copy_of_checkout(folder / "checkout")
+    run(folder, *pip, *build, checkout)
+    shutil.rmtree(checkout)
+    (wheel,) = folder.glob("*.whl")
+    environment = folder / "environment"
+    venv.create(environment, symlinks=True)
+    commands = environment / "bin"
+    into = ["--python", commands / "python", "install", "--no-deps"]
+    run(folder, *pip, *into, wheel)
+    (packages,) = environment.glob("lib/python*/site-packages")
+    libraries = sysconfig.get_path("purelib")
+    (packages / "libraries.pth").write_text(libraries, encoding="utf-8")
+    return commands
+
+
+@pytest.mark.slow
+def test_the_demo_runs(installed: Path, tmp_path: Path) -> None:
+    home = run(tmp_path, installed / "python", "-c", "import fgslam; print(fgslam.__file__)").stdout
+    assert Path(home).is_relative_to(installed.parent)
+    run(tmp_path, installed / "fgslam", "demo")
+    assert (tmp_path / "runs/demo/report.html").is_file()
+    assert (tmp_path / "runs/demo/comparison.csv").is_file()
+
+
+@pytest.mark.slow
+def test_a_folder_becomes_a_map_without_open3d(
+    installed: Path, recording: Path, tmp_path: Path
+) -> None:
+    command = (installed / "fgslam", "run", recording, "--out", "mapped")
+    loaded = run(tmp_path, *command, PYTHONPROFILEIMPORTTIME="1").stderr
+    assert re.search(r"\| +cv2$", loaded, flags=re.MULTILINE)
+    assert not re.search(r"\| +(open3d|rerun|distributed)$", loaded, flags=re.MULTILINE)
+    assert (tmp_path / "mapped/isam2/map.ply").is_file()
+    assert [path.name for path in tmp_path.iterdir()] == ["mapped"]
