@@ -74,28 +74,17 @@ def anchor(
             with little contrast from being deformed arbitrarily.
     """
     maps = np.broadcast_to(np.eye(2), (len(places), 2, 2)).copy()
-    first = _sampled(grey, places, maps, size)
-    across, down = (
-        0.5 * (_sampled(grey, places + e, maps, size) - _sampled(grey, places - e, maps, size))
-        for e in np.eye(2)
-    )
+    first, across, down = _with_slopes(grey, places, maps, size)
     x, y = _offsets(size)
-    slopes = [across, down, across * x, across * y, down * x, down * y]
+    slopes = np.stack([across, down, across * x, across * y, down * x, down * y], axis=1)
     weight = _weight(size)
-    light, slopes_only = _without_light(
-        first.astype(np.float64), np.stack(slopes, axis=1).astype(np.float64), weight
-    )
+    light, slopes_only = _without_light(first, slopes, weight)
     prior = np.diag([_FLAT, _FLAT] + 4 * [(noise / deformation) ** 2])
     weighted = slopes_only * weight
-    step = np.linalg.solve(weighted @ slopes_only.transpose(0, 2, 1) + prior, weighted)
-    return ReferencePatches(
-        size,
-        first,
-        light.astype(np.float32),
-        step.astype(np.float32),
-        _spread(first - _mean(first, weight)[:, None], weight),
-        maps,
-    )
+    curvature = (weighted @ slopes_only.transpose(0, 2, 1)).astype(np.float64) + prior
+    step = np.linalg.inv(curvature).astype(np.float32) @ weighted
+    spread = _spread(first - _mean(first, weight).astype(np.float32)[:, None], weight)
+    return ReferencePatches(size, first, light, step, spread, maps)
 
 
 def align(
@@ -137,16 +126,40 @@ def align(
     return fitted, moved, np.where(good, correlation, -1.0)
 
 
-def _without_light(
-    first: FloatArray, slopes: FloatArray, weight: Float32
-) -> tuple[FloatArray, FloatArray]:
-    """The projection on offset and gain (n, 2, m), and the slopes (n, 6, m) without these two."""
-    light = np.stack([np.ones(first.shape), first], axis=1)
-    weighted = light * weight
-    inverse = np.linalg.inv(weighted @ light.transpose(0, 2, 1) + _FLAT * np.eye(2))
-    projection = inverse @ weighted
-    shares = slopes @ projection.transpose(0, 2, 1)
-    return projection, slopes - shares @ light
+def _with_slopes(
+    grey: Image, places: FloatArray, maps: FloatArray, size: int
+) -> tuple[Float32, Float32, Float32]:
+    """Grey values (n, m) of patches, and their derivatives along columns and rows."""
+    wide = _sampled(grey, places, maps, size + 2).reshape(len(places), size + 2, size + 2)
+    middle = slice(1, -1)
+    across = 0.5 * (wide[:, middle, 2:] - wide[:, middle, :-2])
+    down = 0.5 * (wide[:, 2:, middle] - wide[:, :-2, middle])
+    parts = (wide[:, middle, middle], across, down)
+    first, across, down = (
+        np.ascontiguousarray(one).reshape(len(wide), size * size) for one in parts
+    )
+    return first, across, down
+
+
+def _without_light(first: Float32, slopes: Float32, weight: Float32) -> tuple[Float32, Float32]:
+    """The projection on offset and gain (n, 2, m), and the slopes (n, 6, m) without these two.
+
+    Products of pixels are about the patch's mean, where single precision does.
+    """
+    mean = first @ weight / weight.sum()
+    centred = first - mean[:, None]
+    total, level = float(weight.sum()), mean.astype(np.float64)
+    square = (centred * centred) @ weight + total * level**2
+    normal = np.array([[np.full_like(level, total), total * level], [total * level, square]])
+    inverse = np.linalg.inv(normal.transpose(2, 0, 1) + _FLAT * np.eye(2))
+    at_mean = (inverse[:, :, 0] + inverse[:, :, 1] * level[:, None]).astype(np.float32)
+    slope = inverse[:, :, 1].astype(np.float32)
+    light = weight * (at_mean[:, :, None] + slope[:, :, None] * centred[:, None])
+    shares = slopes @ light.transpose(0, 2, 1)
+    offset = shares[:, :, :1] + shares[:, :, 1:] * mean[:, None, None]
+    rest = slopes - offset
+    rest -= shares[:, :, 1:] * centred[:, None]
+    return light, rest
 
 
 @lru_cache(maxsize=8)
