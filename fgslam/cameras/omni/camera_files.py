@@ -153,12 +153,12 @@ def _read(source: str | Path) -> tuple[OmniCameraKind, Path | None]:
 def _settings_of(source: object) -> OmniCameraKind:
     if isinstance(source, OmniCameraKind):
         return source
-    if not isinstance(source, Mapping) or source.get("kind") not in _KINDS:
+    kind = _KINDS.get(str(source.get("kind"))) if isinstance(source, Mapping) else None
+    if not isinstance(source, Mapping) or kind is None:
         raise CalibrationError(
             f"camera: {shortened(repr(source))} describes none; give a calibration file, or keys "
             f"with a kind, one of {', '.join(_KINDS)}"
         )
-    kind = _KINDS[source["kind"]]
     return make_settings(kind, {str(key): value for key, value in source.items()}, "camera")
 
 

@@ -41,6 +41,7 @@ BROKEN = (
     AttributeError,
     EOFError,
     LookupError,
+    MemoryError,  # a length that is none
     OSError,
     RuntimeError,
     SerdeError,

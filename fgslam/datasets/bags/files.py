@@ -183,6 +183,11 @@ class MessagesByPlace:
         with self._lock:
             if place not in self._kept:
                 self._go_to(place)
+            if place not in self._kept:
+                raise FrameError(
+                    f"message {place} in {self._files.paths[0]} is not where the index names it; "
+                    "copy the bag again"
+                )
             connection, _, raw = self._kept[place]
             return connection, raw
 

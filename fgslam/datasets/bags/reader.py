@@ -225,7 +225,13 @@ class _Images:
         """A grey image. Raises FrameError."""
         connection, raw = self._messages.read(place)
         where = f"{self._files.paths[0]}, {connection.topic}"
-        return messages.grey_of(self._files.decoded(connection, raw), where)
+        message = self._files.decoded(connection, raw)
+        try:
+            return messages.grey_of(message, where)
+        except AttributeError as fault:  # the bag's own definition of the type is not ROS's
+            raise FrameError(
+                f"{where}: message without a field of its type ({fault}); copy the bag again"
+            ) from None
 
     def first(self, topic: str) -> Image:
         """The first image of a topic that can be read. Raises DatasetError without any."""

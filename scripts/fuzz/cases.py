@@ -1,0 +1,117 @@
+"""Kinds of input, and what becomes of a case."""
+
+from __future__ import annotations
+
+import signal
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+
+import fgslam as fg
+from fgslam.core.errors import FgslamError
+from fgslam.datasets.images import read_grey_image
+from fgslam.runs.config import load_experiment
+from scripts.fuzz import calls, pictures, texts
+from scripts.fuzz.archives import BEARINGS, MAP, MEASUREMENTS
+from scripts.fuzz.damage import Rng, require_one_line
+
+HANGS_AFTER_S = 10
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A sort of input.
+
+    Attributes:
+        name: as for --kind.
+        make: writes one case into a folder; where it is.
+        read: what reads it.
+        same: whether what was read equals the undamaged original; None where it need not.
+    """
+
+    name: str
+    make: Callable[[Rng, Path], Any]
+    read: Callable[[Any], Any]
+    same: Callable[[Any], bool] | None = None
+
+
+class Hang(BaseException):
+    """A case took too long."""
+
+
+KINDS = (
+    Kind("configuration", texts.configuration, load_experiment),
+    Kind("override", texts.override, lambda given: load_experiment(*given)),
+    Kind("calibration", texts.calibration, lambda path: fg.load_rig(path)),
+    Kind("log_bytes", MEASUREMENTS.of_damaged_bytes, MEASUREMENTS.load, MEASUREMENTS.is_same),
+    Kind("log_values", MEASUREMENTS.of_odd_values, MEASUREMENTS.load),
+    Kind("trajectory", texts.trajectory, fg.Trajectory.load),
+    Kind("image", pictures.image, read_grey_image),
+    Kind("png", pictures.png, read_grey_image, pictures.is_picture),
+    Kind("recording", pictures.recording, pictures.read_recording),
+    Kind("call", calls.call, calls.read_call),
+    Kind("map_bytes", MAP.of_damaged_bytes, MAP.load, MAP.is_same),
+    Kind("map_values", MAP.of_odd_values, MAP.load),
+    Kind("bearing_bytes", BEARINGS.of_damaged_bytes, BEARINGS.load, BEARINGS.is_same),
+    Kind("bearing_values", BEARINGS.of_odd_values, BEARINGS.load),
+    Kind("odometry", texts.odometry_table, texts.read_odometry),
+    Kind("omni_camera", texts.omni_camera, lambda path: fg.load_camera(path, (640, 480))),
+    Kind("bag", pictures.bag, pictures.read_recording),
+    Kind("film", pictures.film, pictures.read_recording),
+)
+
+
+@contextmanager
+def _time_limit() -> Iterator[None]:
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise Hang
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(HANGS_AFTER_S)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def outcome(kind: Kind, seed: int) -> str:
+    """What became of one case: `read`, `refused`, or a fault in words."""
+    rng = np.random.default_rng([KINDS.index(kind), seed])
+    with tempfile.TemporaryDirectory(prefix="fgslam-fuzz-") as scratch:
+        given = kind.make(rng, Path(scratch))
+        try:
+            with _time_limit():
+                found = kind.read(given)
+        except FgslamError as error:
+            try:
+                require_one_line(error)
+            except AssertionError as wrong:
+                return str(wrong)
+            return "refused"
+        except Hang:
+            return f"more than {HANGS_AFTER_S} s"
+        except Exception as error:
+            return f"{type(error).__name__}: {str(error)[:150]}"
+        if kind.same is not None and not kind.same(found):
+            return "other values without a word"
+    return "read"
+
+
+def faults(kind: Kind, seeds: range) -> tuple[Counter[str], list[str]]:
+    """How many cases were read and refused, and a line for each fault."""
+    counts: Counter[str] = Counter()
+    lines = []
+    for seed in seeds:
+        how = outcome(kind, seed)
+        counts[how if how in ("read", "refused") else "fault"] += 1
+        if how not in ("read", "refused"):
+            lines.append(f"{kind.name} {seed}: {how}")
+    return counts, lines
