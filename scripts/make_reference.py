@@ -27,6 +27,8 @@ _END = """Run it: `python examples/{}`. It opens as a notebook in VS Code and (j
 
 _INTRODUCTION = """# Command line
 
+Every command with its arguments and options; what is the same for several is described once.
+
 <!-- Made by `python -m scripts.make_reference` from the program's help: edit that. -->
 """
 _STATUS = """
@@ -65,8 +67,9 @@ def commands_page() -> str:
         raise TypeError("fgslam is a group of commands")
     lines = [_INTRODUCTION, *paragraph(group.help or ""), "", "```sh", "fgslam COMMAND --help"]
     lines += ["fgslam --version", "fgslam --install-completion", "```"]
+    known = set[str]()
     for name, command in commands_of(group):
-        lines += ["", f"## `fgslam {name}`", "", *_described(command)]
+        lines += ["", f"## `fgslam {name}`", "", *_described(command, known)]
     return "\n".join(lines) + "\n" + _STATUS
 
 
@@ -81,12 +84,20 @@ def commands_of(group: typer.core.TyperGroup) -> Iterator[tuple[str, typer.core.
             raise TypeError(f"{name} is no command")
 
 
-def _described(command: typer.core.TyperCommand) -> Iterator[str]:
+def _described(command: typer.core.TyperCommand, known: set[str]) -> Iterator[str]:
+    """Its help and parameters; parameters on the page already by name."""
+    alike = []
     for text in (command.help or "").split("\n\n"):
         yield from (*paragraph(text), "")
     for parameter in command.params:
         if isinstance(parameter, TyperArgument | TyperOption) and parameter.name != "help":
-            yield from item(_parameter(parameter))
+            line = _parameter(parameter)
+            if line in known:
+                alike.append(line.split(": ")[0])
+            else:
+                known.add(line)
+                yield from item(line)
+    yield from item(f"as above: {', '.join(alike)}") if alike else ()
 
 
 def _parameter(parameter: TyperArgument | TyperOption) -> str:

@@ -17,6 +17,7 @@ from fgslam.runs.config_models import HOMING_TASKS, TASKS, LocalisationConfig
 WIDTH = 118
 
 Node: TypeAlias = dict[str, Any]
+_UNITS = {"_m": "metres", "_deg": "degrees", "_s": "seconds", "_px": "pixels", "_deg_s": "degrees"}
 Known: TypeAlias = set[str | tuple[str, str]]
 """Lines of keys, and titles of groups with their classes, that stand on the page already."""
 
@@ -43,31 +44,26 @@ _INTRODUCTION = """# Settings
 
 <!-- Made by `python -m scripts.make_reference`: edit the settings' descriptions, not this page. -->
 
-An experiment is one YAML file; `experiments/` has examples. Any key can be set from the command
-line, too: `fgslam run CONFIG.yaml --set frontend.sift.octave_layers=3 --set dataset.stop=null`. The
-last value of a key wins. An override that chooses another `kind` drops the file's keys of the old
-one. Unknown keys, keys given twice, NaN and infinity are refused. A run writes the resolved
-configuration, every default filled in, to `RUN/config.yaml`; that file is itself a configuration
-and repeats the run.
+Every key of an experiment, which is one YAML file (examples in `experiments/`). Any key can be set
+from the command line: `fgslam run CONFIG.yaml --set frontend.sift.octave_layers=3`. The last value
+of a key wins; choosing another `kind` drops the file's keys of the old one. Unknown keys, keys given
+twice, NaN and infinity are refused. `RUN/config.yaml` holds every key with its value.
 
-Units are metres, seconds and pixels, angles in degrees, unless the key's name or meaning says
-otherwise. A line gives the key, its default, its choices or range, and the gist of its meaning; all
-of it is in the class that the group's heading names. Keys that stand on the page already are named
-as *alike*. `null` is off, `{}` switches a group on with its defaults. Experiments of homing have a
-key `task`: see [homing experiments](#homing-experiments).
+A line gives the key, its default, other choices or the range (a bracket includes the limit), and
+its meaning. A default without decimal point takes integers. Units are those of the key's name
+(`_m`, `_s`, `_px`, `_deg`). Keys described further up are named as *alike*. `null` is off, `{}`
+switches a group on with its defaults. See also [homing experiments](#homing-experiments).
 """
 
 _LOCALISATION = """## Task `localisation`
 
 {described}
-`dataset`, `odometry`, `frontend`, `estimator` and `output` have the keys that they have above;
-`estimator` is that of the drive that makes the map.
+Other groups have the keys above; `estimator` is that of the drive that makes the map.
 """
 
 _HOMING = """## Homing experiments
 
-Each task has its own keys; the groups of keys that they share are described once, below all of
-them.
+Keys of each task, then the groups that they share.
 """
 
 
@@ -130,7 +126,7 @@ def _sections(schema: Node, node: Node, dotted: str, level: int, known: Known) -
         title = f"`{dotted}`" + (f", kind `{kind}`" if kind else "")
         if (title, group["title"]) not in known:
             known.add((title, group["title"]))
-            said = " ".join(group.get("description", "").split())
+            said = _summary(group)
             about = paragraph(f"`{group['title']}`: {said}")
             yield "\n".join([f"{'#' * level} {title}", "", *about, "", *lines]).rstrip()
         yield from inner
@@ -154,11 +150,12 @@ def _keys(schema: Node, group: Node, known: Known) -> list[str]:
 
 def _line(schema: Node, name: str, node: Node, required: bool) -> str:
     """Key, default, range and meaning; of a long meaning as many clauses as fit on the line."""
-    default = "must be given" if required else f"`{_default(node)}`"
+    default = "required" if required else f"`{_default(node)}`"
     choices = [f"`{json.dumps(value)}`" for value in _choices(schema, node)]
     others = [choice for choice in choices if choice != default]
-    facts = ", ".join(filter(None, (" or ".join([default, *others]), _range(schema, node))))
-    head, meaning = f"`{name}` ({facts}): ", _meaning(schema, node)
+    limits = "" if set(choices) - {"`null`"} else _range(schema, node)
+    facts = ", ".join(filter(None, (" or ".join([default, *others]), limits)))
+    head, meaning = f"`{name}` ({facts}): ", _without_unit(name, _meaning(schema, node))
     clauses = re.split(r"(?<=[;.]) ", meaning)
     fitting = [
         found
@@ -166,6 +163,20 @@ def _line(schema: Node, name: str, node: Node, required: bool) -> str:
         if len(head + (found := " ".join(clauses[:k]).rstrip(";."))) <= WIDTH - 2
     ]
     return head + (fitting[0] if fitting else clauses[0].rstrip(";."))
+
+
+def _without_unit(name: str, meaning: str) -> str:
+    """The meaning without a unit at its end that the key's name ends with."""
+    for suffix, unit in _UNITS.items():
+        if name.endswith(suffix):
+            return meaning.removesuffix(f", {unit}")
+    return meaning
+
+
+def _summary(group: Node) -> str:
+    """First sentence of what a group is."""
+    said = " ".join(group.get("description", "").split())
+    return re.split(r"(?<=\.) (?=[A-Z:])", said)[0]
 
 
 def _alternatives(node: Node) -> list[Node]:
@@ -216,7 +227,9 @@ def _choices(schema: Node, node: Node) -> list[Any]:
 def _range(schema: Node, node: Node) -> str:
     """Limits of a number or of those in a list."""
     parts = [_resolve(schema, part) for part in _alternatives(node)]
-    return " or ".join(dict.fromkeys(filter(None, map(_limits, parts))))
+    whole = any(part.get("type") == "integer" for part in parts)
+    shown = "integer " if whole and not isinstance(node.get("default"), int) else ""
+    return shown + " or ".join(dict.fromkeys(filter(None, map(_limits, parts))))
 
 
 def _limits(node: Node) -> str:
@@ -225,9 +238,15 @@ def _limits(node: Node) -> str:
         inner = _limits(items[0])
         count = f"{len(items)} of" if "prefixItems" in node else "list of"
         return f"{count} {inner}" if inner else ""
-    signs = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
-    found = [f"{sign} {node[key]:g}" for key, sign in signs.items() if key in node]
-    return " ".join([*(["integer"] if node.get("type") == "integer" else []), *found])
+    low, above = node.get("minimum"), node.get("exclusiveMinimum")
+    high, below = node.get("maximum"), node.get("exclusiveMaximum")
+    least, most = low if above is None else above, high if below is None else below
+    left, right = "[" if above is None else "(", "]" if below is None else ")"
+    if least is not None and most is not None:
+        return f"{left}{least:g}, {most:g}{right}"
+    if least is not None:
+        return f"{'>=' if above is None else '>'} {least:g}"
+    return f"{'<=' if below is None else '<'} {most:g}" if most is not None else ""
 
 
 def paragraph(text: str) -> list[str]:

@@ -31,9 +31,8 @@ class FloorSettings:
     mode: Annotated[
         Literal["auto", "none", "soft", "hard"],
         Field(
-            description="`auto` the degrees of freedom of frontend.ego_motion.dof, exactly; `none` "
-            "all six; `hard` and `soft` those of dof (height, pitch and roll where it is 6), "
-            "exactly or up to the deviations below"
+            description="`auto` as frontend.ego_motion.dof; `none`; `hard` exact; `soft` with the "
+            "deviations below"
         ),
     ] = "auto"
     height_sigma_m: Annotated[
@@ -66,7 +65,7 @@ class NamedSettings:
         str | None,
         Field(
             pattern=r"^[A-Za-z0-9][\w.+-]*$",
-            description="name of its folder and of its row in tables; null: its kind",
+            description="name of its folder and row; null: its kind",
         ),
     ] = None
 
@@ -89,9 +88,7 @@ class PerLandmarkSettings(NamedSettings):
 
     pose_covariance: Annotated[
         bool,
-        Field(
-            description="add the pose's covariance to the observation's (6.4 read with IJRR 2002)"
-        ),
+        Field(description="add the pose's covariance to the observation's"),
     ] = True
 
 
@@ -103,9 +100,7 @@ class LandmarkKalmanSettings(PerLandmarkSettings):
     update: Annotated[
         Literal["pixel", "world", "running_mean", "half"],
         Field(
-            description="how a matched landmark moves: `pixel` Kalman update on (column, row, "
-            "disparity), the most accurate measured; `world` Kalman fusion of 3-D positions "
-            "(6.4); `running_mean` and `half` the plain averaging of 4.1 (with and without a count)"
+            description="`pixel` Kalman on (c, r, d); `world` on positions (6.4); averages of 4.1"
         ),
     ] = "pixel"
 
@@ -131,16 +126,14 @@ class EkfSettings(NamedSettings):
         float,
         Field(
             ge=0.0,
-            description="a match is left out when its own innovation exceeds this many standard "
-            "deviations (Mahalanobis distance); 0: no gate",
+            description="gate on a match's innovation, standard deviations; 0: none",
         ),
     ] = 5.0
     max_landmarks: Annotated[
         int,
         Field(
             ge=1,
-            description="refuse to hold more: the joint covariance takes 72 n^2 bytes, 1.2 GB for "
-            "4000 landmarks, and up to half as much again in reserve",
+            description="more are refused; memory 72 n^2 bytes, up to half more in reserve",
         ),
     ] = 4000
 
@@ -154,19 +147,15 @@ class GraphSettings(NamedSettings):
     noise_factor: Annotated[
         Annotated[float, Field(gt=0.0)] | None,
         Field(
-            description="standard deviations of landmark measurements are multiplied by this when "
-            "they are weighed; kernel and trim judge by the stated ones. null: estimated from "
-            "the residuals, since errors of a landmark persist from frame to frame, which a graph "
-            "of independent measurements would average away",
+            description="factor on the stated deviations of landmarks; null: estimated from the "
+            "residuals",
         ),
     ] = None
     gate_px: Annotated[
         float,
         Field(
             ge=0.0,
-            description="matches that the frame's own least squares rejected are left out where "
-            "their image residual exceeds this; nearer ones may be right, and the map have "
-            "drifted: the kernel deals with them. A range sensor's are all left out. 0: none is",
+            description="leave out matches the frame rejected above this residual, px; 0: none",
         ),
     ] = 12.0
 
@@ -194,24 +183,21 @@ class Isam2Settings(GraphSettings):
         int,
         Field(
             ge=1,
-            description="frames between updates of the graph; a tracker (the paper's filter, "
-            "on the smoothed map) answers in between",
+            description="frames between updates; a tracker answers in between",
         ),
     ] = 5
     ordering_window: Annotated[
         int,
         Field(
             ge=0,
-            description="so many last poses are kept at the root of the Bayes tree; 0: GTSAM's own "
-            "choice, all variables of the update",
+            description="last poses kept at the root of the Bayes tree; 0: GTSAM's order",
         ),
     ] = 30
     keyframe_every: Annotated[
         int,
         Field(
             ge=1,
-            description="frames to a keyframe; what the frames between measured is summarised in "
-            "factors of the keyframe. 1: every frame is a variable",
+            description="frames to a keyframe; 1: every frame is a variable",
         ),
     ] = 1
 
@@ -228,9 +214,8 @@ class BatchSettings(GraphSettings):
     trim: Annotated[
         bool,
         Field(
-            description="after the minimum with the kernel, leave out observations beyond the "
-            "99.9 % quantile of chi-square and solve the rest without it: its covariances are "
-            "those of least squares"
+            description="at the end drop observations beyond the 99.9 % quantile and solve without "
+            "kernel"
         ),
     ] = True
     method: Annotated[
@@ -244,8 +229,7 @@ class BatchSettings(GraphSettings):
         int,
         Field(
             ge=0,
-            description="live: solve anew after so many frames and track against the result; 0: "
-            "the tracker alone steers, the solution comes with the estimate",
+            description="live: frames between solutions; 0: at the end only",
         ),
     ] = 0
 

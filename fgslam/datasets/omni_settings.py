@@ -30,8 +30,7 @@ class PanoramasSettings(RecordingSettings):
         Field(
             ge=64,
             le=16384,
-            description="pictures are reduced to this width, and their height with it; null: as "
-            "they are",
+            description="pictures are reduced to this width; null: as they are",
         ),
     ] = None
 
@@ -47,7 +46,7 @@ class OmniPathSettings(RecordingSettings):
         Field(
             min_length=1,
             pattern=r"^[^/\\]+$",
-            description="names of the pictures, with * and ?; in order of the numbers in them",
+            description="names of the pictures, ordered by the numbers in them",
         ),
     ] = "*"
 

@@ -37,22 +37,21 @@ class CalibratedSettings(RecordingSettings):
     camera_file: Annotated[
         str | None,
         Field(
-            description="calibration in place of the recording's own, in any format of "
-            "docs/howto/your_camera.md; images of a rig that is not rectified are rectified by it"
+            description="calibration in place of the recording's own (docs/howto/your_camera.md)"
         ),
     ] = None
     camera_yaw_deg: Annotated[
         float | None,
         Field(
-            description="heading of the reference camera in the body, degrees to the left; given, "
-            "it replaces the mounting (bTc) of the calibration; null: as there, or straight ahead"
+            description="heading of the camera in the body, degrees to the left; null: as "
+            "calibrated"
         ),
     ] = None
     lever_arm_m: Annotated[
         Vector3 | None,
         Field(
-            description="position of the reference (right) camera in the body, metres forward, "
-            "left, up; given, it replaces bTc of the calibration; null: as there, or none"
+            description="position of the right camera in the body, forward, left, up; null: as "
+            "calibrated"
         ),
     ] = None
 
@@ -68,8 +67,8 @@ class ImageFolderSettings(CalibratedSettings):
     odometry_file: Annotated[
         str | None,
         Field(
-            description="odometry inside the folder: .csv is speed and yaw rate, .txt is TUM poses "
-            "of the body; null: odometry.txt or the only odom*.csv, where there is one"
+            description="odometry inside the folder: .csv (speed, yaw rate) or .txt (TUM poses of "
+            "the body)"
         ),
     ] = None
 
@@ -87,16 +86,12 @@ class LooseImagesSettings(CalibratedSettings):
         Field(
             gt=0.0,
             le=1e4,
-            description="frames a second, in place of a list of times; null: by the list, by names "
-            "that are times, else 10",
+            description="frames a second; null: by the list of times or by names, else 10",
         ),
     ] = None
     odometry_file: Annotated[
         str | None,
-        Field(
-            description="odometry inside the folder; null: odometry.txt or the only odom*.csv, "
-            "where there is one"
-        ),
+        Field(description="odometry inside the folder; null: odometry.txt or odom*.csv"),
     ] = None
 
 
@@ -106,15 +101,12 @@ class VideoSettings(CalibratedSettings):
 
     path: Annotated[
         str,
-        Field(min_length=1, description="the film, a folder of one or two, or a pattern of both"),
+        Field(min_length=1, description="the film, a folder of one or two, or a pattern"),
     ]
     kind: Literal["video"] = "video"
     views: Annotated[
         Literal["side_by_side", "over_under"] | None,
-        Field(
-            description="how one film shows both views, left or upper one first; null: by the "
-            "size that the calibration is for, else by their shape"
-        ),
+        Field(description="how one film shows both views; null: by its size"),
     ] = None
     fps: Annotated[
         float | None,
@@ -131,16 +123,14 @@ class RgbdSettings(CalibratedSettings):
         float | None,
         Field(
             gt=0.0,
-            description="units of a depth image in a metre; null: 5000 in TUM's layout, 1000 "
-            "(millimetres) of other 16-bit images, 1 of floats",
+            description="depth units in a metre; null: 5000 (TUM), 1000 (16 bits), 1 (floats)",
         ),
     ] = None
     depth_sigma_m: Annotated[
         float,
         Field(
             gt=0.0,
-            description="noise of a depth of 1 m; it grows with the square of the depth (Kinect: "
-            "Khoshelham and Elberink 2012)",
+            description="noise of a depth of 1 m, growing with its square",
         ),
     ] = 1.425e-3
     pairing_tolerance_ms: Annotated[
@@ -166,10 +156,7 @@ class BagSettings(CalibratedSettings):
     kind: Literal["bag"] = "bag"
     topics: Annotated[
         tuple[str, ...],
-        Field(
-            description="topics to use: the left camera's images, the right one's, then perhaps "
-            "one of odometry; empty: chosen by type and name"
-        ),
+        Field(description="topics: left images, right images, odometry; empty: by type and name"),
     ] = ()
     pairing_tolerance_ms: Annotated[
         float,
@@ -204,24 +191,18 @@ class LightFieldSettings(RecordingSettings):
 
     kind: Literal["light_field"] = "light_field"
     row: Annotated[int, Field(ge=0, description="grid row along which the reference walks")] = 8
-    spacing: Annotated[
-        int, Field(ge=1, description="grid steps from the reference to the left and the top view")
-    ] = 4
+    spacing: Annotated[int, Field(ge=1, description="grid steps to the left and the top view")] = 4
     use_top: Annotated[bool, Field(description="use the vertical neighbour as third camera")] = True
     focal_length_px: Annotated[
         float,
         Field(
             gt=0.0,
-            description="nominal focal length: the recording gives none; depth scales with it, the "
-            "trajectory does not",
+            description="nominal focal length; scales depth, not the trajectory",
         ),
     ] = 800.0
     shift_px_per_step: Annotated[
         float,
-        Field(
-            description="pixels by which each view is shifted per grid step, so that all "
-            "disparities are positive (measured without: -0.3 to 1.5 px a step)"
-        ),
+        Field(description="shift of each view per grid step, so that disparities are positive"),
     ] = 1.0
 
 
@@ -238,8 +219,7 @@ class StereoTracksSettings(FrameSelection):
         str,
         Field(
             min_length=1,
-            description='"00s", "00" or "large": those inside the installed gtsam; or the path of '
-            "a file VO_stereo_factors*.txt with its calibration beside it",
+            description='"00s", "00" or "large" of gtsam; or a file VO_stereo_factors*.txt',
         ),
     ] = "00s"
     pixel_sigma: Annotated[
@@ -264,10 +244,7 @@ class UtiasStereoSettings(RecordingSettings):
     kind: Literal["utias_stereo"] = "utias_stereo"
     left_right_correlation: Annotated[
         tuple[Correlation, Correlation],
-        Field(
-            description="correlation of the noise of both images, in columns and in rows (measured "
-            "against the truth); [0, 0]: independent, as the file's variances alone would have it"
-        ),
+        Field(description="correlation of both images' noise, columns and rows"),
     ] = (0.86, 0.99)
 
 
@@ -334,10 +311,7 @@ class ConstantVelocitySettings:
     kind: Literal["constant_velocity"] = "constant_velocity"
     rotation_sigma_dps2: Annotated[
         PositiveVector3,
-        Field(
-            description="at first, about the camera's axes x, y, z (right, down, forward), "
-            "degrees/s^2"
-        ),
+        Field(description="at first, about the camera's axes x, y, z, degrees/s^2"),
     ] = (100.0, 100.0, 100.0)
     translation_sigma_mps2: Annotated[
         PositiveVector3, Field(description="at first, along the camera's axes x, y, z, m/s^2")
@@ -350,7 +324,7 @@ class ConstantVelocitySettings:
     ] = 20.0
     adapt: Annotated[
         bool,
-        Field(description="estimate the acceleration from the frames; false: it stays as at first"),
+        Field(description="estimate the acceleration from the frames"),
     ] = True
 
 
@@ -375,8 +349,7 @@ class RecordedOdometrySettings:
         float,
         Field(
             gt=0.0,
-            description="longest gap in the odometry that is bridged (inside by interpolation, at "
-            "the ends by the nearest value); over a longer one the step has no odometry, seconds",
+            description="longest gap in the odometry that is bridged",
         ),
     ] = 0.5
     max_speed_mps: Annotated[

@@ -26,8 +26,7 @@ class StereoSettings:
         float | None,
         Field(
             gt=0.0,
-            description="largest disparity; 20 in IJRR 2002 (1.4 m at 320x240). null: any, "
-            "descriptors tell the right partner",
+            description="largest disparity; 20 in IJRR 2002; null: any",
         ),
     ] = None
     scale_ratio: Annotated[
@@ -43,8 +42,8 @@ class StereoSettings:
     measurement: Annotated[
         Literal["fused", "paper"],
         Field(
-            description="`paper`: reference (row, column) and the mean of both disparities; "
-            "`fused`: least squares over all coordinates of the two or three images"
+            description="`fused`: least squares over all images; `paper`: (row, column), mean "
+            "disparity"
         ),
     ] = "fused"
     pixel_sigma: Annotated[
@@ -55,8 +54,7 @@ class StereoSettings:
         float | None,
         Field(
             gt=0.0,
-            description="standard deviation of the disparity, pixels, where a depth camera gives "
-            "it and not a second image; null: by pixel_sigma",
+            description="sigma of a depth camera's disparity; null: by pixel_sigma",
         ),
     ] = None
 
@@ -74,24 +72,16 @@ class MapMatchingSettings:
         float,
         Field(
             ge=0.0,
-            description="widen window and disparity gate by this many standard deviations of the "
-            "predicted measurement; 0 keeps the paper's fixed window",
+            description="widen search windows by so many sigmas of the prediction; 0: fixed",
         ),
     ] = 3.0
     refine: Annotated[
         bool,
-        Field(
-            description="match again around the first pose where that has moved the landmarks far "
-            "in the image, with its smaller uncertainty"
-        ),
+        Field(description="match again around the first pose where that moved landmarks far"),
     ] = True
     rescue: Annotated[
         bool,
-        Field(
-            description="where too few match, search the largest window by descriptor; where "
-            "most of it contradicts the pose, too, all that was seen lately, wherever predicted, "
-            "before falling back to the odometry; needs appearance.mode descriptor"
-        ),
+        Field(description="where matching fails, search without the prediction"),
     ] = True
 
 
@@ -104,37 +94,31 @@ class PermanenceSettings:
         Field(
             ge=0.0,
             lt=1.0,
-            description="a landmark becomes permanent when hits / (hits + misses) exceeds this; "
-            "unstated in 6.2, chosen by measurement (docs/results)",
+            description="least hits / (hits + misses) of a permanent landmark",
         ),
     ] = 0.3
     hits: Annotated[
         int,
-        Field(ge=1, description="and when it has at least so many hits, and valid_hits (6.1)"),
+        Field(ge=1, description="least hits of a permanent landmark, and valid_hits (6.1)"),
     ] = 5
     when: Annotated[
         Literal["running", "saved"],
-        Field(
-            description="`running`: with the hit that makes it so; `saved`: all together when the "
-            "map is saved, as 6.2 does beforehand"
-        ),
+        Field(description="flag set with the hit (`running`), or on saving (`saved`, 6.2)"),
     ] = "running"
     blind_below: Annotated[
         float,
         Field(
             ge=0.0,
             le=1.0,
-            description="a frame that matches less than this share of the landmarks expected well "
-            "in view is blocked or lost: it is no evidence that a landmark is gone; 0 believes all",
+            description="below this share of expected landmarks a frame counts no misses",
         ),
     ] = 0.05
     contradicted_after: Annotated[
         int | None,
         Field(
             ge=1,
-            description="frames that contradict a permanent landmark (rejected as an outlier, or "
-            "missed where the cameras see past its place), no hit between them, until it is an "
-            "ordinary one again; null: never",
+            description="contradicting frames without a hit until it is ordinary again; null: "
+            "never",
         ),
     ] = 20
 
@@ -148,7 +132,7 @@ class ViewpointSettings:
         Field(
             ge=2,
             le=64,
-            description="views of a landmark; a further one replaces that matched longest ago",
+            description="views a landmark; a further one replaces that matched longest ago",
         ),
     ] = 8
 
@@ -167,32 +151,25 @@ class DatabaseSettings:
         int | None,
         Field(
             ge=1,
-            description="frames after which a landmark with fewer than valid_hits hits that was "
-            "not seen again is dropped, in view or not: what a passer-by leaves behind; null keeps "
-            "it until it is missed in view, as the paper",
+            description="frames until a landmark below valid_hits is dropped, in view or not",
         ),
     ] = None
     field_of_view: Annotated[
         Literal["image", "cone"],
-        Field(
-            description="`image`: expected in view within the image's bounds; `cone`: the paper's "
-            "30 degrees on both axes (4.4), which exceeds a 320x240 image's height"
-        ),
+        Field(description="`image`: within its bounds; `cone`: the paper's 30 degrees (4.4)"),
     ] = "image"
     border_px: Annotated[
         float,
         Field(
             ge=0.0,
-            description="this near to an image's edge a landmark may be matched but is not missed",
+            description="nearer to an image's edge a landmark is not missed",
         ),
     ] = 8.0
     least_scale_px: Annotated[
         float | None,
         Field(
             gt=0.0,
-            description="landmarks that would look smaller than this are not expected: SIFT's "
-            "finest scale over 1.5, the largest ratio matched. 0.8 where base_sigma_px is 2 loses "
-            "no match and keeps large maps fast; null expects them at any distance",
+            description="smaller landmarks are not expected; 0.8 suits base_sigma_px 2",
         ),
     ] = None
     permanence: Annotated[
@@ -211,7 +188,7 @@ class EgoMotionSettings:
 
     dof: Annotated[
         Literal[6, 5, 3],
-        Field(description="6 general; 5 height fixed (section 5); 3 planar: x, z and yaw"),
+        Field(description="6 general; 5 fixed height (section 5); 3 planar"),
     ] = 6
     residuals: Annotated[
         Literal["image_disparity", "image"],
@@ -219,10 +196,7 @@ class EgoMotionSettings:
     ] = "image_disparity"
     weighting: Annotated[
         Literal["landmark", "measurement", "uniform"],
-        Field(
-            description="covariance of a residual: `uniform` as in 3.3, `measurement` from the "
-            "matching, `landmark` the landmark's own added"
-        ),
+        Field(description="of `measurement`, with that of the `landmark`, or `uniform` (3.3)"),
     ] = "landmark"
     prior: Annotated[
         bool,
@@ -235,8 +209,7 @@ class EgoMotionSettings:
         float,
         Field(
             ge=0.0,
-            description="drop matches whose residual exceeds this many standard deviations of "
-            "itself as well; 0 switches it off",
+            description="drop matches beyond so many of their standard deviations; 0: none",
         ),
     ] = 4.0
     kernel: Annotated[
@@ -250,8 +223,7 @@ class EgoMotionSettings:
         float,
         Field(
             gt=0.0,
-            description="cap on the correction of the odometry (5), where six standard deviations "
-            "of the prediction are not more",
+            description="cap on the correction of the odometry (5), or six sigmas if larger",
         ),
     ] = 0.3
     max_correction_deg: Annotated[float, Field(gt=0.0, description="likewise of the rotation")] = (
@@ -265,20 +237,17 @@ class RelocalisationSettings:
 
     method: Annotated[
         Literal["ransac", "hough"],
-        Field(description="how poses are proposed: from minimal samples of matches, or by votes"),
+        Field(description="poses by minimal samples, or by votes"),
     ] = "ransac"
     descriptors: Annotated[
         bool,
-        Field(
-            description="propose matches by SIFT descriptor; false: by size, height and "
-            "orientation alone, as features without descriptors would"
-        ),
+        Field(description="match by descriptor; false: by size, height and orientation alone"),
     ] = True
     map_sigma_m: Annotated[
         float,
         Field(
             ge=0.0,
-            description="added to a landmark's: what the map's drift hides from its covariances",
+            description="added to landmarks': drift of the map",
         ),
     ] = 0.01
     max_sigma_m: Annotated[
@@ -297,16 +266,14 @@ class LostSettings:
         int,
         Field(
             ge=1,
-            description="frames in a row that the landmarks did not locate, until the whole map is "
-            "searched",
+            description="unlocated frames in a row until the whole map is searched",
         ),
     ] = 2
     give_up_after: Annotated[
         int,
         Field(
             ge=1,
-            description="frames lost until mapping goes on from the odometry; until then nothing "
-            "new enters the map, which would be misplaced if the robot was carried off",
+            description="frames lost until mapping goes on from the odometry",
         ),
     ] = 10
 
@@ -323,23 +290,21 @@ class LoopSettings:
         int,
         Field(
             ge=2,
-            description="frames unseen until seeing a landmark again is a return; more recent ones "
-            "are the tracker's business",
+            description="frames unseen until a landmark counts as old",
         ),
     ] = 60
     confirm: Annotated[
         int,
         Field(
             ge=1,
-            description="frames in a row that must find the same offset between map and estimate",
+            description="frames in a row that find the same offset",
         ),
     ] = 3
     max_drift_share: Annotated[
         float,
         Field(
             ge=0.0,
-            description="drift of position that is believed, as a share of the way since; poor "
-            "wheels with a gyro-less heading reach 0.05",
+            description="largest drift as a share of the way since (poor wheels: 0.05)",
         ),
     ] = 0.08
     min_matches: Annotated[
@@ -364,10 +329,7 @@ class FrontendSettings:
 
     tracking: Annotated[
         Literal["sift", "hybrid"],
-        Field(
-            description="`sift`: SIFT on every frame; `hybrid`: on key frames, between them the "
-            "landmarks are carried by their patches (KLT), at a fraction of the cost"
-        ),
+        Field(description="`sift` on every frame; `hybrid`: on key frames, KLT between"),
     ] = "sift"
     sift: SiftSettings = SiftSettings()
     stereo: StereoSettings = StereoSettings()
@@ -378,23 +340,20 @@ class FrontendSettings:
     relocalisation: RelocalisationSettings = RelocalisationSettings()
     loops: Annotated[
         LoopSettings | None,
-        Field(description="look for returns to mapped places and close the loop; null does not"),
+        Field(description="close loops; null: off"),
     ] = None
     lost: Annotated[
         LostSettings | None,
-        Field(description="search the whole map when lost; null goes on by odometry alone"),
+        Field(description="search the whole map when lost; null: odometry alone"),
     ] = None
     watch_cameras: Annotated[
         bool,
-        Field(
-            description="leave out frames in which a camera delivers old images, or cameras are "
-            "swapped, and say where one is darker; false uses every frame"
-        ),
+        Field(description="leave out frames of late or swapped cameras, report darker ones"),
     ] = True
     self_calibration: Annotated[
         bool,
         Field(
-            description="estimate from the drive what the rig's calibration leaves uncorrected, "
-            "and take it off every frame's features; needs stereo.measurement fused"
+            description="correct the rig's calibration from the drive; needs "
+            "stereo.measurement fused"
         ),
     ] = True

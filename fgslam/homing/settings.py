@@ -25,7 +25,7 @@ class HomingControlSettings:
         Field(
             gt=0.0,
             lt=0.5,
-            description="part of the leg that may be left when the target counts as reached",
+            description="part of the leg left when the target counts as reached",
         ),
     ] = 0.07
     retry_s: Annotated[
@@ -51,7 +51,7 @@ class AvoidanceSettings:
     ] = "corridors"
     half_width_m: Annotated[
         float,
-        Field(gt=0.0, description="of the corridor that the robot needs: its radius and a margin"),
+        Field(gt=0.0, description="half the corridor needed: the robot's radius and a margin"),
     ] = 0.42
     body_m: Annotated[
         float, Field(gt=0.0, description="half width of the bare robot, for ways out of corners")
@@ -95,8 +95,7 @@ class FrontEndSettings:
         Field(
             ge=0.0,
             lt=0.9,
-            description="share of wrong matches mixed into those of start and target, to test "
-            "robustness; 0 on a robot",
+            description="share of wrong matches mixed in, to test robustness",
         ),
     ] = 0.0
 
@@ -128,7 +127,7 @@ class TopologicalMapSettings:
         int,
         Field(
             ge=0,
-            description="images that each one is tried against, the most alike first; 0: all pairs",
+            description="images that each one is tried against, by similarity; 0: all",
         ),
     ] = 0
 

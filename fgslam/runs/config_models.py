@@ -52,10 +52,7 @@ LiveHoming: TypeAlias = Annotated[
 ComparedHoming: TypeAlias = Annotated[HomingEstimatorSettings, BeforeValidator(kind_as_settings)]
 ComparedList: TypeAlias = Annotated[
     tuple[ComparedHoming, ...],
-    Field(
-        description="estimators that are given the same bearings: kinds, or groups of keys as "
-        "under `estimator`"
-    ),
+    Field(description="further estimators on the same bearings, as under `estimator`"),
 ]
 ViewName: TypeAlias = Annotated[
     str, BeforeValidator(lambda value: str(value) if isinstance(value, int) else value)
@@ -142,8 +139,8 @@ class ExperimentConfig(Experiment):
     compare: Annotated[
         tuple[ComparedEstimator, ...],
         Field(
-            description="estimators that replay the run's own log beside the live one: kinds, or "
-            "groups of keys as under `estimator`"
+            description="estimators that replay the run's log: kinds, or groups as under "
+            "`estimator`"
         ),
     ] = ()
     map: MapSettings = MapSettings()
@@ -250,9 +247,7 @@ class HomingExperiment(Experiment):
     output: HomingOutputSettings = HomingOutputSettings()
     jobs: Annotated[
         int | None,
-        Field(
-            ge=1, description="processes at a time; null: one a core. Results do not depend on it"
-        ),
+        Field(ge=1, description="processes at a time; null: one a core"),
     ] = None
 
 
@@ -281,16 +276,14 @@ class TopologicalMapConfig(HomingExperiment):
     routes: Annotated[
         tuple[Annotated[tuple[ViewName, ...], Field(min_length=2)], ...],
         Field(
-            description="ways to seek on the map, by the views' numbers: start and goal, or all "
-            "nodes of a chain whose links shall be there"
+            description="ways to find, by the views' numbers: start and goal, or a chain of nodes"
         ),
     ] = ()
     held_out_every: Annotated[
         int | None,
         Field(
             ge=2,
-            description="localisation is tried with every so many views, on a map of the others; "
-            "null: not tried",
+            description="localise every so many views on a map of the others",
         ),
     ] = None
 
@@ -324,10 +317,7 @@ class FollowConfig(HomingExperiment):
     route: Annotated[str, Field(description="file that a route was taught into")]
     taught_camera: Annotated[
         bool,
-        Field(
-            description="the camera is the one that the route was taught with, whatever "
-            "`dataset.camera` says"
-        ),
+        Field(description="use the route's camera in place of `dataset.camera`"),
     ] = True
     steering: SteeringSettings = SteeringSettings()
 
@@ -341,8 +331,7 @@ class HomingTrialsConfig(HomingExperiment):
         tuple[Annotated[float, Field(ge=0.0, lt=1.0)], ...],
         Field(
             min_length=1,
-            description="shares of outliers, each with its own trials: of wrong matches, and half "
-            "each of jumping tracks and of gross bearings; they replace the dataset's own",
+            description="shares of outliers, each with its own trials",
         ),
     ] = (0.0, 0.1, 0.2, 0.3)
     trials: Annotated[int, Field(ge=1, description="homings for each share")] = 200
@@ -367,8 +356,7 @@ class DrivingConfig(HomingExperiment):
         float,
         Field(
             ge=0.0,
-            description="the robot starts up to so far from the path's start, turned at random: "
-            "from where homing succeeds",
+            description="largest distance of the start from the path's start, turned at random",
         ),
     ] = 0.0
     wrong_matches: Annotated[
@@ -376,8 +364,7 @@ class DrivingConfig(HomingExperiment):
         Field(
             ge=0.0,
             lt=0.9,
-            description="share of wrong matches mixed into those of start and target, to try how "
-            "much homing bears",
+            description="share of wrong matches mixed in, to test robustness",
         ),
     ] = 0.0
 

@@ -21,7 +21,7 @@ class OutputSettings:
         float,
         Field(
             ge=0.0,
-            description="write all results so far this often, for --resume; 0: after each frame",
+            description="interval of checkpoints for --resume; 0: each frame",
         ),
     ] = 2.0
 
@@ -38,8 +38,7 @@ class HomingOutputSettings:
         int,
         Field(
             ge=0,
-            description="bearing logs kept, of the first trials or runs, which `fgslam compare` "
-            "replays",
+            description="bearing logs kept of the first trials or runs",
         ),
     ] = 4
 
@@ -51,10 +50,7 @@ class KnownMapSettings:
     load: Annotated[str | None, Field(description="map file")] = None
     made_from: Annotated[
         FirstDriveSettings | None,
-        Field(
-            description="drive this first, into RUN/first, with this experiment's front-end and "
-            "estimator, and take its map"
-        ),
+        Field(description="drive this first, into RUN/first, with the same settings"),
     ] = None
 
 
@@ -66,15 +62,14 @@ class QuerySettings:
         tuple[Annotated[int, Field(ge=1, le=100)], ...],
         Field(
             min_length=1,
-            description="frames of a query: 1, or a short submap of so many that ends at it; each "
-            "of these numbers is tried with the same queries",
+            description="frames of a query: 1, or a submap of so many",
         ),
     ] = (1,)
     every: Annotated[
         int,
         Field(
             ge=1,
-            description="queries lie so many frames apart; of bursts of random poses their length",
+            description="frames from query to query; of bursts their length",
         ),
     ] = 1
     within_m: Annotated[

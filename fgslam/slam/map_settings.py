@@ -33,16 +33,14 @@ class MapStartSettings:
         int,
         Field(
             ge=1,
-            description="frames searched for the first that can be located; those before it are "
-            "left out of the run",
+            description="frames searched for the first located one; those before are left out",
         ),
     ] = 30
     sigma_m: Annotated[
         float,
         Field(
             gt=0.0,
-            description="standard deviation of the first pose before its landmarks are seen, per "
-            "axis, metres: how well a robot is put back by hand",
+            description="sigma of the first pose per axis, as put back by hand",
         ),
     ] = 0.1
     sigma_deg: Annotated[
@@ -54,9 +52,9 @@ class MapStartSettings:
 class MapSettings:
     """The map that a run is given, and the one that it leaves."""
 
-    load: Annotated[
-        str | None, Field(description="map file to go on with; null starts with an empty map")
-    ] = None
+    load: Annotated[str | None, Field(description="map file to begin in; null: an empty map")] = (
+        None
+    )
     save: Annotated[
         str | None, Field(description="map file to write when the run has finished")
     ] = None
@@ -66,17 +64,14 @@ class MapSettings:
     ] = None
     start: Annotated[
         Literal["relocalise", "origin", "last", "continue"],
-        Field(
-            description="`relocalise`: found in the map without a prior; `origin`, `last`: put "
-            "back where the map's drive began, or stopped; `continue`: the same run goes on"
-        ),
+        Field(description="first pose: found, the map's first or last, or the same run goes on"),
     ] = "relocalise"
-    extend: Annotated[
-        bool, Field(description="false leaves the map as it is: the run only localises in it")
-    ] = True
+    extend: Annotated[bool, Field(description="false: only localise, the map stays as it is")] = (
+        True
+    )
     session: Annotated[
         bool,
-        Field(description="save what `start: continue` needs as well; without it a map is smaller"),
+        Field(description="save also what `start: continue` needs"),
     ] = True
     begin: MapStartSettings = MapStartSettings()
 

@@ -76,9 +76,7 @@ class HousePathSettings:
     ] = 3.0
     rooms: Annotated[
         Literal["house", "hall"],
-        Field(
-            description="`house`: through doors from room to room; `hall`: within the largest room"
-        ),
+        Field(description="`house`: from room to room; `hall`: within the largest"),
     ] = "house"
 
 

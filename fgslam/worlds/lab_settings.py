@@ -80,18 +80,13 @@ class LabDriveSettings(DriveLimits):
     path: Annotated[
         PathName,
         Field(
-            description="in the lab `paper_loop` once around the chair and back to the start, or "
-            "`laps` around the room; in the rooms `tour`, in the corridors `tour` or `one_way`, "
-            "which never returns; anywhere `waypoints` a smooth curve through the given points, "
-            "or `random_poses` with nothing between them"
+            description="lab: `paper_loop`, `laps`; rooms: `tour`; corridors: `tour`, `one_way`; "
+            "any: the others"
         ),
     ] = "paper_loop"
     frames: Annotated[
         Annotated[int, Field(ge=2, le=100_000)] | None,
-        Field(
-            description="exact number of frames (the speed is scaled down to fit); null drives at "
-            "nine tenths of the speed limits; of `random_poses` null makes 200 poses"
-        ),
+        Field(description="number of frames; null: at nine tenths of the speed limits"),
     ] = 249
     laps: Annotated[
         int,
@@ -109,11 +104,7 @@ class LabDriveSettings(DriveLimits):
     ] = RandomPosesSettings()
     world_from: Annotated[
         Literal["paper_loop", "laps", "waypoints", "tour", "one_way"] | None,
-        Field(
-            description="drive of this place whose first camera frame is the world of the ground "
-            "truth, so that truths of several drives agree; null: this drive's own, of "
-            "`random_poses` that of the place's first drive"
-        ),
+        Field(description="drive whose first camera frame is the truth's world; null: this one"),
     ] = None
 
 
@@ -193,8 +184,7 @@ class LabSettings:
     place: Annotated[
         PlaceName,
         Field(
-            description="`lab` a furnished room of 10 m x 10 m; `rooms` an office building of "
-            "36 m x 24 m; `corridors` a square ring of 24 m whose sections all look alike"
+            description="`lab` 10 m x 10 m; `rooms` office of 36 m x 24 m; `corridors` ring of 24 m"
         ),
     ] = "lab"
     rig: LabRigSettings = LabRigSettings()
@@ -206,14 +196,11 @@ class LabSettings:
     ] = 0
     visit: Annotated[
         Literal[1, 2, 3],
-        Field(
-            description="2: chairs, cartons and the like have been moved since the first visit; 3: "
-            "shelves and posters of the lab have been exchanged too"
-        ),
+        Field(description="2: chairs and cartons moved; 3: shelves and posters exchanged too"),
     ] = 1
     posters: Annotated[
         Literal["different", "identical"],
-        Field(description="`identical`: two posters on different walls of the lab are the same"),
+        Field(description="`identical`: two posters on different walls are the same"),
     ] = "different"
 
 

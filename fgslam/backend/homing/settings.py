@@ -23,8 +23,8 @@ class FilterMotionSettings:
         float,
         Field(
             gt=0.0,
-            description="deviation of the heading after a second, degrees: a random walk. The "
-            "filter expects no turning, so that this must cover the robot's turns",
+            description="deviation of the heading after a second, degrees; must cover the "
+            "robot's turns",
         ),
     ] = 20.0
     speed: Annotated[
@@ -47,46 +47,37 @@ class HomingEkfSettings(NamedSettings):
     gauge: Annotated[
         Literal["one_distance", "unit_leg"],
         Field(
-            description="what fixes the scale: `one_distance` that of one feature, the best known, "
-            "as printed; `unit_leg` the distance from start to target"
+            description="scale: `one_distance` that of one feature, as printed; `unit_leg` start to"
+            " target"
         ),
     ] = "unit_leg"
     exact_bearings: Annotated[
         bool,
-        Field(
-            description="the bearings from the start have no variance, as printed; else "
-            "that of the image"
-        ),
+        Field(description="bearings from the start without variance, as printed"),
     ] = False
     target: Annotated[
         Literal["separate", "joint"],
         Field(
-            description="`separate`: a filter of its own, given the target's bearings anew with "
-            "every image, as printed; `joint`: the target is part of the state and its "
-            "bearings count once, in the initial triangulation"
+            description="`joint`: part of the state, bearings used once; `separate`: own filter, as"
+            " printed"
         ),
     ] = "joint"
     map_covariance: Annotated[
         bool,
-        Field(
-            description="target separate: the map's covariance is added to that of the target's "
-            "bearings; as printed it is not"
-        ),
+        Field(description="target separate: add the map's covariance; not printed"),
     ] = True
     gate_sigmas: Annotated[
         float,
         Field(
             ge=0.0,
-            description="bearings whose innovation exceeds so many deviations are left out; 0: "
-            "none is, as printed",
+            description="gate on the innovation of a bearing; 0: none, as printed",
         ),
     ] = 3.0
     max_relative_distance_sigma: Annotated[
         float,
         Field(
             ge=0.0,
-            description="features whose distance has a larger deviation, relative to itself, do "
-            "not enter the map; 0: all enter, as printed",
+            description="largest relative deviation of a feature's distance in the map; 0: any",
         ),
     ] = 0.3
     motion: FilterMotionSettings = FilterMotionSettings()
@@ -126,39 +117,28 @@ class HomingGraphSettings(NamedSettings):
     kind: Literal["homing_graph"] = "homing_graph"
     solver: Annotated[
         Literal["schur", "isam2", "fixed_lag", "batch"],
-        Field(
-            description="`schur` the whole homing anew with every image, in plain arrays: exact "
-            "and fastest; `isam2` GTSAM's, incremental over the whole homing; `fixed_lag` the same "
-            "over the last images, older ones marginalised; `batch` GTSAM's Levenberg-Marquardt "
-            "anew with every image"
-        ),
+        Field(description="`schur` exact, all images; `isam2`, `fixed_lag`, `batch` by GTSAM"),
     ] = "schur"
     kernel: KernelSettings = KernelSettings("cauchy", 2.0)
     elevations: Annotated[
         Literal["none", "two_views", "all"],
         Field(
-            description="`two_views`: those from start and target, a factor for each landmark, in "
-            "place of the direction and rotation that the initialisation found with them: nothing "
-            "counts twice. `none`: direction and rotation as a prior instead. `all`: those of the "
-            "images on the way, too, with a height for each landmark (twice as slow)"
+            description="`two_views`: of start and target; `none`: a prior instead; `all`: of every"
+            " image"
         ),
     ] = "two_views"
     max_relative_distance_sigma: Annotated[
         float,
         Field(
             gt=0.0,
-            description="a feature enters once its distance, triangulated from the start and the "
-            "target or the present place, has a deviation below this part of itself: worse ones "
-            "may cross the camera's centre and take the solution along",
+            description="a feature enters once its relative distance deviation is below this",
         ),
     ] = 0.3
     gate_sigmas: Annotated[
         float,
         Field(
             ge=0.0,
-            description="bearings that miss the landmark, seen from where all of them together "
-            "say the robot is, by more than so many deviations do not enter; where that would be "
-            "most of them, all enter. 0: all do, and the kernel alone deals with wrong ones",
+            description="gate on the misfit of a bearing; 0: none",
         ),
     ] = 4.0
     motion: GraphMotionSettings = GraphMotionSettings()

@@ -52,16 +52,13 @@ class MirrorMountSettings:
         Field(
             ge=-360.0,
             le=360.0,
-            description="direction in the picture of the robot's heading, degrees clockwise from "
-            "the right; -90 is up",
+            description="direction of the robot's heading in the picture, clockwise from the right;"
+            " -90 is up",
         ),
     ] = -90.0
     clockwise: Annotated[
         bool,
-        Field(
-            description="bearings grow clockwise in the picture, as an upward-looking camera's raw "
-            "picture shows them; false where it was mirrored"
-        ),
+        Field(description="bearings grow clockwise, as in an upward-looking camera's raw picture"),
     ] = True
 
 
@@ -83,8 +80,8 @@ class HyperbolicMirrorSettings(MirrorMountSettings):
         float | None,
         Field(
             gt=0.0,
-            description="of the unified model, pixels: the horizon's radius times xi; null: such "
-            "that the outer rim looks to its elevation",
+            description="of the unified model: the horizon's radius times xi; null: by the "
+            "outer rim",
         ),
     ] = None
     inner_radius_px: Annotated[
@@ -95,8 +92,7 @@ class HyperbolicMirrorSettings(MirrorMountSettings):
         float | None,
         Field(
             gt=0.0,
-            description="nothing is seen outside; null: where its elevation is, and without "
-            "focal_px at the picture's nearest border",
+            description="nothing is seen outside; null: by its elevation",
         ),
     ] = None
     inner_elevation_deg: Annotated[
@@ -121,7 +117,7 @@ class OCamCalibSettings(MirrorMountSettings):
     ] = "calib_results.txt"
     ring_px: Annotated[
         Pair | None,
-        Field(description="inner and outer radius that the mirror shows; null: as the file says"),
+        Field(description="inner and outer radius; null: as the file says"),
     ] = None
 
 
@@ -142,8 +138,7 @@ class RadialPolynomialSettings(MirrorMountSettings):
         Field(
             min_length=2,
             max_length=12,
-            description="elevation in degrees over the radius scaled to -1 at the inner and 1 at "
-            "the outer rim, from the constant upward",
+            description="elevation over the radius scaled to [-1, 1], from the constant upward",
         ),
     ] = (-20.0, 45.0)
 

@@ -22,7 +22,7 @@ class SiftSettings:
     ] = 8
     octave_layers: Annotated[
         int,
-        Field(ge=1, le=8, description="levels an octave; 2 is a factor 1.41 a level (paper: 1.5)"),
+        Field(ge=1, le=8, description="levels an octave; 2: factor 1.41 (paper: 1.5)"),
     ] = 2
     contrast_threshold: Annotated[
         float,
@@ -31,8 +31,8 @@ class SiftSettings:
     contrast: Annotated[
         Literal["relative", "absolute"],
         Field(
-            description="`relative`: the threshold is a well exposed image's and falls with the "
-            "contrast of a dark or pale one, down to its noise; `absolute`: always the same"
+            description="`relative`: the threshold falls with an image's contrast, down to its "
+            "noise"
         ),
     ] = "relative"
     base_sigma_px: Annotated[
@@ -52,10 +52,7 @@ class AppearanceSettings:
 
     mode: Annotated[
         Appearance,
-        Field(
-            description="`descriptor`: among candidates that pass all gates the closest descriptor "
-            "wins; `paper`: no descriptors, more than one candidate means none"
-        ),
+        Field(description="`descriptor`: the closest admissible wins; `paper`: none are used"),
     ] = "descriptor"
     max_distance: Annotated[
         float,
@@ -73,10 +70,7 @@ class ColourMomentSettings:
 
     form: Annotated[
         Literal["ratio", "correlation"],
-        Field(
-            description="`ratio`: mean(PQ) / (mean P mean Q), blind to the gain of each band; "
-            "`correlation`: Pearson's, blind to gain and offset"
-        ),
+        Field(description="`ratio`: blind to gain; `correlation`: to gain and offset"),
     ] = "ratio"
 
 
@@ -88,8 +82,7 @@ class UprightSiftSettings:
         float,
         Field(
             ge=0.0,
-            description="OpenCV's contrast threshold (its default is 0.04); low, as dim rooms "
-            "and wide baselines need many weak features",
+            description="OpenCV's contrast threshold (its default is 0.04)",
         ),
     ] = 0.015
     max_features: Annotated[
@@ -103,10 +96,7 @@ class UprightSiftSettings:
     ] = 60.0
     view: Annotated[
         Literal["unwrapped", "raw"],
-        Field(
-            description="of a mirror's or fisheye's image: `raw` describes features along the "
-            "radius where they are, `unwrapped` works on the panorama; panoramas are as they are"
-        ),
+        Field(description="of mirrors and fisheyes: `raw` image, or `unwrapped` panorama"),
     ] = "unwrapped"
 
 
@@ -119,8 +109,7 @@ class OmniMatchingSettings:
         Field(
             gt=0.0,
             le=1.0,
-            description="SIFT: nearest over second nearest distance below this; high, as colour "
-            "and planar gates take wrong ones, and barely distinct ones weigh little",
+            description="SIFT: nearest over second nearest distance below this",
         ),
     ] = 0.9
     root: Annotated[
@@ -133,10 +122,7 @@ class OmniMatchingSettings:
     ] = 0.2
     planar_gates: Annotated[
         bool,
-        Field(
-            description="among candidates, leave out those no planar motion explains: elevations "
-            "of opposite sign, apparent sizes against elevations"
-        ),
+        Field(description="leave out candidates that no planar motion explains"),
     ] = True
 
 

@@ -14,22 +14,20 @@ from fgslam.core.settings import STRICT
 class HomingVectorSettings:
     """Two-point RANSAC, refinement by least squares, refusals (III-B)."""
 
-    samples: Annotated[
-        int, Field(ge=1, description="at most so many random pairs of matches (200 in the paper)")
-    ] = 200
+    samples: Annotated[int, Field(ge=1, description="at most so many samples (paper: 200)")] = 200
     confidence: Annotated[
         float,
         Field(
             gt=0.0,
             lt=1.0,
-            description="stop earlier once a better answer is this unlikely to have been missed",
+            description="probability at which sampling stops earlier",
         ),
     ] = 0.999
     tilt_sigma_deg: Annotated[
         float,
         Field(
             ge=0.0,
-            description="camera's roll and pitch at each view, estimated along with this prior",
+            description="prior of the camera's roll and pitch",
         ),
     ] = 0.5
     height_sigma: Annotated[
@@ -41,16 +39,14 @@ class HomingVectorSettings:
         float,
         Field(
             gt=0.0,
-            description="expected number of equally likely vectors if all matches were wrong; so "
-            "small because wrong matches have common causes (measured on `omni_home`)",
+            description="expected number of such vectors if all matches were wrong",
         ),
     ] = 1e-9
     rival_log_odds: Annotated[
         float,
         Field(
             ge=0.0,
-            description="the answer must be this much likelier (natural log) than any different "
-            "solution; else it is ambiguous",
+            description="least lead (natural log) over any different solution; else ambiguous",
         ),
     ] = 15.0
     rival_angle_deg: Annotated[
@@ -61,17 +57,13 @@ class HomingVectorSettings:
     ] = 4.0
     second_look: Annotated[
         bool,
-        Field(
-            description="two images whose matches do not decide clearly are looked at again with "
-            "all candidate matches: wider baselines, for a third of a second a pair"
-        ),
+        Field(description="match unclear images again with all candidates, at a third of a second"),
     ] = True
     direction_floor_deg: Annotated[
         float,
         Field(
             ge=0.0,
-            description="added to the direction's sigma in quadrature: what the images themselves "
-            "cannot tell: panoramas stitched from several viewpoints, an inexact reference",
+            description="added to the direction's sigma in quadrature, as for stitched panoramas",
         ),
     ] = 0.0
     rotation_floor_deg: Annotated[float, Field(ge=0.0, description="likewise for the rotation")] = (

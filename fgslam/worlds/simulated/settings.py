@@ -19,10 +19,7 @@ class MeasurementWorldSettings:
 
     place: Annotated[
         Literal["room", "corridor"],
-        Field(
-            description="`room`: the rendered lab's walls and furniture, 10 m x 10 m; `corridor`: "
-            "walls along the way, a closed round for path `laps`, else never the same place twice"
-        ),
+        Field(description="`room`: the lab's walls and furniture; `corridor`: walls along the way"),
     ] = "room"
     landmarks: Annotated[
         int, Field(ge=10, le=1_000_000, description="points in the room, or in 100 m of corridor")
@@ -39,17 +36,13 @@ class MeasurementDriveSettings(DriveLimits):
     path: Annotated[
         Literal["lab_loop", "laps", "sharp_turns", "exploring"],
         Field(
-            description="`lab_loop` the paper's drive around the chair; `laps` round after round; "
-            "`sharp_turns` turns on the spot and tight bends; `exploring` on and on through "
+            description="`lab_loop` the paper's; `laps`; `sharp_turns`; `exploring` through "
             "corridors"
         ),
     ] = "lab_loop"
     frames: Annotated[
         Annotated[int, Field(ge=2, le=100_000)] | None,
-        Field(
-            description="exact number of frames (the speed is scaled down to fit; `sharp_turns` "
-            "repeats its round); null: one way at nine tenths of the speed limits"
-        ),
+        Field(description="number of frames; null: one way at nine tenths of the speed limits"),
     ] = 249
     laps: Annotated[int, Field(ge=1, le=1000, description="rounds, for `laps`")] = 1
     length_m: Annotated[
@@ -140,8 +133,7 @@ class SimulatedMeasurementsSettings(FrameSelection):
         Field(
             ge=0.0,
             le=0.9,
-            description="of matched observations that are wrong: another landmark's measurement, "
-            "or anything in the image, half each; flagged nowhere",
+            description="share of wrong matches: another landmark's, or anywhere, half each",
         ),
     ] = 0.0
     odometry_fault: OdometryFaultSettings | None = None
@@ -163,10 +155,7 @@ class SimulatedBearingsSettings:
     ] = 30
     surrounding: Annotated[
         Literal["isotropic", "anisotropic"],
-        Field(
-            description="`isotropic`: points lie all around, at all distances; `anisotropic`: four "
-            "in five on one side, where they are near, the others far, as beside a wall"
-        ),
+        Field(description="`isotropic`: all around; `anisotropic`: four in five near on one side"),
     ] = "isotropic"
     leg_m: Annotated[
         float, Field(gt=0.0, description="from start to target, metres (paper: about 2 m)")

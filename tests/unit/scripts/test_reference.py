@@ -92,8 +92,10 @@ def test_every_key_of_localisation_is_on_the_page(page: str) -> None:
 
 
 def test_item_holds_range_default_and_meaning(page: str) -> None:
-    assert "- `seed` (`0`, integer >= 0): of everything random in the run" in page
-    assert "- `path` (must be given): folder of the recording" in page
+    assert "- `seed` (`0`, >= 0): of everything random in the run" in page
+    assert "- `path` (required): folder of the recording" in page
+    assert "- `stop` (`null`, integer >= 1): " in page
+    assert "- `baseline_m` (`0.1`, (0, 2]): right to left camera" in page
     assert '- `mode` (`"descriptor"` or `"paper"`):' in page
 
 
