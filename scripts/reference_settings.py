@@ -46,8 +46,8 @@ _INTRODUCTION = """# Settings
 
 Every key of an experiment, which is one YAML file (examples in `experiments/`). Any key can be set
 from the command line: `fgslam run CONFIG.yaml --set frontend.sift.octave_layers=3`. The last value
-of a key wins; choosing another `kind` drops the file's keys of the old one. Unknown keys, keys given
-twice, NaN and infinity are refused. `RUN/config.yaml` holds every key with its value.
+of a key wins; choosing another `kind` drops the file's keys of the old one. Unknown keys, keys
+given twice, NaN and infinity are refused. `RUN/config.yaml` holds every key with its value.
 
 A line gives the key, its default, other choices or the range (a bracket includes the limit), and
 its meaning. A default without decimal point takes integers. Units are those of the key's name
