@@ -98,17 +98,16 @@ def _missed(records: Iterable[Record]) -> list[str]:
 def page(record: Record) -> str:
     """One page: each section with its command, bounds and tables."""
     lines = [f"# {record.title}", "", _NOTE.format(record.name)]
-    for paragraph in record.text:
+    for paragraph in (*record.text, *_when(record)):
         lines += ["", *_wrapped(paragraph)]
     for section in record.sections:
-        lines += ["", f"## {section.title}", "", *_section(section, record)]
+        lines += ["", f"## {section.title}", "", *_section(section)]
     return _joined(lines)
 
 
-def _section(section: Section, record: Record) -> Iterator[str]:
-    for paragraph in section.text:
+def _section(section: Section) -> Iterator[str]:
+    for paragraph in (*section.text, *_stored(section)):
         yield from (*_wrapped(paragraph), "")
-    yield from (*_wrapped(_how(section, record)), "")
     if section.commands:
         yield from ("```sh", *_continued(section.commands), "```", "")
     mixed = any(section.sources)
@@ -123,15 +122,19 @@ def _section(section: Section, record: Record) -> Iterator[str]:
             yield from (*_wrapped(note), "")
 
 
-def _how(section: Section, record: Record) -> str:
-    """When the numbers were measured, and whether the page computes them or a person wrote them."""
-    by_hand = f"{_BY_HAND} on {record.date} with fgslam {record.version}"
-    kept = {name: stored(name) for name in section.sources if name}
-    if not kept:
-        return f"Measured {by_hand}:" if section.commands else f"Measured {by_hand}."
-    files = ", ".join(f"`{name}` ({kept[name].date})" for name in kept)
-    rest = f" What is marked was measured {by_hand}." if "" in section.sources else ""
-    return f"Computed from `benchmarks/measured`: {files}.{rest}"
+def _when(record: Record) -> Iterator[str]:
+    """When the numbers were measured that a person wrote down; nothing where there are none."""
+    sources = [section.sources for section in record.sections]
+    if not all(found and all(found) for found in sources):
+        rest = ", where nothing else is said" if any(map(any, sources)) else ""
+        yield f"Measured {_BY_HAND} on {record.date} with fgslam {record.version}{rest}."
+
+
+def _stored(section: Section) -> Iterator[str]:
+    """The stored measurements that the page computes a section's numbers from."""
+    files = ", ".join(f"`{name}` ({stored(name).date})" for name in section.sources if name)
+    if files:
+        yield f"Computed from `benchmarks/measured`: {files}."
 
 
 def _bounds(rows: Iterable[Row], mixed: bool) -> list[str]:
