@@ -21,6 +21,7 @@ from fgslam.cli.performing import (
     same_with_resume,
     show_all,
     under_way,
+    watched_by,
 )
 from fgslam.cli.signals import stop_flag, stoppable
 from fgslam.cli.sweeping import sweep
@@ -71,6 +72,8 @@ def run(  # noqa: PLR0913 - each option is a parameter
     map_in: options.MapIn = None,
     map_out: options.MapOut = None,
     camera_out: options.CameraOut = None,
+    live: options.Live = False,
+    save_rrd: options.SaveRrd = None,
 ) -> None:
     """Map a recording, or run an experiment: images in, run folder out.
 
@@ -99,8 +102,8 @@ def run(  # noqa: PLR0913 - each option is a parameter
 
     if camera_out is not None:
         require_camera(settings, camera_out)
-    with under_way() as (progress, stopped):
-        result = run_experiment(settings, folder, existing, progress, stopped)
+    with watched_by(settings, live, save_rrd) as watch, under_way() as (progress, stopped):
+        result = run_experiment(settings, folder, existing, progress, stopped, watch)
     show_all([result], resume_command(folder))
     if camera_out is not None:
         typer.echo(corrected_camera(folder, camera_out))

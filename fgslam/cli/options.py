@@ -196,6 +196,17 @@ CameraOut = Annotated[
     ),
 ]
 
+Live = Annotated[
+    bool,
+    typer.Option(
+        "--live", help="show the run in the rerun viewer; pip install 'fgslam[viewer]' provides it"
+    ),
+]
+SaveRrd = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.rrd", help="write what --live shows; needs no screen"),
+]
+
 # --------------------------------------------------------------------------------------------
 # inspect, localize, init
 

@@ -14,8 +14,12 @@ from fgslam.cli import signals
 from fgslam.cli.signals import Tell, stop_flag, stoppable
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from fgslam.runs.config_models import Experiment
     from fgslam.runs.engine import RunResult
     from fgslam.runs.folder import ExistingFolder
+    from fgslam.runs.tasks.slam import Watch
 
 EXIT_FAULT = 1
 EXIT_NOT_LOCATED = 3
@@ -28,6 +32,18 @@ def under_way() -> Iterator[tuple[Tell, Callable[[], bool]]]:
 
     with stop_flag() as stopped, progress_bar() as progress:
         yield stoppable(progress, stopped), stopped
+
+
+@contextmanager
+def watched_by(config: Experiment, live: bool, file: Path | None) -> Iterator[Watch | None]:
+    """What shows a run in the viewer, frame by frame; None where nobody watches."""
+    if not live and file is None:
+        yield None
+        return
+    from fgslam.runs.watching import watched
+
+    with watched(config, live, file) as watch:
+        yield watch
 
 
 def show_all(results: Sequence[RunResult], resume: str = "") -> None:

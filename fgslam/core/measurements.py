@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+import numpy as np
+
 from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray, Rows
 
 
@@ -108,3 +110,17 @@ class Increment(Brief):
     loops: tuple[LoopClosure, ...] = ()
     relocalised: bool = False
     rig_correction: FloatArray | None = None
+
+    @property
+    def kept(self) -> Observations:
+        """The observations but for the rejected ones."""
+        return self.observations.select(~self.rejected)
+
+
+def moved_pixels(earlier: Increment | None, now: Increment) -> tuple[FloatArray, FloatArray]:
+    """(column, row) (k, 2), before and now, of the landmarks that both frames saw and kept."""
+    if earlier is None:
+        return np.empty((0, 2)), np.empty((0, 2))
+    before, after = earlier.kept, now.kept
+    _, a, b = np.intersect1d(before.ids, after.ids, return_indices=True)
+    return before.measurement[a, :2], after.measurement[b, :2]

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.arrays import Image, IntArray
 from fgslam.core.errors import ConfigError, DatasetError, FrameError
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Observations
+from fgslam.core.measurements import Increment, moved_pixels
 from fgslam.core.sensors import CameraRig
 from fgslam.core.trajectories import Trajectory
 from fgslam.datasets.film_files import require_film_suffix, write_film
@@ -78,13 +78,14 @@ def _moments(
     pictures: Pictures,
 ) -> Iterator[tuple[int, Moment, IntArray]]:
     """Pose, what is seen there, and the rows of the map that are known by then."""
-    seen, last = np.zeros(len(points), np.bool_), None
+    seen = np.zeros(len(points), np.bool_)
+    last: Increment | None = None
     for increment, row in zip(log, pose_of.tolist(), strict=True):
         if row < 0:
             continue
-        now = increment.observations.select(~increment.rejected)
+        now = increment.kept
         seen |= np.isin(points.ids, now.ids)
-        before, after = _flow(last, now)
+        before, after = moved_pixels(last, increment)
         title = f"{increment.timestamp - log.increments[0].timestamp:.1f} s: {len(after)} matched"
         new = now.measurement[now.is_new, :2]
         yield (
@@ -92,15 +93,7 @@ def _moments(
             Moment(_image(pictures, int(rows[row])), before, after, new, title),
             np.flatnonzero(seen),
         )
-        last = now
-
-
-def _flow(last: Observations | None, now: Observations) -> tuple[FloatArray, FloatArray]:
-    """Pixels (k, 2) before and after of what both frames saw."""
-    if last is None:
-        return np.empty((0, 2)), np.empty((0, 2))
-    _, a, b = np.intersect1d(last.ids, now.ids, return_indices=True)
-    return last.measurement[a, :2], now.measurement[b, :2]
+        last = increment
 
 
 def _image(pictures: Pictures, frame: int) -> Image | None:

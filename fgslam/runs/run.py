@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fgslam.core.errors import ConfigError
 from fgslam.runs.config_models import (
@@ -21,6 +23,9 @@ from fgslam.runs.engine import Opener, RunResult, run_task
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.units import Progress, Stopped
 
+if TYPE_CHECKING:
+    from fgslam.runs.tasks.slam import Watch
+
 
 def run_experiment(
     config: Experiment,
@@ -28,6 +33,7 @@ def run_experiment(
     existing: ExistingFolder = "refuse",
     progress: Progress = lambda what, done, total: None,
     stopped: Stopped = lambda: False,
+    watch: Watch | None = None,
 ) -> RunResult:
     """Runs a configuration into a run folder.
 
@@ -37,14 +43,17 @@ def run_experiment(
         existing: what to do where it holds a run already.
         progress: called after each step of the work.
         stopped: asked after each step; True ends the run early, resumable, with all files valid.
+        watch: called after each frame of SLAM on images; other tasks have nothing to watch.
 
     Raises:
         FgslamError: of any kind, with a message for the user.
     """
-    return run_task(opener_of(config), config, folder, existing, progress, stopped)
+    return run_task(opener_of(config, watch), config, folder, existing, progress, stopped)
 
 
-def opener_of(config: Experiment) -> Opener[RunResult]:  # noqa: C901, PLR0911 - one a task
+def opener_of(  # noqa: C901, PLR0911 - one a task
+    config: Experiment, watch: Watch | None = None
+) -> Opener[RunResult]:
     """What opens the data of a configuration; each task is imported when it is run."""
     match config:
         case ExperimentConfig(on_measurements=True):
@@ -54,7 +63,7 @@ def opener_of(config: Experiment) -> Opener[RunResult]:  # noqa: C901, PLR0911 -
         case ExperimentConfig():
             from fgslam.runs.tasks.slam import open_slam
 
-            return open_slam
+            return partial(open_slam, watch=watch)
         case LocalisationConfig():
             from fgslam.runs.tasks.localisation import open_localisation
 

@@ -1,6 +1,7 @@
 """A run in the rerun viewer: paths, truth, maps, ellipsoids, pictures and numbers over time.
 
-The viewer is an optional package (``pip install fgslam[viewer]``), imported only here.
+The viewer is an optional package (``pip install fgslam[viewer]``), imported only here. A run under
+way is shown by :mod:`fgslam.runs.watching`.
 """
 
 from __future__ import annotations
@@ -8,25 +9,27 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import MissingDependencyError, OutputError
 from fgslam.core.files import replacing
-from fgslam.core.geometry import quaternion_from_rotation
 from fgslam.report.figures.palette import COUNT, ON_DARK
 from fgslam.report.figures.traces import thinned, world_position_covariances
 from fgslam.report.figures.trajectory import level_axes
 from fgslam.report.run_results import EstimatorReport, ReportData
 from fgslam.runs.report import load_report
 
+Colour: TypeAlias = tuple[int, int, int]
+
 SUFFIX = ".rrd"
-_TIMELINE = "time"
+TIMELINE = "time"
 _ELLIPSOIDS = 60
 _SIGMAS = 3.0
-_WHITE = (235, 235, 235)
+WHITE = (235, 235, 235)
 # Three standard deviations of a centimetre are a speck; the smallest that can still be seen.
 _LEAST_RADIUS_M = 1e-4
 
@@ -46,12 +49,12 @@ def view_run(run: Path, save: Path | None) -> str:
         MissingDependencyError: the viewer's package is not installed.
         FgslamError: there are no results, a file is damaged, or writing failed.
     """
-    rerun = _library()
-    if save is not None and save.suffix.lower() != SUFFIX:
-        raise OutputError(f"cannot write {save}: the viewer opens {SUFFIX} files; use that ending")
+    rerun = library()
+    if save is not None:
+        require_writable(save)
     data = load_report(run)
     stream = rerun.RecordingStream(f"fgslam {data.title}")
-    if save is None and _has_screen():
+    if save is None and has_screen():
         stream.spawn()
         _log(rerun, stream, data)
         stream.flush()
@@ -65,17 +68,26 @@ def view_run(run: Path, save: Path | None) -> str:
     return f"{target}: written; open it with: rerun {target}"
 
 
-def _library() -> Any:
+def library() -> Any:
+    """The viewer's package. Raises MissingDependencyError."""
     try:
         import rerun
     except ImportError:
         raise MissingDependencyError(
-            "fgslam view needs the package rerun-sdk; install it: pip install 'fgslam[viewer]'"
+            "the viewer needs the package rerun-sdk; install it: pip install 'fgslam[viewer]'"
         ) from None
     return rerun
 
 
-def _has_screen() -> bool:
+def require_writable(file: Path) -> None:
+    """Raises OutputError where the viewer's file has another ending, or no folder to be in."""
+    if file.suffix.lower() != SUFFIX:
+        raise OutputError(f"cannot write {file}: the viewer opens {SUFFIX} files; use that ending")
+    if not file.parent.is_dir():
+        raise OutputError(f"cannot write {file}: its folder does not exist; choose another folder")
+
+
+def has_screen() -> bool:
     """Whether a window can open: always but on a Linux without a display."""
     named = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     return sys.platform != "linux" or bool(named)
@@ -92,11 +104,11 @@ def _log(rerun: Any, stream: Any, data: ReportData) -> None:
     stream.log("world/first_camera", level, static=True)
     if data.truth is not None:
         positions = data.truth.poses[:, :3, 3]
-        line = rerun.LineStrips3D([positions], colors=[_WHITE], labels=["truth"], show_labels=False)
+        line = rerun.LineStrips3D([positions], colors=[WHITE], labels=["truth"], show_labels=False)
         stream.log("world/first_camera/truth", line, static=True)
     for i, estimator in enumerate(data.estimators):
         if len(estimator):
-            colour = _rgb(ON_DARK[i % COUNT])
+            colour = rgb(ON_DARK[i % COUNT])
             _log_scene(rerun, stream, estimator, colour)
             _log_numbers(rerun, stream, estimator, colour, data.start)
     for i, picture in enumerate(data.pictures):
@@ -113,9 +125,7 @@ def _about(data: ReportData, captions: str) -> str:
     return "\n\n".join(filter(None, parts))
 
 
-def _log_scene(
-    rerun: Any, stream: Any, estimator: EstimatorReport, colour: tuple[int, int, int]
-) -> None:
+def _log_scene(rerun: Any, stream: Any, estimator: EstimatorReport, colour: Colour) -> None:
     place = ["world", "first_camera", estimator.title]
     for name, poses in (("final", estimator.final_poses), ("online", estimator.online_poses)):
         known = poses[np.isfinite(poses).all(axis=(1, 2)), :3, 3]
@@ -127,12 +137,7 @@ def _log_scene(
         stream.log([*place, "landmarks"], dots, static=True)
     centres, half_sizes, quaternions = ellipsoids(estimator)
     if len(centres):
-        shapes = rerun.Ellipsoids3D(
-            centers=centres,
-            half_sizes=half_sizes,
-            quaternions=[rerun.Quaternion(xyzw=q) for q in quaternions],
-            colors=[colour],
-        )
+        shapes = ellipsoid_shapes(rerun, centres, half_sizes, quaternions, colour)
         stream.log([*place, "three_sigma"], shapes, static=True)
 
 
@@ -142,19 +147,32 @@ def ellipsoids(estimator: EstimatorReport) -> tuple[FloatArray, FloatArray, Floa
     known = np.flatnonzero(np.isfinite(covariances).all(axis=(1, 2)))
     rows = known[thinned(len(known), _ELLIPSOIDS)]
     poses = estimator.final_poses[rows]
-    variances, axes = np.linalg.eigh(world_position_covariances(poses, covariances[rows]))
+    half, turns = half_axes(world_position_covariances(poses, covariances[rows]))
+    return poses[:, :3, 3], half, turns
+
+
+def ellipsoid_shapes(
+    rerun: Any, centres: FloatArray, half: FloatArray, turns: FloatArray, colour: Colour
+) -> Any:
+    """Ellipsoids (k) as the viewer draws them."""
+    return rerun.Ellipsoids3D(centers=centres, half_sizes=half, quaternions=turns, colors=[colour])
+
+
+def half_axes(covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Half axes (k, 3) of three sigma, and turns (k, 4) x y z w, of covariances (k, 3, 3)."""
+    variances, axes = np.linalg.eigh(covariances)
     # Of the two handednesses that the axes may have, turns know one.
     axes[:, :, 0] *= np.where(np.linalg.det(axes) < 0.0, -1.0, 1.0)[:, None]
     half = _SIGMAS * np.sqrt(np.maximum(variances, (_LEAST_RADIUS_M / _SIGMAS) ** 2))
-    turns = np.array([quaternion_from_rotation(a) for a in axes]).reshape(-1, 4)
-    return poses[:, :3, 3], half, turns
+    turns = Rotation.from_matrix(axes).as_quat() if len(axes) else np.empty((0, 4))
+    return half, turns
 
 
 def _log_numbers(
     rerun: Any,
     stream: Any,
     estimator: EstimatorReport,
-    colour: tuple[int, int, int],
+    colour: Colour,
     start: float,
 ) -> None:
     """Curves over time; frames whose value is not known are left out."""
@@ -172,7 +190,7 @@ def _log_numbers(
         stream.log(place, style, static=True)
         stream.send_columns(
             place,
-            [rerun.TimeColumn(_TIMELINE, duration=estimator.timestamps[known] - start)],
+            [rerun.TimeColumn(TIMELINE, duration=estimator.timestamps[known] - start)],
             rerun.Scalars.columns(scalars=values[known]),
         )
 
@@ -181,6 +199,7 @@ def _media(picture: bytes) -> str:
     return "image/png" if picture.startswith(b"\x89PNG") else "image/jpeg"
 
 
-def _rgb(colour: str) -> tuple[int, int, int]:
+def rgb(colour: str) -> Colour:
+    """Red, green and blue of #rrggbb."""
     red, green, blue = bytes.fromhex(colour[1:])
     return red, green, blue

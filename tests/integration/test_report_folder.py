@@ -226,7 +226,7 @@ def test_without_the_extra_one_line_says_how_to_get_it(
         view_run(finished.folder, None)
     assert main(monkeypatch, "view", finished.folder) == 2
     (line,) = capfd.readouterr().err.splitlines()
-    assert line.startswith("fgslam: fgslam view needs the package rerun-sdk")
+    assert line.startswith("fgslam: the viewer needs the package rerun-sdk")
 
 
 def test_the_viewer_s_file_has_its_ending(finished: Finished, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from fgslam.core.errors import DatasetError
 from fgslam.core.recordings import Sequence
@@ -47,6 +47,9 @@ from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import FrameReport
 from fgslam.slam.session import Session
+
+Watch: TypeAlias = Callable[[RunOutputs, FrameReport], None]
+"""Called after each frame, with all that the run has computed; changes nothing of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,19 +195,21 @@ class SlamResult(RunResult):
     pictures: tuple[Path, ...] = ()
 
 
-def open_slam(config: ExperimentConfig, opening: Opening) -> Task[SlamResult]:
+def open_slam(
+    config: ExperimentConfig, opening: Opening, watch: Watch | None = None
+) -> Task[SlamResult]:
     """Opens recording and map. Raises FgslamError."""
     opened = open_run(config, opening)
-    return Task(opened.provenance, lambda context: _run(opened, context))
+    return Task(opened.provenance, lambda context: _run(opened, context, watch))
 
 
-def _run(opened: OpenedRun, context: Context) -> SlamResult:
+def _run(opened: OpenedRun, context: Context, watch: Watch | None) -> SlamResult:
     """The drive that makes the map, where the run asks for one, and the run itself."""
     ended = drive_first(opened.config, context)
     if ended is not None and ended.status == "interrupted":
         return ended
     outputs = begin(opened, context.progress)
-    saved = _loop(outputs, context.progress, context.stopped)
+    saved = _loop(outputs, context.progress, context.stopped, watch)
     if saved is not None:
         return _result(outputs, "interrupted", saved)
     return _finish(outputs, context)
@@ -229,7 +234,10 @@ def drive_first(config: ExperimentConfig, context: Context) -> SlamResult | None
 
 
 def _loop(
-    outputs: RunOutputs, progress: Progress, stopped: Callable[[], bool]
+    outputs: RunOutputs,
+    progress: Progress,
+    stopped: Callable[[], bool],
+    watch: Watch | None = None,
 ) -> EstimatorMetrics | None:
     """Processes the remaining frames; what was saved when stopped before the last one, or None."""
     sequence, recorder = outputs.sequence, outputs.recorder
@@ -245,6 +253,8 @@ def _loop(
             report = _advance(outputs, found, wait_ms)
             if found.i in shown:
                 draw_frame(outputs, found.i, report)
+            if watch is not None:
+                watch(outputs, report)
             progress("tracking", len(recorder), len(sequence))
             done = len(recorder) == len(sequence)
             if not done and stopped():

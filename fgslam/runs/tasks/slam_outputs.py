@@ -13,7 +13,7 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import Estimate, Trajectory
 from fgslam.core.files import make_subfolder
-from fgslam.core.measurements import Increment
+from fgslam.core.measurements import moved_pixels
 from fgslam.core.recordings import Sequence
 from fgslam.evaluation.judging import Truth, closure_counts
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
@@ -308,10 +308,7 @@ def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
         draw_features(folder / f"features_{i:06d}.png", images, report.found.features, title)
     draw_disparities(folder / f"disparities_{i:06d}.png", images[0], report.stereo.pixels, title)
     if len(outputs.recorder.log) > 1:
-        earlier, now = outputs.recorder.log.increments[-2:]
-        a, b = _common(earlier, now)
-        before = earlier.observations.measurement[a, :2]
-        after = now.observations.measurement[b, :2]
+        before, after = moved_pixels(*outputs.recorder.log.increments[-2:])
         draw_flow(folder / f"flow_{i:06d}.png", images[0], before, after, title)
 
 
@@ -396,16 +393,6 @@ def _results(figures: RunFigures) -> ReportData:
     return ReportData(
         title=figures.name, subtitle="", estimators=(report,), truth=truth, up=figures.up
     )
-
-
-def _common(earlier: Increment, now: Increment) -> tuple[IntArray, IntArray]:
-    """Rows of the landmarks that both frames saw, rejected ones left out."""
-    _, a, b = np.intersect1d(
-        earlier.observations.ids[~earlier.rejected],
-        now.observations.ids[~now.rejected],
-        return_indices=True,
-    )
-    return np.flatnonzero(~earlier.rejected)[a], np.flatnonzero(~now.rejected)[b]
 
 
 def _title(outputs: RunOutputs, what: str) -> str:
