@@ -53,7 +53,7 @@ def test_help_of_the_whole(monkeypatch: Patch, capfd: Capture) -> None:
 @pytest.mark.parametrize(
     ("verb", "words"),
     [
-        ("run", ("e.g. lab_loop", "--out", "--set", "--overwrite", "--resume")),
+        ("run", ("e.g. lab_loop", "--out", "--set", "--overwrite", "--resume", "--save-rrd")),
         (
             "export",
             (
