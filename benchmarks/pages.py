@@ -14,7 +14,7 @@ PAGES = Path(__file__).parents[1] / "docs" / "results"
 WIDTH = 118
 _NOTE = "<!-- Made by `python -m benchmarks pages` from benchmarks/results/{}.json: edit that. -->"
 _BY_HAND = "by hand"
-_WORDS = {True: "met", False: "**missed**", None: ""}
+_MISSED = ", **missed**"
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "Mapping and localisation": (
@@ -72,17 +72,15 @@ def overview(records: dict[str, Record]) -> str:
         ),
     ]
     for group, names in GROUPS.items():
-        counts = [_counted(records[name]) for name in names]
-        lines += ["", f"## {group}", "", *grid(("", "bounds", "met", "missed"), counts)]
+        lines += ["", f"## {group}", "", *(_counted(records[name]) for name in names)]
     lines += ["", "## Missed", "", *_missed(records.values())]
     return _joined(lines)
 
 
-def _counted(record: Record) -> tuple[str, ...]:
+def _counted(record: Record) -> str:
     met = sum(row.met is True for row in record.rows)
-    missed = len(record.rows) - met
-    link = f"[{record.title}]({record.name}.md)"
-    return link, str(len(record.rows)), str(met), f"**{missed}**" if missed else ""
+    of = len(record.rows)
+    return f"- [{record.title}]({record.name}.md)" + (f": {met} of {of} bounds met" if of else "")
 
 
 def _missed(records: Iterable[Record]) -> list[str]:
@@ -138,17 +136,16 @@ def _stored(section: Section) -> Iterator[str]:
 
 
 def _bounds(rows: Iterable[Row], mixed: bool) -> list[str]:
-    """Numbers beside their bounds, met or missed, as a Markdown table."""
+    """Numbers beside their bounds, the missed ones marked, as a Markdown table."""
     cells = [
         (
             r.name,
             shown_number(r) + (f" ({_BY_HAND})" if mixed and not r.source else ""),
-            shown_bound(r),
-            _WORDS[r.met],
+            shown_bound(r) + (_MISSED if r.met is False else ""),
         )
         for r in rows
     ]
-    return grid(("", "measured", "bound", ""), cells)
+    return grid(("", "measured", "bound"), cells)
 
 
 def fitted(table: Table, width: int = WIDTH) -> list[str]:

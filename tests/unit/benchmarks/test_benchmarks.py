@@ -173,7 +173,7 @@ def test_pages_compute_numbers_from_stored_measurements(measured: Path, tmp_path
     assert [row.measured for row in rows] == [1.23456, 1.0, 0.5, 7.25]
     assert [row.met for row in rows[:2]] == [False, True]
     text = page(record)
-    assert "| ATE | 1.23 cm | < 1 cm | **missed** |" in text
+    assert "| ATE | 1.23 cm | < 1 cm, **missed** |" in text
     assert "| written down | 7.25 (by hand) |" in text
     assert "| 2.00 | worst |" in text
     assert "| lab | 1.23 |" in text
