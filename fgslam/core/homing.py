@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
-from fgslam.core.planar import between, rotation, wrap
+from fgslam.core.planar import between, wrap
 
 
 def among(ids: IntArray, others: IntArray) -> BoolArray:
@@ -26,7 +26,8 @@ def among(ids: IntArray, others: IntArray) -> BoolArray:
     """
     if not len(others):
         return np.zeros(len(ids), np.bool_)
-    return np.asarray(others[np.minimum(np.searchsorted(others, ids), len(others) - 1)] == ids)
+    places = others.searchsorted(ids)
+    return np.asarray(others[np.minimum(places, len(others) - 1, out=places)] == ids)
 
 
 # --------------------------------------------------------------------------------------------
@@ -303,7 +304,7 @@ def home_vector_jacobian(robot: FloatArray, target: FloatArray) -> FloatArray:
     distance = float(np.hypot(*offset))
     with np.errstate(divide="ignore", invalid="ignore"):
         along = offset / distance
-        across = rotation(np.pi / 2) @ along / distance
+        across = np.array([-along[1], along[0]]) / distance
     out = np.zeros((3, 6))
     out[0, :2], out[0, 3:5] = -along, along
     out[1, :2], out[1, 2], out[1, 3:5] = -across, -1.0, across

@@ -23,13 +23,18 @@ def wrap(angle: FloatArray) -> FloatArray:
 
 def wrapped_pose(pose: FloatArray) -> FloatArray:
     """(3,) the same pose, its heading within half a turn: steps of a solver may lead beyond."""
-    return np.append(pose[:2], wrap(pose[2:]))
+    out = np.array(pose, dtype=np.float64)
+    out[2:] = wrap(out[2:])
+    return out
 
 
 def unit(angle: FloatArray) -> FloatArray:
     """(..., 2) unit vectors (cos, sin) of angles (...)."""
     angle = np.asarray(angle, dtype=np.float64)
-    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    out = np.empty((*angle.shape, 2))  # what stacks its parts takes longer than their sines
+    np.cos(angle, out=out[..., 0])
+    np.sin(angle, out=out[..., 1])
+    return out
 
 
 def rotation(angle: float) -> FloatArray:
@@ -44,7 +49,7 @@ def compose(aTb: FloatArray, bTc: FloatArray) -> FloatArray:
     c, s = np.cos(aTb[..., 2]), np.sin(aTb[..., 2])
     x = aTb[..., 0] + c * bTc[..., 0] - s * bTc[..., 1]
     y = aTb[..., 1] + s * bTc[..., 0] + c * bTc[..., 1]
-    return np.stack([x, y, wrap(aTb[..., 2] + bTc[..., 2])], axis=-1)
+    return _poses(x, y, aTb[..., 2] + bTc[..., 2])
 
 
 def inverse(aTb: FloatArray) -> FloatArray:
@@ -53,7 +58,14 @@ def inverse(aTb: FloatArray) -> FloatArray:
     c, s = np.cos(aTb[..., 2]), np.sin(aTb[..., 2])
     x = -c * aTb[..., 0] - s * aTb[..., 1]
     y = s * aTb[..., 0] - c * aTb[..., 1]
-    return np.stack([x, y, wrap(-aTb[..., 2])], axis=-1)
+    return _poses(x, y, -aTb[..., 2])
+
+
+def _poses(x: FloatArray, y: FloatArray, turn: FloatArray) -> FloatArray:
+    """(..., 3) of coordinates and headings (...), these still to be wrapped."""
+    out = np.empty((*np.shape(x), 3))
+    out[..., 0], out[..., 1], out[..., 2] = x, y, wrap(turn)
+    return out
 
 
 def between(wTa: FloatArray, wTb: FloatArray) -> FloatArray:
@@ -73,6 +85,7 @@ def bearings(wTr: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def circular_median(angles: FloatArray) -> float:
-    """The angle of (n,), n > 0, with the least sum of absolute differences to all."""
-    apart = np.abs(wrap(angles[:, None] - angles[None, :]))
+    """The angle of (n,) wrapped ones, n > 0, with the least sum of absolute differences to all."""
+    apart = np.abs(angles[:, None] - angles)
+    apart = np.minimum(apart, np.abs(2.0 * np.pi - apart))
     return float(angles[int(np.argmin(apart.sum(axis=0)))])

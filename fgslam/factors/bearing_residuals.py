@@ -23,9 +23,12 @@ def bearing(pose: FloatArray, points: FloatArray, measured: FloatArray) -> Float
 def bearing_jacobians(pose: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Derivatives of bearings by the pose, (n, 3), and by their points, (n, 2)."""
     offset = points - pose[:2]
-    squared = np.einsum("ij,ij->i", offset, offset)[:, None]
-    across = np.column_stack([-offset[:, 1], offset[:, 0]]) / squared
-    return np.column_stack([-across, np.full(len(points), -1.0)]), across
+    squared = np.einsum("ij,ij->i", offset, offset)
+    by_pose, across = np.empty((len(points), 3)), np.empty((len(points), 2))
+    np.divide(-offset[:, 1], squared, out=across[:, 0])
+    np.divide(offset[:, 0], squared, out=across[:, 1])
+    by_pose[:, :2], by_pose[:, 2] = -across, -1.0
+    return by_pose, across
 
 
 def polar_points(polar: FloatArray) -> FloatArray:
@@ -36,8 +39,10 @@ def polar_points(polar: FloatArray) -> FloatArray:
 def polar_jacobians(polar: FloatArray) -> FloatArray:
     """(n, 2, 2) derivatives of :func:`polar_points` by (distance, bearing)."""
     along = unit(polar[:, 1])
-    across = np.column_stack([-along[:, 1], along[:, 0]])
-    return np.stack([along, polar[:, :1] * across], axis=-1)
+    out = np.empty((len(polar), 2, 2))
+    out[:, :, 0] = along
+    out[:, 0, 1], out[:, 1, 1] = -polar[:, 0] * along[:, 1], polar[:, 0] * along[:, 0]
+    return out
 
 
 def target_pose(target: FloatArray) -> FloatArray:

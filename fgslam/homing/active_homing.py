@@ -233,8 +233,9 @@ def _misfit(pose: FloatArray, landmarks: FloatArray, seen: FloatArray) -> float:
     known = np.isfinite(landmarks).all(axis=1)
     if np.count_nonzero(known) < _FEWEST:
         return float("nan")
-    residuals = wrap(seen[known] - bearings(pose, landmarks[known]))
-    return float(np.median(np.abs(residuals)))
+    ordered = np.sort(np.abs(wrap(seen[known] - bearings(pose, landmarks[known]))))
+    # NumPy's own median takes ten times as long for so few, and this is asked with every image.
+    return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 
 def parallax(matches: BearingMatches, rotation: float) -> float:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from scipy.linalg import lapack
 
 from fgslam.backend.homing.estimator import TrackedFeatures
 from fgslam.backend.homing.settings import FilterMotionSettings, HomingEkfSettings
@@ -219,7 +220,7 @@ def _seen(
     polar = state.polar
     points = polar_points(polar)
     by_pose, by_point = bearing_jacobians(pose, points)
-    by_polar = (by_point[:, None] @ polar_jacobians(polar))[:, 0]
+    by_polar = np.einsum("ni,nij->nj", by_point, polar_jacobians(polar))
     return by_pose, by_polar, -bearing(pose, points, measured)
 
 
@@ -323,10 +324,10 @@ def updated(
         gate_sigmas: innovations beyond so many of their own deviations are left out; 0: none.
         extra: (m, m) covariance of the measurement besides its own variances.
     """
-    noise = np.diag(seen.variance) if extra is None else np.diag(seen.variance) + extra
     jacobian, innovation = seen.jacobian, seen.innovation
-    finite = np.asarray(np.isfinite(jacobian).all(axis=1))
-    if not finite.all():
+    noise = np.diag(seen.variance) if extra is None else np.diag(seen.variance) + extra
+    if not np.isfinite(jacobian).all():
+        finite = np.asarray(np.isfinite(jacobian).all(axis=1))
         jacobian, innovation, noise = _rows(finite, jacobian, innovation, noise)
     crossed = state.covariance @ jacobian.T
     expected = jacobian @ crossed + noise
@@ -334,12 +335,22 @@ def updated(
     if gate_sigmas > 0.0 and not near.all():
         jacobian, innovation, noise = _rows(near, jacobian, innovation, noise)
         crossed, expected = crossed[:, near], expected[np.ix_(near, near)]
-    gain = np.linalg.solve(expected, crossed.T).T
+    gain = _solved(expected, crossed.T).T
     # Joseph's (1 - K H) P (1 - K H)^T + K R K^T without products of two matrices of P's size.
     left = state.covariance - gain @ crossed.T
     covariance = left - (left @ jacobian.T - gain @ noise) @ gain.T
     mean = state.mean + gain @ innovation
     return FilterState(state.ids, mean, 0.5 * (covariance + covariance.T))
+
+
+def _solved(expected: FloatArray, right: FloatArray) -> FloatArray:
+    """(m, k) of a covariance (m, m); by elimination where rounding has left it indefinite.
+
+    Raises:
+        numpy.linalg.LinAlgError: it is singular.
+    """
+    _, solved, info = lapack.dposv(expected, right, lower=1)
+    return np.linalg.solve(expected, right) if info else np.asarray(solved)
 
 
 def _rows(

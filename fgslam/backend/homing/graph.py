@@ -8,8 +8,9 @@ each image adds, with first guesses; :mod:`fgslam.backend.homing.schur_solver` a
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import repeat
 from typing import Any, ClassVar
 
 import numpy as np
@@ -121,8 +122,7 @@ class HomingProblem:
         pose, fits = self._resected(tracked, taken & self._entered[rows], before, points)
         new = NewPart(image, pose, before.velocity, (before.time, tracked.time))
         entering = self._enter_seen(new, rows, tracked, taken & ~self._entered[rows], before)
-        for k in np.flatnonzero(fits | entering).tolist():
-            self._see(new, int(rows[k]), tracked, k)
+        self._see(new, rows, tracked, fits | entering)
         return new
 
     def _resected(
@@ -148,12 +148,17 @@ class HomingProblem:
         fits[seen] = ~misses & (self._missed[numbers] == 0)
         return pose, fits
 
-    def _see(self, new: NewPart, row: int, tracked: TrackedBearings, k: int) -> None:
-        measured, sigma = float(tracked.bearing[k]), float(tracked.sigma_bearing[k])
-        new.bearings.append(Sight(new.image, row, measured, sigma))
-        if self._tall[row] and np.isfinite(tracked.elevation[k]):
-            measured, sigma = float(tracked.elevation[k]), float(tracked.sigma_elevation[k])
-            new.elevations.append(Sight(new.image, row, measured, sigma))
+    def _see(
+        self, new: NewPart, rows: IntArray, tracked: TrackedBearings, which: BoolArray
+    ) -> None:
+        """Notes what is seen of landmarks ``rows`` (m,), where ``which`` (m,) says so."""
+        new.bearings += _sights(
+            new.image, rows[which], tracked.bearing[which], tracked.sigma_bearing[which]
+        )
+        tall = which & self._tall[rows] & np.isfinite(tracked.elevation)
+        new.elevations += _sights(
+            new.image, rows[tall], tracked.elevation[tall], tracked.sigma_elevation[tall]
+        )
 
     # ----------------------------------------------------------------------------------------
     # Landmarks
@@ -273,6 +278,11 @@ class HomingProblem:
         self._sighted[rows] = np.column_stack([distance, spread])
 
 
+def _sights(view: int, rows: IntArray, measured: FloatArray, sigma: FloatArray) -> Iterator[Sight]:
+    """Of one view: landmarks (k,), values and deviations."""
+    return map(Sight, repeat(view), rows.tolist(), measured.tolist(), sigma.tolist())
+
+
 def _drift(motion: GraphMotionSettings, step: float) -> FloatArray:
     """(3,) how far the robot may be from where it is expected: place in legs, heading."""
     place = max(motion.forward, motion.sideways) * step**0.5
@@ -309,12 +319,18 @@ def resected(
 
     def linearised(poses: FloatArray, iteration: int) -> Linearised:
         pose = poses[0]
-        residual = bearing(pose, points, measured) / sigma
-        by_pose = bearing_jacobians(pose, points)[0] / sigma[:, None]
-        weighted = by_pose / (1.0 + (residual / _WIDTH) ** 2)[:, None]
-        normal = weighted.T @ by_pose + np.diag(information)
-        gradient = weighted.T @ residual + information * (pose - predicted)
+        dx, dy = x - pose[0], y - pose[1]
+        squared = sigma * (dx * dx + dy * dy)
+        residual = wrap(np.arctan2(dy, dx) - (measured + pose[2])) / sigma
+        by_pose[0], by_pose[1] = dy / squared, -dx / squared
+        weighted = by_pose / (1.0 + (residual / _WIDTH) ** 2)
+        normal = weighted @ by_pose.T + known
+        gradient = weighted @ residual + information * (pose - predicted)
         return normal[None], gradient[None]
+
+    (x, y), known = points.T, np.diag(information)
+    by_pose = np.empty((3, len(points)))
+    by_pose[2] = -1.0 / sigma
 
     return np.asarray(_SEARCH.minimise(predicted[None], linearised)[0])
 

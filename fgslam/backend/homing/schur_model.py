@@ -109,10 +109,17 @@ class Sights:
         self._table = np.zeros((2, 0, 0))
         self.any = False
 
-    def put(self, view: int, landmark: int, measured: float, sigma: float) -> None:
-        """Notes one; ``view`` 0 is the target, 1 the start."""
-        self._reach(view + 1, landmark + 1)
-        self._table[:, view, landmark] = measured, sigma**-2.0
+    def put(self, sights: list[Sight], landmarks: dict[int, int]) -> None:
+        """Notes some, of landmarks whose numbers are those of their rows.
+
+        Of the views the target is 0 here, the start 1.
+        """
+        if not sights:
+            return
+        views, rows, measured, sigmas = zip(*sights, strict=True)
+        at = np.array(views) + 1, np.array([landmarks[row] for row in rows])
+        self._reach(int(at[0].max()) + 1, int(at[1].max()) + 1)
+        self._table[0][at], self._table[1][at] = measured, np.array(sigmas) ** -2.0
         self.any = True
 
     def drop(self, view: int, landmark: int) -> None:
@@ -205,10 +212,8 @@ class SchurModel:
             self._motions = np.concatenate([self._motions, information])
         for row in new.points:
             self._enter(row, new)
-        for sight in new.bearings:
-            self._note(self._bearings, sight)
-        for sight in new.elevations:
-            self._note(self._elevations, sight)
+        self._bearings.put(new.bearings, self.landmarks)
+        self._elevations.put(new.elevations, self.landmarks)
         for pair in new.pairs:
             self._pairs.put(self.landmarks[pair.row], pair)
         chain = np.vstack([state.chain, np.append(new.pose, new.velocity)])
@@ -223,9 +228,6 @@ class SchurModel:
         self.landmarks[row] = len(self._places)
         self._places = np.vstack([self._places, place])
         self._place_informations = np.vstack([self._place_informations, information])
-
-    def _note(self, sights: Sights, sight: Sight) -> None:
-        sights.put(sight.view + 1, self.landmarks[sight.row], sight.measured, sight.sigma)
 
     # ----------------------------------------------------------------------------------------
     # Residuals and cost

@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 from numpy.linalg import LinAlgError
-from scipy.linalg import cho_factor, cho_solve, lapack
+from scipy.linalg import lapack
 
 from fgslam.backend.homing.graph_parts import NewPart
 from fgslam.backend.homing.schur_model import STATE, Look, NormalEquations, SchurModel, State
@@ -65,10 +65,10 @@ class Factored:
         reduced = e.border - crossed.T @ crossed
         if damping > 0.0:
             reduced[np.diag_indices(m)] += damping * np.diagonal(e.border)
-        self._reduced = cho_factor(reduced, lower=True, check_finite=False)
-        self.border = -cho_solve(
-            self._reduced, e.border_gradient - crossed.T @ gradient[:, 0], check_finite=False
-        )
+        self._reduced, info = lapack.dpotrf(reduced, lower=1, clean=0, overwrite_a=1)
+        if info != 0:
+            raise LinAlgError("target and landmarks are not determined")
+        self.border = -self._solved(e.border_gradient - crossed.T @ gradient[:, 0])
         left = gradient[:, 0] + crossed @ self.border
         chain, _ = lapack.dtbtrs(band, left[:, None], uplo="L", trans="T")
         self.chain = -chain.reshape(count, STATE)
@@ -77,9 +77,13 @@ class Factored:
         """Length of the step in its own deviations."""
         self._carried = self._end.T @ crossed
 
+    def _solved(self, right: FloatArray) -> FloatArray:
+        """The reduced border's solutions for (m,) or (m, k)."""
+        return np.asarray(lapack.dpotrs(self._reduced, right, lower=1)[0])
+
     def border_covariance(self) -> FloatArray:
         """(m, m) of target and landmarks."""
-        return np.asarray(cho_solve(self._reduced, np.eye(self._size), check_finite=False))
+        return self._solved(np.eye(self._size))
 
     def covariance(self, columns: IntArray) -> FloatArray:
         """Joint covariance (3 + k) of the last image's pose and numbers (k,) of the border."""
@@ -87,7 +91,7 @@ class Factored:
         chosen = np.zeros((self._size, k + 3))
         chosen[columns, np.arange(k)] = 1.0
         chosen[:, k:] = self._carried.T
-        solved = cho_solve(self._reduced, chosen, check_finite=False)
+        solved = self._solved(chosen)
         out = np.empty((3 + k, 3 + k))
         out[:3, :3] = self._end.T @ self._end + self._carried @ solved[:, k:]
         out[3:, :3] = -solved[columns, k:]

@@ -57,7 +57,8 @@ class ReferencePatches(Rows):
 
     def deformation(self) -> FloatArray:
         """(n,) Frobenius norm of how far each map is from none."""
-        return np.asarray(np.linalg.norm(self.maps - np.eye(2), axis=(1, 2)), dtype=np.float64)
+        change = self.maps - np.eye(2)
+        return np.asarray(np.sqrt(np.einsum("nij,nij->n", change, change)))
 
 
 def anchor(
@@ -108,7 +109,7 @@ def align(
     gain = np.clip(level[:, 1:], *_GAIN)
     rest = (seen - level[:, :1]) / gain - patches.first
     change = (patches.step @ rest[:, :, None])[:, :, 0].astype(np.float64)
-    maps = patches.maps @ np.linalg.inv(np.eye(2) + change[:, 2:].reshape(-1, 2, 2))
+    maps = patches.maps @ _inverse(np.eye(2) + change[:, 2:].reshape(-1, 2, 2))
     move = -(maps @ change[:, :2, None])[:, :, 0]
     unlike = _spread(rest, _weight(patches.size)) / np.maximum(patches.contrast, _FLAT)
     correlation = 1.0 / np.hypot(1.0, unlike)
@@ -124,6 +125,19 @@ def align(
     )
     moved = np.where(good[:, None], places + move, places)
     return fitted, moved, np.where(good, correlation, -1.0)
+
+
+def _inverse(maps: FloatArray) -> FloatArray:
+    """(n, 2, 2) inverses of matrices (n, 2, 2), whatever they are: not finite where there is none.
+
+    A patch may be crushed to nothing by one step; it is lost then, no error.
+    """
+    (a, b), (c, d) = maps[:, 0].T, maps[:, 1].T
+    out = np.empty_like(maps)
+    out[:, 0, 0], out[:, 0, 1], out[:, 1, 0], out[:, 1, 1] = d, -b, -c, a
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out /= (a * d - b * c)[:, None, None]
+    return out
 
 
 def _with_slopes(

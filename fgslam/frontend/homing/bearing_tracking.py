@@ -171,7 +171,7 @@ class BearingTracker:
         kinds = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT
         criteria = (kinds, _ITERATIONS, _PRECISION_PX)
         start = np.empty_like(origin)  # not read without the flag
-        alike = _in_light_of(before.grey, now.grey)
+        alike = _in_light_of(before, now)
         found, good, _ = cv2.calcOpticalFlowPyrLK(
             before.grey, alike, origin, start, None, None,
             window, _PYRAMID_LEVELS, criteria, 0, MIN_EIGENVALUE,
@@ -214,20 +214,18 @@ def _anchored(image: StabilisedImage, places: FloatArray) -> ReferencePatches:
     return anchor(image.grey, places, PATCH_PX, _PATCH_NOISE_GREY, _PATCH_DEFORMATION)
 
 
-def _in_light_of(before: Image, now: Image) -> Image:
+def _in_light_of(before: StabilisedImage, now: StabilisedImage) -> Image:
     """The present view with mean and contrast of the one before.
 
     OpenCV's tracker takes a brighter exposure for motion wherever contrast is low.
     """
-    (mean, spread), (mean_now, spread_now) = (
-        (float(m[0, 0]), float(s[0, 0])) for m, s in map(cv2.meanStdDev, (before, now))
-    )
+    (mean, spread), (mean_now, spread_now) = before.light, now.light
     gain = float(np.clip(spread / max(spread_now, 1.0), *_GAIN))
     offset = mean - gain * mean_now
     if abs(gain - 1.0) < _SAME_GAIN and abs(offset + (gain - 1.0) * mean_now) < _SAME_LEVEL:
-        return now
+        return now.grey
     levels = np.clip(np.round(gain * np.arange(256) + offset), 0, 255).astype(np.uint8)
-    return np.asarray(cv2.LUT(now, levels), dtype=np.uint8)
+    return np.asarray(cv2.LUT(now.grey, levels), dtype=np.uint8)
 
 
 # --------------------------------------------------------------------------------------------

@@ -35,11 +35,13 @@ class StabilisedImage:
         grey: (height, period + 2 margin) view, its rows continued on both sides.
         bands: (bands, period) complex spectra of bands of rows, of the view *before* any shift.
         shift: columns by which the view was moved to the right, modulo the period.
+        light: mean and standard deviation of the grey values.
     """
 
     grey: Image
     bands: npt.NDArray[np.complex128]
     shift: int
+    light: tuple[float, float]
 
 
 class StabilisedView:
@@ -86,10 +88,18 @@ class StabilisedView:
             turned = _common_shift(before.bands, bands, self.period, max_shift)
             # The picture moved right by `turned` columns: undo it on top of what was undone before.
             shift = (before.shift - turned) % self.period
-        first = (-shift - self.margin) % self.period
-        last = first + self.period + 2 * self.margin
-        repeated = np.concatenate([grey] * -(-last // self.period), axis=1)
-        return StabilisedImage(repeated[:, first:last], bands, shift)
+        view = self._continued(grey, (-shift - self.margin) % self.period)
+        mean, spread = cv2.meanStdDev(view)
+        return StabilisedImage(view, bands, shift, (float(mean[0, 0]), float(spread[0, 0])))
+
+    def _continued(self, grey: Image, first: int) -> Image:
+        """(height, period + 2 margin) columns from the ``first`` on, the view over and over."""
+        wanted, parts = self.period + 2 * self.margin, []
+        while wanted > 0:
+            parts.append(grey[:, first : first + wanted])
+            wanted -= parts[-1].shape[1]
+            first = 0
+        return np.concatenate(parts, axis=1)
 
     def to_stabilised(self, pixels: FloatArray, image: StabilisedImage) -> FloatArray:
         """(n, 2) places in the padded view of places (n, 2) in the view itself."""
@@ -156,7 +166,7 @@ def _common_shift(
     # Half-way between plain and phase correlation: blur and noise have no say, edges keep theirs.
     cross = np.sum(cross / np.sqrt(np.maximum(np.abs(cross), 1e-9)), axis=0)
     score = np.fft.irfft(cross, n=period)
-    shifts = np.arange(period)
-    shifts = np.where(shifts > period // 2, shifts - period, shifts)
-    score[np.abs(shifts) > max_shift] = -np.inf
-    return int(shifts[int(np.argmax(score))])
+    most = min(int(max_shift), (period - 1) // 2)
+    score[most + 1 : period - most] = -np.inf
+    best = int(np.argmax(score))
+    return best if best <= most else best - period
