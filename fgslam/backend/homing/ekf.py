@@ -350,7 +350,7 @@ def _solved(expected: FloatArray, right: FloatArray) -> FloatArray:
         numpy.linalg.LinAlgError: it is singular.
     """
     _, solved, info = lapack.dposv(expected, right, lower=1)
-    return np.linalg.solve(expected, right) if info else np.asarray(solved)
+    return np.asarray(np.linalg.solve(expected, right) if info else solved)
 
 
 def _rows(

@@ -41,7 +41,10 @@ _ROUNDING = 1e-6
 
 
 def match_features(
-    a: OmniFeatures, b: OmniFeatures, settings: OmniMatchingSettings
+    a: OmniFeatures,
+    b: OmniFeatures,
+    settings: OmniMatchingSettings,
+    squared: Float32Array | None = None,
 ) -> BearingMatches:
     """Matches of both kinds: SIFT first, then column segments; each ascending in ``index_a``.
 
@@ -49,8 +52,10 @@ def match_features(
         a: features of the present image.
         b: of the target image.
         settings: thresholds.
+        squared: distances of their SIFT features as of :func:`planar_distances`, where they are
+            known; they are not changed.
     """
-    sift = match_sift(a.sift, b.sift, settings)
+    sift = match_sift(a.sift, b.sift, settings, squared)
     return sift.join(match_columns(a.columns, b.columns, settings))
 
 
@@ -59,12 +64,15 @@ def match_features(
 
 
 def match_sift(
-    a: UprightFeatures, b: UprightFeatures, settings: OmniMatchingSettings
+    a: UprightFeatures,
+    b: UprightFeatures,
+    settings: OmniMatchingSettings,
+    squared: Float32Array | None = None,
 ) -> BearingMatches:
     """Mutual nearest descriptors that are distinct, planar and of one colour."""
     if not len(a) or not len(b):
         return sift_matches(a, b, np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
-    i, j, ratio = _mutual_nearest(planar_distances(a, b, settings))
+    i, j, ratio = _mutual_nearest(planar_distances(a, b, settings) if squared is None else squared)
     colour = np.linalg.norm(a.colour[i] - b.colour[j], axis=1)
     keep = (ratio < settings.ratio) & (colour < settings.max_colour_distance)
     return sift_matches(a, b, i[keep], j[keep], 1.0 - ratio[keep])
@@ -123,7 +131,7 @@ def _height_in_sizes(features: UprightFeatures, margin: float) -> Float32Array:
 def _mutual_nearest(squared: Float32Array) -> tuple[IntArray, IntArray, FloatArray]:
     """Rows, columns, and nearest over second nearest distance of mutual nearest pairs.
 
-    A candidate without any competing candidate has ratio 0. The distances are used up.
+    A candidate without any competing candidate has ratio 0.
     """
     every = np.arange(len(squared))
     j = squared.argmin(axis=1)
@@ -131,6 +139,7 @@ def _mutual_nearest(squared: Float32Array) -> tuple[IntArray, IntArray, FloatArr
     best = squared[every, j].astype(np.float64)
     squared[every, j] = np.inf
     second = squared.min(axis=1).astype(np.float64)
+    squared[every, j] = best
     keep = mutual & np.isfinite(best)
     # Equal descriptors differ by rounding; two equal ones in a row compete all the same.
     best, second = (np.maximum(d[keep], 0.0) + _ROUNDING for d in (best, second))

@@ -17,7 +17,7 @@ from fgslam.core.planar import wrap
 from fgslam.frontend.features.settings import OmniMatchingSettings
 from fgslam.frontend.homing.candidates import Candidates, GuidedScore, candidate_matches
 from fgslam.frontend.homing.homing_vector import INLIER_SIGMAS, LEAST_PARALLAX, HomingSearch
-from fgslam.frontend.homing.matching import match_features
+from fgslam.frontend.homing.matching import match_features, planar_distances
 from fgslam.frontend.homing.refinement import HomingRefinement, Refined
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view_geometry import EpipolarTest
@@ -52,12 +52,13 @@ def vector_between(
         settings: of the search, and when it refuses.
         rng: chooses RANSAC's samples.
     """
-    matches = match_features(present, target, matching)
+    distances = planar_distances(present.sift, target.sift, matching)
+    matches = match_features(present, target, matching, distances)
     search = HomingSearch(matches, settings, rng)
     answer = search.answer()
     if not settings.second_look or _is_final(answer, search):
         return answer, matches
-    candidates = candidate_matches(present.sift, target.sift, matching)
+    candidates = candidate_matches(present.sift, target.sift, distances)
     hypotheses = search.different(_HYPOTHESES)
     if len(candidates) < settings.min_inliers or not len(hypotheses):
         return answer, matches

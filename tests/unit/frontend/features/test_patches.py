@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -60,6 +62,18 @@ def test_something_else_does_not_correlate() -> None:
         _, places, correlation = align(patches, image, PLACES)
         np.testing.assert_array_equal(places, PLACES)
         np.testing.assert_array_equal(correlation, -1.0)
+
+
+def test_a_patch_that_one_step_crushes_to_nothing_is_lost_and_no_error() -> None:
+    patches = anchor(GREY, PLACES, 13, 4.0, 0.05)
+    step = np.zeros_like(patches.step)
+    step[:, [2, 5], 0] = -0.01  # by a remainder of 100 each map changes by minus itself
+    dull = np.zeros_like(patches.light)
+    crushed = replace(patches, first=np.zeros_like(patches.first), light=dull, step=step)
+    kept, places, correlation = align(crushed, np.full_like(GREY, 20), PLACES)
+    np.testing.assert_array_equal(places, PLACES)
+    np.testing.assert_array_equal(correlation, -1.0)
+    assert np.isfinite(kept.maps).all()
 
 
 def test_taken_joined_and_none() -> None:

@@ -12,7 +12,13 @@ from fgslam.core.homing import OmniFeatures, Refusal, TwoViewVector, UprightFeat
 from fgslam.core.planar import wrap
 from fgslam.frontend.features.column_segments import empty_segments
 from fgslam.frontend.features.settings import OmniMatchingSettings
-from fgslam.frontend.homing.candidates import GuidedScore, candidate_matches, edge_likeness
+from fgslam.frontend.homing.candidates import (
+    Candidates,
+    GuidedScore,
+    candidate_matches,
+    edge_likeness,
+)
+from fgslam.frontend.homing.matching import match_sift, planar_distances
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view_geometry import EpipolarTest
 from fgslam.frontend.homing.view_pairs import pair_generator, vector_between
@@ -127,6 +133,39 @@ def test_inliers_are_features_that_occur_once() -> None:
 # What counts as evidence
 
 
+def candidates_of(a: UprightFeatures, b: UprightFeatures) -> Candidates:
+    """Candidate matches by the distances of two views' descriptors."""
+    return candidate_matches(a, b, planar_distances(a, b, MATCHING))
+
+
+def test_candidates_are_the_five_nearest_of_either_view() -> None:
+    a, b = (views.sift for views in two_views(3, 40, 20.0))
+    squared = planar_distances(a, b, MATCHING)
+    before = squared.copy()
+    found = candidate_matches(a, b, squared).matches
+    order, back = np.argsort(before, axis=1), np.argsort(before, axis=0)
+    nearest = {(i, j) for i in range(len(a)) for j in order[i, :5].tolist()}
+    nearest |= {(i, j) for j in range(len(b)) for i in back[:5, j].tolist()}
+    pairs = set(zip(found.index_a.tolist(), found.index_b.tolist(), strict=True))
+    assert pairs
+    assert pairs <= nearest
+    np.testing.assert_array_equal(squared, before)
+
+
+def test_distances_that_are_known_give_the_same_matches_and_stay_as_they_are() -> None:
+    a, b = (views.sift for views in two_views(4, 40, 5.0))
+    squared = planar_distances(a, b, MATCHING)
+    squared[7] = np.inf  # nothing may be like it
+    before = squared.copy()
+    known, anew = match_sift(a, b, MATCHING, squared), match_sift(a, b, MATCHING)
+    candidate_matches(a, b, squared)
+    np.testing.assert_array_equal(squared, before)
+    others = anew.index_a != 7
+    assert np.count_nonzero(others) > 20
+    np.testing.assert_array_equal(known.index_a, anew.index_a[others])
+    np.testing.assert_array_equal(known.index_b, anew.index_b[others])
+
+
 def test_gradients_along_one_line_are_an_edge() -> None:
     edge, all_around = np.zeros((1, 16, 8)), np.ones((1, 16, 8))
     edge[:, :8, 1], edge[:, 8:, 5] = 90.0, 40.0  # both sides of it
@@ -140,13 +179,13 @@ def test_gradients_along_one_line_are_an_edge() -> None:
 
 def test_edges_and_the_floor_at_the_feet_are_no_candidates() -> None:
     a, b = two_views(2, 60, 5.0)
-    whole = candidate_matches(a.sift, b.sift, MATCHING)
+    whole = candidates_of(a.sift, b.sift)
     flat = replace(a.sift, descriptors=np.tile(a.sift.descriptors[:, :1], 128) * 0)
     flat.descriptors[:, ::8] = 200  # all gradients point one way
     low = replace(a.sift, elevation=np.full(len(a.sift), np.deg2rad(-50.0)))
     assert len(whole)
-    assert not len(candidate_matches(flat, b.sift, MATCHING))
-    assert not len(candidate_matches(low, b.sift, MATCHING))
+    assert not len(candidates_of(flat, b.sift))
+    assert not len(candidates_of(low, b.sift))
 
 
 @pytest.mark.parametrize("width", [np.deg2rad(3.0), np.pi])
@@ -164,7 +203,7 @@ def test_things_in_one_place_say_less_than_things_all_around(width: float) -> No
         [[np.cos(psi), -np.sin(psi), 0.0], [np.sin(psi), np.cos(psi), 0.0], [0.0, 0.0, 1.0]]
     )
     a, b = view(points, looks, rng), view((points - leg) @ turn, looks, rng)
-    candidates = candidate_matches(a, b, MATCHING)
+    candidates = candidates_of(a, b)
     good, residuals = EpipolarTest.of(candidates.matches).inliers(TRUE[:1], TRUE[1:], 3.0, 0.05)
     score, rows = GuidedScore(candidates).of(
         theta, psi, np.where(good, residuals, np.nan)[:, 0], 3.0
