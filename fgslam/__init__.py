@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from fgslam.homing.api import HomingVector, PathFollower, teach
     from fgslam.homing.command import DriveCommand
     from fgslam.homing.path_memory import PathMemory
+    from fgslam.homing.route_map import RouteMap
     from fgslam.report.plotting import plot
     from fgslam.runs.library import open_recording, rendered_recording, replay, run, sweep
     from fgslam.runs.live import Result, Slam
@@ -57,6 +58,7 @@ __all__ = [
     "PathMemory",
     "Refusal",
     "Result",
+    "RouteMap",
     "Slam",
     "Step",
     "StereoRig",
@@ -90,6 +92,7 @@ _HOMES = {
     "PathMemory": "fgslam.homing.path_memory",
     "Refusal": "fgslam.core.homing",
     "Result": "fgslam.runs.live",
+    "RouteMap": "fgslam.homing.route_map",
     "Slam": "fgslam.runs.live",
     "Step": "fgslam.slam.results",
     "StereoRig": "fgslam.cameras.rig",

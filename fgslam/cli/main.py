@@ -211,6 +211,8 @@ def _baselines(results: Results, written: Path | None, expected: Baseline | None
 app.command()(sweep)
 app.command()(routes.teach)
 app.command()(routes.follow)
+app.command()(routes.join)
+app.command()(routes.route)
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""Commands of routes: teach one from a recording, follow it with another."""
+"""Commands of routes: teach one from a recording, follow it with another, join several."""
 
 from __future__ import annotations
 
@@ -79,6 +79,53 @@ def follow(  # noqa: PLR0913 - each option is a parameter
     chosen = options.as_overrides(options.frames(start, stop, stride))
     config = following(route, recording, camera, [*(overrides or ()), *chosen])
     _perform(config, out, overwrite)
+
+
+def join(
+    routes: Annotated[
+        list[Path], typer.Argument(metavar="ROUTE...", help="routes, as fgslam teach writes them")
+    ],
+    out: Annotated[Path, typer.Option(metavar="MAP", help="the file to write, .fgmap")],
+    report: Report = None,
+    overrides: options.Overrides = None,
+    overwrite: options.Overwrite = False,
+) -> None:
+    """Join routes where their views match: one map, with crossroads.
+
+    A place is called after its route's file and its image: monday/12. Routes may have been taught
+    on different days; where they have nothing in common they stay apart, and that is said.
+    """
+    from fgslam.runs.bare_routes import joining
+
+    _perform(joining(routes, out, overrides or ()), report, overwrite)
+
+
+def route(
+    stored: Annotated[
+        Path, typer.Argument(metavar="MAP", help="routes, as fgslam join writes them")
+    ],
+    start: Annotated[
+        str,
+        typer.Option(
+            "--from", metavar="IMAGE", help="a picture from where the robot is, or a place's name"
+        ),
+    ],
+    goal: Annotated[
+        str, typer.Option("--to", metavar="PLACE", help="a place's name; of a route: its end")
+    ],
+    camera: OmniCamera = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="ROUTE", help="write the way as a route, to be followed")
+    ] = None,
+) -> None:
+    """Say the shortest way on a map of routes, and write it as a route of its own.
+
+    Without --camera the picture is of the routes' own. Exits with 2 where there is no way.
+    """
+    from fgslam.runs.bare_routes import way_said
+
+    for line in way_said(stored, start, goal, camera, out):
+        typer.echo(line)
 
 
 def _perform(config: Experiment, folder: Path | None, overwrite: bool) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.worlds.house import OmniWorld
+from fgslam.worlds.house import OmniWorld as OmniWorld
 from fgslam.worlds.house_settings import OmniHouseSettings
 from fgslam.worlds.simulated.bearings import HomingOutliers, SimulatedHoming, simulate_homing
 from fgslam.worlds.simulated.settings import SimulatedBearingsSettings

@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.homing import OmniFeatures
+from fgslam.core.homing import BearingMatches, FeatureKind, OmniFeatures, Refusal
 from fgslam.core.planar import wrap
-from fgslam.homing.links import Link, Pair
+from fgslam.homing.links import Answer, Link, Pair
 
 _HEADING_DEG = 15.0  # largest misfit of an edge's rotation with all others' together
 _LOOP_DEG = 6.0
@@ -25,37 +26,65 @@ _LOOP_DEG = 6.0
 three deviations."""
 
 _LONE_SUPPORT = 50
-"""Inliers of an edge that no third image confirms, unless its images follow each other in an
-ordered set (false ones had up to 39 on `omni_home`)."""
+"""Inliers of an edge that no third image confirms, unless its images follow each other on a walk
+(false ones had up to 39 on `omni_home`)."""
 
 _SIGMAS = 3.0
 _ROUNDS = 10  # of the rotation averaging's reweighting
 _HUBER = np.deg2rad(5.0)  # residual from which on a link's rotation counts less
 
 
+@dataclass(frozen=True, slots=True)
+class Walks:
+    """Which images follow each other: each walk's, numbered one walk after the other.
+
+    Attributes:
+        lengths: images of each; none at all where images are in no order.
+    """
+
+    lengths: tuple[int, ...] = ()
+
+    def steps(self) -> set[Pair]:
+        """Pairs (k, k + 1) of images that follow each other."""
+        ends = np.cumsum((0, *self.lengths)).tolist()
+        return {(k, k + 1) for a, b in itertools.pairwise(ends) for k in range(a, b - 1)}
+
+    def near(self, image: int, reach: int) -> range:
+        """Images of the same walk, at most so many steps away."""
+        ends = np.cumsum((0, *self.lengths))
+        walk = int(np.searchsorted(ends, image, side="right")) - 1
+        return range(
+            max(int(ends[walk]), image - reach), min(int(ends[walk + 1]), image + reach + 1)
+        )
+
+
+UNORDERED = Walks()
+
+
 class LinkConsistency:
     """Links of a map, those that contradict others taken out."""
 
-    def __init__(self, count: int, links: Iterable[Link]) -> None:
-        """Takes links between ``count`` images, one a pair."""
+    def __init__(self, count: int, links: Iterable[Link], walks: Walks = UNORDERED) -> None:
+        """Takes links between ``count`` images, one a pair.
+
+        Images that follow each other on a walk need no third view. It is no proof: their link must
+        still not contradict others.
+        """
         self._count = count
+        self._steps = walks.steps()
         self._links = {(link.a, link.b): link for link in links}
         self._holding = self._test_triangles()
 
-    def accepted(
-        self, *, ordered: bool, confirmed: Collection[Pair] = ()
-    ) -> tuple[list[Link], dict[Pair, str]]:
+    def accepted(self, confirmed: Collection[Pair] = ()) -> tuple[list[Link], dict[Pair, str]]:
         """Links that pass every check, by pair, and why the others do not.
 
         Args:
-            ordered: images follow each other on a way; neighbours in it need no third view. It
-                is no proof: their link must still not contradict others.
-            confirmed: links that third images confirm in other ways, likewise.
+            confirmed: links that third images confirm in other ways: as those of a walk.
         """
         rejected: dict[Pair, str] = {}
-        self._drop_contradicted(rejected, ordered=ordered)
-        self._drop_lone(rejected, confirmed, ordered=ordered)
-        self._drop_turned(rejected, ordered=ordered)
+        self._drop_contradicted(rejected)
+        self._drop_lone(rejected, confirmed)
+        self._drop_turned(rejected)
         return [self._links[pair] for pair in sorted(self._links)], rejected
 
     # ----------------------------------------------------------------------------------------
@@ -93,31 +122,25 @@ class LinkConsistency:
                 out[pair] = (good + holds, bad + (not holds))
         return out
 
-    def _drop_contradicted(self, rejected: dict[Pair, str], *, ordered: bool) -> None:
+    def _drop_contradicted(self, rejected: dict[Pair, str]) -> None:
         """Drops links, the worst first; following each other counts as one triangle kept."""
         while True:
             votes = self.votes()
-            excess = {
-                p: bad - good - (ordered and p[1] == p[0] + 1)
-                for p, (good, bad) in votes.items()
-                if bad
-            }
+            excess = {p: bad - good - (p in self._steps) for p, (good, bad) in votes.items() if bad}
             suspects = [p for p in excess if excess[p] >= 0]
             if not suspects:
                 return
             worst = max(
                 suspects,
-                key=lambda p: (excess[p], p[1] - p[0] > 1, -self._links[p].support, p),
+                key=lambda p: (excess[p], p not in self._steps, -self._links[p].support, p),
             )
             good, bad = votes[worst]
             self._drop(worst, f"breaks {bad} of {good + bad} triangles", rejected)
 
-    def _drop_lone(
-        self, rejected: dict[Pair, str], confirmed: Collection[Pair], *, ordered: bool
-    ) -> None:
+    def _drop_lone(self, rejected: dict[Pair, str], confirmed: Collection[Pair]) -> None:
         for pair, (good, _) in self.votes().items():
             support = self._links[pair].support
-            follows = (ordered and pair[1] == pair[0] + 1) or pair in confirmed
+            follows = pair in self._steps or pair in confirmed
             if good == 0 and not follows and support < _LONE_SUPPORT:
                 text = f"no third image confirms it, and {support} inliers are too few alone"
                 self._drop(pair, text, rejected)
@@ -134,16 +157,15 @@ class LinkConsistency:
     # ----------------------------------------------------------------------------------------
     # Headings
 
-    def _drop_turned(self, rejected: dict[Pair, str], *, ordered: bool) -> None:
+    def _drop_turned(self, rejected: dict[Pair, str]) -> None:
         """Drops links whose rotation contradicts all others; neighbours on a walk weigh most."""
         limit = np.deg2rad(_HEADING_DEG)
         while self._links:
             pairs = list(self._links)
             rotations = np.array([self._links[p].rotation for p in pairs])
             supports = np.array([self._links[p].support for p in pairs], dtype=np.float64)
-            if ordered:
-                follows = np.array([b - a == 1 for a, b in pairs])
-                supports = supports + follows * supports.max()
+            follows = np.array([pair in self._steps for pair in pairs])
+            supports = supports + follows * supports.max()
             residual = np.abs(heading_residuals(self._count, pairs, rotations, supports))
             worst = int(np.argmax(residual))
             if residual[worst] <= limit:
@@ -241,7 +263,7 @@ what true and false ones got."""
 
 
 class ThirdViewConsistency:
-    """Links of an ordered set, and the features that make them: a test for perceptual aliasing.
+    """Links of walks, and the features that make them: a test for perceptual aliasing.
 
     Halls with two equal sides, corridors with the same lockers: links between them have hundreds of
     inliers, agree in triangles, and are false. They match things of one kind, not one thing: a
@@ -256,9 +278,10 @@ class ThirdViewConsistency:
         images: Sequence[OmniFeatures],
         links: Iterable[Link],
         rows: InlierRows,
+        walks: Walks,
     ) -> None:
-        """Takes links of images in the order of the walk, and the inliers of their answers."""
-        self._images = images
+        """Takes links of images in the order of walks, and the inliers of their answers."""
+        self._images, self._walks, self._steps = images, walks, walks.steps()
         self._links = list(links)
         self._maps: dict[Pair, IntArray] = {}
         for link in self._links:
@@ -291,9 +314,9 @@ class ThirdViewConsistency:
 
         Where neighbours do not match, the walk may have gone on anywhere.
         """
-        steps = ((k, k + 1) for k in range(link.a, link.b))
+        steps = [(k, k + 1) for k in range(link.a, link.b)]
         near = link.b - link.a <= _ORDER_REACH
-        return near and all(step in self._maps for step in steps)
+        return near and all(step in self._maps and step in self._steps for step in steps)
 
     def share(self, link: Link) -> float:
         """Confirmations by third views, of either end's neighbours, over the link's inliers."""
@@ -303,7 +326,7 @@ class ThirdViewConsistency:
     def _confirmations(self, a: int, b: int) -> int:
         """Features of a that are the same in a neighbour of b, matched directly and by way of b."""
         count = 0
-        for c in range(max(0, b - _ORDER_REACH), min(len(self._images), b + _ORDER_REACH + 1)):
+        for c in self._walks.near(b, _ORDER_REACH):
             if c in (a, b) or (b, c) not in self._maps or (a, c) not in self._maps:
                 continue
             direct = self._maps[a, c]
@@ -327,6 +350,14 @@ class ThirdViewConsistency:
         if there is not None:
             out[there[:, 0]] = there[:, 1]
         return out
+
+
+def sift_inliers(answer: Answer, matches: BearingMatches) -> IntArray | None:
+    """(k, 2) SIFT features of both images that are inliers of an answer; None of a refusal."""
+    if isinstance(answer, Refusal):
+        return None
+    kept = matches.select(answer.inliers & (matches.kind == FeatureKind.SIFT))
+    return np.column_stack([kept.index_a, kept.index_b])
 
 
 def _followed(first: IntArray, second: IntArray) -> IntArray:

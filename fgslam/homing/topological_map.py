@@ -17,7 +17,13 @@ from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import OmniFeatures
 from fgslam.homing.feature_files import VERSIONS
-from fgslam.homing.link_consistency import InlierRows, LinkConsistency, ThirdViewConsistency
+from fgslam.homing.link_consistency import (
+    UNORDERED,
+    InlierRows,
+    LinkConsistency,
+    ThirdViewConsistency,
+    Walks,
+)
 from fgslam.homing.links import Answer, Link, Pair, link_pairs
 from fgslam.homing.path_memory import PathMemory, load_images, save_images
 from fgslam.homing.retrieval import VisualWords, candidate_pairs
@@ -27,7 +33,7 @@ FILE = ArrayFile(
     name="fgslam topological map",
     versions=VERSIONS,
     error=StoredMapError,
-    give="give a file that holds one",
+    give="give a file that holds one, as fgslam join writes it",
     again="build it again",
 )
 _PER_LINK: Items = {
@@ -144,26 +150,23 @@ def map_candidates(
     images: Sequence[OmniFeatures],
     settings: TopologicalMapSettings,
     rng: np.random.Generator,
-    *,
-    ordered: bool,
+    walks: Walks = UNORDERED,
 ) -> list[Pair]:
-    """Pairs a < b that are worth a homing; of an ordered set neighbours always."""
+    """Pairs a < b that are worth a homing; neighbours on a walk always."""
     n = len(images)
     if settings.candidates == 0 or settings.candidates >= n - 1:
         likenesses = np.zeros((n, n))
     else:
         likenesses = VisualWords(images, rng).likenesses()
     pairs = {(int(a), int(b)) for a, b in candidate_pairs(likenesses, settings.candidates)}
-    if ordered:
-        pairs |= {(k, k + 1) for k in range(n - 1)}
-    return sorted(pairs)
+    return sorted(pairs | walks.steps())
 
 
 def map_of_answers(
     images: Sequence[OmniFeatures],
     answers: Mapping[Pair, Answer],
     *,
-    ordered: bool = False,
+    walks: Walks = UNORDERED,
     names: Sequence[str] | None = None,
     rows: InlierRows | None = None,
 ) -> TopologicalMap:
@@ -172,18 +175,17 @@ def map_of_answers(
     Args:
         images: features of the nodes.
         answers: of pairs (from, to), both ways; pairs with one way only are passed over.
-        ordered: the images follow each other on a way.
+        walks: images that follow each other on a way.
         names: of the images; numbered if absent.
-        rows: inliers of the answers; with them, far links of an ordered set need third views.
+        rows: inliers of the answers; with them, links of walks far apart need third views.
     """
     memory = PathMemory.of(images, names)
     links, refused = link_pairs(answers)
     seen: set[Pair] = set()
-    if ordered and rows is not None:
-        links, seen, unseen = ThirdViewConsistency(images, links, rows).confirmed()
+    if walks.lengths and rows is not None:
+        links, seen, unseen = ThirdViewConsistency(images, links, rows, walks).confirmed()
         refused |= unseen
-    checks = LinkConsistency(len(images), links)
-    accepted, rejected = checks.accepted(ordered=ordered, confirmed=seen)
+    accepted, rejected = LinkConsistency(len(images), links, walks).accepted(seen)
     costs = np.array([link_cost(link) for link in accepted])
     return TopologicalMap(memory.images, memory.names, tuple(accepted), costs, refused | rejected)
 

@@ -322,6 +322,19 @@ class FollowConfig(HomingExperiment):
     steering: SteeringSettings = SteeringSettings()
 
 
+class JoinConfig(HomingExperiment):
+    """Taught routes as one map, joined where their views match."""
+
+    task: Annotated[Literal["join"], _TASK]
+    routes: Annotated[
+        tuple[str, ...],
+        Field(min_length=1, description="files that routes were taught into; named after them"),
+    ]
+    map: Annotated[str | None, Field(description="file to write; null: RUN/routes.fgmap alone")] = (
+        None
+    )
+
+
 class HomingTrialsConfig(HomingExperiment):
     """Simulated homings of bearings alone: estimators against outliers."""
 
@@ -387,6 +400,15 @@ class PathFollowingConfig(DrivingConfig):
     task: Annotated[Literal["path_following"], _TASK]
 
 
+class CrossroadsConfig(DrivingConfig):
+    """Two routes taught on their own, joined, and a way over both driven in closed loop."""
+
+    task: Annotated[Literal["crossroads"], _TASK]
+    back: Annotated[
+        bool, Field(description="from the second route's end to where the first one begins")
+    ] = False
+
+
 TASKS: dict[str | None, type[Experiment]] = {
     None: ExperimentConfig,
     "localisation": LocalisationConfig,
@@ -395,9 +417,11 @@ TASKS: dict[str | None, type[Experiment]] = {
     "omni_video": OmniVideoConfig,
     "teach": TeachConfig,
     "follow": FollowConfig,
+    "join": JoinConfig,
     "homing_trials": HomingTrialsConfig,
     "homing": HomingConfig,
     "path_following": PathFollowingConfig,
+    "crossroads": CrossroadsConfig,
 }
 """The model of each value of the key `task`; None where a file has no such key."""
 

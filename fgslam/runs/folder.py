@@ -74,6 +74,7 @@ _RESULT_FILES = (
     "commands.csv",
     "trajectory.csv",
     "route.fgpath",
+    "routes.fgmap",
     "path_images.csv",
     "follow.csv",
     "logs/*.npz",

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 
 from fgslam.core.errors import ConfigError
 from fgslam.runs.config_models import (
+    CrossroadsConfig,
     DrivingConfig,
     Experiment,
     ExperimentConfig,
     FollowConfig,
     HomingPairsConfig,
     HomingTrialsConfig,
+    JoinConfig,
     LocalisationConfig,
     OmniVideoConfig,
     TeachConfig,
@@ -88,10 +90,18 @@ def opener_of(  # noqa: C901, PLR0911 - one a task
             from fgslam.runs.tasks.route_following import open_following
 
             return open_following
+        case JoinConfig():
+            from fgslam.runs.tasks.route_joining import open_joining
+
+            return open_joining
         case HomingTrialsConfig():
             from fgslam.runs.tasks.homing_trials import open_trials
 
             return open_trials
+        case CrossroadsConfig():
+            from fgslam.runs.tasks.crossroads import open_crossroads
+
+            return open_crossroads
         case DrivingConfig():
             from fgslam.runs.tasks.homing_drives import open_drives
 

@@ -131,9 +131,9 @@ class OmniWorld:
         self.model = open_house(settings.house_seed)
         self.camera: OmniCamera = make_house_camera(settings.camera)
         self._renderer = Renderer(omni_view(self.camera), self.model.bank, _EDGE_CONTRAST)
-        planner = PathPlanner(self.model.space, _PATH_CLEARANCE_M)
+        self._planner = PathPlanner(self.model.space, _PATH_CLEARANCE_M)
         within = None if settings.path.rooms == "house" else settings.path.rooms
-        self.reference_poses = planner.reference_path(
+        self.reference_poses = self._planner.reference_path(
             settings.path.spacing_m, settings.path.legs, self._rng(0), within
         )
         self._people = People(
@@ -207,6 +207,14 @@ class OmniWorld:
         return tuple(
             self.picture(pose, k, tilt.angles(10.0 * k)) for k, pose in enumerate(self.target_poses)
         )
+
+    def crossing_routes(self) -> tuple[FloatArray, FloatArray]:
+        """Poses (n, 3) and (m, 3) of two routes through the house that meet in its corridor.
+
+        Raises:
+            DatasetError: there are none with such legs.
+        """
+        return self._planner.crossing_routes(self.settings.path.spacing_m, self._rng(7))
 
     def picture(self, pose: FloatArray, number: int, tilt: FloatArray | None = None) -> Image:
         """(h, w, 3) as target images are taken, from any planar pose (3,); ``number`` seeds it."""

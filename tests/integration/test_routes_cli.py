@@ -12,6 +12,7 @@ import pytest
 from PIL import Image as PictureFile
 from running import main
 
+import fgslam as fg
 from fgslam.homing.path_memory import PathMemory
 from fgslam.runs.folder import RUN_MARKER
 from tests import textured_room
@@ -187,3 +188,66 @@ def test_wrong_routes_are_one_line_each(
     said = mistake(capfd, monkeypatch, "follow", tmp_path / "blind.fgpath", again)
     assert "holds no camera" in said
     assert not (tmp_path / "runs").exists()
+
+
+# --------------------------------------------------------------------------------------------
+# Routes joined
+
+
+@pytest.fixture(scope="module")
+def crossing(taught: Path, data: Path) -> Path:
+    """A route across the one that was taught, of three images."""
+    camera = PathMemory.load(taught).camera
+    assert camera is not None
+    poses = [np.array([0.1, y, 1.571]) for y in (-1.5, 0.2, 1.7)]
+    views = [np.ascontiguousarray(textured_room.picture(pose)[::2, ::2]) for pose in poses]
+    fg.teach(views, camera).save(data / "across.fgpath")
+    return data / "across.fgpath"
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_routes_are_joined_and_the_way_is_said(
+    taught: Path, crossing: Path, data: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    """As the library joins them, to the byte."""
+    monkeypatch.chdir(tmp_path)
+    assert main(monkeypatch, "join", taught, crossing, "--out", "house.fgmap") == 0
+    assert "Every place can be reached" in " ".join(capfd.readouterr().out.split())
+    assert (tmp_path / "runs" / "join_house" / "links.csv").is_file()
+    joined = fg.RouteMap.join(
+        {"route": PathMemory.load(taught), "across": PathMemory.load(crossing)}
+    )
+    joined.save(tmp_path / "library.fgmap")
+    assert Path("library.fgmap").read_bytes() == Path("house.fgmap").read_bytes()
+
+    first = data / "drive" / "view_0.png"
+    given = ("--from", first, "--to", "across", "--out", "way.fgpath")
+    assert main(monkeypatch, "route", "house.fgmap", *given) == 0
+    said = capfd.readouterr().out
+    assert f"{first}: at route/view_0" in said
+    assert PathMemory.load("way.fgpath").names[-1] == "across/2"
+    ends = ("--from", "across/0", "--to", "route")
+    assert main(monkeypatch, "route", "house.fgmap", *ends) == 0
+    assert "degrees" in capfd.readouterr().out
+
+    said = mistake(capfd, monkeypatch, "route", "house.fgmap", "--from", "x", "--to", "route")
+    assert "no place x; its routes are route, across" in said
+    PictureFile.fromarray(np.full((91, 301, 3), 90, np.uint8)).save("grey.png")
+    said = mistake(
+        capfd, monkeypatch, "route", "house.fgmap", "--from", "grey.png", "--to", "route"
+    )
+    assert "grey.png: " in said
+    said = mistake(capfd, monkeypatch, "route", taught, *ends)
+    assert "not an fgslam topological map; give a file that holds one" in said
+
+
+def test_routes_that_cannot_be_joined_are_one_line_each(
+    taught: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    said = mistake(capfd, monkeypatch, "join", taught, taught, "--out", "x.fgmap")
+    assert "two files are called route" in said
+    said = mistake(capfd, monkeypatch, "join", taught, "--out", "no/x.fgmap")
+    assert "its folder does not exist" in said
+    assert "no such file" in mistake(capfd, monkeypatch, "join", "none", "--out", "x.fgmap")
+    assert not Path("runs").exists()

@@ -10,17 +10,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeAlias, runtime_checkable
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
 from fgslam.backend.homing.factory import make_homing_estimator
-from fgslam.core.arrays import ByteArray, FloatArray, Image
+from fgslam.core.arrays import ByteArray, FloatArray
 from fgslam.core.errors import OutputError
 from fgslam.core.files import make_subfolder
 from fgslam.core.homing import TrackedBearings
 from fgslam.core.planar import between
-from fgslam.datasets.simulated_homing import open_house
+from fgslam.datasets.simulated_homing import OmniWorld, open_house
 from fgslam.homing.active_homing import ActiveHoming
 from fgslam.homing.closed_loop import Driver, World, follow
 from fgslam.homing.command import Command
@@ -29,7 +29,7 @@ from fgslam.homing.drive_record import (
     DriveRecord,
     pass_distances,
 )
-from fgslam.homing.front_end import HomingFrontEnd, make_front_end
+from fgslam.homing.front_end import HomingFrontEnd, ImageFrontEnd, make_front_end
 from fgslam.homing.path_following import HomingChain
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.settings import FrontEndSettings
@@ -57,17 +57,7 @@ _TRIES = 50  # places drawn for a start that is free
 
 
 class PathWorld(World, Protocol):
-    """A world with a path in it: target images, where they were taken, and walls to draw."""
-
-    @property
-    def targets(self) -> Sequence[Image]:
-        """Target images, in order."""
-        ...
-
-    @property
-    def target_poses(self) -> FloatArray:
-        """(m, 3) where they were taken."""
-        ...
+    """A world to put a robot into, with walls to draw."""
 
     @property
     def outlines(self) -> Sequence[FloatArray]:
@@ -83,9 +73,25 @@ class PathWorld(World, Protocol):
         ...
 
 
-Opened: TypeAlias = tuple[PathWorld, HomingFrontEnd]
-Opener: TypeAlias = Callable[[DrivingConfig, int], Opened]
-"""Opens the world of one seed, and makes the front-end for it; of a module's top level."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Opened:
+    """What a drive begins with.
+
+    Attributes:
+        world: with the robot where it starts.
+        front_end: for its camera.
+        memory: the path.
+        poses: (m, 3) where its images were taken.
+    """
+
+    world: PathWorld
+    front_end: HomingFrontEnd
+    memory: PathMemory
+    poses: FloatArray
+
+
+Opener: TypeAlias = Callable[[Any, int], Opened]
+"""Opens the world of one seed of a configuration; of a module's top level."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,6 +154,13 @@ def drives_task(config: DrivingConfig, opener: Opener) -> Task[RunResult]:
 
 def open_house_drive(config: DrivingConfig, seed: int) -> Opened:
     """World and front-end of one seed. Raises FgslamError where the house cannot be built."""
+    world, front_end = open_house_front_end(config, seed)
+    memory = PathMemory.of([front_end.describe(image) for image in world.targets])
+    return Opened(world, front_end, memory, world.target_poses)
+
+
+def open_house_front_end(config: DrivingConfig, seed: int) -> tuple[OmniWorld, ImageFrontEnd]:
+    """The house of one seed, and the front-end for its camera. Raises as above."""
     world = open_house(config.dataset, seed)
     settings = FrontEndSettings(config.features, config.homing_vector, config.wrong_matches)
     return world, make_front_end(world.camera, settings, seed)
@@ -168,10 +181,10 @@ def _run(config: DrivingConfig, opener: Opener, context: Context) -> RunResult:
 def perform_drive(task: DriveTask) -> DrivenSeed:
     """One drive from start to end."""
     config, behaviour = task.config, task.config.behaviour
-    world, front_end = task.opener(config, task.seed)
+    opened = task.opener(config, task.seed)
+    world, front_end, memory = opened.world, opened.front_end, opened.memory
     if config.start_offset_m > 0.0:
         world.put(_displaced(world, config.start_offset_m, np.random.default_rng((task.seed, 7))))
-    memory = PathMemory.of([front_end.describe(image) for image in world.targets])
     follower = HomingChain(
         front_end,
         memory.images,
@@ -185,8 +198,8 @@ def perform_drive(task: DriveTask) -> DrivenSeed:
     watcher = (
         DriveWatcher(front_end, follower) if shown and isinstance(front_end, Unwrapping) else None
     )
-    record = follow(world, follower, driver, behaviour.loop, world.target_poses, watcher)
-    leg = float(np.hypot(*(world.target_poses[0, :2] - start[:2])))
+    record = follow(world, follower, driver, behaviour.loop, opened.poses, watcher)
+    leg = float(np.hypot(*(opened.poses[0, :2] - start[:2])))
     views = () if watcher is None else watcher.views(shown)
     return DrivenSeed(task.seed, record, memory, tuple(world.outlines), leg, views)
 

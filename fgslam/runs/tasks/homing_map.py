@@ -19,14 +19,12 @@ from fgslam.core.homing import OmniFeatures, Refusal, TwoViewVector
 from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.frontend.homing.view_pairs import vector_between
-from fgslam.homing.link_consistency import InlierRows
-from fgslam.homing.links import Answer, Link, Pair
+from fgslam.homing.link_consistency import UNORDERED, InlierRows, Walks
+from fgslam.homing.links import Answer, Pair
 from fgslam.homing.localisation import Localiser
 from fgslam.homing.retrieval import VisualWords
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
 from fgslam.report.content import Column, Picture, TextTable
-from fgslam.report.figures.plan import Links, network_figure, unfolded
-from fgslam.report.figures.traces import Figure
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.config_models import TopologicalMapConfig
 from fgslam.runs.engine import (
@@ -38,6 +36,7 @@ from fgslam.runs.engine import (
     write_document,
     write_page,
 )
+from fgslam.runs.tasks.homing_map_links import link_lengths, map_figure, write_links
 from fgslam.runs.tasks.homing_views import (
     PairAnswer,
     PairSearch,
@@ -50,21 +49,7 @@ from fgslam.runs.tasks.homing_views import (
 )
 
 MAP_FILE = "map.npz"
-LINKS_FILE = "links.csv"
 ROUTES_FILE = "routes.csv"
-_LINK_COLUMNS = (
-    "from",
-    "to",
-    "direction_deg",
-    "sigma_direction_deg",
-    "rotation_deg",
-    "sigma_rotation_deg",
-    "back_deg",
-    "inliers",
-    "cost",
-    "places_apart",
-    "distance_m",
-)
 _UNKNOWN = "-"
 Found = TypeVar("Found")
 
@@ -97,7 +82,8 @@ def _run(config: TopologicalMapConfig, views: OmniRecording, context: Context) -
     folder = context.folder
     features = extract_features(views, config.dataset, config.features, context)
     rng = np.random.default_rng(config.seed)
-    half = map_candidates(features, config.map, rng, ordered=config.ordered)
+    walks = _walks(config, len(features))
+    half = map_candidates(features, config.map, rng, walks)
     pairs = tuple(pair for a, b in half for pair in ((a, b), (b, a)))
     search = PairSearch(
         tuple(features), pairs, config.features.matching, config.homing_vector, config.seed
@@ -105,7 +91,7 @@ def _run(config: TopologicalMapConfig, views: OmniRecording, context: Context) -
     found, failures = answer_pairs(search, context)
     answers: dict[Pair, Answer] = {(answer.a, answer.b): answer.found for answer in found}
     names, rows = view_names(views)[: len(features)], inlier_rows(found)
-    topology = map_of_answers(features, answers, ordered=config.ordered, names=names, rows=rows)
+    topology = map_of_answers(features, answers, walks=walks, names=names, rows=rows)
     kilobytes = topology.save(folder / MAP_FILE)
     routes = [_route(topology, asked) for asked in config.routes]
     located = _localise(config, features, answers, rows, names, context)
@@ -121,7 +107,7 @@ def _run(config: TopologicalMapConfig, views: OmniRecording, context: Context) -
         (_table(numbers),),
         (*views.notes, *failures, *missing),
     )
-    write_csv(folder / LINKS_FILE, _LINK_COLUMNS, _link_rows(topology, views))
+    write_links(folder, topology, views.poses)
     write_csv(folder / ROUTES_FILE, ("asked", "found", "reason"), _route_rows(routes))
     if located is not None:
         write_csv(folder / LOCALISATION_FILE, Localised._fields, located)
@@ -130,10 +116,15 @@ def _run(config: TopologicalMapConfig, views: OmniRecording, context: Context) -
     write_page(
         result,
         f"{len(topology)} views of {views.name}",
-        figures=(_figure(topology, views),),
+        figures=(map_figure(topology, views.poses),),
         pictures=pictures,
     )
     return result
+
+
+def _walks(config: TopologicalMapConfig, count: int) -> Walks:
+    """One walk through all views of an ordered set."""
+    return Walks((count,)) if config.ordered else UNORDERED
 
 
 def _require_nodes(config: TopologicalMapConfig, names: Sequence[str]) -> None:
@@ -172,7 +163,7 @@ def _numbers(
 ) -> dict[str, JsonValue]:
     parts = topology.components()
     gaps = [link.b - link.a for link in topology.links]
-    lengths = _lengths(topology, views)
+    lengths = link_lengths(topology, views.poses)
     return {
         "nodes": len(topology),
         "homings_tried": len(answers),
@@ -186,14 +177,6 @@ def _numbers(
         "pairs_not_linked": len(topology.rejected),
         "kilobytes_per_view": kilobytes,
     }
-
-
-def _lengths(topology: TopologicalMap, views: OmniRecording) -> np.ndarray | None:
-    """(m,) true lengths of the links, metres; None without poses."""
-    if views.poses is None:
-        return None
-    ends = [(views.poses[k.a, :2], views.poses[k.b, :2]) for k in topology.links]
-    return np.array([float(np.hypot(*(b - a))) for a, b in ends])
 
 
 def _of_routes(routes: Sequence[Route]) -> dict[str, JsonValue]:
@@ -247,62 +230,9 @@ def _value(value: JsonValue) -> str:
 # Rows, figures, pictures
 
 
-def _link_rows(topology: TopologicalMap, views: OmniRecording) -> Iterator[list[Cell]]:
-    lengths = _lengths(topology, views)
-    for k, link in enumerate(topology.links):
-        sigma = np.rad2deg(np.sqrt(np.diagonal(link.covariance)))
-        angles = np.rad2deg([link.direction, link.rotation, link.back])
-        yield [
-            topology.names[link.a],
-            topology.names[link.b],
-            angles[0],
-            sigma[0],
-            angles[1],
-            sigma[1],
-            angles[2],
-            link.support,
-            float(topology.costs[k]),
-            link.b - link.a,
-            None if lengths is None else float(lengths[k]),
-        ]
-
-
 def _route_rows(routes: Sequence[Route]) -> Iterator[list[Cell]]:
     for route in routes:
         yield ["-".join(route.asked), "-".join(route.found), route.reason]
-
-
-def _figure(topology: TopologicalMap, views: OmniRecording) -> Figure:
-    pairs = tuple((link.a, link.b) for link in topology.links)
-    surveyed = views.poses is not None
-    places = (
-        unfolded(len(topology), pairs) if views.poses is None else views.poses[: len(topology), :2]
-    )
-    labels = tuple(_label(topology, link) for link in topology.links)
-    rejected = tuple(sorted(topology.rejected))
-    why = tuple(
-        f"{topology.names[a]} to {topology.names[b]}: {topology.rejected[a, b]}"
-        for a, b in rejected
-    )
-    kinds = (
-        Links("links", 0, pairs, labels),
-        Links("tried, no link", 1, rejected, why, shown=False),
-    )
-    where = (
-        "Views at their true places."
-        if surveyed
-        else "There are no true places: views are drawn so that distances are as along the links."
-    )
-    words = ("map", "The topological map", f"{where} A line is a homing that is believed.")
-    axes = ("x (m)", "y (m)") if surveyed else ("", "")
-    return network_figure(words, places, topology.names, kinds, axes)
-
-
-def _label(topology: TopologicalMap, link: Link) -> str:
-    return (
-        f"{topology.names[link.a]} to {topology.names[link.b]}: {link.support} inliers, rotation "
-        f"{np.rad2deg(link.rotation):.0f} degrees"
-    )
 
 
 def _pictures(
@@ -314,7 +244,7 @@ def _pictures(
     count: int,
 ) -> tuple[Picture, ...]:
     """The doubtful links: half of them the longest ones, half those with the fewest inliers."""
-    lengths = _lengths(topology, views)
+    lengths = link_lengths(topology, views.poses)
     gaps = np.array([float(link.b - link.a) for link in topology.links])
     length = gaps if lengths is None else lengths
     support = np.array([link.support for link in topology.links])
@@ -370,7 +300,7 @@ def _localise(
     topology = map_of_answers(
         nodes,
         _among(kept, answers),
-        ordered=config.ordered,
+        walks=_walks(config, len(kept)),
         names=[names[k] for k in kept],
         rows=_among(kept, rows),
     )

@@ -31,6 +31,7 @@ from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingS
 from fgslam.frontend.homing.matching import plain_sift
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.view_pairs import pair_generator, vector_between
+from fgslam.homing.link_consistency import sift_inliers
 from fgslam.report.content import Picture
 from fgslam.runs.engine import Context
 from fgslam.runs.units import Stage, in_blocks, interleaved
@@ -217,7 +218,7 @@ def answer_pair(search: PairSearch, a: int, b: int) -> tuple[PairAnswer, Bearing
     """One pair's answer and its tentative matches."""
     views, rng = (search.features[a], search.features[b]), pair_generator(search.seed, a, b)
     found, matches = vector_between(*views, search.matching, search.vector, rng)
-    return PairAnswer(a, b, found, len(matches), _inlier_rows(found, matches)), matches
+    return PairAnswer(a, b, found, len(matches), sift_inliers(found, matches)), matches
 
 
 def answer_pairs(
@@ -243,13 +244,6 @@ def answer_pairs(
 def inlier_rows(answers: Sequence[PairAnswer]) -> dict[tuple[int, int], IntArray]:
     """Of each answered pair (a, b): (k, 2) SIFT features of both views that are inliers."""
     return {(k.a, k.b): k.rows for k in answers if k.rows is not None}
-
-
-def _inlier_rows(found: TwoViewVector | Refusal, matches: BearingMatches) -> IntArray | None:
-    if isinstance(found, Refusal):
-        return None
-    kept = matches.select(found.inliers & (matches.kind == FeatureKind.SIFT))
-    return np.column_stack([kept.index_a, kept.index_b])
 
 
 def _perform(search: PairSearch) -> list[PairAnswer]:

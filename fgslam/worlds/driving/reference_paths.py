@@ -70,6 +70,33 @@ class PathPlanner:
             f"in {where}; lower path.spacing_m or path.legs"
         )
 
+    def crossing_routes(
+        self, spacing: float, rng: np.random.Generator, crossing: str = "corridor"
+    ) -> tuple[FloatArray, FloatArray]:
+        """Poses (n, 3) and (m, 3) of two routes, each from one room to another, that meet between.
+
+        Args:
+            spacing: between poses, metres; the last ones lie about as far from the routes' ends.
+            rng: chooses rooms and places.
+            crossing: name of the room that they meet in: both lead by one place of it.
+
+        Raises:
+            DatasetError: no such routes are found.
+        """
+        rooms = [room.name for room in ROOMS if room.name != crossing]
+        for _ in range(_STARTS):
+            a, b, c, d = (self._spot(_room(str(name)), rng) for name in rng.permutation(rooms)[:4])
+            middle = self._spot(_room(crossing), rng)
+            one, other = (
+                self._searched(tour, spacing, None, rng, None)
+                for tour in ((a, middle, b), (c, middle, d))
+            )
+            if one is not None and other is not None:
+                return _with_headings(one), _with_headings(other)
+        raise DatasetError(
+            f"no two routes of legs of {spacing} m meet in the {crossing}; lower path.spacing_m"
+        )
+
     def walk(
         self, places: Sequence[FloatArray], spacing: float, steps: int, rng: np.random.Generator
     ) -> FloatArray | None:
@@ -83,7 +110,7 @@ class PathPlanner:
         self,
         tour: Sequence[FloatArray],
         spacing: float,
-        legs: int,
+        legs: int | None,
         rng: np.random.Generator,
         within: str | None,
     ) -> FloatArray | None:
@@ -184,12 +211,14 @@ class _Search:
         self._spacing, self._clearance = spacing, clearance
         self._ways: dict[int, FloatArray] = {}
 
-    def run(self, legs: int, rng: np.random.Generator, room: Room | None) -> FloatArray | None:
-        """(legs + 1, 2) targets, or None where nothing is found."""
+    def run(
+        self, legs: int | None, rng: np.random.Generator, room: Room | None
+    ) -> FloatArray | None:
+        """(legs + 1, 2) targets, or None where nothing is found; legs None: to the last place."""
         path = [_Node(self._tour[0], 1, [])]
         path[0].children = self._candidates(path, rng, room)
         for _ in range(_MOST_STEPS):
-            if len(path) == legs + 1:
+            if len(path) - 1 == legs or (legs is None and self._ends(path[-1])):
                 return np.array([node.place for node in path])
             if not path[-1].children:
                 path.pop()
@@ -200,6 +229,11 @@ class _Search:
             path.append(_Node(place, self._next_goal(path[-1].goal, place), []))
             path[-1].children = self._candidates(path, rng, room)
         return None
+
+    def _ends(self, node: _Node) -> bool:
+        """Whether the tour's last place is within a leg."""
+        last = len(self._tour) - 1
+        return node.goal == last and bool(self._way(last, node.place[None])[0] < self._spacing)
 
     def _next_goal(self, goal: int, place: FloatArray) -> int:
         """The goal after a place: the next one of the tour as soon as this one is near."""

@@ -7,7 +7,7 @@ import pytest
 
 from fgslam.core.arrays import IntArray
 from fgslam.core.homing import OmniFeatures, TwoViewVector
-from fgslam.homing.link_consistency import ThirdViewConsistency
+from fgslam.homing.link_consistency import ThirdViewConsistency, Walks
 from fgslam.homing.links import Answer, Link, Pair
 from fgslam.homing.settings import TopologicalMapSettings
 from fgslam.homing.topological_map import TopologicalMap, map_of_answers
@@ -15,6 +15,7 @@ from tests.landmark_world import landmark_features
 
 SETTINGS = TopologicalMapSettings()
 COUNT, THINGS = 12, 60
+WALK = Walks((COUNT,))
 FAR = (1, 9)
 
 
@@ -49,7 +50,7 @@ def checked(far: list[Pair], seed: int | None) -> ThirdViewConsistency:
     """A walk, and links from one end of it to the other whose matches are true or by lot."""
     walk = [(k, k + 1) for k in range(COUNT - 1)]
     rows = rows_of(walk) | rows_of(far, seed)
-    return ThirdViewConsistency([view()] * COUNT, [link(p) for p in (*walk, *far)], rows)
+    return ThirdViewConsistency([view()] * COUNT, [link(p) for p in (*walk, *far)], rows, WALK)
 
 
 NEIGHBOURS = [FAR, (1, 8), (1, 10), (2, 9), (0, 9)]
@@ -91,7 +92,7 @@ def test_consecutive_images_confirm_links_of_a_few_steps_but_not_across_a_gap() 
     by_lot = rows_of([short], 1)
     for steps, believed in ((walk, True), ([p for p in walk if p != (4, 5)], False)):
         links = [link(p) for p in (*steps, short)]
-        views = ThirdViewConsistency([view()] * COUNT, links, rows_of(steps) | by_lot)
+        views = ThirdViewConsistency([view()] * COUNT, links, rows_of(steps) | by_lot, WALK)
         assert (short not in views.confirmed()[2]) is believed
 
 
@@ -111,7 +112,7 @@ def test_map_of_a_walk_has_confirmed_far_links_only(monkeypatch: pytest.MonkeyPa
         }
         rows = rows_of(walk) | rows_of(NEIGHBOURS, seed)
         images = [view()] * COUNT
-        return map_of_answers(images, answers, ordered=True, rows=rows)
+        return map_of_answers(images, answers, walks=WALK, rows=rows)
 
     true, false = built(None), built(0)
     assert FAR in {(k.a, k.b) for k in true.links}

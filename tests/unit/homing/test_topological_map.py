@@ -18,6 +18,7 @@ from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.homing.link_consistency import (
     _LONE_SUPPORT,
     LinkConsistency,
+    Walks,
     between_misfit,
     heading_residuals,
 )
@@ -166,7 +167,7 @@ def test_false_links_are_found_and_true_ones_kept(seed: int) -> None:
         turned(link, *rng.uniform(0.6, 2.5, 2) * rng.choice([-1, 1], 2)) if k in wrong else link
         for k, link in enumerate(links)
     ]
-    believed, rejected = LinkConsistency(16, spoiled).accepted(ordered=False)
+    believed, rejected = LinkConsistency(16, spoiled).accepted()
     false = {(links[k].a, links[k].b) for k in wrong}
     assert false == set(rejected)
     assert len(believed) == len(links) - len(false)
@@ -177,10 +178,10 @@ def test_long_link_between_similar_places_needs_a_third_view() -> None:
     poses = np.column_stack([np.arange(8.0), np.zeros(8), np.zeros(8)])
     chain = [true_link(poses, k, k + 1, 20) for k in range(7)]
     long = turned(true_link(poses, 1, 6, _LONE_SUPPORT - 1), 0.0, 1.0)
-    believed, rejected = LinkConsistency(8, [*chain, long]).accepted(ordered=True)
+    believed, rejected = LinkConsistency(8, [*chain, long], Walks((8,))).accepted()
     assert [(k.a, k.b) for k in believed] == [(k, k + 1) for k in range(7)]
     assert "no third image" in rejected[1, 6]
-    unordered, _ = LinkConsistency(8, chain).accepted(ordered=False)
+    unordered, _ = LinkConsistency(8, chain).accepted()
     assert unordered == []  # nothing but their order confirmed it
 
 
@@ -190,7 +191,7 @@ def test_strong_lone_link_that_is_turned_breaks_a_loop() -> None:
     poses = np.column_stack([4.0 * np.cos(angle), 4.0 * np.sin(angle), angle])
     ring = [true_link(poses, *sorted((k, (k + 1) % 10)), 120) for k in range(10)]
     across = turned(true_link(poses, 2, 7, 110), np.deg2rad(90.0))
-    believed, rejected = LinkConsistency(10, [*ring, across]).accepted(ordered=True)
+    believed, rejected = LinkConsistency(10, [*ring, across], Walks((10,))).accepted()
     assert set(rejected) == {(2, 7)}
     assert "off all other rotations" in rejected[2, 7]
     assert len(believed) == 10
@@ -245,10 +246,11 @@ def link_by_landmarks(a: OmniFeatures, b: OmniFeatures) -> Answer:
 def map_of_all(images: Sequence[OmniFeatures], settings: TopologicalMapSettings) -> TopologicalMap:
     """The map of images that follow each other: every candidate pair is tried both ways."""
     answers: dict[Pair, Answer] = {}
-    for a, b in map_candidates(images, settings, np.random.default_rng(0), ordered=True):
+    walks = Walks((len(images),))
+    for a, b in map_candidates(images, settings, np.random.default_rng(0), walks):
         answers[a, b] = link_by_landmarks(images[a], images[b])
         answers[b, a] = link_by_landmarks(images[b], images[a])
-    return map_of_answers(images, answers, ordered=True)
+    return map_of_answers(images, answers, walks=walks)
 
 
 @pytest.fixture(scope="module")
