@@ -82,18 +82,8 @@ def opener_of(  # noqa: C901, PLR0911 - one a task
             from fgslam.runs.tasks.homing_video import open_video
 
             return open_video
-        case TeachConfig():
-            from fgslam.runs.tasks.route_teaching import open_teaching
-
-            return open_teaching
-        case FollowConfig():
-            from fgslam.runs.tasks.route_following import open_following
-
-            return open_following
-        case JoinConfig():
-            from fgslam.runs.tasks.route_joining import open_joining
-
-            return open_joining
+        case TeachConfig() | FollowConfig() | JoinConfig():
+            return _opener_of_routes(config)
         case HomingTrialsConfig():
             from fgslam.runs.tasks.homing_trials import open_trials
 
@@ -108,3 +98,19 @@ def opener_of(  # noqa: C901, PLR0911 - one a task
             return open_drives
         case _:
             raise ConfigError(f"task {config.task_name}: cannot be run")
+
+
+def _opener_of_routes(config: TeachConfig | FollowConfig | JoinConfig) -> Opener[RunResult]:
+    match config:
+        case TeachConfig():
+            from fgslam.runs.tasks.route_teaching import open_teaching
+
+            return open_teaching
+        case FollowConfig():
+            from fgslam.runs.tasks.route_following import open_following
+
+            return open_following
+        case JoinConfig():
+            from fgslam.runs.tasks.route_joining import open_joining
+
+            return open_joining
