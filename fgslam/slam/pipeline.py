@@ -227,6 +227,7 @@ class SlamPipeline:
         return dataclasses.replace(seen, loops=loops)
 
     def _remember(self, increment: Increment, seen: _Seen, stats: UpdateStats) -> None:
+        self.tracker.parts.book(increment, stats.closed)
         if self.places is not None:
             self.places.remember(increment, seen.tracking.wTc, stats)
 

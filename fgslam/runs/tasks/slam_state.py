@@ -39,6 +39,7 @@ def state_of(pipeline: SlamPipeline, recorder: RunRecorder) -> StateArrays:
         "database": pipeline.tracker.database.state(),
         "estimator": _resumable(pipeline.estimator).state(),
         "motion": pipeline.motion.state(),
+        "parts": pipeline.tracker.parts.state(),
         "recorder": recorder.state(),
     }
     if pipeline.places is not None:
@@ -65,6 +66,7 @@ def restore(
     pipeline.tracker.database.restore(_part(state, "database"))
     _resumable(pipeline.estimator).restore(_part(state, "estimator"))
     pipeline.motion.restore(_part(state, "motion"))
+    pipeline.tracker.parts.restore(_part(state, "parts"))
     recorder.restore(_part(state, "recorder"), log)
     if pipeline.places is not None:
         pipeline.places.restore(_part(state, "places"), recorder.log)
