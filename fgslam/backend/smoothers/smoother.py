@@ -20,7 +20,12 @@ import numpy as np
 
 from fgslam.backend.filters.filtered import require_finite
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
-from fgslam.backend.filters.loop_correction import CLOSURE_FACTOR, FREE, Constraint
+from fgslam.backend.filters.loop_correction import (
+    CLOSURE_FACTOR,
+    FREE,
+    Constraint,
+    founds_anew,
+)
 from fgslam.backend.settings import GraphSettings, LandmarkKalmanSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
 from fgslam.backend.smoothers.keyframes import Segments, fill_between
@@ -130,7 +135,8 @@ class Smoother:
             EstimatorError: a number is not finite, or time does not increase; the state is then as
                 before. Or the solver failed beyond repair; the estimator is then at its end.
         """
-        if increment.relocalised and self._inputs.increments:
+        free = increment.relocalised or founds_anew(increment, tracking)
+        if free and self._inputs.increments:
             increment = dataclasses.replace(increment, odometry=self._unknown_step(tracking))
         require_finite(increment, tracking)
         before = self._tracker.predict(None).wTc
@@ -195,7 +201,7 @@ class Smoother:
     # -- its steps -----------------------------------------------------------------------------
 
     def _unknown_step(self, tracking: EgoMotion) -> Odometry:
-        """The step to a frame found without a prior: as found, and free to be any other."""
+        """The step to a frame found without a prior, or not at all: free to be any other."""
         before = self._tracker.predict(None).wTc
         return Odometry(inverse(before) @ tracking.wTc, FREE, measured=False)
 

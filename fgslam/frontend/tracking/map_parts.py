@@ -52,7 +52,7 @@ class MapParts:
     @property
     def connected(self) -> BoolArray:
         """(n,) frames that hang together with the first one by measurements."""
-        return np.array(self._frames, np.int64) == _FIRST
+        return np.asarray(np.array(self._frames, np.int64) == _FIRST)
 
     def placed_by(self, ids: IntArray) -> int:
         """The part that most of the landmarks (k,) belong to, the oldest of several; -1 of none."""

@@ -80,8 +80,9 @@ class LandmarkTracker:
         matcher: MapMatcher,
         ego_motion: EgoMotionSolver,
     ) -> None:
-        """The database is shared with whoever shows or saves it; the loop books frames in ``parts``.
+        """The database is shared with whoever shows or saves it.
 
+        Which part of the map is which is booked in ``parts`` by whoever drives.
         With ``keeps_map`` nothing is booked, started or pruned: the map is only localised in. With
         ``expects_returns`` place recognition tells old landmarks from recent ones where they
         contradict each other; without, the prediction was wrong.
