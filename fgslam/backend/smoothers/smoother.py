@@ -137,7 +137,8 @@ class Smoother:
         """
         free = increment.relocalised or founds_anew(increment, tracking)
         if free and self._inputs.increments:
-            increment = dataclasses.replace(increment, odometry=self._unknown_step(tracking))
+            step = self._unknown_step(increment, tracking)
+            increment = dataclasses.replace(increment, odometry=step)
         require_finite(increment, tracking)
         before = self._tracker.predict(None).wTc
         stats = self._tracker.update(dataclasses.replace(increment, loops=()), tracking)
@@ -200,10 +201,17 @@ class Smoother:
 
     # -- its steps -----------------------------------------------------------------------------
 
-    def _unknown_step(self, tracking: EgoMotion) -> Odometry:
-        """The step to a frame found without a prior, or not at all: free to be any other."""
-        before = self._tracker.predict(None).wTc
-        return Odometry(inverse(before) @ tracking.wTc, FREE, measured=False)
+    def _unknown_step(self, increment: Increment, tracking: EgoMotion) -> Odometry:
+        """The step to a frame found without a prior, or not at all: free to be any other.
+
+        But a gyroscope has felt even how the camera was carried.
+        """
+        before, turn = self._tracker.predict(None).wTc, increment.odometry
+        motion, covariance = inverse(before) @ tracking.wTc, FREE
+        if turn is not None and turn.turned:
+            motion[:3, :3], covariance = turn.motion[:3, :3], FREE.copy()
+            covariance[:3, :3] = turn.covariance[:3, :3]
+        return Odometry(motion, covariance, measured=False)
 
     def _record(self, increment: Increment, tracking: EgoMotion) -> None:
         self._inputs.append(increment, tracking)
