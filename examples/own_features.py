@@ -2,10 +2,11 @@
 # # Features of your own
 #
 # A feature extractor is any function from a grey image to `fgslam.Features`
-# (`fgslam.FeatureExtractor`): n positions, scales and orientations with descriptors (n, 128) of
-# bytes. Everything after it, from stereo matching to the map, works on them.
+# (`fgslam.FeatureExtractor`): n positions, scales and orientations, with descriptors of any kind.
+# 128 bytes are taken as they are, other bytes as packed bits (ORB, BRISK, AKAZE), other numbers as
+# vectors. Everything after it, from stereo matching to the map, works on them.
 #
-# Here: RootSIFT (Arandjelovic and Zisserman, CVPR 2012), SIFT whose descriptors are compared by the
+# First RootSIFT (Arandjelovic and Zisserman, CVPR 2012): SIFT whose descriptors are compared by the
 # Hellinger kernel, which is the Euclidean distance of their square roots.
 
 # %%
@@ -32,10 +33,32 @@ def root_sift(image: Image) -> fg.Features:
     )
 
 
+# %% [markdown]
+# Then ORB (Rublee et al., ICCV 2011): another detector, too, corners with 256 bits. It finds them
+# at whole pixels, which would cost a stereo camera its depth; `cornerSubPix` refines them.
+
+
+# %%
+def orb(image: Image) -> fg.Features:
+    """Features of a grey image (height, width) uint8; called from several threads at once."""
+    detector = cv2.ORB.create(nfeatures=1500, fastThreshold=7)
+    points, descriptors = detector.detectAndCompute(image, None)
+    xy = np.array([point.pt for point in points], np.float32).reshape(-1, 2)
+    if points:
+        enough = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 0.01)
+        cv2.cornerSubPix(image, xy, (3, 3), (-1, -1), enough)  # in place
+    return fg.Features(
+        xy=xy.astype(np.float64),
+        scale=np.array([1.2**point.octave for point in points]),
+        orientation=np.deg2rad([point.angle for point in points]),
+        descriptors=np.zeros((0, 32), np.uint8) if descriptors is None else descriptors,
+    )
+
+
 # %%
 recording = fg.rendered_recording("lab", frames=12)
 results = {}
-for name, extractor in {"SIFT": None, "RootSIFT": root_sift}.items():
+for name, extractor in {"SIFT": None, "RootSIFT": root_sift, "ORB": orb}.items():
     with fg.Slam(recording.rig, estimator="landmark_kalman", features=extractor) as slam:
         for t, images, odometry in recording:
             step = slam.track(t, images, odometry)

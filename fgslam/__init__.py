@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from fgslam.runs.live import Result, Slam
     from fgslam.runs.maps import Map
     from fgslam.slam.feature_stream import FeatureExtractor
+    from fgslam.slam.motion import MotionModel
     from fgslam.slam.newest_frame import NewestFrame
     from fgslam.slam.results import Step
 
@@ -52,6 +53,7 @@ __all__ = [
     "HomingVector",
     "Map",
     "MeasurementLog",
+    "MotionModel",
     "NewestFrame",
     "Odometry",
     "PathFollower",
@@ -86,6 +88,7 @@ _HOMES = {
     "HomingVector": "fgslam.homing.api",
     "Map": "fgslam.runs.maps",
     "MeasurementLog": "fgslam.core.measurement_log",
+    "MotionModel": "fgslam.slam.motion",
     "NewestFrame": "fgslam.slam.newest_frame",
     "Odometry": "fgslam.core.measurements",
     "PathFollower": "fgslam.homing.api",

@@ -34,7 +34,7 @@ from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.opening import open_sequence
 from fgslam.slam.factory import make_pipeline, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
-from fgslam.slam.motion import body_motion
+from fgslam.slam.motion import body_motion, description_of
 from fgslam.slam.pipeline import SlamPipeline
 from fgslam.slam.results import RunRecorder
 
@@ -164,7 +164,7 @@ def run_blocks(
 ) -> tuple[Series, int]:
     """The whole drive, block by block; and how many landmarks the map had at its end."""
     pipeline = make_pipeline(sequence.rig, config.frontend, config.odometry, config.estimator)
-    recorder = RunRecorder(MeasurementLog(sequence.rig, pipeline.motion.description()))
+    recorder = RunRecorder(MeasurementLog(sequence.rig, description_of(pipeline.motion)))
     ways = raw_sift(config)
     way, series = None, Series()
     for number, start in enumerate(range(0, len(sequence), BLOCK)):

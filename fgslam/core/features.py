@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,19 +14,19 @@ from fgslam.core.measurements import Observations
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Features(Rows):
-    """SIFT features of one image.
+    """Features of one image.
 
     Attributes:
         xy: (n, 2) sub-pixel (column, row).
         scale: (n,) standard deviation of the Gaussian at which the feature was found, in pixels.
         orientation: (n,) radians, clockwise from the image's x axis, in [0, 2 pi).
-        descriptors: (n, 128) uint8.
+        descriptors: (n, 128) uint8; as an own extractor gives them, (n, d) of any kind.
     """
 
     xy: FloatArray
     scale: FloatArray
     orientation: FloatArray
-    descriptors: ByteArray
+    descriptors: npt.NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

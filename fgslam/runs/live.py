@@ -27,6 +27,7 @@ from fgslam.runs.opening import open_sequence
 from fgslam.slam.arrival import MapStart, evidence_of, saved_map
 from fgslam.slam.feature_stream import FeatureExtractor
 from fgslam.slam.map_settings import MapSettings
+from fgslam.slam.motion import MotionModel
 from fgslam.slam.results import SessionResult
 from fgslam.slam.session import Session
 
@@ -73,7 +74,7 @@ class Slam(Session):
         estimator: str | EstimatorSettings | Estimator = DEFAULT_ESTIMATOR,
         *,
         frontend: FrontendSettings | Mapping[str, Any] | None = None,
-        odometry: OdometrySettings | None = None,
+        odometry: OdometrySettings | MotionModel | None = None,
         features: FeatureExtractor | None = None,
         seed: int = 0,
         start_map: Map | MapStart | None = None,
@@ -95,10 +96,11 @@ class Slam(Session):
                 for what differs from these: ``{"stereo": {"max_disparity_px": 80}}``.
             odometry: what predicts the motion. None: the odometry that is handed in, and constant
                 velocity over frames without any. With `constant_velocity` what is handed in is
-                ignored.
+                ignored. Or an own object with the members of :class:`fgslam.MotionModel`, for this
+                session alone.
             features: an own extractor, from a grey image (height, width) uint8 to
-                :class:`~fgslam.core.features.Features`; it is called from several threads. None
-                for SIFT.
+                :class:`~fgslam.core.features.Features`, descriptors of any kind; it is called from
+                several threads. None for SIFT.
             seed: of everything random: samples of place recognition.
             start_map: where to begin, as :meth:`fgslam.Map.load` gives it; None: an empty map.
             extend_map: False leaves the map as it is, and the session only localises in it

@@ -36,6 +36,7 @@ from fgslam.datasets.settings import (
     ConstantVelocitySettings,
     OdometrySettings,
     RecordedOdometrySettings,
+    SyntheticOdometrySettings,
 )
 from fgslam.frontend.camera_watch import CameraWatch
 from fgslam.frontend.features.sift import SiftExtractor
@@ -49,7 +50,12 @@ from fgslam.frontend.tracking.map_matching import MapMatcher
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.slam.arrival import Arrival, take_over, trusted
 from fgslam.slam.feature_stream import FeatureExtractor, FeatureFrame, FeatureStream
-from fgslam.slam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
+from fgslam.slam.motion import (
+    MOTION_MEMBERS,
+    ConstantVelocityMotion,
+    MotionModel,
+    OdometryMotion,
+)
 from fgslam.slam.pipeline import SlamPipeline
 
 if TYPE_CHECKING:
@@ -97,10 +103,12 @@ def make_key_frames(
     return KeyFrameTracker(tracker, carrier)
 
 
-def make_motion(rig: CameraRig, settings: OdometrySettings) -> MotionModel:
-    """Motion model by the settings."""
+def make_motion(rig: CameraRig, settings: OdometrySettings | MotionModel) -> MotionModel:
+    """Motion model by the settings; one that is given is taken as it is."""
     if isinstance(settings, ConstantVelocitySettings):
         return ConstantVelocityMotion(settings)
+    if not isinstance(settings, RecordedOdometrySettings | SyntheticOdometrySettings):
+        return settings
     gap = settings.gap if isinstance(settings, RecordedOdometrySettings) else None
     stand_in = ConstantVelocityMotion(gap or ConstantVelocitySettings())
     return OdometryMotion(rig.bTc, settings.kind, stand_in)
@@ -186,7 +194,7 @@ def make_floor(rig: Sensor, settings: FloorSettings, dof: DegreesOfFreedom) -> F
 def make_pipeline(
     rig: CameraRig,
     frontend: FrontendSettings,
-    odometry: OdometrySettings,
+    odometry: OdometrySettings | MotionModel,
     estimator_settings: EstimatorSettings | Estimator,
     seed: int = 0,
     arrival: Arrival | None = None,
@@ -196,14 +204,14 @@ def make_pipeline(
     Args:
         rig: the rectified cameras.
         frontend: settings of all that measures.
-        odometry: settings of what predicts the motion.
+        odometry: settings of what predicts the motion; or what predicts it.
         estimator_settings: which estimator to make; or one already made, at its prior pose.
         seed: of place recognition's samples.
         arrival: where the run begins in a saved map; None begins with an empty one.
     """
     prior = None if arrival is None else arrival.prior
     estimator = made_or_given(rig, estimator_settings, frontend.ego_motion, prior)
-    measured_odometry = odometry.kind != "constant_velocity"
+    measured_odometry = not isinstance(odometry, ConstantVelocitySettings)
     require_support(estimator, measured_odometry, loops=frontend.loops is not None)
     tracker = make_tracker(rig, frontend)
     if arrival is not None:
@@ -215,9 +223,7 @@ def make_pipeline(
         tracker=tracker,
         motion=make_motion(rig, odometry),
         estimator=estimator,
-        places=make_places(
-            rig, frontend, tracker, seed, MeasurementType.LOOP in estimator.supports
-        ),
+        places=make_places(rig, frontend, tracker, seed),
         calibration=make_calibration(rig, frontend),
         key_frames=make_key_frames(rig, frontend, tracker),
         watch=CameraWatch(rig) if frontend.watch_cameras else None,
@@ -243,22 +249,14 @@ def make_calibration(rig: CameraRig, settings: FrontendSettings) -> SelfCalibrat
 
 
 def make_places(
-    rig: CameraRig,
-    settings: FrontendSettings,
-    tracker: LandmarkTracker,
-    seed: int,
-    joins: bool = False,
+    rig: CameraRig, settings: FrontendSettings, tracker: LandmarkTracker, seed: int
 ) -> PlaceRecognition | None:
-    """Place recognition: loop closures and relocalisation; None where neither is wanted.
-
-    Where the estimator takes closures it joins parts of the map (``joins``).
-    """
-    if settings.loops is None and settings.lost is None and not joins:
+    """Place recognition: loop closures and relocalisation; None where neither is wanted."""
+    if settings.loops is None and settings.lost is None:
         return None
     from fgslam.frontend.places.recognition import PlaceRecognition, RecognitionParts
 
     parts = RecognitionParts(
-        joins=joins,
         loops=settings.loops,
         lost=settings.lost,
         appearance=settings.appearance,
@@ -378,16 +376,32 @@ def chosen_frontend(given: FrontendSettings | Mapping[str, Any] | None) -> Front
         ) from None
 
 
-def chosen_odometry(given: OdometrySettings | None) -> OdometrySettings:
-    """Settings of the odometry as given; None: the defaults. Raises ConfigError for others."""
+def chosen_odometry(
+    given: OdometrySettings | MotionModel | None,
+) -> OdometrySettings | MotionModel:
+    """Settings of the odometry, or a motion model, as given; None: the default settings.
+
+    Raises:
+        ConfigError: it is neither.
+    """
     if given is None:
         return RecordedOdometrySettings()
-    if not any(isinstance(given, kind) for kind in _members(OdometrySettings)):
+    if _is_odometry_settings(given):
+        return given
+    lacking = [name for name in MOTION_MEMBERS if not hasattr(given, name)]
+    if lacking or isinstance(given, type):
+        why = f"lacks {', '.join(lacking)}" if lacking else "is a class"
+        name = given.__name__ if isinstance(given, type) else type(given).__name__
         raise ConfigError(
-            f"odometry is a {type(given).__name__}; give settings, e.g. "
-            "fgslam.datasets.settings.ConstantVelocitySettings()"
+            f"odometry: {name} {why}; give settings, e.g. "
+            "fgslam.datasets.settings.ConstantVelocitySettings(), or an object with the members of "
+            "fgslam.MotionModel"
         )
     return given
+
+
+def _is_odometry_settings(value: object) -> TypeGuard[OdometrySettings]:
+    return isinstance(value, _members(OdometrySettings))
 
 
 def _dotted(location: tuple[int | str, ...]) -> str:

@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import zip_longest
 from typing import Protocol, TypeAlias
@@ -19,6 +19,7 @@ from fgslam.core.arrays import BoolArray, Image
 from fgslam.core.errors import ConfigError, FrameError
 from fgslam.core.features import Features
 from fgslam.core.recordings import Frame, Sequence
+from fgslam.frontend.features.own_descriptors import as_bytes
 
 # Frames in work at once. Three images on two cores leave one idle at the end of each frame;
 # the next frame's images fill the gap.
@@ -64,8 +65,9 @@ class FeatureExtractor(Protocol):
         Returns:
             n features: ``xy`` (n, 2) (column, row) in pixels, ``scale`` (n,) in pixels,
             ``orientation`` (n,) in radians from x axis to y axis, in [0, 2 pi), ``descriptors``
-            (n, 128) uint8. Matching compares Euclidean distances of descriptors whose norm is about
-            512, as SIFT's is; shorter ones are padded with zeros.
+            (n, d) of any kind. Of uint8, 128 are taken as they are, with a norm of about 512 as
+            SIFT's; others are packed bits, as ORB's, compared by Hamming distance. Other numbers
+            are vectors, compared by the angle between them.
         """
         ...
 
@@ -188,19 +190,19 @@ def _checked(found: Features) -> Features:
         if not isinstance(value, np.ndarray):
             raise ConfigError(f"features: {name} is a {type(value).__name__}; give an array")
     n = found.scale.size
-    shapes = {"xy": (n, 2), "scale": (n,), "orientation": (n,), "descriptors": (n, 128)}
+    shapes = {"xy": (n, 2), "scale": (n,), "orientation": (n,)}
     for name, shape in shapes.items():
         if np.shape(getattr(found, name)) != shape:
             raise ConfigError(
                 f"features: {name} has shape {np.shape(getattr(found, name))}, not {shape}; {n} "
-                "features were found (pad shorter descriptors with zeros)"
+                "features were found"
             )
-    if found.descriptors.dtype != np.uint8:
+    descriptors = as_bytes(found.descriptors)
+    if len(descriptors) != n:
         raise ConfigError(
-            f"features: descriptors are {found.descriptors.dtype}; give uint8, scaled as SIFT's to "
-            "a norm of about 512"
+            f"features: {len(descriptors)} descriptors of {n} features; give each one"
         )
-    return found
+    return replace(found, descriptors=descriptors)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -18,6 +17,7 @@ from fgslam.core.sensors import CameraRig
 from fgslam.datasets.odometry import pose_noise
 from fgslam.datasets.settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.frontend.features.images import grey_image
+from fgslam.slam.motion import MotionModel
 
 Images: TypeAlias = Sequence[npt.ArrayLike]
 """Images (left, right[, top]) of one instant."""
@@ -64,9 +64,9 @@ def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
 
 
 def checked_odometry(
-    given: Odometry | npt.ArrayLike | None, settings: OdometrySettings
+    given: Odometry | npt.ArrayLike | None, settings: OdometrySettings | MotionModel
 ) -> Odometry | None:
-    """Motion of the body with covariance; a bare (4, 4) gets the noise of the settings.
+    """Motion of the body with covariance; a bare (4, 4) gets the noise of settings.
 
     Raises:
         OdometryError: it is not finite, of another shape, no rigid motion, or its covariance is
@@ -76,7 +76,7 @@ def checked_odometry(
         return None
     if isinstance(given, Odometry):
         motion = _rigid(given.motion)
-        return replace(given, motion=motion, covariance=_covariance(given.covariance))
+        return Odometry(motion, _covariance(given.covariance), given.measured)
     motion = _rigid(given)
     noise = settings if isinstance(settings, RecordedOdometrySettings) else None
     return Odometry(motion, pose_noise(motion, noise or RecordedOdometrySettings()))

@@ -13,7 +13,6 @@ from fgslam.core.geometry import inverse, odometry_of_camera, se3_exp, se3_log
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
 from fgslam.datasets.settings import ConstantVelocitySettings
-from fgslam.slam.gyroscope import GyroscopeError, turn_of_camera, turned_by
 from fgslam.slam.motion_noise import MotionNoise
 
 _LARGEST_SIGMA = np.repeat([3.0, 30.0], 3)
@@ -22,7 +21,7 @@ more, and leave a graph that no solver solves."""
 
 
 class MotionModel(Protocol):
-    """Gives the camera's motion from the previous frame to the next one."""
+    """Gives the camera's motion from the previous frame to the next one: an extension point."""
 
     @property
     def uses_odometry(self) -> bool:
@@ -31,6 +30,9 @@ class MotionModel(Protocol):
 
     def between(self, timestamp: float, body: Odometry | None) -> Odometry | None:
         """Camera motion since the last frame, measured or a stand-in; None for the first frame.
+
+        Estimators take it as a measurement with its covariance. One that is marked ``measured`` is
+        in the log, and so the same in every replay.
 
         Args:
             timestamp: of the new frame, seconds.
@@ -56,24 +58,26 @@ class MotionModel(Protocol):
         """Learns a pose that its prediction failed to foresee, though the camera moved there."""
         ...
 
-    def description(self) -> dict[str, Any]:
-        """Kind and numbers, as plain JSON values, for the log."""
-        ...
 
-    def state(self) -> StateArrays:
-        """What is needed to continue."""
-        ...
+MOTION_MEMBERS = ("uses_odometry", "between", "observe", "displaced", "regained")
+"""What the loop needs of a motion model."""
 
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        ...
+
+def description_of(motion: MotionModel) -> dict[str, Any]:
+    """What the log says of a motion model.
+
+    Of one that is not of this package only the name: what it measured is in the log frame by
+    frame, and over other frames a replay assumes constant velocity.
+    """
+    if isinstance(motion, OdometryMotion | ConstantVelocityMotion):
+        return motion.description()
+    return {"kind": type(motion).__name__, "stand_in": asdict(ConstantVelocitySettings())}
 
 
 class OdometryMotion:
     """The robot's odometry, moved from its body to the camera (Se et al. 5).
 
-    Over a gap in it, constant velocity stands in; so it does for the translation of a gyroscope's
-    turns, which are corrected by what the matches say of its bias.
+    Over a gap in it, constant velocity stands in.
     """
 
     uses_odometry = True
@@ -83,44 +87,36 @@ class OdometryMotion:
         self._bTc = bTc
         self._kind = kind
         self._stand_in = stand_in
-        self._gyroscope = GyroscopeError()
 
     def between(self, timestamp: float, body: Odometry | None) -> Odometry | None:
         """Camera motion by the odometry, or by the stand-in."""
         if body is None:
             return self._stand_in.between(timestamp)
-        if not body.turned:
-            return odometry_of_camera(body, self._bTc)
-        turn = self._gyroscope.corrected(turn_of_camera(body, self._bTc))
-        return self._gyroscope.handed(self._stand_in.between(timestamp, turn))
+        return odometry_of_camera(body, self._bTc)
 
     def observe(self, timestamp: float, pose: Prediction, measured: bool) -> None:
-        """Updates the velocity of the stand-in, how far it is to be trusted, and the bias."""
+        """Updates the velocity of the stand-in, and how far it is to be trusted."""
         self._stand_in.observe(timestamp, pose, measured)
-        self._gyroscope.observe(pose)
 
     def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
         """The stand-in goes on from there."""
         self._stand_in.displaced(timestamp, wTc, carried)
-        self._gyroscope.displaced()
 
     def regained(self, timestamp: float, wTc: FloatArray) -> None:
         """The stand-in goes on from there."""
         self._stand_in.regained(timestamp, wTc)
-        self._gyroscope.displaced()
 
     def description(self) -> dict[str, Any]:
         """The kind of odometry and what bridges its gaps."""
         return {"kind": self._kind, "stand_in": self._stand_in.description()}
 
     def state(self) -> StateArrays:
-        """State of the stand-in and of the gyroscope's bias."""
-        return self._stand_in.state() | self._gyroscope.state()
+        """State of the stand-in."""
+        return self._stand_in.state()
 
     def restore(self, state: StateArrays) -> None:
-        """State of the stand-in and of the gyroscope's bias."""
+        """State of the stand-in."""
         self._stand_in.restore(state)
-        self._gyroscope.restore(state)
 
 
 class ConstantVelocityMotion:
@@ -143,24 +139,17 @@ class ConstantVelocityMotion:
         self._velocity: FloatArray | None = None
 
     def between(self, timestamp: float, body: Odometry | None = None) -> Odometry | None:
-        """Motion at the last velocity over the new interval ``dt``.
-
-        Where ``body`` is a turn of the camera, its rotation takes the place of the velocity's;
-        other odometry is not used.
+        """Motion at the last velocity over the new interval ``dt``; ``body`` is not used.
 
         The velocity has wandered by ``sigma * T`` over the time T since it was last measured, so
         the step's standard deviation is ``sigma * T * dt``: ``sigma * dt^2`` from frame to frame,
         and growing while the camera is blind. Then the velocity fades, too.
         """
-        guess = None if self._timestamp is None else self._guess(timestamp - self._timestamp)
-        if guess is None or body is None or not body.turned:
-            return guess
-        return turned_by(guess, body)
-
-    def _guess(self, dt: float) -> Odometry:
-        if self._velocity is None or self._timestamp is None:
+        if self._timestamp is None:
+            return None
+        dt = timestamp - self._timestamp
+        if self._velocity is None:
             return Odometry(np.eye(4), np.diag((self._start_sigma * dt) ** 2), measured=False)
-        timestamp = self._timestamp + dt
         wandered = self._noise.variance * (timestamp - self._measured_at) ** 2
         variance = np.minimum(wandered * dt**2, _LARGEST_SIGMA**2)
         blind = self._measured_at < self._timestamp

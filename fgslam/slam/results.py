@@ -258,10 +258,7 @@ class SessionResult(Brief):
         return (*self.notes, *self.estimate.remarks)
 
     def column(self, name: str) -> npt.NDArray[Any]:
-        """(n,) one number of every frame: `status`, `matched`, `inliers`, `nis`, `update_ms`...
-
-        `connected` is False where a gap that nothing bridges lies between the first frame and it.
-        """
+        """(n,) one number of every frame: `status`, `matched`, `inliers`, `nis`, `update_ms`..."""
         return self.frames[name]
 
 
@@ -288,8 +285,7 @@ def result_of(
         online=online,
         online_covariances=covariances,
         closed=() if pipeline.places is None else tuple(pipeline.places.taken),
-        frames=_columns(recorder)
-        | {"connected": pipeline.tracker.parts.connected[: len(recorder)]},
+        frames=_columns(recorder),
         notes=notes,
         rig=None if pipeline.calibration is None else pipeline.calibration.found,
     )

@@ -42,7 +42,7 @@ from fgslam.slam.feature_stream import (
 )
 from fgslam.slam.first_images import FirstImages, any_uint16, stereo_remarks
 from fgslam.slam.inputs import Images, checked_images, checked_odometry
-from fgslam.slam.part_remarks import part_remarks
+from fgslam.slam.motion import MotionModel, description_of
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.results import RunRecorder, SessionResult, Step, result_of
 
@@ -81,7 +81,7 @@ class Session:
         estimator: str | EstimatorSettings | Estimator = DEFAULT_ESTIMATOR,
         *,
         frontend: FrontendSettings | Mapping[str, Any] | None = None,
-        odometry: OdometrySettings | None = None,
+        odometry: OdometrySettings | MotionModel | None = None,
         features: FeatureExtractor | None = None,
         seed: int = 0,
         beginning: Arrival | MapStart | None = None,
@@ -97,7 +97,8 @@ class Session:
                 for what differs from these: ``{"stereo": {"max_disparity_px": 80}}``.
             odometry: what predicts the motion. None: the odometry that is handed in, and constant
                 velocity over frames without any. With `constant_velocity` what is handed in is
-                ignored.
+                ignored. Or an own object with the members of
+                :class:`fgslam.slam.motion.MotionModel`, for this session alone.
             features: an own extractor, from a grey image (height, width) uint8 to
                 :class:`~fgslam.core.features.Features`; it is called from several threads. None
                 for SIFT.
@@ -125,7 +126,7 @@ class Session:
             beginning = self._begun(beginning, chosen, seed)
         self._describer = FrameDescriber(features or make_extractor(frontend))
         self.pipeline = self._made(beginning)
-        self.recorder = RunRecorder(MeasurementLog(rig, self.pipeline.motion.description()))
+        self.recorder = RunRecorder(MeasurementLog(rig, description_of(self.pipeline.motion)))
         self._left_out = _LeftOut()
         self._seen = FirstImages()
         self._margins = rig.margins if isinstance(rig, StereoRig) else ()
@@ -281,7 +282,6 @@ class Session:
             raise SessionError(self._why_empty())
         notes = stereo_remarks(self.recorder, self._seen)
         notes = (*camera_remarks(self.recorder, self.pipeline.watch), *notes)
-        notes = (*part_remarks(self.recorder, self.pipeline.tracker.parts), *notes)
         if left_out.count:
             notes = (*notes, f"the first {left_out.count} frames could not be located: left out")
         with one_blas_thread():

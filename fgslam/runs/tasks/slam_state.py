@@ -24,6 +24,7 @@ from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, e
 from fgslam.runs.tasks.slam_outputs import RunOutputs
 from fgslam.slam.arrival import evidence_of, saved_map
 from fgslam.slam.map_settings import MapSettings
+from fgslam.slam.motion import MotionModel
 from fgslam.slam.pipeline import SlamPipeline
 from fgslam.slam.results import RunRecorder
 
@@ -38,8 +39,7 @@ def state_of(pipeline: SlamPipeline, recorder: RunRecorder) -> StateArrays:
     parts = {
         "database": pipeline.tracker.database.state(),
         "estimator": _resumable(pipeline.estimator).state(),
-        "motion": pipeline.motion.state(),
-        "parts": pipeline.tracker.parts.state(),
+        "motion": _resumable(pipeline.motion).state(),
         "recorder": recorder.state(),
     }
     if pipeline.places is not None:
@@ -65,8 +65,7 @@ def restore(
     """
     pipeline.tracker.database.restore(_part(state, "database"))
     _resumable(pipeline.estimator).restore(_part(state, "estimator"))
-    pipeline.motion.restore(_part(state, "motion"))
-    pipeline.tracker.parts.restore(_part(state, "parts"))
+    _resumable(pipeline.motion).restore(_part(state, "motion"))
     recorder.restore(_part(state, "recorder"), log)
     if pipeline.places is not None:
         pipeline.places.restore(_part(state, "places"), recorder.log)
@@ -107,14 +106,15 @@ def load_checkpoint(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder)
         )
 
 
-def _resumable(estimator: Estimator) -> Resumable:
-    """The estimator, if its state can be kept. Raises OutputError where it cannot."""
-    if not isinstance(estimator, Resumable):
+def _resumable(part: Estimator | MotionModel) -> Resumable:
+    """The part of a run, if its state can be kept. Raises OutputError where it cannot."""
+    if not isinstance(part, Resumable):
+        name = f"estimator {part.kind}" if hasattr(part, "kind") else type(part).__name__
         raise OutputError(
-            f"estimator {estimator.kind} has no state() and restore(): its run keeps no "
+            f"{name} has no state() and restore(): its run keeps no "
             "checkpoint; give it both, or set output.checkpoint_seconds beyond the run's length"
         )
-    return estimator
+    return part
 
 
 def _part(state: StateArrays, part: str) -> StateArrays:

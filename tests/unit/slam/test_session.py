@@ -31,7 +31,9 @@ from fgslam.core.features import Features
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.datasets.settings import ConstantVelocitySettings
+from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.slam.pipeline import FrameReport
+from fgslam.slam.replay import replay
 from fgslam.slam.results import SessionResult
 from fgslam.slam.session import Session
 
@@ -305,8 +307,48 @@ def test_a_failure_in_the_first_frame_is_why_there_is_no_result(views: Views) ->
 
 
 def test_what_are_no_odometry_settings_is_refused(views: Views) -> None:
-    with pytest.raises(ConfigError, match="odometry is a str; give settings"):
+    with pytest.raises(ConfigError, match=r"odometry: str lacks uses_odometry, .*; give settings"):
         session(views, odometry="constant_velocity")
+
+
+class Standing:
+    """A motion model of one's own: the camera stays, to 20 cm and 3 degrees a frame."""
+
+    uses_odometry = False
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[float, bool]] = []
+
+    def between(self, timestamp: float, body: Odometry | None) -> Odometry | None:
+        assert body is None
+        sigma = np.repeat([0.05, 0.2], 3)
+        return Odometry(np.eye(4), np.diag(sigma**2)) if self.seen else None
+
+    def observe(self, timestamp: float, pose: Any, measured: bool) -> None:
+        self.seen.append((timestamp, measured))
+
+    def displaced(self, timestamp: float, wTc: Any, carried: bool) -> None:
+        raise AssertionError("nothing moved it")
+
+    regained = displaced
+
+
+def test_a_motion_model_of_ones_own_predicts_and_is_in_the_log(views: Views) -> None:
+    motion = Standing()
+    slam = session(views, odometry=motion)
+    push(slam, views, range(FRAMES))
+    assert motion.seen == [(0.5 * k, True) for k in range(FRAMES)]
+    steps = [increment.odometry for increment in slam.log]
+    assert steps[0] is None
+    assert all(step is not None and np.array_equal(step.motion, np.eye(4)) for step in steps[1:])
+    again = replay(slam.log, LandmarkKalmanSettings(), EgoMotionSettings())
+    expected = slam.result().trajectory.poses
+    np.testing.assert_allclose(again.estimate.trajectory.poses, expected, rtol=0, atol=0.02)
+
+
+def test_a_motion_model_that_is_none_is_refused(views: Views) -> None:
+    with pytest.raises(ConfigError, match=r"odometry: Standing is a class; give settings"):
+        session(views, odometry=Standing)
 
 
 class FailingAfterUpdate(LandmarkKalman):
@@ -408,12 +450,20 @@ def test_what_is_no_rig_is_refused() -> None:
     [
         (lambda f: "features", "returned str"),
         (
-            lambda f: dataclasses.replace(f, descriptors=f.descriptors[:, :64]),
-            r"descriptors has shape \(\d+, 64\)",
+            lambda f: dataclasses.replace(f, descriptors=f.descriptors[:, 0]),
+            r"descriptors has shape \(\d+,\); give a row for each feature",
         ),
         (
-            lambda f: dataclasses.replace(f, descriptors=f.descriptors.astype(float)),
-            "give uint8",
+            lambda f: dataclasses.replace(f, descriptors=f.descriptors.astype(complex)),
+            "descriptors are complex128; give numbers or bits",
+        ),
+        (
+            lambda f: dataclasses.replace(f, descriptors=f.descriptors + np.nan),
+            "descriptors are not finite",
+        ),
+        (
+            lambda f: dataclasses.replace(f, descriptors=f.descriptors[1:]),
+            r"\d+ descriptors of \d+ features",
         ),
         (lambda f: dataclasses.replace(f, xy=f.xy[:-1]), "xy has shape"),
         (lambda f: dataclasses.replace(f, scale=None), "scale is a NoneType"),
