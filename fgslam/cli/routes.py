@@ -38,6 +38,12 @@ def teach(  # noqa: PLR0913 - each option is a parameter
     recording: Recording,
     out: Annotated[Path, typer.Option(metavar="ROUTE", help="the file to write, .fgpath")],
     camera: OmniCamera = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="RUN/ESTIMATOR/final.tum of stereo SLAM on this drive: metres"
+        ),
+    ] = None,
     report: Report = None,
     start: options.Start = None,
     stop: options.Stop = None,
@@ -51,7 +57,8 @@ def teach(  # noqa: PLR0913 - each option is a parameter
     """
     from fgslam.runs.bare_routes import teaching
 
-    chosen = options.as_overrides(options.frames(start, stop, stride))
+    given = {**options.frames(start, stop, stride), "poses": poses}
+    chosen = options.as_overrides(given)
     config = teaching(recording, camera, out, [*(overrides or ()), *chosen])
     _perform(config, report, overwrite)
 

@@ -9,7 +9,7 @@ import numpy as np
 from fgslam.cameras.omni.camera_files import make_camera
 from fgslam.core.errors import DatasetError
 from fgslam.datasets.images import read_colour_image
-from fgslam.datasets.omni_recording import OmniRecording, ids_of, no_times, pictures_in
+from fgslam.datasets.omni_recording import OmniRecording, ids_of, pictures_in, times_of
 from fgslam.datasets.omni_settings import OmniPathSettings, OmniVideoSettings
 from fgslam.datasets.recording import recording_identity, select_frames
 from fgslam.datasets.video_frames import VideoFrames
@@ -33,7 +33,7 @@ def open_omni_path(settings: OmniPathSettings) -> OmniRecording:
         camera=make_camera(settings.camera, (first.shape[1], first.shape[0]), root),
         ids=ids_of([path.stem for path in paths]),
         names=tuple(path.name for path in paths),
-        timestamps=no_times(len(paths)),
+        timestamps=times_of(paths, root),
         load_image=lambda i: read_colour_image(paths[i]),
     )
     return recording.select(chosen)

@@ -16,6 +16,7 @@ from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.datasets.loose_files import IMAGE_SUFFIXES, natural
+from fgslam.datasets.stamps import written_stamps
 
 ColourLoader: TypeAlias = Callable[[int], Image]
 """Picture (height, width, 3) in R, G, B by place in the recording; raises FrameError."""
@@ -119,6 +120,16 @@ def ids_of(names: Sequence[str]) -> IntArray:
     if -1 in last or max(Counter(last).values()) > 1:
         return np.arange(len(names), dtype=np.int64)
     return np.array(last, dtype=np.int64)
+
+
+def times_of(images: Sequence[Path], folder: Path) -> FloatArray:
+    """Time stamps (n,) of a folder's images, by a list beside them or their names; NaN without.
+
+    Raises:
+        DatasetError: the list is malformed, or lacks an image.
+    """
+    written = written_stamps(images, [folder])
+    return no_times(len(images)) if written is None else written[0]
 
 
 def no_times(count: int) -> FloatArray:

@@ -22,8 +22,8 @@ from fgslam.datasets.omni_recording import (
     ColourLoader,
     OmniRecording,
     ids_of,
-    no_times,
     pictures_in,
+    times_of,
 )
 from fgslam.datasets.omni_settings import PanoramasSettings
 from fgslam.datasets.recording import recording_identity, select_frames
@@ -69,7 +69,7 @@ def open_panoramas(settings: PanoramasSettings) -> OmniRecording:
         camera=make_camera(settings.camera, reduced, root),
         ids=ids_of([p.stem for p in paths]) if places is None else _ids(places),
         names=tuple(path.name for path in paths),
-        timestamps=no_times(len(paths)),
+        timestamps=times_of(paths, root),
         poses=None if places is None else _poses(places),
         rooms=None if places is None or not any(p.room for p in places) else _rooms(places),
         notes=_unlike_a_panorama(size, settings)

@@ -38,15 +38,9 @@ def stamps_of(
     Raises:
         DatasetError: the list is malformed, or lacks an image.
     """
-    if fps is None:
-        for folder in folders:
-            for path in (folder / name for name in LISTS):
-                if path.is_file():
-                    found, unit = _in_seconds(_listed(path, images), str(path))
-                    return found, unit, (path,)
-        if len(images) > 1 and all(_NAME.match(image.stem) for image in images):
-            found, unit = _in_seconds(_numbers([p.stem for p in images]), "names of the images")
-            return found, unit, ()
+    written = written_stamps(images, folders) if fps is None else None
+    if written is not None:
+        return written
     rate = fps or _ASSUMED_FPS
     note = (
         ()
@@ -54,6 +48,21 @@ def stamps_of(
         else (f"no list of times: taken as {rate:g} frames a second (--fps says otherwise)",)
     )
     return np.arange(len(images)) / rate, note, ()
+
+
+def written_stamps(
+    images: Sequence[Path], folders: Sequence[Path]
+) -> tuple[FloatArray, tuple[str, ...], tuple[Path, ...]] | None:
+    """As :func:`stamps_of`, from a list or from names; None where neither says anything."""
+    for folder in folders:
+        for path in (folder / name for name in LISTS):
+            if path.is_file():
+                found, unit = _in_seconds(_listed(path, images), str(path))
+                return found, unit, (path,)
+    if len(images) > 1 and all(_NAME.match(image.stem) for image in images):
+        found, unit = _in_seconds(_numbers([p.stem for p in images]), "names of the images")
+        return found, unit, ()
+    return None
 
 
 def _numbers(texts: Sequence[str]) -> tuple[FloatArray, float]:

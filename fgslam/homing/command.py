@@ -71,6 +71,21 @@ class Drive:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MetricPlace:
+    """Where that is in metres, on a path whose images carry poses.
+
+    Attributes:
+        position: (3,) in the world of these poses, on the straight line between two path images.
+        sigma: of it along the path and as the poses are known, metres.
+        to_target: metres to the next path image.
+    """
+
+    position: FloatArray
+    sigma: float
+    to_target: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PathPlace:
     """Where on a path one image was taken.
 
@@ -82,6 +97,7 @@ class PathPlace:
         refusal: why, in words; empty where there is a vector.
         remaining: part of the way between path images that is left, roughly: by parallax.
         reached: the path's end is.
+        metric: the same in metres; None where it is not known.
     """
 
     nearest: int
@@ -91,6 +107,7 @@ class PathPlace:
     refusal: str
     remaining: float
     reached: bool
+    metric: MetricPlace | None = None
 
     @property
     def sure(self) -> bool:

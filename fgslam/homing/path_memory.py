@@ -6,13 +6,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from scipy.sparse import csr_matrix, diags
 
 from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.cameras.omni.camera_values import camera_of, camera_values
-from fgslam.core.array_files import ArrayFile, write_arrays
-from fgslam.core.arrays import StateArrays
+from fgslam.core.array_files import (
+    ArrayFile,
+    Items,
+    by_field,
+    fields_from,
+    of_rows,
+    write_arrays,
+)
+from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.errors import CalibrationError, StoredMapError
+from fgslam.core.geometry import is_rigid
 from fgslam.core.homing import OmniFeatures
 from fgslam.homing.feature_files import VERSIONS, pack_features, unpack_features
 
@@ -25,6 +34,23 @@ FILE = ArrayFile(
 )
 
 
+_METRIC = "metric_"
+_PER_POSE: Items = {f"{_METRIC}poses": ("f", (4, 4)), f"{_METRIC}covariances": ("f", (6, 6))}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MetricPoses:
+    """Poses of path images, as SLAM on the same drive found them.
+
+    Attributes:
+        poses: (n, 4, 4) ``wTc`` of the SLAM run's reference camera; NaN where not known.
+        covariances: (n, 6, 6) in the tangent space at them; NaN where not known.
+    """
+
+    poses: FloatArray
+    covariances: FloatArray
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PathMemory:
     """Target images of a path.
@@ -33,11 +59,13 @@ class PathMemory:
         images: their features, in the order in which they are to be reached.
         names: of the images, for people; as many.
         camera: that took them; None where it is not known.
+        metric: their poses; None where there are none.
     """
 
     images: tuple[OmniFeatures, ...]
     names: tuple[str, ...]
     camera: OmniCamera | None = None
+    metric: MetricPoses | None = None
 
     @staticmethod
     def of(
@@ -106,6 +134,8 @@ def save_images(
     camera = None if memory.camera is None else camera_values(memory.camera)
     header = kind.header(names=list(memory.names), camera=camera)
     arrays = header | pack_features(memory.images) | (others or {})
+    if memory.metric is not None:
+        arrays |= by_field(memory.metric, _METRIC)
     return write_arrays(Path(path), arrays, compressed=True) / 1000.0 / max(len(memory), 1)
 
 
@@ -125,4 +155,18 @@ def load_images(kind: ArrayFile, path: str | Path) -> tuple[PathMemory, StateArr
         camera = None if values is None else camera_of(values, str(path))
     except CalibrationError as error:
         raise StoredMapError(str(error)) from None
-    return PathMemory(images, tuple(str(name) for name in names), camera), arrays
+    metric = _metric_of(kind, arrays, len(images), str(path))
+    return PathMemory(images, tuple(str(name) for name in names), camera, metric), arrays
+
+
+def _metric_of(kind: ArrayFile, arrays: StateArrays, count: int, where: str) -> MetricPoses | None:
+    if f"{_METRIC}poses" not in arrays:
+        return None
+    kind.require(arrays, of_rows(count, _PER_POSE), where)
+    metric = MetricPoses(**fields_from(MetricPoses, arrays, _METRIC))
+    for pose, covariance in zip(metric.poses, metric.covariances, strict=True):
+        if np.isfinite(pose).all() and not is_rigid(pose):
+            raise kind.damaged(f"{_METRIC}poses", where)
+        if np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance).min() < -1e-12:
+            raise kind.damaged(f"{_METRIC}covariances", where)
+    return metric

@@ -22,6 +22,7 @@ from fgslam.homing.command import SURE, PathPlace
 from fgslam.homing.front_end import compare_views
 from fgslam.homing.links import Answer
 from fgslam.homing.localisation import Localiser, inliers_of
+from fgslam.homing.metric_places import metric_place
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.retrieval import VisualWords
 from fgslam.homing.settings import FrontEndSettings, LocalisationSettings
@@ -127,8 +128,10 @@ class PathPlaces:
         aim = self._aimed(nearest)
         reached = self._reached(aim, nearest)
         vector, refusal = self._vector(aim)
+        metric = metric_place(self._path.metric, aim.target, self._left(aim.target))
+        remaining = self._remaining(aim)
         return PathPlace(
-            nearest, probability, aim.target, vector, refusal, self._remaining(aim), reached
+            nearest, probability, aim.target, vector, refusal, remaining, reached, metric
         )
 
     # ----------------------------------------------------------------------------------------
@@ -222,6 +225,11 @@ class PathPlaces:
         if seen is None or aim.widest == 0.0:
             return 1.0 if seen is None else 0.0
         return min(1.0, seen / aim.widest)
+
+    def _left(self, target: int) -> float:
+        """Part of the leg to a path image that is left, by parallax to both its ends; NaN else."""
+        before, after = (self._parallax.get(k, float("nan")) for k in (target - 1, target))
+        return after / (before + after) if before + after > 0.0 else float("nan")
 
     def _reached(self, aim: _Aim, nearest: int) -> bool:
         """Whether two images in a row were taken at the path's end, or just past it."""

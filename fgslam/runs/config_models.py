@@ -307,6 +307,13 @@ class TeachConfig(HomingExperiment):
     route: Annotated[
         str | None, Field(description="file to write; null: RUN/route.fgpath alone")
     ] = None
+    poses: Annotated[
+        str | None,
+        Field(
+            description="trajectory of SLAM on the same drive, by the same clock: a TUM file; a "
+            "covariance.csv beside it is taken, too; null: a route without metres"
+        ),
+    ] = None
 
 
 class FollowConfig(HomingExperiment):

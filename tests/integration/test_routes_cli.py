@@ -13,6 +13,7 @@ from PIL import Image as PictureFile
 from running import main
 
 import fgslam as fg
+from fgslam.core.trajectories import write_covariances
 from fgslam.homing.path_memory import PathMemory
 from fgslam.runs.folder import RUN_MARKER
 from tests import textured_room
@@ -44,6 +45,11 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder_of(root / "drive", np.arange(0.0, 3.6, 0.4))
     folder_of(root / "again", np.arange(0.2, 3.6, 0.8))
     (root / "camera.yaml").write_text(CAMERA, encoding="utf-8")
+    times = "".join(f"view_{k}.png {5 + k}\n" for k in range(9))
+    (root / "drive" / "times.txt").write_text(times, encoding="utf-8")
+    # SLAM on the drive: 0.4 m a second along x.
+    poses = "".join(f"{5 + 0.5 * k} {0.2 * k} 0 0 0 0 0 1\n" for k in range(17))
+    (root / "final.tum").write_text(poses, encoding="utf-8")
     return root
 
 
@@ -52,6 +58,7 @@ def taught(data: Path) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         route = data / "route.fgpath"
         given = (data / "drive", "--camera", data / "camera.yaml", "--out", route)
+        given += ("--poses", data / "final.tum")
         assert main(patch, "teach", *given, "--report", data / "taught") == 0
     return route
 
@@ -108,6 +115,12 @@ def test_another_drive_follows_it(
         assert float(row["sigma_direction_deg"]) < 5.0
         assert float(row["v_mps"]) > 0.0
     assert all(row["state"] == "wait" for row in rows if row["refusal"])
+    metres = [(0.2 + 0.8 * k, row) for k, row in enumerate(rows) if row["x_m"]]
+    assert len(metres) >= 2
+    for truth, row in metres:
+        assert abs(float(row["x_m"]) - truth) < 0.4
+        assert 0.0 < float(row["sigma_position_m"]) < 0.4
+        assert float(row["to_target_m"]) > 0.0
     again = tmp_path / "again"
     assert main(monkeypatch, "run", tmp_path / "run" / RUN_MARKER, "--out", again) == 0
     assert (again / "follow.csv").read_bytes() == (tmp_path / "run" / "follow.csv").read_bytes()
@@ -133,6 +146,26 @@ def film_of(path: Path, count: int) -> Path:
         film.write(np.ascontiguousarray(seen_at(0.1 * k)[:, :, ::-1]))
     film.release()
     return path
+
+
+def test_poses_of_another_clock_or_without_times_are_refused(
+    data: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    given = ("--camera", data / "camera.yaml", "--out", "r.fgpath", "--poses")
+    said = mistake(capfd, monkeypatch, "teach", data / "again", *given, data / "final.tum")
+    assert "its images have no times" in said
+    late = tmp_path / "late.tum"
+    late.write_text("105 0 0 0 0 0 0 1\n106 1 0 0 0 0 0 1\n", encoding="utf-8")
+    said = mistake(capfd, monkeypatch, "teach", data / "drive", *given, late)
+    assert "from 105.000 to 106.000 s, but drive from 5.000 to 13.000 s" in said
+    write_covariances(tmp_path / "covariance.csv", np.arange(2.0), np.zeros((2, 6, 6)))
+    said = mistake(capfd, monkeypatch, "teach", data / "drive", *given, late)
+    assert "covariance.csv: not the poses' of late.tum" in said
+    assert "no_such.tum" in mistake(
+        capfd, monkeypatch, "teach", data / "drive", *given, "no_such.tum"
+    )
+    assert not (tmp_path / "runs").exists()
 
 
 def test_a_film_is_a_recording_too(data: Path, tmp_path: Path, monkeypatch: Patch) -> None:

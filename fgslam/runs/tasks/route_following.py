@@ -18,7 +18,7 @@ from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.datasets.opening import open_omni
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.homing.api import PathFollower
-from fgslam.homing.command import SURE, DriveCommand
+from fgslam.homing.command import SURE, DriveCommand, MetricPlace
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.report.content import Column, TextTable
@@ -57,6 +57,11 @@ COLUMNS = (
     "omega_deg_s",
     "state",
     "refusal",
+    "x_m",
+    "y_m",
+    "z_m",
+    "sigma_position_m",
+    "to_target_m",
 )
 _RATE_HZ = 10.0  # of images without times
 _JUMP_DEG = 30.0
@@ -164,7 +169,14 @@ def _row(i: int, recording: OmniRecording, path: PathMemory, command: DriveComma
         np.rad2deg(command.omega),
         command.state.value,
         "" if known else command.reason,
+        *_metres(None if place is None else place.metric),
     ]
+
+
+def _metres(metric: MetricPlace | None) -> list[Cell]:
+    if metric is None:
+        return [None] * 5
+    return [*metric.position.tolist(), metric.sigma, metric.to_target]
 
 
 # --------------------------------------------------------------------------------------------
@@ -180,6 +192,7 @@ def _numbers(commands: list[DriveCommand], recorded: int) -> dict[str, JsonValue
         "images": len(commands),
         "recorded_images": recorded,
         "sure": len(sure),
+        "in_metres": sum(p.metric is not None for p in places),
         "with_vector": int(np.isfinite(directions).sum()),
         "first_path_image": sure[0].nearest if sure else None,
         "last_path_image": sure[-1].nearest if sure else None,
@@ -213,6 +226,7 @@ def _sentences(numbers: dict[str, JsonValue], path: PathMemory) -> tuple[str, ..
         f"0 to {len(path) - 1}; the end {end}.",
         f"{numbers['with_vector']} images have a homing vector to the next path image; it turns by "
         f"more than {_JUMP_DEG:g} degrees from one to the next {numbers['jumps']} times.",
+        *([] if path.metric is None else [f"{numbers['in_metres']} have a place in metres."]),
     )
 
 

@@ -7,6 +7,7 @@ of the path images, the page.
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,6 +34,7 @@ from fgslam.runs.engine import (
     write_page,
 )
 from fgslam.runs.tasks.homing_views import open_checked
+from fgslam.runs.tasks.route_poses import MetricDrive
 
 ROUTE_FILE = "route.fgpath"
 IMAGES_FILE = "path_images.csv"
@@ -56,19 +58,28 @@ def open_teaching(config: TeachConfig, opening: Opening) -> Task[RunResult]:
     if config.route is not None and not Path(config.route).resolve().parent.is_dir():
         raise OutputError(f"{config.route}: its folder does not exist; choose another one")
     recording = open_checked(config.dataset)
-    return Task(provenance_of(recording), lambda context: _run(config, recording, context))
+    drive = None if config.poses is None else MetricDrive.load(Path(config.poses))
+    if drive is not None:
+        drive.require(recording)
+    return Task(provenance_of(recording), lambda context: _run(config, recording, drive, context))
 
 
-def _run(config: TeachConfig, recording: OmniRecording, context: Context) -> RunResult:
+def _run(
+    config: TeachConfig, recording: OmniRecording, drive: MetricDrive | None, context: Context
+) -> RunResult:
     """Stopped early, the route ends where the recording was read to."""
     folder = context.folder
     taught, whole = _teach(config, recording, context)
+    if drive is not None:
+        numbers = [row.number for row in taught.rows]
+        metric = drive.at(recording.timestamps[numbers])
+        taught = replace(taught, memory=replace(taught.memory, metric=metric))
     kilobytes = taught.memory.save(folder / ROUTE_FILE)
     written = folder / ROUTE_FILE if config.route is None else Path(config.route)
     if config.route is not None:
         taught.memory.save(written)
     write_csv(folder / IMAGES_FILE, _COLUMNS, list(_rows(taught)))
-    numbers = _numbers(taught, len(recording), kilobytes)
+    said = _numbers(taught, len(recording), kilobytes)
     gaps = sum(row.reason == GAP for row in taught.rows)
     lines = _sentences(taught, len(recording), kilobytes, gaps)
     notes = (*recording.notes, *taught.unusable)
@@ -76,7 +87,7 @@ def _run(config: TeachConfig, recording: OmniRecording, context: Context) -> Run
         config, folder, "finished" if whole else "interrupted", lines, (_table(taught),), notes,
         (("route", str(written)),),
     )  # fmt: skip
-    write_document(result, numbers)
+    write_document(result, said)
     write_page(
         result,
         f"{len(taught.memory)} path images of {recording.name}",
@@ -135,15 +146,25 @@ def _numbers(taught: Taught, recorded: int, kilobytes: float) -> dict[str, JsonV
         "compared_images": taught.seen,
         "kilobytes_per_image": kilobytes,
         "reasons": dict(sorted(reasons.items())),
+        "with_poses": _with_poses(taught),
         "common_features_least": min((r.common for r in taught.rows if r.common), default=None),
     }
 
 
+def _with_poses(taught: Taught) -> int | None:
+    """Path images that have one; None for a route without metres."""
+    metric = taught.memory.metric
+    return None if metric is None else int(np.isfinite(metric.poses[:, 0, 3]).sum())
+
+
 def _sentences(taught: Taught, recorded: int, kilobytes: float, gaps: int) -> tuple[str, ...]:
-    said = (
+    said: tuple[str, ...] = (
         f"{len(taught.memory)} of {recorded} images are path images, {kilobytes:.1f} kB each "
         f"({taught.seen} were compared).",
     )
+    posed = _with_poses(taught)
+    if posed is not None:
+        said = (*said, f"{posed} have a pose in metres.")
     if not gaps:
         return (*said, "Each is seen well from the one before.")
     return (
