@@ -106,7 +106,7 @@ def write_bag(path: Path, written: Iterable[Written], packed: bool = False) -> P
     ``packed``: with compressed chunks, lz4 in ROS 1 and zstd in ROS 2.
     """
     ros1 = path.suffix == ".bag"
-    made = _Maker(get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE), ros1)
+    made = Maker(get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE), ros1)
     messages = sorted(written, key=lambda each: each[1])
     if ros1:
         bag = Writer1(path)
@@ -126,7 +126,9 @@ def write_bag(path: Path, written: Iterable[Written], packed: bool = False) -> P
 
 
 @dataclass
-class _Maker:
+class Maker:
+    """Makes messages of one version of ROS, and writes them."""
+
     store: Any
     ros1: bool
     connections: dict[str, Any] = field(default_factory=dict)
@@ -136,11 +138,11 @@ class _Maker:
             if topic not in self.connections:
                 made = writer.add_connection(topic, kind, typestore=self.store)
                 self.connections[topic] = made
-            message = self._message(kind, stamp, fields)
+            message = self.message(kind, stamp, fields)
             serialize = self.store.serialize_ros1 if self.ros1 else self.store.serialize_cdr
             writer.write(self.connections[topic], stamp + LATE_NS, serialize(message, kind))
 
-    def _message(self, kind: str, stamp: int, fields: dict[str, Any]) -> Any:
+    def message(self, kind: str, stamp: int, fields: dict[str, Any]) -> Any:
         values = dict(fields)
         if kind.endswith("CameraInfo"):
             roi = self._make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)

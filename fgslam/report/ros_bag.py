@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -50,19 +51,31 @@ def write_mcap(path: Path, trajectory: Trajectory, covariances: FloatArray | Non
             rows = zip(trajectory.timestamps, trajectory.poses, covariances, strict=True)
             for t, wTc, covariance in rows:
                 stamp = round(float(t) * 1e9)
-                message = _message(store.types, stamp, wTc, np.nan_to_num(covariance))
+                message = pose_message(store.types, stamp, wTc, covariance)
                 writer.write(topic, stamp, store.serialize_cdr(message, _KIND))
         write_bytes(path, (bag / f"{bag.name}{SUFFIX}").read_bytes())
 
 
-def _message(types: Any, stamp: int, wTc: FloatArray, covariance: FloatArray) -> Any:
+def pose_message(
+    types: Mapping[str, Any], stamp: int, wTc: FloatArray, covariance: FloatArray
+) -> Any:
+    """A PoseWithCovarianceStamped, as :func:`write_mcap` writes it.
+
+    Args:
+        types: classes of the messages by their names, of rosbags or of ROS itself.
+        stamp: nanoseconds.
+        wTc: (4, 4) pose of the reference camera.
+        covariance: (6, 6) of it; NaN for unknown.
+    """
+    covariance = np.nan_to_num(covariance)
     seconds, nanoseconds = divmod(stamp, 1_000_000_000)
     turned = _ROS_FROM_CAMERA @ wTc[:3, :3]
     x, y, z, w = quaternion_from_rotation(turned @ _ROS_FROM_CAMERA.T).tolist()
     to_world = np.zeros((6, 6))  # [translation, rotation] about the world's axes
     to_world[:3, 3:] = to_world[3:, :3] = turned
     time = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
-    point = types["geometry_msgs/msg/Point"](*(_ROS_FROM_CAMERA @ wTc[:3, 3]).tolist())
+    x_ahead, y_left, z_up = (_ROS_FROM_CAMERA @ wTc[:3, 3]).tolist()
+    point = types["geometry_msgs/msg/Point"](x=x_ahead, y=y_left, z=z_up)
     quaternion = types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
     pose = types["geometry_msgs/msg/PoseWithCovariance"](
         pose=types["geometry_msgs/msg/Pose"](position=point, orientation=quaternion),
