@@ -329,7 +329,10 @@ class FrontendSettings:
 
     tracking: Annotated[
         Literal["sift", "hybrid"],
-        Field(description="`sift` on every frame; `hybrid`: on key frames, KLT between"),
+        Field(
+            description="`sift` on all images; `hybrid`: on the reference image of key frames, "
+            "patches (KLT) between and across"
+        ),
     ] = "sift"
     sift: SiftSettings = SiftSettings()
     stereo: StereoSettings = StereoSettings()

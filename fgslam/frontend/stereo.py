@@ -71,11 +71,15 @@ class StereoMatcher:
         return replace(every, complete=np.arange(len(every)) < len(whole))
 
     def measured(
-        self, found: tuple[Features, ...], correction: RigCorrection | None = None
+        self,
+        found: tuple[Features, ...],
+        share: float,
+        correction: RigCorrection | None = None,
     ) -> tuple[StereoFeatures, BoolArray]:
         """Stereo features of points found row by row in all images, and which (n,) can be right.
 
         The latter lie on the epipolar lines and at one depth, by the gates of :meth:`match`.
+        ``share``: sigma of their coordinates over that of SIFT's.
         """
         straight = found if correction is None else correction.straightened(found)
         s, right, left = self._settings, straight[0].xy, straight[1].xy
@@ -88,7 +92,8 @@ class StereoMatcher:
             good &= np.abs(top[:, 0] - right[:, 0]) <= s.epipolar_px
             good &= np.abs(vertical - horizontal) <= s.disparity_agreement_px
         kept = np.flatnonzero(good)
-        return self._measure(found, straight, (kept,) * len(found)), np.asarray(good)
+        every = (kept,) * len(found)
+        return self._measure(found, straight, every, share), np.asarray(good)
 
     def match_left(self, right: Features, left: Features) -> tuple[IntArray, IntArray]:
         """Pairs of right and left features, ascending in the right ones."""
@@ -149,6 +154,7 @@ class StereoMatcher:
         features: tuple[Features, ...],
         straight: tuple[Features, ...],
         matches: tuple[IntArray | None, ...],
+        share: float = 1.0,
     ) -> StereoFeatures:
         """Matched features (n,) of each camera, None for one that does not show them."""
         seen = [(camera, m) for camera, m in enumerate(matches) if m is not None]
@@ -162,7 +168,7 @@ class StereoMatcher:
         if len(cameras) < len(features):
             linear = partial_map(cameras, len(features), self._vertical_to_horizontal)
         measurement = np.concatenate(used, axis=1) @ linear.T
-        covariance = np.tile(self._covariance(linear), (len(pixels), 1, 1))
+        covariance = np.tile(share**2 * self._covariance(linear), (len(pixels), 1, 1))
         scale, orientation = _average([(features[camera], index) for camera, index in seen])
         return StereoFeatures(
             measurement=measurement,

@@ -40,6 +40,7 @@ from fgslam.datasets.settings import (
 )
 from fgslam.frontend.camera_watch import CameraWatch
 from fgslam.frontend.features.sift import SiftExtractor
+from fgslam.frontend.patch_stereo import PatchStereo
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.carrying import LandmarkCarrier
@@ -99,8 +100,9 @@ def make_key_frames(
     """Tracking between key frames; None where every frame is one."""
     if settings.tracking == "sift":
         return None
-    carrier = LandmarkCarrier(rig, make_stereo_matcher(rig, settings))
-    return KeyFrameTracker(tracker, carrier)
+    stereo = make_stereo_matcher(rig, settings)
+    across = PatchStereo(rig, stereo, settings.stereo.largest_disparity_px)
+    return KeyFrameTracker(tracker, LandmarkCarrier(rig, stereo), across)
 
 
 def make_motion(rig: CameraRig, settings: OdometrySettings | MotionModel) -> MotionModel:

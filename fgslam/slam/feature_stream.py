@@ -32,12 +32,13 @@ _SUPPORT = 3.0
 class FeatureFrame:
     """A frame with its features, or the reason why it has none.
 
-    Where SIFT runs on key frames only, a frame has none until it is found to be one.
+    Where SIFT runs on key frames only, a frame has none until it is found to be one, and then those
+    of its reference image alone.
 
     Attributes:
         i: position in the sequence.
         frame: the images, or None when they could not be read.
-        features: of right, left[, top]; empty when there is no image.
+        features: of right, left[, top], or of right; empty when there is no image.
         problem: what was wrong with the frame, in words; empty when nothing was.
         load_ms: time spent reading, in its own thread.
         sift_ms: the images' SIFT times, added up over threads.
@@ -94,6 +95,13 @@ class FrameDescriber:
         timed = partial(_timed, self._extract)
         tasks = [self._pool.submit(timed, *view) for view in _views(frame)]
         return _Pending(found.i, frame, "", found.load_ms, tasks).finish()
+
+    def of_reference(self, found: FeatureFrame) -> FeatureFrame:
+        """The frame with the features of its reference image alone, unless it has any."""
+        if found.frame is None or found.features:
+            return found
+        features, ms = _timed(self._extract, *next(iter(_views(found.frame))))
+        return replace(found, features=(features,), sift_ms=ms)
 
     def close(self) -> None:
         """Ends the threads."""

@@ -26,15 +26,17 @@ class FirstImages:
 
     def __init__(self) -> None:
         """No image yet."""
-        self._left: list[int] = []
+        self._frames = 0
+        self._left: list[int] = []  # features, where they were sought
         self._brightest = 0
         self._uint16 = False
 
     def add(self, found: FeatureFrame, uint16: bool) -> None:
         """Counts a frame with features; ``uint16``: they were given so."""
-        if found.frame is None or not found.features or len(self._left) >= _FRAMES:
+        if found.frame is None or not found.features or self._frames >= _FRAMES:
             return
-        self._left.append(len(found.features[1]))
+        self._frames += 1
+        self._left += [len(own) for own in found.features[1:2]]
         self._brightest = max(self._brightest, *(int(image.max()) for image in found.frame.images))
         self._uint16 |= uint16
 
@@ -44,7 +46,7 @@ class FirstImages:
 
     def lost_bits(self) -> str:
         """That bits were given which are not used; empty where none were."""
-        if not self._left or self._brightest > _DARK or not self._uint16:
+        if not self._frames or self._brightest > _DARK or not self._uint16:
             return ""
         return (
             f"of uint16 the upper eight bits count, and they reach {self._brightest} of 255: "
@@ -53,7 +55,7 @@ class FirstImages:
 
     def fault(self) -> str:
         """What is wrong with the grey values: bits lost, or darkness; empty where nothing is."""
-        if not self._left or self._brightest > _DARK:
+        if not self._frames or self._brightest > _DARK:
             return ""
         dark = f"the images are dark, their largest grey value is {self._brightest} of 255"
         return self.lost_bits() or dark

@@ -152,6 +152,9 @@ class SlamPipeline:
     def _match_stereo(self, found: FeatureFrame) -> StereoFeatures:
         if found.frame is None:
             return StereoFeatures.empty()
+        if self.key_frames is not None and len(found.features) == 1:
+            images, features = found.frame.images, found.features[0]
+            return self.key_frames.stereo.match(images, features, self._correction())
         return self.stereo.match_all(found.features, self._correction())
 
     def _correction(self) -> RigCorrection | None:

@@ -136,7 +136,8 @@ class Session:
 
     def _made(self, beginning: Arrival | None) -> SlamPipeline:
         pipeline = self._make(beginning)
-        pipeline.describe = self._describer.complete
+        describer, every = self._describer, self.frontend.tracking == "sift"
+        pipeline.describe = describer.complete if every else describer.of_reference
         return pipeline
 
     def _begun(

@@ -19,14 +19,12 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows, StateArrays
 from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.rig_correction import RigCorrection
-from fgslam.core.sensors import CameraRig, vertical_to_horizontal
+from fgslam.core.sensors import CameraRig
 from fgslam.frontend.features.patches import ReferencePatches, align, anchor
+from fgslam.frontend.patch_stereo import DEFORMATION, GREY_NOISE, PATCH_PX, across
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks
 
-PATCH_PX = 15  # side of the patch and of the window of the search before it
-_GREY_NOISE = 4.0  # sigma of a grey value: noise, and what no affine map does
-_DEFORMATION = 0.05  # sigma of a patch's stretching from image to image, beside the predicted one
 _MIN_CORRELATION = 0.65  # of a patch with its first look, gain and offset taken out
 _FARTHEST_PX = 2.0  # between what the search found and the patch: beyond, it is another thing
 _MARGIN_PX = 4.0  # of the patch's middle to the border of the reference image
@@ -34,10 +32,10 @@ _PYRAMID_LEVELS = 2
 _SEARCH = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03)
 _MIN_EIGENVALUE = 1e-4
 _ALIGNMENTS = 2  # in the reference image, after the search
-_ALIGNMENTS_ACROSS = 3  # in the others, from the predicted disparity
 _FARTHEST_FLOW = 0.06
 """Of the image's width: where the landmarks are expected to have moved farther in the median,
 patches are not looked for at all: half of them would be lost (EuRoC's key frames)."""
+
 
 NOISE_SHARE = 0.6
 """Sigma of a carried coordinate over that of a SIFT one."""
@@ -136,16 +134,18 @@ class LandmarkCarrier:
         patches, places, good = self._in_reference(last, images[0], patches, predicted)
         pixels = [places]
         for camera in range(1, len(images)):
-            seen, fits = self._across(images[camera], camera, patches, places, predicted[:, 2])
+            seen, alike = across(
+                self._rig, images[camera], camera, patches, places, predicted[:, 2]
+            )
             pixels.append(seen)
-            good &= fits
+            good &= alike >= _MIN_CORRELATION
         looks = (expected.scale[rows], expected.orientation[rows], expected.descriptors[rows])
         found = tuple(Features(seen, *looks).select(good) for seen in pixels)
-        features, consistent = self._stereo.measured(found, correction)
+        features, consistent = self._stereo.measured(found, NOISE_SHARE, correction)
         good[good] = consistent
         self._points = _Points(self._points.ids[good], places[good], depths[good])
         self._patches = patches.select(good)
-        return Carried(self._points.ids, rows[good], _noisier(features, NOISE_SHARE))
+        return Carried(self._points.ids, rows[good], features)
 
     def state(self) -> StateArrays:
         """All that is carried over."""
@@ -188,7 +188,7 @@ class LandmarkCarrier:
         """The patches of all points, those of the fresh ones taken now."""
         fresh, self._fresh = self._fresh, _Points.none()
         if len(fresh) or self._patches is None:
-            new = anchor(last, fresh.places, PATCH_PX, _GREY_NOISE, _DEFORMATION)
+            new = anchor(last, fresh.places, PATCH_PX, GREY_NOISE, DEFORMATION)
             patches = new if self._patches is None else self._patches.join(new)
             points = self._points.join(fresh)
             order = np.argsort(points.ids)
@@ -210,39 +210,12 @@ class LandmarkCarrier:
         good &= np.linalg.norm(places - at, axis=1) < _FARTHEST_PX
         return patches, places, np.asarray(good & self._inside(places, _MARGIN_PX))
 
-    def _across(
-        self,
-        image: Image,
-        camera: int,
-        patches: ReferencePatches,
-        places: FloatArray,
-        disparity: FloatArray,
-    ) -> tuple[FloatArray, BoolArray]:
-        """Pixels (n, 2) of the points in another camera's image, and which (n,) fit there."""
-        start = places.copy()
-        if camera == 1:
-            start[:, 0] += disparity
-        else:
-            start[:, 1] += disparity / vertical_to_horizontal(self._rig)
-        _, seen, correlation = _aligned(patches, image, start, _ALIGNMENTS_ACROSS)
-        fits = (correlation >= _MIN_CORRELATION) & self._inside(seen, 0.0)
-        return seen, fits
-
     def _inside(self, places: FloatArray, margin: float) -> BoolArray:
         last = np.array([self._rig.width, self._rig.height]) - 1.0 - margin
         return np.asarray(((places >= margin) & (places <= last)).all(axis=1))
 
 
 _PATCH_ARRAYS = ("first", "light", "step", "contrast", "maps")
-
-
-def _noisier(features: StereoFeatures, share: float) -> StereoFeatures:
-    """The features with sigmas times ``share``."""
-    return dataclasses.replace(
-        features,
-        measurement_covariance=share**2 * features.measurement_covariance,
-        position_covariance=share**2 * features.position_covariance,
-    )
 
 
 def _aligned(

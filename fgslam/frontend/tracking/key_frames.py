@@ -1,8 +1,9 @@
 """Frames tracked by carried landmarks, and when it takes a key frame instead.
 
-On a key frame SIFT finds features, describes the landmarks that are carried, finds again those that
-were lost, and starts new ones. Between key frames the carried landmarks alone place the camera, and
-nothing is missed, pruned or started.
+On a key frame SIFT finds features in the reference image, whose patches are measured in the others
+(:mod:`fgslam.frontend.patch_stereo`). It describes the landmarks that are carried, finds again
+those that were lost, and starts new ones. Between key frames the carried landmarks alone place the
+camera, and nothing is missed, pruned or started.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, StateArra
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.features import StereoFeatures
 from fgslam.core.rig_correction import RigCorrection
+from fgslam.frontend.patch_stereo import PATCH_PX, PatchStereo
 from fgslam.frontend.tracking.carrying import Carried, LandmarkCarrier
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks, MapMatches
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
@@ -44,8 +46,11 @@ class CarriedFrame:
 class KeyFrameTracker:
     """A tracker that is asked for matches of SIFT features on key frames only."""
 
-    def __init__(self, tracker: LandmarkTracker, carrier: LandmarkCarrier) -> None:
-        """Takes the tracker whose landmarks are carried."""
+    def __init__(
+        self, tracker: LandmarkTracker, carrier: LandmarkCarrier, stereo: PatchStereo
+    ) -> None:
+        """Takes the tracker whose landmarks are carried; ``stereo`` measures what SIFT finds."""
+        self.stereo = stereo
         self._tracker = tracker
         self._carrier = carrier
         self._count = 0  # landmarks of the last key frame
@@ -87,7 +92,7 @@ class KeyFrameTracker:
         the image has not changed, and described by SIFT.
         """
         if frame is None or not frame.tracked.ego_motion.status.measured:
-            return self._tracker.track(prediction, landmarks, sift), sift
+            return _spread(self._tracker.track(prediction, landmarks, sift), sift), sift
         pose = frame.tracked.ego_motion
         around = Prediction(pose.wTc, pose.covariance)
         expected, matches = self._tracker.matched_around(around, landmarks, sift)
@@ -95,8 +100,8 @@ class KeyFrameTracker:
         features, joined = _joined(expected, matches, frame.carried.select(kept), sift)
         tracked = self._tracker.solved(prediction, landmarks, (expected, joined, features))
         if not tracked.ego_motion.status.measured:
-            return self._tracker.track(prediction, landmarks, sift), sift
-        return tracked, features
+            return _spread(self._tracker.track(prediction, landmarks, sift), sift), sift
+        return _spread(tracked, features), features
 
     def begin(self, image: Image, features: StereoFeatures, association: Association) -> None:
         """After a key frame: its landmarks are carried from here, those in use by their patch.
@@ -141,6 +146,25 @@ def _cells(places: FloatArray, image: Image) -> IntArray:
     size = np.array([image.shape[1], image.shape[0]])
     at = np.clip(places * _CELLS // size, 0, np.array(_CELLS) - 1).astype(np.int64)
     return np.unique(at[:, 0] * _CELLS[1] + at[:, 1])
+
+
+def _spread(tracked: Tracked, features: StereoFeatures) -> Tracked:
+    """The frame starting landmarks only in squares of a patch's size that show none yet.
+
+    Patches that overlap err alike: more of them cost as much and tell little. Of several features
+    the finest is taken, which is seen longest on the way towards it.
+    """
+    matches = tracked.matches
+    square = np.floor(features.pixels[:, 0] / PATCH_PX).astype(np.int64)
+    square = square[:, 0] + (square[:, 0].max(initial=0) + 1) * square[:, 1]
+    taken = np.isin(square, square[matches.features[tracked.ego_motion.inliers]])
+    order = np.lexsort((features.scale, matches.had_candidates | taken, square))
+    first = np.ones(len(square), np.bool_)
+    first[order[1:]] = np.diff(square[order]) > 0
+    starts = first & ~taken & ~matches.had_candidates
+    return dataclasses.replace(
+        tracked, matches=dataclasses.replace(matches, had_candidates=~starts)
+    )
 
 
 def _joined(

@@ -2,43 +2,21 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.geometry import project
-from fgslam.core.sensors import CameraRig
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import StereoSettings
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.carrying import NOISE_SHARE, Carried, LandmarkCarrier
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks
-from tests.textured_room import TEXTURE
+from tests.textured_wall import HERE, RIG, WALL_M, pictures
 
-RIG = CameraRig(320, 240, 260.0, 260.0, 159.5, 119.5, 0.1, 0.1, np.eye(4))
-WALL_M = 2.0
-TEXELS_A_METRE = 130.0  # one a pixel, from the first place
-WALL = np.asarray(TEXTURE[:, :900], np.float32)
-MIDDLE = np.array([450.0, 200.0])
 GRID = np.stack(np.meshgrid(np.linspace(-0.8, 0.8, 9), np.linspace(-0.5, 0.5, 6)), -1).reshape(
     -1, 2
 )
-
-
-def pictures(place: FloatArray, rng: np.random.Generator | None = None) -> tuple[Image, ...]:
-    """What right, left and top camera see of the wall from a place (3,) before it."""
-    out = []
-    for offset in ((0.0, 0.0), (-RIG.baseline, 0.0), (0.0, -RIG.baseline)):
-        depth = WALL_M - place[2]
-        scale = RIG.fx / depth / TEXELS_A_METRE
-        centre = MIDDLE + TEXELS_A_METRE * (place[:2] + np.array(offset))
-        shift = np.array([RIG.cx, RIG.cy]) - scale * centre
-        affine = np.array([[scale, 0.0, shift[0]], [0.0, scale, shift[1]]])
-        seen = cv2.warpAffine(WALL, affine, (RIG.width, RIG.height), flags=cv2.INTER_CUBIC)
-        noise = 0.0 if rng is None else rng.normal(0.0, 1.0, seen.shape)
-        out.append(np.asarray(np.clip(np.round(seen + noise), 0, 255), np.uint8))
-    return tuple(out)
 
 
 def measurements(place: FloatArray) -> FloatArray:
@@ -76,9 +54,6 @@ def followed(carrier: LandmarkCarrier, place: FloatArray, off: float = 0.0) -> C
     found = carrier.follow(pictures(place), expected(place, off))
     assert found is not None
     return found
-
-
-HERE = np.zeros(3)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,70 @@
+"""Features of the reference image measured in the others, on the images of a wall known exactly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.features import Features, StereoFeatures
+from fgslam.frontend.features.settings import AppearanceSettings, SiftSettings
+from fgslam.frontend.features.sift import SiftExtractor
+from fgslam.frontend.patch_stereo import PatchStereo
+from fgslam.frontend.settings import StereoSettings
+from fgslam.frontend.stereo import StereoMatcher
+from tests.textured_wall import HERE, RIG, WALL_M, pictures
+
+
+def measured(images: tuple[Image, ...]) -> tuple[Features, StereoFeatures]:
+    """Features of the first image, and those of them that all images show."""
+    found = SiftExtractor(SiftSettings(), "descriptor").extract(images[0])
+    matcher = StereoMatcher(RIG, StereoSettings(), AppearanceSettings())
+    return found, PatchStereo(RIG, matcher, np.inf).match(images, found)
+
+
+def in_view(found: Features, disparity: float) -> int:
+    """How many features all three images show with a patch around them."""
+    size = np.array([RIG.width, RIG.height]) - 8.0
+    return int(((found.xy > 8.0) & (found.xy + disparity < size)).all(axis=1).sum())
+
+
+@pytest.mark.parametrize("depth", [0.6, 1.2, WALL_M])
+def test_features_are_measured_wherever_all_images_show_them(depth: float) -> None:
+    """To a tenth of a pixel; at the borders, too, and near by (43 px of disparity)."""
+    truth = RIG.fx * RIG.baseline / depth
+    found, seen = measured(pictures(np.array([0.0, 0.0, WALL_M - depth])))
+    assert len(seen) >= 0.9 * in_view(found, truth)
+    error: FloatArray = seen.measurement[:, 2] - truth
+    assert abs(float(np.median(error))) < 1.0 / 16.0
+    assert float(1.4826 * np.median(np.abs(error))) < 0.1
+    assert (np.abs(error) > 1.0).mean() < 0.02
+    assert np.isin(seen.pixels[:, 0], found.xy).all()
+
+
+def test_light_does_not_matter() -> None:
+    images = pictures(HERE)
+    dim = tuple(
+        np.asarray(share * image, np.uint8)
+        for share, image in zip((0.2, 0.15, 0.2), images, strict=True)
+    )
+    found, seen = measured(dim)
+    assert len(seen) >= 0.8 * in_view(found, RIG.fx * RIG.baseline / WALL_M)
+
+
+def test_what_another_image_does_not_show_is_left_out() -> None:
+    images = [image.copy() for image in pictures(HERE)]
+    images[1] = np.random.default_rng(1).integers(0, 255, images[1].shape, np.uint8)
+    found, seen = measured(tuple(images))
+    assert len(seen) <= 0.02 * len(found)
+
+
+def test_swapped_cameras_give_next_to_nothing() -> None:
+    right, left, top = pictures(np.array([0.0, 0.0, 1.0]))
+    found, seen = measured((left, right, top))
+    assert len(seen) <= 0.02 * len(found)
+
+
+def test_no_features_are_no_match() -> None:
+    found = SiftExtractor(SiftSettings(), "descriptor").extract(np.zeros((240, 320), np.uint8))
+    matcher = StereoMatcher(RIG, StereoSettings(), AppearanceSettings())
+    assert not len(PatchStereo(RIG, matcher, np.inf).match(pictures(HERE), found))
