@@ -141,12 +141,13 @@ def _row(given: dict[str, Any]) -> Row:
 
 
 def _table(given: dict[str, Any]) -> Table:
-    """A table: whole from a measurement (`from`, perhaps some `columns` only), or cell by cell."""
+    """A table: of a measurement (`from`, perhaps some `columns` and `lines` only), or by cells."""
     title, notes = given.get("title", ""), tuple(given.get("notes", ()))
     if "from" in given:
         stored = value_at(given["from"])
         columns = tuple(given.get("columns", stored))
         rows = list(zip(*(stored[column] for column in columns), strict=True))
+        rows = [rows[k] for k in given.get("lines", range(len(rows)))]
         return Table(title, columns, rows, notes, (_source(given),))
     cells = [cell for row in given["rows"] for cell in row if isinstance(cell, dict)]
     rows = [tuple(map(_cell, row)) for row in given["rows"]]

@@ -22,6 +22,7 @@ Known: TypeAlias = set[str | tuple[str, str]]
 """Lines of keys, and titles of groups with their classes, that stand on the page already."""
 
 _UNWRITTEN = ("kind", "task", "provenance")
+_EVERYWHERE = ("name", "seed", "start", "stop", "stride", "label")
 _DESCRIBED_ELSEWHERE = ("map.made_from.dataset", "map.made_from.odometry")
 FIRST = {
     "dataset.kind, dataset.path, dataset.start, dataset.stop": "the recording: its layout, its "
@@ -49,10 +50,12 @@ from the command line: `fgslam run CONFIG.yaml --set frontend.sift.octave_layers
 of a key wins; choosing another `kind` drops the file's keys of the old one. Unknown keys, keys
 given twice, NaN and infinity are refused. `RUN/config.yaml` holds every key with its value.
 
-A line gives the key, its default, other choices or the range (a bracket includes the limit), and
-its meaning. A default without decimal point takes integers. Units are those of the key's name
-(`_m`, `_s`, `_px`, `_deg`). Keys described further up are named as *alike*. `null` is off, `{}`
-switches a group on with its defaults. See also [homing experiments](#homing-experiments).
+A line gives the key, its default, then other choices or the range (a bracket includes the limit),
+and its meaning. A default without decimal point takes integers. Units are those of the key's name
+(`_m`, `_s`, `_px`, `_deg`). `null` is off, `{}` switches a group on with its defaults. Keys
+described further up are named as *alike*; `start`, `stop` and `stride` are keys of every recording,
+`label` of every estimator, `name` and `seed` of every task. See also [homing
+experiments](#homing-experiments).
 """
 
 _LOCALISATION = """## Task `localisation`
@@ -126,9 +129,10 @@ def _sections(schema: Node, node: Node, dotted: str, level: int, known: Known) -
         title = f"`{dotted}`" + (f", kind `{kind}`" if kind else "")
         if (title, group["title"]) not in known:
             known.add((title, group["title"]))
-            said = _summary(group)
-            about = paragraph(f"`{group['title']}`: {said}")
-            yield "\n".join([f"{'#' * level} {title}", "", *about, "", *lines]).rstrip()
+            again = ("", group["title"]) in known
+            known.add(("", group["title"]))
+            about = [] if again else [*paragraph(f"`{group['title']}`: {_summary(group)}"), ""]
+            yield "\n".join([f"{'#' * level} {title}", "", *about, *lines]).rstrip()
         yield from inner
 
 
@@ -141,7 +145,7 @@ def _keys(schema: Node, group: Node, known: Known) -> list[str]:
             continue
         line = _line(schema, name, node, required=name in group.get("required", ()))
         if line in known:
-            alike.append(f"`{name}`")
+            alike += [f"`{name}`"] if name not in _EVERYWHERE else []
         else:
             known.add(line)
             lines += item(line)
@@ -154,7 +158,7 @@ def _line(schema: Node, name: str, node: Node, required: bool) -> str:
     choices = [f"`{json.dumps(value)}`" for value in _choices(schema, node)]
     others = [choice for choice in choices if choice != default]
     limits = "" if set(choices) - {"`null`"} else _range(schema, node)
-    facts = ", ".join(filter(None, (" or ".join([default, *others]), limits)))
+    facts = ", ".join(filter(None, (", ".join([default, *others]), limits)))
     head, meaning = f"`{name}` ({facts}): ", _without_unit(name, _meaning(schema, node))
     clauses = re.split(r"(?<=[;.]) ", meaning)
     fitting = [

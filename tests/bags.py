@@ -100,6 +100,11 @@ def twists(stamps_ns: Iterable[int], speed: float, yaw_rate: float) -> list[Writ
     return [("/twist", stamp, "geometry_msgs/msg/TwistStamped", fields) for stamp in stamps_ns]
 
 
+def gyroscope(stamps_ns: Iterable[int], rate: FloatArray, topic: str = "/imu") -> list[Written]:
+    """sensor_msgs/Imu of one angular velocity (3,)."""
+    return [(topic, stamp, "sensor_msgs/msg/Imu", {"rate": rate}) for stamp in stamps_ns]
+
+
 def write_bag(path: Path, written: Iterable[Written], packed: bool = False) -> Path:
     """The bag; its ending says which kind. Of ROS 2 the file inside its folder.
 
@@ -165,7 +170,20 @@ class Maker:
             }
         elif kind.endswith("TwistStamped"):
             values = {"twist": self._twist(*fields["twist"])}
+        elif kind.endswith("Imu"):
+            values = self._imu(fields["rate"])
         return self.store.types[kind](header=self._header(stamp), **values)
+
+    def _imu(self, rate: FloatArray) -> dict[str, Any]:
+        vector, none = "geometry_msgs/msg/Vector3", np.zeros(9)
+        return {
+            "orientation": self._make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
+            "orientation_covariance": none,
+            "angular_velocity": self._make(vector, *map(float, rate)),
+            "angular_velocity_covariance": none,
+            "linear_acceleration": self._make(vector, 0.0, 0.0, 9.8),
+            "linear_acceleration_covariance": none,
+        }
 
     def _make(self, kind: str, *values: Any) -> Any:
         return self.store.types[kind](*values)

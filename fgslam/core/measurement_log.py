@@ -39,12 +39,13 @@ from fgslam.core.sensors import CameraRig, RangeBearingSensor, Sensor
 
 LOG = ArrayFile(
     name="fgslam measurement log",
-    versions=(1, 2, 3, 4),  # version 1 knew cameras only, 2 no loops, 3 no corrections of the rig
+    # Version 1 knew cameras only, 2 no loops, 3 no corrections of the rig, 4 no gyroscope.
+    versions=(1, 2, 3, 4, 5),
     error=MeasurementLogError,
     give="give a run folder's measurements.npz",
     again="run again",
 )
-_BEFORE_LOOPS, _WITH_LOOPS, _WITH_CORRECTIONS = 2, 3, 4
+_BEFORE_LOOPS, _WITH_LOOPS, _WITH_CORRECTIONS, _WITH_TURNS = 2, 3, 4, 5
 _UPPER = np.triu_indices(3)
 
 # Arrays by the count that their first axis has, with type and the shape of an item.
@@ -103,9 +104,7 @@ class MeasurementLog(Brief):
                 f"frame {increment.index}: time stamp {increment.timestamp:.9f} s does not come "
                 f"after {self.increments[-1].timestamp:.9f} s; sort the measurements by time"
             )
-        odometry = increment.odometry
-        if odometry is not None and not odometry.measured:
-            increment = dataclasses.replace(increment, odometry=None)
+        increment = dataclasses.replace(increment, odometry=_without_stand_in(increment.odometry))
         self.increments.append(increment)
 
     def to_arrays(self) -> StateArrays:
@@ -127,14 +126,19 @@ class MeasurementLog(Brief):
         out["rejected"] = joined([s.rejected for s in self], (), np.bool_)
         if version >= _WITH_LOOPS:
             out |= self._loop_arrays()
-        if version >= _WITH_CORRECTIONS:
+        if version >= _WITH_CORRECTIONS and isinstance(self.rig, CameraRig):
+            terms = len(term_names(self.rig))
+            known = any(s.rig_correction is not None for s in self)
+            none = np.full(terms, 0.0 if known else np.nan)
             corrections = [s.rig_correction for s in self]
-            none = np.zeros_like(next(c for c in corrections if c is not None))
-            out["rig_correction"] = np.array([none if c is None else c for c in corrections])
+            rows = [none if c is None else c for c in corrections]
+            out["rig_correction"] = _stack(rows, (terms,))
         return out
 
     def _version(self) -> int:
         """The first that has a place for all that is there."""
+        if any(s.odometry is not None and s.odometry.turned for s in self):
+            return _WITH_TURNS
         if any(s.rig_correction is not None for s in self):
             return _WITH_CORRECTIONS
         return _WITH_LOOPS if any(s.loops or s.relocalised for s in self) else _BEFORE_LOOPS
@@ -222,7 +226,7 @@ def _require_sound(arrays: StateArrays, where: str) -> None:
     covariances = from_upper(arrays["measurement_covariance"], 3)
     require_covariances(LOG, "measurement_covariance", covariances, where)
     known = ~np.isnan(arrays["odometry_motion"][:, 0, 0])
-    motions = {"odometry_motion": arrays["odometry_motion"][known]}
+    motions = {"odometry_motion": _with_translation(arrays["odometry_motion"][known])}
     require_finite(LOG, motions, ("odometry_motion",), where)
     moved = arrays["odometry_covariance"][known]
     require_covariances(LOG, "odometry_covariance", moved, where, definite=False)
@@ -288,7 +292,7 @@ def _require_consistent_loops(arrays: StateArrays, where: str) -> None:
 def _corrections(
     arrays: StateArrays, version: int, rig: Sensor, where: str
 ) -> list[FloatArray | None]:
-    """The rig's correction in each frame; None before version 4.
+    """The rig's correction in each frame; None before version 4, and in a log of NaN.
 
     Raises MeasurementLogError where they are not there, or of another rig.
     """
@@ -297,11 +301,36 @@ def _corrections(
         return [None] * frames
     terms = len(term_names(rig))
     LOG.require(arrays, {"rig_correction": ("f", (frames, terms))}, where)
-    return list(arrays["rig_correction"])
+    rows = arrays["rig_correction"]
+    return [None] * frames if np.isnan(rows).all() else list(rows)
+
+
+def _without_stand_in(odometry: Odometry | None) -> Odometry | None:
+    """What of a step was measured: all of it, its turn, or nothing."""
+    if odometry is None or odometry.measured:
+        return odometry
+    if odometry.turned:
+        return Odometry.turn(odometry.motion[:3, :3], odometry.covariance[:3, :3])
+    return None
 
 
 def _motion(increment: Increment) -> FloatArray:
-    return np.full((4, 4), np.nan) if increment.odometry is None else increment.odometry.motion
+    """(4, 4); NaN where nothing was measured, and as translation of a mere turn."""
+    odometry = increment.odometry
+    if odometry is None:
+        return np.full((4, 4), np.nan)
+    return odometry.motion + (_NO_TRANSLATION if odometry.turned else 0.0)
+
+
+_NO_TRANSLATION = np.zeros((4, 4))
+_NO_TRANSLATION[:3, 3] = np.nan
+
+
+def _with_translation(motions: FloatArray) -> FloatArray:
+    """Motions (n, 4, 4), mere turns without translation."""
+    out = np.array(motions)
+    out[np.isnan(motions[:, :3, 3]).all(axis=1), :3, 3] = 0.0
+    return out
 
 
 def _motion_covariance(increment: Increment) -> FloatArray:
@@ -311,10 +340,12 @@ def _motion_covariance(increment: Increment) -> FloatArray:
 
 
 def _odometry(arrays: StateArrays, k: int) -> Odometry | None:
-    motion = arrays["odometry_motion"][k]
+    motion, covariance = arrays["odometry_motion"][k], arrays["odometry_covariance"][k]
     if np.isnan(motion[0, 0]):
         return None
-    return Odometry(motion, arrays["odometry_covariance"][k])
+    if np.isnan(motion[0, 3]):
+        return Odometry.turn(motion[:3, :3], covariance[:3, :3])
+    return Odometry(motion, covariance)
 
 
 def _stack(parts: list[FloatArray], shape: tuple[int, ...]) -> FloatArray:

@@ -9,6 +9,9 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray, Rows
 
+FREE_TRANSLATION_M = 30.0
+"""Standard deviation per axis of a step's translation of which nothing is known."""
+
 
 class MeasurementType(str, Enum):
     """Kinds of measurement that an estimator may support; checked before a run starts."""
@@ -20,6 +23,21 @@ class MeasurementType(str, Enum):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
+class BiasEffect(Brief):
+    """What the unknown bias of a gyroscope does to a step that it measured.
+
+    Attributes:
+        jacobian: (3, 3) of the step's rotation vector, at its end, by the bias: rad by rad/s.
+        start_variance: of the bias per axis before the drive, (rad/s)^2.
+        walk: by how much that variance grows in the step, (rad/s)^2.
+    """
+
+    jacobian: FloatArray
+    start_variance: float
+    walk: float
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Odometry(Brief):
     """Motion between two consecutive frames, with its uncertainty.
 
@@ -28,11 +46,25 @@ class Odometry(Brief):
         covariance: (6, 6) of the tangent vector at the new pose, [rotation, translation].
         measured: by wheels or another sensor; else a motion model's stand-in, such as constant
             velocity, which belongs in no log.
+        turned: its rotation alone was measured, by a gyroscope; the translation is a stand-in's, or
+            free (:meth:`turn`), and ``measured`` is false.
+        bias: of that gyroscope, where the rotation is not corrected for it; None where it is.
     """
 
     motion: FloatArray
     covariance: FloatArray
     measured: bool = True
+    turned: bool = False
+    bias: BiasEffect | None = None
+
+    @staticmethod
+    def turn(
+        rotation: FloatArray, covariance: FloatArray, bias: BiasEffect | None = None
+    ) -> Odometry:
+        """A rotation (3, 3) and its covariance (3, 3); nothing is known of the translation."""
+        motion, full = np.eye(4), np.diag(np.repeat([0.0, FREE_TRANSLATION_M**2], 3))
+        motion[:3, :3], full[:3, :3] = rotation, covariance
+        return Odometry(motion, full, measured=False, turned=True, bias=bias)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

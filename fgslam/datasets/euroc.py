@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from fgslam.core.files import read_lines
 from fgslam.core.geometry import inverse
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.calibrated import mounted
+from fgslam.datasets.gyroscope import recorded_gyroscope
 from fgslam.datasets.images import (
     RawImages,
     StereoFiles,
@@ -23,9 +25,15 @@ from fgslam.datasets.images import (
     missing_notes,
     require_folder,
 )
+from fgslam.datasets.odometry import recorded_motions
 from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
-from fgslam.datasets.recording import Recording, recording_identity, select_frames
-from fgslam.datasets.settings import EurocSettings
+from fgslam.datasets.recording import (
+    OdometrySource,
+    Recording,
+    recording_identity,
+    select_frames,
+)
+from fgslam.datasets.settings import EurocSettings, RecordedOdometrySettings
 from fgslam.datasets.tables import (
     Table,
     poses_from_quaternions,
@@ -39,7 +47,12 @@ CAMERA_FOLDERS = ("cam0", "cam1")
 _MAX_TRUTH_GAP_S = 0.1
 
 
-def open_euroc(settings: EurocSettings) -> Recording:
+_DEFAULT_LIMITS = RecordedOdometrySettings()
+
+
+def open_euroc(
+    settings: EurocSettings, odometry: RecordedOdometrySettings = _DEFAULT_LIMITS
+) -> Recording:
     """Open a recording; ``settings.path`` is the folder mav0 or the one that holds it.
 
     Raises:
@@ -61,13 +74,26 @@ def open_euroc(settings: EurocSettings) -> Recording:
         rig=rig.plain(),
         rectifier=rig.rectifier,
         timestamps=stamps[chosen],
-        identity=_identity(folders, files),
+        identity=_identity(root, folders, files),
         ground_truth=_true_poses(root, rig, stamps[chosen]),
         notes=rig.remarks + notes + missing_notes(files, stamps),
         indices=chosen,
         load_images=RawImages(files, rig).load,
         load_colour=RawImages(files, rig).load_colour,
+        odometry_source=_gyroscope(root, odometry),
     )
+
+
+def _gyroscope(root: Path, settings: RecordedOdometrySettings) -> OdometrySource | None:
+    """Turns by imu0, read when they are first needed; None where there is none."""
+    path = root / "imu0" / "data.csv"
+    if not path.is_file():
+        return None
+    own = root / "imu0" / "sensor.yaml"
+    noise = next((p for p in (own, root.parent / "dso" / "imu_config.yaml") if p.is_file()), None)
+    mounting = own if own.is_file() else None
+    read = partial(recorded_gyroscope, path, mounting, noise, settings)
+    return recorded_motions(str(path), read, settings)
 
 
 def _rig(settings: EurocSettings, root: Path, folders: list[Path]) -> StereoRig:
@@ -96,8 +122,9 @@ def _pairs(
     return stamps, files, notes
 
 
-def _identity(folders: list[Path], files: StereoFiles) -> str:
-    named = [folder / name for folder in folders for name in ("sensor.yaml", "data.csv")]
+def _identity(root: Path, folders: list[Path], files: StereoFiles) -> str:
+    sensors = [*folders, root / "imu0"]
+    named = [folder / name for folder in sensors for name in ("sensor.yaml", "data.csv")]
     defining = [path for path in named if path.is_file()]
     images = [path for pair in files.paths for path in pair if path.is_file()]
     return recording_identity(defining, images)

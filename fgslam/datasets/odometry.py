@@ -1,5 +1,6 @@
 """Odometry of recordings: body motions from speed and yaw rate, from poses, or from the truth.
 
+Turns of a gyroscope are in ``gyroscope.py``.
 The body's axes are x forward, y left, z up. All covariances are 6x6 [rotation, translation] in the
 tangent space at the new pose.
 """
@@ -9,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -20,6 +22,8 @@ from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.core.recordings import Sequence as FrameSequence
 from fgslam.core.sensors import CameraRig
+from fgslam.datasets.gyroscope import GyroscopeLog, motions_from_gyroscope
+from fgslam.datasets.odometry_checks import require_samples, require_sane, steps_covered
 from fgslam.datasets.recording import OdometrySource
 from fgslam.datasets.settings import RecordedOdometrySettings, SyntheticOdometrySettings
 from fgslam.datasets.tables import (
@@ -58,33 +62,12 @@ def read_speed_log(path: Path, settings: RecordedOdometrySettings) -> SpeedLog:
 
 def checked_speeds(table: Table, settings: RecordedOdometrySettings) -> SpeedLog:
     """Rows (time, forward speed, yaw rate) as a log; raises as :func:`read_speed_log`."""
-    _require_samples(table.path, len(table))
+    require_samples(table.path, len(table))
     require_increasing(table, table.column(0), OdometryError)
-    _require_sane(table, table.column(1), settings.max_speed_mps, "forward speed", "m/s")
+    require_sane(table, table.column(1), settings.max_speed_mps, "forward speed", "m/s")
     turn = np.degrees(table.column(2))
-    _require_sane(table, turn, settings.max_turn_dps, "yaw rate", "degrees/s")
+    require_sane(table, turn, settings.max_turn_dps, "yaw rate", "degrees/s")
     return SpeedLog(table.column(0) + settings.time_offset_s, table.column(1), table.column(2))
-
-
-def _require_samples(path: Path, count: int) -> None:
-    if count < 2:
-        raise OdometryError(
-            f"{path} holds {count} samples, at least 2 are needed; restore the file, or choose "
-            "another odometry.kind (constant_velocity, synthetic)"
-        )
-
-
-def _require_sane(table: Table, values: FloatArray, limit: float, what: str, unit: str) -> None:
-    """Raise OdometryError, naming the line, if one of the values (n,) exceeds the limit."""
-    bad = np.flatnonzero(np.abs(values) > limit)
-    if len(bad):
-        k = int(bad[0])
-        hint = ", radians are expected: are these degrees?" if what == "yaw rate" else ""
-        raise OdometryError(
-            f"{table.path}, line {table.lines[k]}: {what} of {values[k]:.4g} {unit} is absurd "
-            f"(limit {limit:g}){hint}; correct the line, or raise the limit in the odometry "
-            "settings"
-        )
 
 
 # --------------------------------------------------------------------------------------------
@@ -154,20 +137,6 @@ def _motions(
     return tuple(Odometry(m, c) if ok else None for m, c, ok in steps)
 
 
-def steps_covered(stamps: FloatArray, frames: FloatArray, max_gap: float, hold: float) -> BoolArray:
-    """Which of the n - 1 steps between frames (n,) the increasing stamps (m,) cover.
-
-    A step is covered unless it overlaps a gap between stamps longer than ``max_gap`` seconds, or
-    reaches more than ``hold`` seconds beyond the first or last stamp.
-    """
-    before, after = frames[:-1], frames[1:]
-    long = np.diff(stamps) > max_gap
-    starts, ends = stamps[:-1][long], stamps[1:][long]
-    overlapped = np.searchsorted(starts, after, "left") - np.searchsorted(ends, before, "right")
-    within = (before >= stamps[0] - hold) & (after <= stamps[-1] + hold)
-    return np.asarray(within & (overlapped == 0))
-
-
 # --------------------------------------------------------------------------------------------
 # Poses
 
@@ -184,7 +153,7 @@ def read_pose_log(path: Path, settings: RecordedOdometrySettings) -> Trajectory:
 def checked_poses(table: Table, settings: RecordedOdometrySettings) -> Trajectory:
     """Rows (time, position, quaternion) as a trajectory; raises as :func:`read_pose_log`."""
     log = trajectory_of(table, OdometryError)
-    _require_samples(table.path, len(table))
+    require_samples(table.path, len(table))
     motions = inverse(log.poses[:-1]) @ log.poses[1:]
     duration = np.diff(log.timestamps)
     speed = np.linalg.norm(motions[:, :3, 3], axis=1) / duration
@@ -192,8 +161,8 @@ def checked_poses(table: Table, settings: RecordedOdometrySettings) -> Trajector
 
     angle = Rotation.from_matrix(motions[:, :3, :3]).magnitude()
     arrival = Table(table.path, table.values[1:], table.lines[1:])
-    _require_sane(arrival, speed, settings.max_speed_mps, "speed", "m/s")
-    _require_sane(arrival, np.degrees(angle) / duration, settings.max_turn_dps, "turn", "degrees/s")
+    require_sane(arrival, speed, settings.max_speed_mps, "speed", "m/s")
+    require_sane(arrival, np.degrees(angle) / duration, settings.max_turn_dps, "turn", "degrees/s")
     return Trajectory(log.timestamps + settings.time_offset_s, log.poses)
 
 
@@ -209,10 +178,14 @@ def motions_from_poses(
     return _motions(poses, covariances, known)
 
 
+AnyLog: TypeAlias = SpeedLog | GyroscopeLog | Trajectory
+"""What odometry is recorded as: speeds, angular velocities, or poses."""
+
+
 def recorded_motions(
-    name: str, read: Callable[[], SpeedLog | Trajectory], settings: RecordedOdometrySettings
+    name: str, read: Callable[[], AnyLog], settings: RecordedOdometrySettings
 ) -> OdometrySource:
-    """Body motions by speeds or poses that are read when motions are first asked for.
+    """Body motions by a log that is read when motions are first asked for.
 
     Args:
         name: of the file or topic, for messages.
@@ -227,6 +200,8 @@ def recorded_motions(
         log = read()
         if isinstance(log, SpeedLog):
             steps = motions_from_speed(log, frames, settings)
+        elif isinstance(log, GyroscopeLog):
+            steps = motions_from_gyroscope(log, frames)
         else:
             steps = motions_from_poses(log, frames, settings)
         if len(frames) > 1 and all(step is None for step in steps):

@@ -1,8 +1,9 @@
-"""Odometry in a table with named columns: speeds, wheels, ticks of encoders, or poses."""
+"""Odometry in a table with named columns: speeds, wheels, ticks, poses, or a gyroscope."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,18 +11,22 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import OdometryError
-from fgslam.core.estimates import Trajectory
 from fgslam.core.files import read_lines
-from fgslam.datasets.odometry import SpeedLog, checked_poses, checked_speeds
+from fgslam.datasets.gyroscope import checked_rates
+from fgslam.datasets.odometry import AnyLog, checked_poses, checked_speeds
 from fgslam.datasets.settings import RecordedOdometrySettings
-from fgslam.datasets.stamps import time_unit
+from fgslam.datasets.stamps import SLOWEST_MOTION_S, time_unit
 from fgslam.datasets.tables import Table, require_increasing
 
 _NAMES = {
     "time": "t time stamp timestamp sec secs seconds header_stamp",
     "speed": "v vx speed velocity forward_speed linear_x linear_velocity twist_linear_x v_forward",
     "yaw_rate": "w wz omega yaw_rate yawrate turn_rate angular_z angular_velocity "
-    "twist_angular_z gyro_z",
+    "twist_angular_z gyro_z w_z omega_z angular_velocity_z gz gyr_z rotation_rate_z w_rs_s_z",
+    "rate_x": "wx w_x omega_x angular_x angular_velocity_x gyro_x gx gyr_x rotation_rate_x "
+    "w_rs_s_x",
+    "rate_y": "wy w_y omega_y angular_y angular_velocity_y gyro_y gy gyr_y rotation_rate_y "
+    "w_rs_s_y",
     "left_speed": "v_left left_speed speed_left left_velocity velocity_left vl v_l",
     "right_speed": "v_right right_speed speed_right right_velocity velocity_right vr v_r",
     "left_ticks": "left_ticks ticks_left left_encoder encoder_left left_count count_left left",
@@ -59,7 +64,8 @@ _UNITS = {
     "rad_s": 1.0,
     "radps": 1.0,
     "rps": 1.0,
-    **dict.fromkeys(("deg", "degrees", "dps", "deg_s", "degps"), np.pi / 180.0),
+    "rad_s_1": 1.0,
+    **dict.fromkeys(("deg", "degrees", "dps", "deg_s", "degps", "deg_s_1"), np.pi / 180.0),
 }
 """Units at the end of a name, in seconds, metres, radians."""
 
@@ -72,8 +78,8 @@ def has_named_columns(path: Path) -> bool:
     )
 
 
-def read_named_columns(path: Path, settings: RecordedOdometrySettings) -> SpeedLog | Trajectory:
-    """Speed and yaw rate, or poses of the body, by what columns there are.
+def read_named_columns(path: Path, settings: RecordedOdometrySettings) -> AnyLog:
+    """Speed and yaw rate, angular velocity, or poses of the body, by what columns there are.
 
     Raises:
         OdometryError: no known set of columns, a line is malformed, or a value is absurd.
@@ -85,12 +91,11 @@ def read_named_columns(path: Path, settings: RecordedOdometrySettings) -> SpeedL
         if set(names) <= set(have):
             found = make(table, time, settings)
             require_increasing(found, found.column(0), OdometryError)
-            log = checked_speeds if found.values.shape[1] == 3 else checked_poses
-            return log(found, settings)
+            return _CHECKED[found.values.shape[1]](found, settings)
     raise OdometryError(
         f"{path}: columns {', '.join(have) or 'none'} were understood; needed are time with speed "
-        "and yaw_rate, left_speed and right_speed, left_ticks and right_ticks, or x, y and yaw (or "
-        "qx, qy, qz, qw); name the columns so"
+        "and yaw_rate, left_speed and right_speed, left_ticks and right_ticks, x, y and yaw (or "
+        "qx, qy, qz, qw), or gyro_x, gyro_y and gyro_z; name the columns so"
     )
 
 
@@ -169,15 +174,20 @@ def _seconds(table: _Columns) -> FloatArray:
     if "time" not in table.columns:
         raise OdometryError(f"{table.path}: no column is named time; name the columns")
     time = table["time"]
-    return time * time_unit(time)[1] if table.plain_time else time
+    return time * time_unit(time, SLOWEST_MOTION_S)[1] if table.plain_time else time
 
 
 # --------------------------------------------------------------------------------------------
-# What sets of columns become: (time, speed, yaw rate), or a time and a pose as in a TUM file
+# What sets of columns become: time with speed and yaw rate, with angular velocity, or with a pose
+# as in a TUM file
 
 
 def _of_speed(table: _Columns, time: FloatArray, _: RecordedOdometrySettings) -> Table:
     return table.table(time, table["speed"], table["yaw_rate"])
+
+
+def _of_rates(table: _Columns, time: FloatArray, _: RecordedOdometrySettings) -> Table:
+    return table.table(time, table["rate_x"], table["rate_y"], table["yaw_rate"])
 
 
 def _of_wheels(table: _Columns, time: FloatArray, settings: RecordedOdometrySettings) -> Table:
@@ -239,5 +249,13 @@ _SETS = (
     (("left_ticks", "right_ticks"), _of_ticks),
     (("speed", "yaw_rate"), _of_speed),
     (("left_speed", "right_speed"), _of_wheels),
+    (("rate_x", "rate_y", "yaw_rate"), _of_rates),
 )
 """Columns that are enough, the best first."""
+
+_CHECKED: Mapping[int, Callable[[Table, RecordedOdometrySettings], AnyLog]] = {
+    3: checked_speeds,
+    4: checked_rates,
+    8: checked_poses,
+}
+"""What a set becomes, by its number of columns."""

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from fgslam.core.errors import DatasetError
-from fgslam.core.estimates import Trajectory
+from fgslam.datasets.gyroscope import checked_rates, read_rates
 from fgslam.datasets.odometry import (
-    SpeedLog,
+    AnyLog,
     read_pose_log,
     read_speed_log,
     recorded_motions,
@@ -20,6 +20,8 @@ from fgslam.datasets.settings import RecordedOdometrySettings
 
 def find_odometry(root: Path, name: str | None) -> Path | None:
     """The file of odometry in a recording's folder: the named one, else the only one there is.
+
+    Without any, the only file of a gyroscope, imu*.csv or gyro*.csv.
 
     Raises:
         DatasetError: it is not there, or there are several.
@@ -33,6 +35,8 @@ def find_odometry(root: Path, name: str | None) -> Path | None:
         return root / name
     found: Iterable[Path] = [root / "odometry.txt", *sorted(root.glob("odom*.csv"))]
     candidates = [path for path in found if path.is_file()]
+    if not candidates:  # wheels say more than a gyroscope
+        candidates = [path for path in sorted(root.glob("*.csv")) if _of_gyroscope(path)]
     if len(candidates) > 1:
         raise DatasetError(
             f"{root} has several odometry files ({', '.join(p.name for p in candidates)}); name "
@@ -49,9 +53,15 @@ def file_odometry(path: Path | None, settings: RecordedOdometrySettings) -> Odom
     return recorded_motions(str(path), lambda: _read(path, settings), settings)
 
 
-def _read(path: Path, settings: RecordedOdometrySettings) -> SpeedLog | Trajectory:
+def _of_gyroscope(path: Path) -> bool:
+    return path.is_file() and path.name.lower().startswith(("imu", "gyro"))
+
+
+def _read(path: Path, settings: RecordedOdometrySettings) -> AnyLog:
     if has_named_columns(path):
         return read_named_columns(path, settings)
+    if _of_gyroscope(path):
+        return checked_rates(read_rates(path), settings)
     if path.suffix == ".csv":
         return read_speed_log(path, settings)
     return read_pose_log(path, settings)

@@ -74,10 +74,6 @@ def _opened(settings: FileRecordingSettings, odometry: RecordedOdometrySettings)
             from fgslam.datasets.kitti_raw import open_kitti_raw
 
             return open_kitti_raw(settings)
-        case EurocSettings():
-            from fgslam.datasets.euroc import open_euroc
-
-            return open_euroc(settings)
         case LightFieldSettings():
             from fgslam.datasets.light_field import open_light_field
 
@@ -97,7 +93,7 @@ def _open_film_or_depth(settings: _FilmOrDepth) -> Recording:
     return open_rgbd(settings)
 
 
-_WithOdometry: TypeAlias = ImageFolderSettings | LooseImagesSettings | BagSettings
+_WithOdometry: TypeAlias = ImageFolderSettings | LooseImagesSettings | EurocSettings | BagSettings
 
 
 def _open_with_odometry(settings: _WithOdometry, odometry: RecordedOdometrySettings) -> Recording:
@@ -110,6 +106,10 @@ def _open_with_odometry(settings: _WithOdometry, odometry: RecordedOdometrySetti
             from fgslam.datasets.loose_images import open_loose_images
 
             return open_loose_images(settings, odometry)
+        case EurocSettings():
+            from fgslam.datasets.euroc import open_euroc
+
+            return open_euroc(settings, odometry)
         case BagSettings():
             from fgslam.datasets.bags.reader import open_bag
 

@@ -19,6 +19,8 @@ LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv", "data.csv
 _ASSUMED_FPS = 10.0
 _UNITS = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 _SLOWEST_S = 10.0  # between two images: what makes a unit plausible
+SLOWEST_MOTION_S = 1.0
+"""The same between two samples of odometry."""
 _NAME = re.compile(r"^\d{10,19}(\.\d+)?$")
 _DATE = re.compile(r"^\d{4}-\d{2}-\d{2}[ T]\d{2}:\d{2}:\d{2}")
 
@@ -95,12 +97,15 @@ def _in_seconds(
     return unit * (first + values), note
 
 
-def time_unit(times: FloatArray) -> tuple[str, float]:
-    """The largest unit in which the times (n,) follow each other as a sensor's do, in seconds."""
+def time_unit(times: FloatArray, slowest_s: float = _SLOWEST_S) -> tuple[str, float]:
+    """The largest unit in which the times (n,) follow each other as a sensor's do, in seconds.
+
+    ``slowest_s`` is the longest time that is plausible between two of them.
+    """
     step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     known = _UNITS.items()
     return next(
-        ((name, unit) for name, unit in known if step * unit <= _SLOWEST_S), ("seconds", 1.0)
+        ((name, unit) for name, unit in known if step * unit <= slowest_s), ("seconds", 1.0)
     )
 
 

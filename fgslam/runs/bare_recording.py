@@ -121,6 +121,12 @@ def has_odometry(sequence: Sequence) -> bool:
     return any(sequence.odometry(i) is not None for i in range(1, len(sequence)))
 
 
+def _odometry_in_words(sequence: Sequence) -> str:
+    steps = (sequence.odometry(i) for i in range(1, len(sequence)))
+    known = [step for step in steps if step is not None]
+    return "a gyroscope, no odometry" if known and known[0].turned else "odometry"
+
+
 def _name(recording: Path) -> str:
     """Of a folder its name, of a file its name without ending."""
     path = recording.resolve()
@@ -174,7 +180,7 @@ def _said(config: ExperimentConfig, sequence: Sequence) -> str:
     duration = float(stamps[-1] - stamps[0])
     rate = f" at {(len(stamps) - 1) / duration:.3g} Hz" if duration > 0.0 else ""
     lenses = ", unrectified" if getattr(sequence, "unrectified", False) else ""
-    motion = {"recorded": "odometry", "constant_velocity": "no odometry"}
+    motion = {"recorded": _odometry_in_words(sequence), "constant_velocity": "no odometry"}
     truth = "" if sequence.ground_truth is None else "; truth, for evaluation only"
     line = (
         f"{sequence.name}: {LAYOUTS[config.dataset.kind].name}, {rig.cameras} cameras "

@@ -225,7 +225,9 @@ def make_pipeline(
         tracker=tracker,
         motion=make_motion(rig, odometry),
         estimator=estimator,
-        places=make_places(rig, frontend, tracker, seed),
+        places=make_places(
+            rig, frontend, tracker, seed, MeasurementType.LOOP in estimator.supports
+        ),
         calibration=make_calibration(rig, frontend),
         key_frames=make_key_frames(rig, frontend, tracker),
         watch=CameraWatch(rig) if frontend.watch_cameras else None,
@@ -251,14 +253,22 @@ def make_calibration(rig: CameraRig, settings: FrontendSettings) -> SelfCalibrat
 
 
 def make_places(
-    rig: CameraRig, settings: FrontendSettings, tracker: LandmarkTracker, seed: int
+    rig: CameraRig,
+    settings: FrontendSettings,
+    tracker: LandmarkTracker,
+    seed: int,
+    joins: bool = False,
 ) -> PlaceRecognition | None:
-    """Place recognition: loop closures and relocalisation; None where neither is wanted."""
-    if settings.loops is None and settings.lost is None:
+    """Place recognition: loop closures and relocalisation; None where neither is wanted.
+
+    Where the estimator takes closures it joins parts of the map (``joins``).
+    """
+    if settings.loops is None and settings.lost is None and not joins:
         return None
     from fgslam.frontend.places.recognition import PlaceRecognition, RecognitionParts
 
     parts = RecognitionParts(
+        joins=joins,
         loops=settings.loops,
         lost=settings.lost,
         appearance=settings.appearance,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -76,7 +77,7 @@ def checked_odometry(
         return None
     if isinstance(given, Odometry):
         motion = _rigid(given.motion)
-        return Odometry(motion, _covariance(given.covariance), given.measured)
+        return replace(given, motion=motion, covariance=_covariance(given.covariance))
     motion = _rigid(given)
     noise = settings if isinstance(settings, RecordedOdometrySettings) else None
     return Odometry(motion, pose_noise(motion, noise or RecordedOdometrySettings()))

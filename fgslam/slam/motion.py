@@ -13,6 +13,7 @@ from fgslam.core.geometry import inverse, odometry_of_camera, se3_exp, se3_log
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
 from fgslam.datasets.settings import ConstantVelocitySettings
+from fgslam.slam.gyroscope import GyroscopeError, turn_of_camera, turned_by
 from fgslam.slam.motion_noise import MotionNoise
 
 _LARGEST_SIGMA = np.repeat([3.0, 30.0], 3)
@@ -77,7 +78,8 @@ def description_of(motion: MotionModel) -> dict[str, Any]:
 class OdometryMotion:
     """The robot's odometry, moved from its body to the camera (Se et al. 5).
 
-    Over a gap in it, constant velocity stands in.
+    Over a gap in it, constant velocity stands in; so it does for the translation of a gyroscope's
+    turns, which are corrected by what the matches say of its bias.
     """
 
     uses_odometry = True
@@ -87,36 +89,44 @@ class OdometryMotion:
         self._bTc = bTc
         self._kind = kind
         self._stand_in = stand_in
+        self._gyroscope = GyroscopeError()
 
     def between(self, timestamp: float, body: Odometry | None) -> Odometry | None:
         """Camera motion by the odometry, or by the stand-in."""
         if body is None:
             return self._stand_in.between(timestamp)
-        return odometry_of_camera(body, self._bTc)
+        if not body.turned:
+            return odometry_of_camera(body, self._bTc)
+        turn = self._gyroscope.corrected(turn_of_camera(body, self._bTc))
+        return self._gyroscope.handed(self._stand_in.between(timestamp, turn))
 
     def observe(self, timestamp: float, pose: Prediction, measured: bool) -> None:
-        """Updates the velocity of the stand-in, and how far it is to be trusted."""
+        """Updates the velocity of the stand-in, how far it is to be trusted, and the bias."""
         self._stand_in.observe(timestamp, pose, measured)
+        self._gyroscope.observe(pose)
 
     def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
         """The stand-in goes on from there."""
         self._stand_in.displaced(timestamp, wTc, carried)
+        self._gyroscope.displaced()
 
     def regained(self, timestamp: float, wTc: FloatArray) -> None:
         """The stand-in goes on from there."""
         self._stand_in.regained(timestamp, wTc)
+        self._gyroscope.displaced()
 
     def description(self) -> dict[str, Any]:
         """The kind of odometry and what bridges its gaps."""
         return {"kind": self._kind, "stand_in": self._stand_in.description()}
 
     def state(self) -> StateArrays:
-        """State of the stand-in."""
-        return self._stand_in.state()
+        """State of the stand-in and of the gyroscope's bias."""
+        return self._stand_in.state() | self._gyroscope.state()
 
     def restore(self, state: StateArrays) -> None:
-        """State of the stand-in."""
+        """State of the stand-in and of the gyroscope's bias."""
         self._stand_in.restore(state)
+        self._gyroscope.restore(state)
 
 
 class ConstantVelocityMotion:
@@ -139,17 +149,24 @@ class ConstantVelocityMotion:
         self._velocity: FloatArray | None = None
 
     def between(self, timestamp: float, body: Odometry | None = None) -> Odometry | None:
-        """Motion at the last velocity over the new interval ``dt``; ``body`` is not used.
+        """Motion at the last velocity over the new interval ``dt``.
+
+        Where ``body`` is a turn of the camera, its rotation takes the place of the velocity's;
+        other odometry is not used.
 
         The velocity has wandered by ``sigma * T`` over the time T since it was last measured, so
         the step's standard deviation is ``sigma * T * dt``: ``sigma * dt^2`` from frame to frame,
         and growing while the camera is blind. Then the velocity fades, too.
         """
-        if self._timestamp is None:
-            return None
-        dt = timestamp - self._timestamp
-        if self._velocity is None:
+        guess = None if self._timestamp is None else self._guess(timestamp - self._timestamp)
+        if guess is None or body is None or not body.turned:
+            return guess
+        return turned_by(guess, body)
+
+    def _guess(self, dt: float) -> Odometry:
+        if self._velocity is None or self._timestamp is None:
             return Odometry(np.eye(4), np.diag((self._start_sigma * dt) ** 2), measured=False)
+        timestamp = self._timestamp + dt
         wandered = self._noise.variance * (timestamp - self._measured_at) ** 2
         variance = np.minimum(wandered * dt**2, _LARGEST_SIGMA**2)
         blind = self._measured_at < self._timestamp

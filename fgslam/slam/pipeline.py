@@ -109,7 +109,8 @@ class SlamPipeline:
             watch.lap("sift")
             every = self._match_stereo(found)
             watch.lap("stereo")
-            every, seen = self._track(prediction, found, every, landmarks, carried)
+            guessed = odometry is not None and not odometry.measured
+            every, seen = self._track(prediction, found, every, landmarks, carried, guessed)
             stereo = every.whole
             watch.lap("track")
             seen = self._recognise(seen, stereo, landmarks)
@@ -193,6 +194,7 @@ class SlamPipeline:
         stereo: StereoFeatures,
         landmarks: LandmarkMap,
         carried: CarriedFrame | None,
+        guessed: bool,
     ) -> tuple[StereoFeatures, _Seen]:
         """A key frame by all its features, those carried among them."""
         if found.frame is None:
@@ -211,7 +213,7 @@ class SlamPipeline:
             tracked = anew if relocalised else tracked
         elif self.places is not None and found.i > 0:
             tracked = self.places.placed_by_recent(tracked, prediction, landmarks, stereo)
-            tracked, located = self.places.recover(tracked, landmarks, stereo.whole)
+            tracked, located = self.places.recover(tracked, landmarks, stereo.whole, guessed)
             relocalised |= located
             maps_on = self.places.maps_on
         image = found.frame.images[0]
@@ -230,6 +232,7 @@ class SlamPipeline:
         return dataclasses.replace(seen, loops=loops)
 
     def _remember(self, increment: Increment, seen: _Seen, stats: UpdateStats) -> None:
+        self.tracker.parts.book(increment, stats.closed)
         if self.places is not None:
             self.places.remember(increment, seen.tracking.wTc, stats)
 

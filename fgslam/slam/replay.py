@@ -159,8 +159,8 @@ def replay_frame(
 ) -> ReplayedFrame:
     """Gives frame ``k`` of a log to an estimator: the live loop without its matching."""
     watch = Stopwatch()
-    if increment.odometry is None:
-        stand_in = motion.between(increment.timestamp, None)
+    if increment.odometry is None or increment.odometry.turned:
+        stand_in = motion.between(increment.timestamp, increment.odometry)
         increment = dataclasses.replace(increment, odometry=stand_in)
     prediction = predicted(estimator, increment.odometry)
     watch.lap("predict")

@@ -258,7 +258,10 @@ class SessionResult(Brief):
         return (*self.notes, *self.estimate.remarks)
 
     def column(self, name: str) -> npt.NDArray[Any]:
-        """(n,) one number of every frame: `status`, `matched`, `inliers`, `nis`, `update_ms`..."""
+        """(n,) one number of every frame: `status`, `matched`, `inliers`, `nis`, `update_ms`...
+
+        `connected` is False where a gap that nothing bridges lies between the first frame and it.
+        """
         return self.frames[name]
 
 
@@ -285,7 +288,8 @@ def result_of(
         online=online,
         online_covariances=covariances,
         closed=() if pipeline.places is None else tuple(pipeline.places.taken),
-        frames=_columns(recorder),
+        frames=_columns(recorder)
+        | {"connected": pipeline.tracker.parts.connected[: len(recorder)]},
         notes=notes,
         rig=None if pipeline.calibration is None else pipeline.calibration.found,
     )

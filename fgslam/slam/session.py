@@ -43,6 +43,7 @@ from fgslam.slam.feature_stream import (
 from fgslam.slam.first_images import FirstImages, any_uint16, stereo_remarks
 from fgslam.slam.inputs import Images, checked_images, checked_odometry
 from fgslam.slam.motion import MotionModel, description_of
+from fgslam.slam.part_remarks import part_remarks
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.results import RunRecorder, SessionResult, Step, result_of
 
@@ -283,6 +284,7 @@ class Session:
             raise SessionError(self._why_empty())
         notes = stereo_remarks(self.recorder, self._seen)
         notes = (*camera_remarks(self.recorder, self.pipeline.watch), *notes)
+        notes = (*part_remarks(self.recorder, self.pipeline.tracker.parts), *notes)
         if left_out.count:
             notes = (*notes, f"the first {left_out.count} frames could not be located: left out")
         with one_blas_thread():

@@ -21,6 +21,8 @@ from fgslam.backend.filters.loop_correction import (
     Chain,
     DriveRecord,
     changes,
+    founds_anew,
+    guessed,
     home_changes,
     rotated,
     transported,
@@ -131,17 +133,6 @@ class LandmarkRows:
         self.counts[:], self.homes[:] = counts, homes
 
 
-def _guessed(increment: Increment, tracking: EgoMotion) -> bool:
-    """Whether nothing measured a frame's pose: neither landmarks nor odometry, after the first.
-
-    What it starts is one piece, whose place among the rest nobody knows. The filter has no
-    correlations: with the guess's covariance on each landmark none would tell where the next frame
-    is, though together they do.
-    """
-    odometry = increment.odometry
-    return not tracking.status.measured and odometry is not None and not odometry.measured
-
-
 class LandmarkKalman:
     """Estimator of kind ``landmark_kalman``, on :class:`fgslam.backend.protocol.Estimator`."""
 
@@ -191,7 +182,7 @@ class LandmarkKalman:
         """
         self._past.require_later(increment)
         before, self._current = self._current, Prediction(tracking.wTc, tracking.covariance)
-        shared = self._settings.pose_covariance and not _guessed(increment, tracking)
+        shared = self._settings.pose_covariance and not guessed(increment, tracking)
         self._by_pose = tracking.covariance if shared else None
         matched = increment.observations.select(~increment.observations.is_new)
         used = matched.select(tracking.inliers)
@@ -278,7 +269,8 @@ class LandmarkKalman:
     ) -> None:
         """Keeps the step to this frame, for later loops, and which old landmarks placed it."""
         step = inverse(before.wTc) @ tracking.wTc if len(self._past) else tracking.wTc
-        self._drive.step(step, tracking, increment.odometry, increment.relocalised)
+        free = increment.relocalised or founds_anew(increment, tracking)
+        self._drive.step(step, tracking, increment.odometry, free)
         homes = self._rows.homes[self._rows.rows(used)]
         self._drive.tie(homes, self._past.poses, tracking, increment.relocalised)
 

@@ -21,7 +21,7 @@ from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, Prediction
 from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise, se3_log, skew
-from fgslam.core.measurements import LoopClosure, Odometry
+from fgslam.core.measurements import Increment, LoopClosure, Odometry
 from fgslam.factors.graphs import pose_key, poses_of_frame, solver_parameters
 from fgslam.factors.motion import odometry_factor, pose_prior
 from fgslam.factors.noise import robust
@@ -48,12 +48,33 @@ FREE_RAD, FREE_M = 3.0, 30.0
 (a frame's own landmarks know the pose a thousand times better), yet the graph stays solvable."""
 FREE = np.diag([FREE_RAD**2] * 3 + [FREE_M**2] * 3)
 """(6, 6) covariance of such a step."""
+_PART = 6  # landmarks by which a later frame can be placed
 _TIED_BY = 10  # landmarks of an old place that hold a frame there
 _OLD = 5  # submaps
 _TIE_FACTOR = 5.0
 """On the deviations of a pose tracked by old landmarks, which lie about their homes as the drift
 has bent them. Measured on four rounds of the lab: up to 20 the corrected drive is as accurate,
 below 5 true closures are taken for impossible (docs/results)."""
+
+
+def guessed(increment: Increment, tracking: EgoMotion) -> bool:
+    """Whether nothing measured a frame's pose: neither landmarks nor odometry, after the first.
+
+    What it starts is one piece, whose place among the rest nobody knows. A filter has no
+    correlations: with the guess's covariance on each landmark none would tell where the next frame
+    is, though together they do.
+    """
+    odometry = increment.odometry
+    return not tracking.status.measured and odometry is not None and not odometry.measured
+
+
+def founds_anew(increment: Increment, tracking: EgoMotion) -> bool:
+    """Whether a frame begins another part of the map: its step is as free as of one carried off.
+
+    It sees enough, and nothing of what its guess made expect: the guess is refuted, and with it
+    what it said of its own uncertainty.
+    """
+    return guessed(increment, tracking) and int(increment.observations.is_new.sum()) >= _PART
 
 
 @dataclass(frozen=True, slots=True, eq=False)

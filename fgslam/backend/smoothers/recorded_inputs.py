@@ -87,9 +87,11 @@ class RecordedInputs:
                 EgoMotionStatus.OK if state["measured"][k] else EgoMotionStatus.TOO_FEW_MATCHES,
                 0,
             )
-            if increment.odometry is None and state["motion_known"][k]:
+            measured = increment.odometry
+            turned = measured is not None and measured.turned
+            if (measured is None or turned) and state["motion_known"][k]:
                 motion, covariance = state["motion"][row[k]], state["motion_covariance"][row[k]]
-                stand_in = Odometry(motion, covariance, measured=False)
+                stand_in = Odometry(motion, covariance, measured=False, turned=turned)
                 increment = dataclasses.replace(increment, odometry=stand_in)
             out.append(increment, tracking)
         return out

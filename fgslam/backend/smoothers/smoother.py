@@ -20,7 +20,12 @@ import numpy as np
 
 from fgslam.backend.filters.filtered import require_finite
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
-from fgslam.backend.filters.loop_correction import CLOSURE_FACTOR, FREE, Constraint
+from fgslam.backend.filters.loop_correction import (
+    CLOSURE_FACTOR,
+    FREE,
+    Constraint,
+    founds_anew,
+)
 from fgslam.backend.settings import GraphSettings, LandmarkKalmanSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
 from fgslam.backend.smoothers.keyframes import Segments, fill_between
@@ -130,8 +135,10 @@ class Smoother:
             EstimatorError: a number is not finite, or time does not increase; the state is then as
                 before. Or the solver failed beyond repair; the estimator is then at its end.
         """
-        if increment.relocalised and self._inputs.increments:
-            increment = dataclasses.replace(increment, odometry=self._unknown_step(tracking))
+        free = increment.relocalised or founds_anew(increment, tracking)
+        if free and self._inputs.increments:
+            step = self._unknown_step(increment, tracking)
+            increment = dataclasses.replace(increment, odometry=step)
         require_finite(increment, tracking)
         before = self._tracker.predict(None).wTc
         stats = self._tracker.update(dataclasses.replace(increment, loops=()), tracking)
@@ -194,10 +201,17 @@ class Smoother:
 
     # -- its steps -----------------------------------------------------------------------------
 
-    def _unknown_step(self, tracking: EgoMotion) -> Odometry:
-        """The step to a frame found without a prior: as found, and free to be any other."""
-        before = self._tracker.predict(None).wTc
-        return Odometry(inverse(before) @ tracking.wTc, FREE, measured=False)
+    def _unknown_step(self, increment: Increment, tracking: EgoMotion) -> Odometry:
+        """The step to a frame found without a prior, or not at all: free to be any other.
+
+        But a gyroscope has felt even how the camera was carried.
+        """
+        before, turn = self._tracker.predict(None).wTc, increment.odometry
+        motion, covariance = inverse(before) @ tracking.wTc, FREE
+        if turn is not None and turn.turned:
+            motion[:3, :3], covariance = turn.motion[:3, :3], FREE.copy()
+            covariance[:3, :3] = turn.covariance[:3, :3]
+        return Odometry(motion, covariance, measured=False)
 
     def _record(self, increment: Increment, tracking: EgoMotion) -> None:
         self._inputs.append(increment, tracking)

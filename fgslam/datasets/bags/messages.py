@@ -19,6 +19,7 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TWIST = "geometry_msgs/msg/TwistStamped"
 TWIST_WITH_COVARIANCE = "geometry_msgs/msg/TwistWithCovarianceStamped"
+IMU = "sensor_msgs/msg/Imu"
 
 _GREY = {"mono8", "8UC1", "mono16", "16UC1"}
 _COLOURS: Mapping[str, tuple[int, int]] = {
@@ -125,7 +126,14 @@ def _letters(message: Any, letter: str) -> list[float]:
 
 
 def motion_of(message: Any) -> FloatArray:
-    """Of an Odometry (7,) position and quaternion x, y, z, w; of a twist (2,) m/s and rad/s."""
+    """The numbers of a message by its type.
+
+    Of an Odometry (7,) position and quaternion x, y, z, w; of a twist (2,) m/s and rad/s; of an Imu
+    (3,) rad/s about its axes.
+    """
+    if hasattr(message, "angular_velocity"):
+        rate = message.angular_velocity
+        return np.array([rate.x, rate.y, rate.z])
     if hasattr(message, "pose"):
         p, q = message.pose.pose.position, message.pose.pose.orientation
         return np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])

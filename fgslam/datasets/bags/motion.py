@@ -1,4 +1,4 @@
-"""The odometry of a bag: poses of nav_msgs/Odometry, or speed and yaw rate of a stamped twist."""
+"""The odometry of a bag: poses of nav_msgs/Odometry, speeds of a stamped twist, turns of an Imu."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import OdometryError
-from fgslam.core.estimates import Trajectory
 from fgslam.datasets.bags.files import Topic
-from fgslam.datasets.bags.messages import ODOMETRY
+from fgslam.datasets.bags.messages import IMU, ODOMETRY
+from fgslam.datasets.gyroscope import checked_rates
 from fgslam.datasets.odometry import (
-    SpeedLog,
+    AnyLog,
     checked_poses,
     checked_speeds,
     recorded_motions,
@@ -33,10 +33,12 @@ def odometry_source(
         return None
     name = topic.name
 
-    def read() -> SpeedLog | Trajectory:
+    def read() -> AnyLog:
         table = _table(name, stamps, values)
         if topic.kind == ODOMETRY:
             return checked_poses(table, settings)
+        if topic.kind == IMU:
+            return checked_rates(table, settings)
         return checked_speeds(table, settings)
 
     return recorded_motions(name, read, settings)

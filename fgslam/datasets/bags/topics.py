@@ -12,7 +12,7 @@ from fgslam.datasets.bags.files import Topic
 from fgslam.datasets.sides import camera_pairs
 
 IMAGES = (kinds.IMAGE, kinds.COMPRESSED)
-MOTIONS = (kinds.ODOMETRY, kinds.TWIST, kinds.TWIST_WITH_COVARIANCE)
+MOTIONS = (kinds.ODOMETRY, kinds.TWIST, kinds.TWIST_WITH_COVARIANCE, kinds.IMU)
 """The first that a bag has is its odometry."""
 
 _TRANSPORT = "/compressed"

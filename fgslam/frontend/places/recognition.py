@@ -1,4 +1,8 @@
-"""Place recognition beside the loop: the return to a mapped place, and oneself when lost."""
+"""Place recognition beside the loop: the return to a mapped place, and oneself when lost.
+
+Parts of the map between which nothing is measured are joined by it, too: a frame of one that is
+recognised in another is a closure between them.
+"""
 
 from __future__ import annotations
 
@@ -35,6 +39,7 @@ _WORDS_EVERY = 16
 first look after a long time would find them all at once."""
 _Looks: TypeAlias = tuple[int, IntArray, LandmarkAppearances | None]
 """State of the database's views, landmarks (n,), and their appearances then."""
+_JOINT = LoopSettings()  # how sharp a closure between parts of the map must be
 _NOBODY: IntArray = np.empty(0, np.int64)
 _NO_PAIRS: IntArray = np.empty((0, 2), np.int64)
 
@@ -53,8 +58,12 @@ class Locator(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecognitionParts:
-    """What place recognition works with; loops or lost None where it is not wanted."""
+    """What place recognition works with; loops or lost None where it is not wanted.
 
+    ``joins``: whether the estimator takes closures, so that parts of the map may be joined.
+    """
+
+    joins: bool
     loops: LoopSettings | None
     lost: LostSettings | None
     appearance: AppearanceSettings
@@ -81,7 +90,7 @@ class PlaceRecognition:
         self._fuse_since = -1  # a frame: landmarks made after it may be older ones' doubles
         self._pose: FloatArray = np.eye(4)
         self._looks: _Looks = (-1, _NOBODY, None)
-        tracker.database.find_words()
+        self._find_words()
 
     @property
     def maps_on(self) -> bool:
@@ -106,16 +115,26 @@ class PlaceRecognition:
     def wants_features(self) -> bool:
         """Whether the next frame is looked at, so that its features must be found."""
         loops, confirmation = self._parts.loops, self._confirmation
-        if loops is None or confirmation is None:
-            return self._lost > 0
-        return self._lost > 0 or self._time_to_look(loops, confirmation)
+        if self._lost > 0 or self._apart:
+            return True
+        return (
+            loops is not None
+            and confirmation is not None
+            and self._time_to_look(loops, confirmation)
+        )
 
     # -- lost --------------------------------------------------------------------------------
 
     def recover(
-        self, tracked: Tracked, landmarks: LandmarkMap, features: StereoFeatures
+        self,
+        tracked: Tracked,
+        landmarks: LandmarkMap,
+        features: StereoFeatures,
+        guessed: bool = False,
     ) -> tuple[Tracked, bool]:
         """The frame as tracked; or, when that failed for long, as found in the whole map.
+
+        A frame whose motion is ``guessed`` has no other place: it is looked for at once.
 
         Returns:
             The result, and whether it was found without a prior.
@@ -126,7 +145,10 @@ class PlaceRecognition:
         self._lost = 0 if located else self._lost + 1
         if self._astray and self._confirmation is not None:
             self._confirmation.forget()  # its frames are to be in a row
-        if lost is None or self._lost < lost.after or not len(features):
+        after = 1 if guessed and self._parts.joins else None
+        if lost is not None:
+            after = lost.after
+        if after is None or self._lost < after or not len(features):
             return tracked, False
         found = self._locate(landmarks, self._trusted(), features)
         if not found.found:
@@ -186,6 +208,9 @@ class PlaceRecognition:
             features: the frame's.
             association: which landmarks they are taken for.
         """
+        joint = self._joined(landmarks, features, association)
+        if joint is not None:
+            return (joint,)
         loops, confirmation = self._parts.loops, self._confirmation
         if loops is None or confirmation is None or not self._time_to_look(loops, confirmation):
             return ()
@@ -196,14 +221,8 @@ class PlaceRecognition:
         if not confirmation.offer(found.wTc, wTc):
             return ()
         confirmation.forget()
-        closure = close_loop(
-            self._memory,
-            landmarks,
-            features,
-            found,
-            association.partners(len(features)),
-            self._tracker.resection,
-        )
+        partners = association.partners(len(features))
+        closure = self._closure(landmarks, features, found, partners)
         if closure is None or not is_sharp(closure, loops):
             return ()
         self._offered = len(self._memory)
@@ -218,8 +237,8 @@ class PlaceRecognition:
         Args:
             landmarks: the map as corrected.
         """
-        loops, since = self._parts.loops, self._fuse_since
-        if loops is None or since < 0:
+        since = self._fuse_since
+        if since < 0:
             return _NOBODY
         ended = self._tracker.merge(self._merging)
         self._merging, self._fuse_since = _NO_PAIRS, -1
@@ -249,7 +268,7 @@ class PlaceRecognition:
         self._memory.add(increment, step, stats.closed)
         self._pose = stats.wTc
         if len(self._memory) % _WORDS_EVERY == 0:
-            self._tracker.database.find_words()
+            self._find_words()
 
     def state(self) -> StateArrays:
         """All but what the log tells."""
@@ -275,9 +294,56 @@ class PlaceRecognition:
         self._merging, self._pose = state["merging"], state["pose"]
         if self._confirmation is not None:
             self._confirmation.count, self._confirmation.offset = count, state["offset"]
-        self._tracker.database.find_words()
+        self._find_words()
 
     # ----------------------------------------------------------------------------------------
+
+    def _find_words(self) -> None:
+        if self._parts.loops is not None or self._parts.lost is not None or self._apart:
+            self._tracker.database.find_words()
+
+    @property
+    def _apart(self) -> bool:
+        return self._parts.joins and self._tracker.parts.several
+
+    def _joined(
+        self,
+        landmarks: LandmarkMap,
+        features: StereoFeatures,
+        association: Association,
+    ) -> LoopClosure | None:
+        """The closure between two parts of the map that a located frame sees; None without one.
+
+        Looked for where the frame was found in another part than the last one, else at every few.
+        What places the frame in each is strict enough to be believed of a lost one; no drift could
+        tell whether the offset is plausible.
+        """
+        if not self._apart or not len(features):
+            return None
+        seen, parts = association.observations, self._tracker.parts
+        own = parts.placed_by(seen.ids[~seen.is_new & ~association.rejected])
+        moved = not len(parts) or own != parts.of_frame(len(parts) - 1)
+        if own < 0 or not (moved or len(self._memory) % _JOINT.every == 0):
+            return None
+        others = landmarks.ids[parts.of(landmarks.ids) != own]
+        if len(others) < _JOINT.min_matches:
+            return None
+        found = self._locate(landmarks, others, features)
+        if not found.found:
+            return None
+        partners = association.partners(len(features))
+        closure = self._closure(landmarks, features, found, partners)
+        return closure if closure is not None and is_sharp(closure, _JOINT) else None
+
+    def _closure(
+        self,
+        landmarks: LandmarkMap,
+        features: StereoFeatures,
+        found: Relocalisation,
+        partners: IntArray,
+    ) -> LoopClosure | None:
+        resection = self._tracker.resection
+        return close_loop(self._memory, landmarks, features, found, partners, resection)
 
     @property
     def _astray(self) -> bool:

@@ -3,7 +3,8 @@
 What was in view lately is looked for by its descriptor alone, wherever the prediction expects it.
 The pose that most of it agrees with is believed where chance does not explain so many agreeing
 matches (a-contrario test of Moisan and Stival, IJCV 57(3), 2004), and where no other pose has half
-as many.
+as many. Parts of the map that lie beside each other by a guess are looked through one by one: in
+two of them a frame has two poses, and both are right.
 """
 
 from __future__ import annotations
@@ -12,13 +13,14 @@ import math
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion, LandmarkMap, Prediction
-from fgslam.core.features import StereoFeatures
+from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.features.matching import mutual_nearest
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
+from fgslam.frontend.tracking.map_parts import MapParts
 from fgslam.frontend.tracking.resection import Resection, sample_size
 
 _LATELY = 10  # frames before the last sighting whose landmarks are looked for
@@ -28,10 +30,13 @@ _FALSE_POSES = 1e-6  # poses by chance that are allowed in a frame
 class Regainer:
     """Finds a frame by landmarks seen lately, without a prediction."""
 
-    def __init__(self, rig: CameraRig, database: LandmarkDatabase, solver: EgoMotionSolver) -> None:
+    def __init__(
+        self, rig: CameraRig, database: LandmarkDatabase, solver: EgoMotionSolver, parts: MapParts
+    ) -> None:
         """Takes the tracker's own parts."""
         self._database = database
         self._solver = solver
+        self._parts = parts
         self._resection = Resection(solver)
         self._by_chance = math.pi * solver.farthest**2 / (rig.width * rig.height)
 
@@ -40,14 +45,33 @@ class Regainer:
         recent = np.intersect1d(self._database.described_lately(_LATELY), landmarks.ids)
         looks = self._database.appearances(recent)
         latest = np.flatnonzero(np.diff(looks.ids, append=-1))
+        part = self._parts.of(looks.ids[latest])
+        within = [
+            self._among(latest[part == one], looks, landmarks, features)
+            for one in np.unique(part).tolist()
+        ]
+        found = [one for one in within if one is not None]
+        if not found:
+            return None
+        best = max(found, key=lambda one: int(one.inliers.sum()))
+        return Prediction(best.wTc, best.covariance)
+
+    def _among(
+        self,
+        rows: IntArray,
+        looks: LandmarkAppearances,
+        landmarks: LandmarkMap,
+        features: StereoFeatures,
+    ) -> EgoMotion | None:
+        """The frame by some landmarks, given by rows of their looks; None if not to be believed."""
         seen = features.whole
-        i, j = mutual_nearest(seen.descriptors, looks.descriptors[latest])
-        observed = seen.observations(i, looks.ids[latest[j]], is_new=False)
+        i, j = mutual_nearest(seen.descriptors, looks.descriptors[rows])
+        observed = seen.observations(i, looks.ids[rows[j]], is_new=False)
         problem = PoseProblem.of(landmarks, observed)
         found = self._resection.solve(problem)
         if not found.status.measured or not self._certain(found, problem):
             return None
-        return Prediction(found.wTc, found.covariance)
+        return found
 
     def _certain(self, found: EgoMotion, problem: PoseProblem) -> bool:
         agreeing = places(problem.measurement[found.inliers, :2], self._solver.farthest)

@@ -23,6 +23,7 @@ from fgslam.frontend.tracking.map_matching import (
     lean,
     predicted_covariance,
 )
+from fgslam.frontend.tracking.map_parts import MapParts
 from fgslam.frontend.tracking.regaining import Regainer
 from fgslam.frontend.tracking.resection import Resection
 
@@ -81,6 +82,7 @@ class LandmarkTracker:
     ) -> None:
         """The database is shared with whoever shows or saves it.
 
+        Which part of the map is which is booked in ``parts`` by whoever drives.
         With ``keeps_map`` nothing is booked, started or pruned: the map is only localised in. With
         ``expects_returns`` place recognition tells old landmarks from recent ones where they
         contradict each other; without, the prediction was wrong.
@@ -92,7 +94,8 @@ class LandmarkTracker:
         self._matcher = matcher
         self._ego_motion = ego_motion
         self.resection = Resection(ego_motion)
-        self._regainer = Regainer(rig, database, ego_motion)
+        self.parts = MapParts()
+        self._regainer = Regainer(rig, database, ego_motion, self.parts)
 
     def track(
         self, prediction: Prediction, landmarks: LandmarkMap, features: StereoFeatures

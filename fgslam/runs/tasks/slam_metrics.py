@@ -20,6 +20,7 @@ from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, UpdateTime
 from fgslam.report.content import Column, TextTable
 from fgslam.report.tables import Cell, write_csv
 from fgslam.runs.engine import LocatedShare
+from fgslam.slam.part_remarks import located_frames
 from fgslam.slam.replay import peak_memory_mb
 from fgslam.slam.results import STAGES, RunRecorder
 
@@ -67,9 +68,8 @@ def run_numbers(recorder: RunRecorder) -> dict[str, JsonValue]:
 
 def located(recorder: RunRecorder) -> LocatedShare:
     """Frames that landmarks gave a pose; the first one, which the world is, among them."""
-    statuses = [EgoMotionStatus(status) for status in recorder.column("status").tolist()]
-    known = [one.measured or one is EgoMotionStatus.FIRST for one in statuses]
-    return LocatedShare(sum(known), len(known))
+    known = located_frames(recorder)
+    return LocatedShare(int(known.sum()), len(known))
 
 
 def frame_problems(recorder: RunRecorder) -> list[str]:

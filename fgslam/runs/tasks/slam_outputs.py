@@ -51,6 +51,7 @@ from fgslam.runs.tasks.slam_metrics import (
 from fgslam.runs.tasks.truth import rendered_landmark_truth
 from fgslam.slam.camera_remarks import camera_remarks
 from fgslam.slam.first_images import stereo_remarks
+from fgslam.slam.part_remarks import in_first_map, part_remarks
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.results import STAGES, RunRecorder
 from fgslam.slam.session import Session
@@ -110,18 +111,28 @@ class RunOutputs:
     def write_metrics(self, estimators: Mapping[str, EstimatorMetrics], status: str) -> None:
         """metrics.json of the live estimator and of those that replayed its log."""
         about = self._about(status) | run_numbers(self.recorder)
-        if self.pipeline.places is not None:
+        if self._looks_for_places:
             truth = load_truth(self.folder, self.recorder.log).trajectory
-            closures = closures_of(self.recorder, self.pipeline.places.taken, truth)
+            closures = closures_of(self.recorder, self._taken, truth)
             write_closures(self.folder, self.recorder, closures)
             about["places"] = place_numbers(self.recorder, closures)
         if self.pipeline.calibration is not None:
             about["rig"] = calibration_numbers(self.pipeline.calibration)
         write_metrics(self.folder / "metrics.json", len(self.recorder), estimators, about)
 
+    @property
+    def _taken(self) -> tuple[bool, ...]:
+        """Of all closures offered, whether the estimator took them."""
+        return () if self.pipeline.places is None else self.pipeline.places.taken
+
+    @property
+    def _looks_for_places(self) -> bool:
+        """Whether the configuration asks for place recognition, or it joined parts of the map."""
+        frontend = self.config.frontend
+        return frontend.loops is not None or frontend.lost is not None or bool(self._taken)
+
     def _with_kind(self, metrics: EstimatorMetrics) -> EstimatorMetrics:
-        places = self.pipeline.places
-        closures = {} if places is None else closure_counts(places.taken)
+        closures = closure_counts(self._taken)
         more = {"kind": self.pipeline.estimator.kind} | dict(metrics.more) | closures
         return dataclasses.replace(metrics, more=more)
 
@@ -168,7 +179,9 @@ class RunOutputs:
         """Notes on the recording, its cameras and its first images."""
         of_cameras = camera_remarks(self.recorder, self.pipeline.watch)
         of_images = stereo_remarks(self.recorder)
-        return (*self.sequence.notes, *self.notes, *self._unlocated(), *of_cameras, *of_images)
+        of_parts = part_remarks(self.recorder, self.pipeline.tracker.parts)
+        of_run = (*self.sequence.notes, *self.notes, *self._unlocated(), *of_parts)
+        return (*of_run, *of_cameras, *of_images)
 
     def _unlocated(self) -> tuple[str, ...]:
         found = located(self.recorder)
@@ -182,6 +195,7 @@ class RunOutputs:
             "status": status,
             "frames_in_recording": len(self.sequence),
             "odometry": self.config.odometry.kind,
+            "located_in_first_map": in_first_map(self.recorder, self.pipeline.tracker.parts),
             "landmarks_permanent": int(self.pipeline.tracker.database.permanent.sum()),
             "remark": self.remark or None,
             "notes": list(self.remarks()),
@@ -198,7 +212,7 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
     matches = numbers["landmark_matches"]
     rows: list[tuple[str, object]] = [
         ("frames", f"{len(outputs.recorder)} of {len(outputs.sequence)}"),
-        ("located by landmarks", located(outputs.recorder)),
+        ("located by landmarks", _located(outputs)),
         ("pose found from", _counts(numbers["status_counts"])),
         ("landmarks", metrics.landmarks),
         ("landmarks matched, median (5 %)", _spread(matches)),
@@ -213,6 +227,12 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
     heading = f"{outputs.config.name}: {outputs.title}{remark}"
     cells = tuple((name, (str(value),)) for name, value in rows)
     return TextTable("summary", heading, "", (Column("", "of the run"),), cells)
+
+
+def _located(outputs: RunOutputs) -> str:
+    share = located(outputs.recorder)
+    first = in_first_map(outputs.recorder, outputs.pipeline.tracker.parts)
+    return str(share) + (f", {first} in the first map" if first < share.frames else "")
 
 
 def run_notes(outputs: RunOutputs, metrics: EstimatorMetrics) -> tuple[str, ...]:

@@ -40,6 +40,7 @@ def state_of(pipeline: SlamPipeline, recorder: RunRecorder) -> StateArrays:
         "database": pipeline.tracker.database.state(),
         "estimator": _resumable(pipeline.estimator).state(),
         "motion": _resumable(pipeline.motion).state(),
+        "parts": pipeline.tracker.parts.state(),
         "recorder": recorder.state(),
     }
     if pipeline.places is not None:
@@ -66,6 +67,7 @@ def restore(
     pipeline.tracker.database.restore(_part(state, "database"))
     _resumable(pipeline.estimator).restore(_part(state, "estimator"))
     _resumable(pipeline.motion).restore(_part(state, "motion"))
+    pipeline.tracker.parts.restore(_part(state, "parts"))
     recorder.restore(_part(state, "recorder"), log)
     if pipeline.places is not None:
         pipeline.places.restore(_part(state, "places"), recorder.log)

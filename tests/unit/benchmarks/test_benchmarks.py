@@ -165,7 +165,7 @@ def test_pages_compute_numbers_from_stored_measurements(measured: Path, tmp_path
             {"name": "size", "from": "seeds/Seeds/ATE cm/0", "size": True},
             {"name": "written down", "measured": 7.25},
         ],
-        "tables": [{"from": "seeds/Seeds", "columns": ["ATE cm", "seed"]},
+        "tables": [{"from": "seeds/Seeds", "columns": ["ATE cm", "seed"], "lines": [1]},
                    {"columns": ["", "cm"], "rows": [["lab", {"from": ate, "times": 100}]]}],
     }  # fmt: skip
     record = load_record(written(tmp_path / "page.json", section))
@@ -176,6 +176,7 @@ def test_pages_compute_numbers_from_stored_measurements(measured: Path, tmp_path
     assert "| ATE | 1.23 cm | < 1 cm, **missed** |" in text
     assert "| written down | 7.25 (by hand) |" in text
     assert "| 2.00 | worst |" in text
+    assert record.sections[0].tables[0].rows == [(2.0, "worst")]
     assert "| lab | 1.23 |" in text
     assert "Computed from `benchmarks/measured`: `lab` (" in text
     assert "Measured by hand on 2026-01-01 with fgslam 1, where nothing else is said." in text

@@ -1,0 +1,40 @@
+"""What a session says of frames that only a guess places beside the rest."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.core.arrays import BoolArray
+from fgslam.core.estimates import EgoMotionStatus
+from fgslam.frontend.tracking.map_parts import MapParts
+from fgslam.slam.results import RunRecorder
+
+
+def located_frames(recorder: RunRecorder) -> BoolArray:
+    """(n,) frames that landmarks gave a pose; the first one, which the world is, among them."""
+    statuses = [EgoMotionStatus(status) for status in recorder.column("status").tolist()]
+    return np.array([one.measured or one is EgoMotionStatus.FIRST for one in statuses], np.bool_)
+
+
+def connected_frames(recorder: RunRecorder, parts: MapParts) -> BoolArray:
+    """(n,) frames that measurements tie to the first one; of a frame that failed, nothing."""
+    return parts.connected[: len(recorder)]
+
+
+def in_first_map(recorder: RunRecorder, parts: MapParts) -> int:
+    """How many frames are located in what hangs together with the first one by measurements."""
+    return int((located_frames(recorder) & connected_frames(recorder, parts)).sum())
+
+
+def part_remarks(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
+    """A line where frames are located in parts that a guess alone joins to the first."""
+    adrift = located_frames(recorder) & ~connected_frames(recorder, parts)
+    if not adrift.any():
+        return ()
+    numbers = np.array([increment.index for increment in recorder.log])[adrift]
+    known, n = in_first_map(recorder, parts), len(recorder)
+    return (
+        f"{len(numbers)} frames from {numbers[0]} to {numbers[-1]} are located beside each other "
+        "only, not in the first map: before them is a gap that neither landmarks nor odometry "
+        f"bridge; {known} of {n} frames ({100.0 * known / n:.0f} %) are located in the first map",
+    )

@@ -1,0 +1,55 @@
+"""Frames that a guess alone places beside the first map are told, with their share."""
+
+from __future__ import annotations
+
+import numpy as np
+from simulated import RIG
+
+from fgslam.core.features import StereoFeatures
+from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.measurements import Increment
+from fgslam.frontend.tracking.map_parts import MapParts
+from fgslam.slam.part_remarks import in_first_map, part_remarks
+from fgslam.slam.results import FrameRow, RunRecorder
+
+NONE = np.empty(0, np.int64)
+
+
+class Apart(MapParts):
+    """Parts as given."""
+
+    def __init__(self, connected: list[bool]) -> None:
+        super().__init__()
+        self._frames = [int(not one) for one in connected]
+
+
+def recorded(statuses: list[str]) -> RunRecorder:
+    recorder = RunRecorder(MeasurementLog(RIG, {}))
+    nothing = StereoFeatures.empty().observations(NONE, NONE, is_new=False)
+    for i, status in enumerate(statuses):
+        recorder.log.append(
+            Increment(10 * i, float(i), None, nothing, np.empty(0, np.bool_), NONE, NONE)
+        )
+        recorder.rows.append(FrameRow(status, 0, 0, 0, 0, 0, 0.0, 0.0, 0, 0.0, ""))
+    return recorder
+
+
+STATUSES = ["first", "ok", "too_few_matches", "relocalised", "ok"]
+
+
+def test_nothing_is_said_of_one_map() -> None:
+    parts = Apart([True, True, False, True, True])
+    assert part_remarks(recorded(STATUSES), parts) == ()
+    assert in_first_map(recorded(STATUSES), parts) == 4
+
+
+def test_frames_beyond_a_gap_are_told() -> None:
+    parts = Apart([True, True, False, False, False])
+    (remark,) = part_remarks(recorded(STATUSES), parts)
+    assert remark.startswith("2 frames from 30 to 40 are located beside each other only")
+    assert remark.endswith("2 of 5 frames (40 %) are located in the first map")
+
+
+def test_a_frame_that_failed_is_not_counted() -> None:
+    parts = Apart([True, True, False, True, True, True])
+    assert in_first_map(recorded(STATUSES), parts) == 4
