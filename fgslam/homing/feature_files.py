@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from fgslam.core.array_files import ArrayFile, joined, of_rows, offsets, split
+from fgslam.core.array_values import require_finite
 from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import ColumnSegments, OmniFeatures, UprightFeatures
@@ -118,10 +119,29 @@ def _split(
     rows = _FEATURES.require_offsets(arrays, start, None, where)
     kinds = {name: (np.dtype(kind).kind, item) for name, (kind, item) in specification.items()}
     _FEATURES.require(arrays, of_rows(rows, kinds), where)
+    _require_values(arrays, specification, where)
     whole = {name: split(arrays[name], arrays[start]) for name in specification}
     return [
         {name: parts[k] for name, parts in whole.items()} for k in range(len(arrays[start]) - 1)
     ]
+
+
+_CODES: dict[str, float] = {
+    "sift_bearing": np.pi * _ANGLE,
+    "sift_elevation": 0.5 * np.pi * _ANGLE + 1.0,
+    "sift_correlation": _CORRELATION,
+    "column_bearing": np.pi * _ANGLE,
+}
+"""Largest whole numbers that features are kept as, of either sign."""
+
+
+def _require_values(arrays: Mapping[str, Any], specification: _Arrays, where: str) -> None:
+    """Raises StoredMapError for what no image's features are."""
+    for name, (kind, _) in specification.items():
+        if np.dtype(kind).kind == "f":
+            require_finite(_FEATURES, arrays, (name,), where)
+        elif name in _CODES and (np.abs(arrays[name].astype(np.int64)) > _CODES[name]).any():
+            raise _FEATURES.damaged(name, where)
 
 
 # --------------------------------------------------------------------------------------------

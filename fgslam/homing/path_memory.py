@@ -19,6 +19,7 @@ from fgslam.core.array_files import (
     of_rows,
     write_arrays,
 )
+from fgslam.core.array_values import require_covariances
 from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.errors import CalibrationError, StoredMapError
 from fgslam.core.geometry import is_rigid
@@ -164,9 +165,8 @@ def _metric_of(kind: ArrayFile, arrays: StateArrays, count: int, where: str) -> 
         return None
     kind.require(arrays, of_rows(count, _PER_POSE), where)
     metric = MetricPoses(**fields_from(MetricPoses, arrays, _METRIC))
-    for pose, covariance in zip(metric.poses, metric.covariances, strict=True):
-        if np.isfinite(pose).all() and not is_rigid(pose):
-            raise kind.damaged(f"{_METRIC}poses", where)
-        if np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance).min() < -1e-12:
-            raise kind.damaged(f"{_METRIC}covariances", where)
+    if not all(is_rigid(pose) for pose in metric.poses if not np.isnan(pose).all()):
+        raise kind.damaged(f"{_METRIC}poses", where)
+    known = metric.covariances[~np.isnan(metric.covariances).all(axis=(1, 2))]
+    require_covariances(kind, f"{_METRIC}covariances", known, where, definite=False)
     return metric

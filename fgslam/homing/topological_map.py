@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.core.array_files import ArrayFile, Items, of_rows, rows_of
+from fgslam.core.array_values import require_covariances
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import OmniFeatures
@@ -138,6 +139,8 @@ class TopologicalMap:
             StoredMapError: the file is missing, truncated, damaged, foreign or of another version.
         """
         memory, arrays = load_images(FILE, path)
+        if len(set(memory.names)) < len(memory):
+            raise StoredMapError(f"{path}: two places have one name; {FILE.again}")
         links, costs = _read_links(arrays, len(memory), str(path))
         return TopologicalMap(memory.images, memory.names, links, costs, {}, memory.camera)
 
@@ -229,12 +232,7 @@ def _read_links(
 ) -> tuple[tuple[Link, ...], FloatArray]:
     FILE.require(arrays, of_rows(rows_of(arrays, "link_support"), _PER_LINK), where)
     support, ends, angles, covariances, costs = (arrays[name] for name in _PER_LINK)
-    if (
-        not (ends[:, 0] < ends[:, 1]).all()
-        or ((ends < 0) | (ends >= count)).any()
-        or not (costs > 0.0).all()
-    ):
-        raise StoredMapError(f"{where}: array link_ends or link_cost is damaged; build it again")
+    _require_links(arrays, count, where)
     links = tuple(
         Link(
             a=int(ends[k, 0]),
@@ -249,3 +247,28 @@ def _read_links(
         for k in range(len(support))
     )
     return links, np.array(costs)
+
+
+def _require_links(arrays: Mapping[str, Any], count: int, where: str) -> None:
+    """Raises StoredMapError for links that no map has, of arrays of the right shapes.
+
+    A driven step without a homing vector has no inliers and knows no angle; images of one place
+    have a rotation alone.
+    """
+    support, ends, angles, covariances, costs = (arrays[name] for name in _PER_LINK)
+    step, turn = support == 0, np.isnan(angles[:, [0, 2]]).all(axis=1)
+    known = np.isfinite(angles)
+    wrong = {
+        "link_support": support < 0,
+        "link_ends": (ends < 0).any(axis=1)
+        | (ends >= count).any(axis=1)
+        | (ends[:, 0] >= ends[:, 1]),
+        "link_cost": ~((costs > 0.0) & np.isfinite(costs)),
+        "link_angles": ~(known.all(axis=1) | (turn & (known[:, 1] | step))),
+    }
+    for name, rows in wrong.items():
+        if rows.any():
+            raise FILE.damaged(name, where)
+    if len(np.unique(ends, axis=0)) < len(ends):
+        raise FILE.damaged("link_ends", where)
+    require_covariances(FILE, "link_covariances", covariances[~turn].reshape(-1, 2, 2), where)

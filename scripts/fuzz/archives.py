@@ -1,14 +1,15 @@
-"""Measurement logs, bearing logs and maps: archives of arrays."""
+"""Measurement logs, bearing logs, maps, routes and their maps: archives of arrays."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import cv2
 import numpy as np
 
 import fgslam as fg
@@ -21,6 +22,7 @@ from fgslam.core.sensors import CameraRig
 from fgslam.frontend.homing.homing_vector import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view_geometry import make_local_map
+from fgslam.homing.path_memory import MetricPoses
 from fgslam.worlds.simulated.bearings import simulate_homing
 from fgslam.worlds.simulated.settings import SimulatedBearingsSettings
 from scripts.fuzz.damage import Arrays, Rng, damaged_arrays, damaged_bytes, written
@@ -123,7 +125,22 @@ def _map() -> fg.Map:
     return slam.result().map
 
 
-def _map_contents(found: fg.Map) -> Arrays:
+def _route() -> fg.PathMemory:
+    """Four views of one scene of noise, a step apart, with poses."""
+    rng = np.random.default_rng(3)
+    camera = fg.load_camera("equirectangular", (256, 128))
+    scene = cv2.GaussianBlur(rng.integers(0, 255, (128, 256, 3), np.uint8), (5, 5), 0)
+    views = [np.roll(scene, 4 * k, axis=1) for k in range(4)]
+    metric = MetricPoses(np.tile(np.eye(4), (4, 1, 1)), np.tile(0.01 * np.eye(6), (4, 1, 1)))
+    return replace(fg.teach(views, camera), metric=metric)
+
+
+def _route_map() -> fg.RouteMap:
+    route = replace(_route(), metric=None)
+    return fg.RouteMap.join({"one": route, "other": route})
+
+
+def _saved(found: fg.Map | fg.PathMemory | fg.RouteMap) -> Arrays:
     with TemporaryDirectory(prefix="fgslam-fuzz-") as scratch:
         path = Path(scratch) / "again.fgmap"
         found.save(path)
@@ -135,4 +152,6 @@ MEASUREMENTS = Archive(
     ".npz", _measurement_log, MeasurementLog.load, lambda log: dict(log.to_arrays())
 )
 BEARINGS = Archive(".npz", _bearing_log, BearingLog.load, lambda log: dict(log.to_arrays()))
-MAP = Archive(".fgmap", _map, fg.Map.load, _map_contents)
+MAP = Archive(".fgmap", _map, fg.Map.load, _saved)
+ROUTE = Archive(".fgpath", _route, fg.PathMemory.load, _saved)
+ROUTE_MAP = Archive(".fgmap", _route_map, fg.RouteMap.load, _saved)

@@ -19,7 +19,7 @@ from fgslam.core.errors import FgslamError
 from fgslam.datasets.images import read_grey_image
 from fgslam.runs.config import load_experiment
 from scripts.fuzz import calls, pictures, texts
-from scripts.fuzz.archives import BEARINGS, MAP, MEASUREMENTS
+from scripts.fuzz.archives import BEARINGS, MAP, MEASUREMENTS, ROUTE, ROUTE_MAP
 from scripts.fuzz.damage import Rng, require_one_line
 
 HANGS_AFTER_S = 10
@@ -65,6 +65,10 @@ KINDS = (
     Kind("omni_camera", texts.omni_camera, lambda path: fg.load_camera(path, (640, 480))),
     Kind("bag", pictures.bag, pictures.read_recording),
     Kind("film", pictures.film, pictures.read_recording),
+    Kind("route_bytes", ROUTE.of_damaged_bytes, ROUTE.load, ROUTE.is_same),
+    Kind("route_values", ROUTE.of_odd_values, ROUTE.load),
+    Kind("joined_bytes", ROUTE_MAP.of_damaged_bytes, ROUTE_MAP.load, ROUTE_MAP.is_same),
+    Kind("joined_values", ROUTE_MAP.of_odd_values, ROUTE_MAP.load),
 )
 
 

@@ -79,8 +79,11 @@ def damaged_array(rng: Rng, array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]
     """The array changed in type, shape or one value."""
     if array.dtype.kind in "fi" and array.size and rng.random() < 0.6:
         flat = array.copy().reshape(-1)
-        odd = (0, -1, 2**31) if array.dtype.kind == "i" else (np.nan, np.inf, -1e300, 1e-300, -1.0)
-        flat[rng.integers(flat.size)] = odd[rng.integers(len(odd))]
+        odd: tuple[float, ...] = (np.nan, np.inf, -1e300, 1e-300, -1.0)
+        if array.dtype.kind == "i":
+            odd = (0, -1, min(2**31, np.iinfo(array.dtype).max))
+        with np.errstate(over="ignore"):  # 1e300 is infinite as float32
+            flat[rng.integers(flat.size)] = odd[rng.integers(len(odd))]
         return flat.reshape(array.shape)
     if rng.random() >= 0.5:
         return array.reshape(-1)[: rng.integers(array.size + 1)]

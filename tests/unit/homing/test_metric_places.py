@@ -54,7 +54,7 @@ def test_poses_survive_the_route_s_file_and_damage_is_refused(tmp_path: Path) ->
     for name, value in (("metric_poses", 2.0), ("metric_covariances", -1.0)):
         spoiled = {**arrays, name: value * arrays[name]}
         np.savez(tmp_path / "bad.npz", **spoiled)
-        with pytest.raises(StoredMapError, match=f"array {name} is absent or damaged"):
+        with pytest.raises(StoredMapError, match=f"array {name}"):
             PathMemory.load(tmp_path / "bad.npz")
     np.savez(tmp_path / "bad.npz", **{**arrays, "metric_poses": arrays["metric_poses"][:2]})
     with pytest.raises(StoredMapError, match="metric_poses"):

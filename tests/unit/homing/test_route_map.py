@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -143,3 +145,36 @@ def test_wrong_routes_and_places_are_refused(
     mixed = RouteMap.join({"a": few, "b": fg.PathMemory(few.images, few.names, CAMERA)})
     with pytest.raises(CalibrationError, match="give the image's"):
         mixed.locate(picture(0.0, 0.0))
+
+
+SPOILED = [
+    ("link_cost", lambda a: a * np.nan, "array link_cost"),
+    ("link_cost", lambda a: -a, "array link_cost"),
+    ("link_support", lambda a: a - 10_000, "array link_support"),
+    ("link_ends", lambda a: a[:, ::-1].copy(), "array link_ends"),
+    ("link_ends", lambda a: np.repeat(a[:1], len(a), axis=0), "array link_ends"),
+    ("link_angles", lambda a: a * [1.0, np.nan, 1.0], "array link_angles"),
+    ("link_covariances", lambda a: -a, "array link_covariances, row 0, is no covariance"),
+    ("column_tangents", lambda a: a * np.float32(np.inf), "array column_tangents is not finite"),
+    ("sift_elevation", lambda a: np.full_like(a, 32767), "array sift_elevation"),
+]
+
+
+@pytest.mark.parametrize(("name", "spoil", "said"), SPOILED)
+def test_values_that_no_map_has_are_refused(
+    joined: RouteMap, tmp_path: Path, name: str, spoil: Callable[[Any], Any], said: str
+) -> None:
+    joined.save(tmp_path / "house.fgmap")
+    with np.load(tmp_path / "house.fgmap") as file:
+        arrays = dict(file)
+    with np.errstate(invalid="ignore"):
+        arrays[name] = spoil(arrays[name]).astype(arrays[name].dtype)
+    np.savez(tmp_path / "bad.npz", **arrays)
+    with pytest.raises(StoredMapError, match=said):
+        RouteMap.load(tmp_path / "bad.npz")
+
+
+def test_places_of_one_name_are_refused(joined: RouteMap, tmp_path: Path) -> None:
+    replace(joined.topology, names=("a/0",) * len(joined)).save(tmp_path / "bad.fgmap")
+    with pytest.raises(StoredMapError, match="two places have one name"):
+        RouteMap.load(tmp_path / "bad.fgmap")
