@@ -24,6 +24,7 @@ from fgslam.runs.named_experiments import find_experiment, suggestion
 
 if TYPE_CHECKING:
     from fgslam.core.recordings import Sequence
+    from fgslam.datasets.checks.clock import Judged
 
 _SETTINGS = {each.kind: each for each in get_args(FileRecordingSettings)}
 
@@ -72,12 +73,15 @@ def bare_experiment(
     }
     where = str(folder)
     sequence = open_sequence(make_config(values, where, overrides))
-    if not has_odometry(sequence):
+    judged = _judged_odometry(sequence, overrides)
+    if judged.fault or not has_odometry(sequence):
         values["odometry"] = {"kind": "constant_velocity"}
+    elif judged.time_offset_s:
+        values["odometry"]["time_offset_s"] = judged.time_offset_s
     if (noise := getattr(sequence, "disparity_sigma_px", None)) is not None:
         values["frontend"] = {"stereo": {"disparity_sigma_px": noise}}
     config = make_config(values, where, overrides)
-    return Bare(values, config, _said(config, sequence))
+    return Bare(values, config, _said(config, sequence, judged.note))
 
 
 def experiment_of(
@@ -119,6 +123,17 @@ def short_config(folder: Path, camera: Path | None = None, overrides: Iterable[s
 def has_odometry(sequence: Sequence) -> bool:
     """Whether any step of the recording has odometry. Raises OdometryError where it is damaged."""
     return any(sequence.odometry(i) is not None for i in range(1, len(sequence)))
+
+
+def _judged_odometry(sequence: Sequence, overrides: tuple[str, ...]) -> Judged:
+    """What the images say of the odometry; nothing where an override says more."""
+    from fgslam.datasets.checks.clock import Judged, judged_turns
+    from fgslam.datasets.recording import Recording
+
+    asked = any(each.partition("=")[0].strip().startswith("odometry.") for each in overrides)
+    if asked or not isinstance(sequence, Recording):
+        return Judged()
+    return judged_turns(sequence)
 
 
 def _odometry_in_words(sequence: Sequence) -> str:
@@ -175,7 +190,7 @@ def _asked(overrides: tuple[str, ...], key: str) -> list[str]:
     return [value.strip() for name, _, value in pairs if name.strip() == key]
 
 
-def _said(config: ExperimentConfig, sequence: Sequence) -> str:
+def _said(config: ExperimentConfig, sequence: Sequence, more: str) -> str:
     rig, stamps = sequence.rig, sequence.timestamps
     duration = float(stamps[-1] - stamps[0])
     rate = f" at {(len(stamps) - 1) / duration:.3g} Hz" if duration > 0.0 else ""
@@ -188,4 +203,6 @@ def _said(config: ExperimentConfig, sequence: Sequence) -> str:
         f"{motion.get(config.odometry.kind, config.odometry.kind)}{truth}; estimator "
         f"{config.estimator.kind}"
     )
-    return "\n".join((line, *(f"note: {note}" for note in sequence.notes)))
+    return "\n".join(
+        (line, *(f"note: {note}" for note in (*sequence.notes, *filter(None, [more]))))
+    )

@@ -1,0 +1,85 @@
+"""Odometry's clock, unit and axes against turns that images show."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import OdometryError
+from fgslam.core.geometry import so3_exp, so3_log
+from fgslam.datasets.checks.clock import Judged, SeenTurns, judged, judged_turns
+from fgslam.datasets.gyroscope import GyroscopeLog, integrated
+from fgslam.datasets.image_folder import open_image_folder
+from fgslam.datasets.odometry import recorded_motions
+from fgslam.datasets.settings import ImageFolderSettings, RecordedOdometrySettings
+
+BIAS = np.radians([0.3, -1.2, 4.3])
+FRAMES: FloatArray = np.linspace(1.0, 6.9, 60)
+SAMPLES: FloatArray = np.linspace(0.0, 8.5, 1701)
+
+
+def shaken(stamps: FloatArray) -> FloatArray:
+    """Rates (n, 3) of a camera in a hand."""
+    x, y = np.sin(5.0 * stamps), np.cos(3.1 * stamps + 0.4)
+    return np.column_stack([0.8 * x, 0.6 * y, 0.5 * x * y])
+
+
+def seen_with(
+    late: float = 0.0,
+    axes: FloatArray | None = None,
+    unit: float = 1.0,
+    slow: float = 1.0,
+    noise: float = 2e-3,
+) -> SeenTurns:
+    """Turns by images; and a gyroscope that is late, turned, in another unit, and biased."""
+    true = GyroscopeLog(SAMPLES, slow * shaken(SAMPLES))
+    rotations, _ = integrated(true, FRAMES)
+    rng = np.random.default_rng(5)
+    turns = np.array([so3_log(r) for r in rotations]) + noise * rng.standard_normal((59, 3))
+    measured = unit * (true.rates @ (np.eye(3) if axes is None else axes).T + BIAS)
+    log = GyroscopeLog(SAMPLES + late, measured)
+    source = recorded_motions("shaken", lambda: log, RecordedOdometrySettings())
+    return SeenTurns("shaken", np.arange(1, 60), turns, FRAMES, source, by_gyroscope=True)
+
+
+@pytest.mark.parametrize("late", [-0.17, -0.03, 0.012, 0.06, 0.2])
+def test_an_injected_offset_is_found_and_said(late: float) -> None:
+    found = judged(seen_with(late))
+    assert found.time_offset_s == pytest.approx(-late, abs=0.005)
+    assert not found.fault
+    way = "ahead" if late > 0.0 else "behind"
+    assert f"{way} by the turns that the images show" in found.note
+    assert f"odometry.time_offset_s is {found.time_offset_s:.3f}" in found.note
+
+
+def test_a_clock_that_is_right_is_left_alone() -> None:
+    for seed_noise in (1e-4, 2e-3, 2e-2):
+        assert judged(seen_with(noise=seed_noise)) == Judged()
+
+
+def test_a_drive_that_hardly_turns_says_nothing_of_the_clock() -> None:
+    assert judged(seen_with(0.1, slow=1e-3)) == Judged()
+
+
+def test_degrees_are_said() -> None:
+    with pytest.raises(OdometryError, match=r"turns [56]\d times as fast .* degrees/s"):
+        judged(seen_with(unit=180.0 / np.pi, slow=0.05, noise=2e-4))
+
+
+def test_a_gyroscope_in_other_axes_is_not_used() -> None:
+    found = judged(seen_with(axes=so3_exp(np.array([0.0, 0.5 * np.pi, 0.0]))))
+    assert found.fault
+    assert "does not turn as the images do" in found.note
+    assert "T_cam_imu" in found.note
+
+
+@pytest.mark.data
+def test_the_clock_of_a_real_car_is_found_without_its_truth(shared_data: Path) -> None:
+    """By the truth its odometry agrees best at -0.06 s (docs/datasets/image_folder.md)."""
+    folder = ImageFolderSettings(path=str(shared_data / "kitti_raw_0926_5hz"))
+    assert judged_turns(open_image_folder(folder)).time_offset_s == pytest.approx(-0.06, abs=0.015)
+    shifted = open_image_folder(folder, RecordedOdometrySettings(time_offset_s=0.09))
+    assert judged_turns(shifted).time_offset_s == pytest.approx(-0.15, abs=0.015)
