@@ -22,7 +22,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 EXAMPLES = Path(__file__).parents[1] / "examples"
 _CELL = re.compile(r"^# %%(?P<kind> \[markdown\])?.*\n", re.MULTILINE)
 _NOTE = "<!-- Made by `python -m scripts.make_reference` from examples/{}: edit that. -->"
-_END = """Run it: `python examples/{}`. It opens as a notebook in VS Code and (jupytext) in Jupyter.
+_END = """Run it: `python examples/{}` (a notebook in VS Code, by jupytext in Jupyter).
 """
 
 _INTRODUCTION = """# Command line

@@ -129,10 +129,9 @@ def _sections(schema: Node, node: Node, dotted: str, level: int, known: Known) -
         title = f"`{dotted}`" + (f", kind `{kind}`" if kind else "")
         if (title, group["title"]) not in known:
             known.add((title, group["title"]))
-            again = ("", group["title"]) in known
-            known.add(("", group["title"]))
-            about = [] if again else [*paragraph(f"`{group['title']}`: {_summary(group)}"), ""]
-            yield "\n".join([f"{'#' * level} {title}", "", *about, *lines]).rstrip()
+            about = [*paragraph(_summary(group)), ""] if kind or not lines else []
+            head = f"{'#' * level} {title} (`{group['title']}`)"
+            yield "\n".join([head, "", *about, *lines]).rstrip()
         yield from inner
 
 
