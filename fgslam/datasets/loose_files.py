@@ -49,7 +49,7 @@ def find_cameras(root: Path, files: Sequence[Path] | None = None) -> CameraFiles
     """The files of a left and a right camera; None where there is no such pair.
 
     Two folders side by side (left and right, image_0 and image_1, cam0 and cam1), or one folder in
-    which names differ in the side alone.
+    which names differ in the side alone, or end in the camera's number (12_0 and 12_1).
 
     Args:
         root: the folder.
@@ -64,9 +64,32 @@ def find_cameras(root: Path, files: Sequence[Path] | None = None) -> CameraFiles
     named = {path.name: path for path in files}
     pairs = camera_pairs(named, any_number=False)
     if not pairs:
-        return None
+        return _by_last_number(files, root)
     left, right = (tuple(sorted({named[p[k]] for p in pairs}, key=natural)) for k in (0, 1))
     return CameraFiles(left, right, root, interleaved=True)
+
+
+def _by_last_number(files: Sequence[Path], root: Path) -> CameraFiles | None:
+    """Both cameras by the last number of the names, where that is one of two for all of them."""
+    ends = {path: int(match[2]) for path in files if (match := _NUMBERED.match(path.stem))}
+    numbers = sorted(set(ends.values()))
+    if len(ends) < len(files) or len(files) < _FEWEST_NUMBERED or len(numbers) != 2:
+        return None
+    if numbers[1] != numbers[0] + 1 or numbers[0] not in (0, 1):
+        return None
+    left, right = (tuple(path for path in files if ends[path] == n) for n in numbers)
+    if len({_moment(p.stem) for p in left} & {_moment(p.stem) for p in right}) * 2 < len(left):
+        return None
+    return CameraFiles(left, right, root, interleaved=True)
+
+
+_NUMBERED = re.compile(r"(.*\d)[_-](\d+)$")
+_FEWEST_NUMBERED = 4  # files: of two pairs
+
+
+def _moment(stem: str) -> str:
+    """A name without the camera's number at its end."""
+    return re.sub(r"[_-]\d+$", "", stem)
 
 
 def _two_folders(root: Path) -> tuple[Path, Path] | None:
@@ -119,5 +142,6 @@ _KEYS: tuple[Callable[[str], object], ...] = (
     lambda stem: natural(Path(stem)),
     lambda stem: natural(Path(without_side(stem))),
     lambda stem: natural(Path(without_side(stem, camera_number=True))),
+    lambda stem: natural(Path(_moment(stem))),
 )
 """What two names of a pair have in common; the first that most of them have counts."""

@@ -16,6 +16,7 @@ from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.geometry import pose
 from fgslam.datasets.kitti_raw import open_kitti_raw
 from fgslam.datasets.layouts import recognise_layout
+from fgslam.datasets.loose_files import find_cameras, pair_files
 from fgslam.datasets.loose_images import open_loose_images
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import (
@@ -259,3 +260,24 @@ def test_kitti_raw_that_lacks_a_part(tmp_path: Path) -> None:
     (drive / "image_01").rename(drive / "image_07")
     with pytest.raises(DatasetError, match="has no two cameras' images"):
         open_kitti_raw(KittiRawSettings(path=str(drive)))
+
+
+def test_one_folder_may_number_the_cameras_last(tmp_path: Path) -> None:
+    """As Basalt and Kalibr's targets are stored: moment, then camera; not frames that go on."""
+    for k in (0, 2, 10):
+        for camera in (0, 1):
+            save(tmp_path / f"{k}_{camera}.png", picture(10 * k + camera))
+    found = find_cameras(tmp_path)
+    assert found is not None
+    pairs, notes = pair_files(found)
+    names = [(left.name, right.name) for right, left in pairs]
+    assert names == [("0_0.png", "0_1.png"), ("2_0.png", "2_1.png"), ("10_0.png", "10_1.png")]
+    assert notes == ()
+    save(tmp_path / "10_2.png", picture(1))
+    assert find_cameras(tmp_path) is None, "three numbers: these count something else"
+
+
+def test_frames_of_one_camera_are_no_pairs(tmp_path: Path) -> None:
+    for k in range(4):
+        save(tmp_path / f"frame_{k}.png", picture(k))
+    assert find_cameras(tmp_path) is None
