@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 
 import cv2
@@ -13,13 +14,14 @@ from fgslam.core.errors import FrameError
 _PAIRS = 3  # that are looked at
 _TRIED = 12  # frames, until so many could be read
 _FEATURES = 800
+_WIDE_PX = 400  # wider images are made smaller: a misfit is large
 _RATIO = 0.8
 _FEWEST_MATCHES = 60
 """In all pairs; below, nothing is said."""
 _ROW_PX = 2.0  # at 640 columns: rows of a sound pair agree within half a pixel
 _LEAST_SHARE = 1.0 / 3.0
-"""Of matches whose rows agree, wrong matches included. Real pairs by their own calibration: 0.63 to
-0.96 (chessboards whose pattern repeats, a room); by another's: 0.02 to 0.12."""
+"""Of matches whose rows agree, wrong matches included. Real pairs by their own calibration: 0.74 to
+0.96 (chessboards whose pattern repeats, a room); by another's: 0.01 to 0.16."""
 _MOST_NEGATIVE = 0.5
 """Of disparities: wrong matches make a tenth so."""
 
@@ -32,11 +34,12 @@ def fit_notes(load: Callable[[int], tuple[Image, ...]], count: int) -> tuple[str
             FrameError.
         count: how many frames there are.
     """
-    found = [_matched(*images[:2]) for images in _first(load, count)]
+    pairs = [images[:2] for images in _first(load, count)]
+    found = [_matched(*pair) for pair in pairs]
     if sum(map(len, found)) < _FEWEST_MATCHES:
         return ()
     offsets = np.concatenate(found)
-    wide = next(_first(load, count))[0].shape[1]
+    wide = pairs[0][0].shape[1]
     limit = _ROW_PX * max(1.0, wide / 640.0)
     share = float(np.mean(np.abs(offsets[:, 1]) < limit))
     negative = float(np.mean(offsets[:, 0] < 0.0))
@@ -73,7 +76,9 @@ def _first(load: Callable[[int], tuple[Image, ...]], count: int) -> Iterator[tup
 def _matched(right: Image, left: Image) -> FloatArray:
     """(n, 2) column and row in the left minus those in the right image, of features that match."""
     detector = cv2.SIFT.create(_FEATURES)
-    (there, a), (here, b) = (detector.detectAndCompute(image, None) for image in (left, right))
+    factor = max(1, math.ceil(right.shape[1] / _WIDE_PX))
+    small = (_shrunk(image, factor) for image in (left, right))
+    (there, a), (here, b) = (detector.detectAndCompute(image, None) for image in small)
     if a is None or b is None or len(a) < 2 or len(b) < 2:
         return np.empty((0, 2))
     matcher = cv2.BFMatcher(cv2.NORM_L2)
@@ -84,4 +89,11 @@ def _matched(right: Image, left: Image) -> FloatArray:
         if first.distance < _RATIO * second.distance and back[first.trainIdx] == first.queryIdx
     ]
     moved = [np.subtract(there[j].pt, here[i].pt) for i, j in kept]
-    return np.array(moved, np.float64).reshape(-1, 2)
+    return np.asarray(factor * np.array(moved, np.float64).reshape(-1, 2))
+
+
+def _shrunk(image: Image, factor: int) -> Image:
+    size = (image.shape[1] // factor, image.shape[0] // factor)
+    if factor == 1:
+        return image
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
