@@ -119,6 +119,10 @@ class RouteMap:
         """Of the places."""
         return self.topology.names
 
+    def knows(self, name: str) -> bool:
+        """Whether a place or a route is called so."""
+        return name in self.names or name in map(route_of, self.names)
+
     def link(self, start: str, end: str) -> Link:
         """From one place to another, by their names. Raises StoredMapError where they have none."""
         a, b = self._node(start), self._node(end)

@@ -95,15 +95,14 @@ def way_said(
     from fgslam.homing.route_map import RouteMap  # loads arrays
 
     joined = RouteMap.load(stored)
-    picture = Path(start)
     lines = []
-    if start not in joined.names and picture.is_file():
-        place = _place(joined, picture, camera)
+    if joined.knows(start):
+        way = joined.way(start, goal)
+    else:
+        place = _place(joined, Path(start), camera)
         near = f"near {place.name}, {place.inliers} features in common"
         lines.append(f"{start}: {f'at {place.name}' if place.at else near}")
         way = joined.way(place, goal)
-    else:
-        way = joined.way(start, goal)
     lines += [f"{len(way)} path images:", *_legs(joined, way.names)]
     if out is not None:
         way.save(out)
@@ -116,6 +115,11 @@ def _place(joined: RouteMap, picture: Path, camera: str | None) -> MapPlace:
     from fgslam.core.homing import Refusal
     from fgslam.datasets.images import read_colour_image
 
+    if not picture.is_file():
+        raise StoredMapError(
+            f"{picture}: neither a picture nor a place of the map; its places are "
+            f"{joined.names[0]} to {joined.names[-1]}"
+        )
     image = read_colour_image(picture)
     size = (image.shape[1], image.shape[0])
     place = joined.locate(image, None if camera is None else load_camera(camera, size))

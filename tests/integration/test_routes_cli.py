@@ -264,7 +264,7 @@ def test_routes_are_joined_and_the_way_is_said(
     assert "degrees" in capfd.readouterr().out
 
     said = mistake(capfd, monkeypatch, "route", "house.fgmap", "--from", "x", "--to", "route")
-    assert "no place x; its routes are route, across" in said
+    assert "x: neither a picture nor a place of the map" in said
     PictureFile.fromarray(np.full((91, 301, 3), 90, np.uint8)).save("grey.png")
     said = mistake(
         capfd, monkeypatch, "route", "house.fgmap", "--from", "grey.png", "--to", "route"
