@@ -41,7 +41,7 @@ from fgslam.homing.teaching import Teacher, with_neighbours_votes
 
 
 class HomingVector:
-    """Where one image was taken as seen from another, by Goedemé et al. (2005), section III."""
+    """The homing vector between two omnidirectional images (Goedemé et al. 2005, section III)."""
 
     def __init__(
         self,

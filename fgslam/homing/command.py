@@ -117,7 +117,7 @@ class PathPlace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveCommand:
-    """What the wheels are to do after one image.
+    """Speed and turning rate commanded after one image.
 
     Attributes:
         v: speed, m/s, forward.
